@@ -1,0 +1,57 @@
+"""Builds our networks from the weights of the authors' release."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from torch import Tensor, nn
+
+from torchrl_tit.interop.tit import tit_from_official
+
+_BUILDERS: dict[str, Callable[[Mapping[str, Any], Mapping[str, Tensor]], nn.Module]] = {
+    "tit": tit_from_official,
+}
+
+
+def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Module:
+    """Builds a network of this library from one of the authors' release.
+
+    The network computes what the authors' computes from the same input, to float precision.
+
+    Args:
+        config: what the network is. ``kind`` is ``"tit"``; the other entries of that kind are
+            ``variant`` ("vanilla" or "enhanced"), ``observation`` ("array" or "image"),
+            ``observation_shape`` ((D,) or (K, H, W)), ``patch_size``, ``num_blocks``,
+            ``features_dim``, ``embed_dim``, ``num_heads_inner``, ``num_heads_outer``,
+            ``activation_inner``, ``activation_outer``, ``activation_head``,
+            ``ffn_expansion_inner``, ``ffn_expansion_outer``, ``position_encoding`` and
+            ``share_blocks``; dropout probabilities (``attention_dropout_inner``, ...) are 0 where
+            missing.
+        params: the parameters under the authors' names, those of ``state_dict()``; with or without
+            a prefix such as ``features_extractor.pure_transformer_backbone.``.
+
+    Returns:
+        A module that takes what the authors' takes: arrays [B, D] without a history axis, images
+        [B, K, H, W]; floats are taken as they are (the authors divide images by 255 before the
+        network), only uint8 is divided by 255.
+
+    Raises:
+        ValueError: if the kind is not known, an entry is missing, or parameters are missing, left
+            over or of another shape.
+
+    Example:
+        >>> import torch
+        >>> from safetensors import safe_open
+        >>> def load(path: str) -> nn.Module:
+        ...     with safe_open(path, "pt") as file:
+        ...         config = json.loads(file.metadata()["config"])
+        ...         return from_official(config, {k: file.get_tensor(k) for k in file.keys()})
+    """
+    kind = config.get("kind")
+    if kind not in _BUILDERS:
+        raise ValueError(f"unknown kind of network {kind!r}: choose one of {sorted(_BUILDERS)}")
+    try:
+        return _BUILDERS[kind](config, params)
+    except KeyError as error:
+        raise ValueError(f"the config of kind {kind!r} has no entry {error}: {config}") from error

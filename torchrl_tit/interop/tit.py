@@ -1,0 +1,65 @@
+"""Vanilla_TIT and Enhanced_TIT of the authors' release."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from torch import Tensor, nn
+
+from torchrl_tit.interop.weights import load_renamed
+from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig, VanillaTIT, VanillaTITConfig
+
+_RENAMING = [
+    (r"obs_patch_embed\.weight", "frame_encoder.patch_embedding.weight"),
+    (r"class_token_encoding", "frame_encoder.class_token"),
+    (r"obs_patch_pos_encoding", "frame_encoder.positions"),
+    # Enhanced_TIT keeps pairs of blocks (one pair where they are shared), Vanilla_TIT two lists.
+    (r"blocks\.(\d+)\.inner_Transformer_block\.(.*)", r"frame_encoder.blocks.\1.\2"),
+    (r"blocks\.(\d+)\.outer_Transformer_block\.(.*)", r"history_encoder.blocks.\1.\2"),
+    (r"block\.inner_Transformer_block\.(.*)", r"frame_encoder.blocks.0.\1"),
+    (r"block\.outer_Transformer_block\.(.*)", r"history_encoder.blocks.0.\1"),
+    (r"inner_blocks\.(\d+)\.(.*)", r"frame_encoder.blocks.\1.\2"),
+    (r"outer_blocks\.(\d+)\.(.*)", r"history_encoder.blocks.\1.\2"),
+    (r"ln1\.(.*)", r"head.0.\1"),
+    (r"head\.0\.(.*)", r"head.1.\1"),
+    (r"ln2\.(.*)", r"head.3.\1"),
+]
+
+
+def tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
+    """Builds Vanilla_TIT or Enhanced_TIT; see :func:`~torchrl_tit.interop.from_official`."""
+    config_class = _choose(config, "variant", vanilla=VanillaTITConfig, enhanced=EnhancedTITConfig)
+    required = {"patch_size", "embed_dim", "num_blocks", "features_dim"}
+    known = {field.name for field in fields(config_class)}
+    hyperparameters = {name: config[name] for name in sorted(required)}
+    hyperparameters |= {name: value for name, value in config.items() if name in known}
+    params = _strip_prefix(params)
+    # The authors share blocks in Enhanced_TIT only: their Vanilla_TIT ignores the setting.
+    shared = any(name.startswith("block.") for name in params)
+    hyperparameters["share_blocks"] = shared
+    # The authors' causal masks are parameters too; ours are not.
+    params = {n.replace(".ln", ".norm"): p for n, p in params.items() if "attention_mask" not in n}
+
+    array = _choose(config, "observation", array=True, image=False)
+    shape = tuple(config["observation_shape"])
+    history, shape = (1, shape) if array else (shape[0], shape[1:])
+    network_class = VanillaTIT if config["variant"] == "vanilla" else EnhancedTIT
+    network = network_class(shape, history, config_class(**hyperparameters))
+    load_renamed(network, params, _RENAMING)
+    # The authors' arrays have no history axis.
+    return nn.Sequential(nn.Unflatten(-1, (1, *shape)), network) if array else network
+
+
+def _choose(config: Mapping[str, Any], entry: str, **choices: Any) -> Any:
+    if config[entry] not in choices:
+        raise ValueError(f"{entry} is {config[entry]!r}: expected one of {sorted(choices)}")
+    return choices[config[entry]]
+
+
+def _strip_prefix(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Drops the prefix that the class token's name has, and whatever else lies outside it."""
+    marker = "class_token_encoding"
+    prefix = next((n.removesuffix(marker) for n in params if n.endswith(marker)), "")
+    return {n.removeprefix(prefix): p for n, p in params.items() if n.startswith(prefix)}

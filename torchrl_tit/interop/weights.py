@@ -1,0 +1,50 @@
+"""Moving weights between names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+from torch import Tensor, nn
+
+Renaming = Sequence[tuple[str, str]]
+"""Pairs of a regular expression and its replacement, tried in order on the whole name."""
+
+
+def load_renamed(network: nn.Module, params: Mapping[str, Tensor], renaming: Renaming) -> None:
+    """Loads parameters of other names into a network, all of them and nothing else.
+
+    Args:
+        network: the network, changed in place.
+        params: parameters by their old names.
+        renaming: the first expression that matches a whole old name gives the new one.
+
+    Raises:
+        ValueError: if a name is not known, or names or shapes do not fit the network.
+
+    Example:
+        >>> import torch
+        >>> linear = nn.Linear(2, 1, bias=False)
+        >>> load_renamed(linear, {"old.w": torch.ones(1, 2)}, [(r"old\\.w", "weight")])
+        >>> linear.weight.tolist()
+        [[1.0, 1.0]]
+    """
+    renamed = {_rename(name, renaming): value for name, value in params.items()}
+    own = network.state_dict()
+    problems = [f"missing {name}" for name in own.keys() - renamed.keys()]
+    problems += [f"left over {name}" for name in renamed.keys() - own.keys()]
+    problems += [
+        f"{name} has shape {tuple(renamed[name].shape)} instead of {tuple(own[name].shape)}"
+        for name in own.keys() & renamed.keys()
+        if renamed[name].shape != own[name].shape
+    ]
+    if problems:
+        raise ValueError("the parameters do not fit the config: " + "; ".join(sorted(problems)))
+    network.load_state_dict(renamed)
+
+
+def _rename(name: str, renaming: Renaming) -> str:
+    for pattern, replacement in renaming:
+        if re.fullmatch(pattern, name):
+            return re.sub(pattern, replacement, name)
+    raise ValueError(f"unknown parameter {name!r}: it is none of the authors' network")

@@ -1,0 +1,37 @@
+"""Activation functions by the names that the configurations use."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+from torch import nn
+
+Activation = Literal["gelu", "relu", "silu", "tanh"]
+
+_ACTIVATIONS: dict[str, type[nn.Module]] = {
+    "gelu": nn.GELU,
+    "relu": nn.ReLU,
+    "silu": nn.SiLU,
+    "tanh": nn.Tanh,
+}
+
+
+def make_activation(name: Activation) -> nn.Module:
+    """Builds an activation function from its name.
+
+    Args:
+        name: one of ``"gelu"`` (the exact one, with erf), ``"relu"``, ``"silu"``, ``"tanh"``.
+
+    Returns:
+        A parameterless module, elementwise on any shape.
+
+    Raises:
+        ValueError: if the name is not known.
+
+    Example:
+        >>> make_activation("relu")
+        ReLU()
+    """
+    if name not in _ACTIVATIONS:
+        raise ValueError(f"unknown activation {name!r}: choose one of {get_args(Activation)}")
+    return _ACTIVATIONS[name]()

@@ -1,0 +1,120 @@
+"""Multi-head self-attention that computes only the positions that are read."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+Read = Literal["all", "first", "last"]
+"""Which positions of a sequence are read: all, the first (class token) or the last (newest step)."""
+
+READ_SLICES: dict[Read, slice] = {
+    "all": slice(None),
+    "first": slice(0, 1),
+    "last": slice(-1, None),
+}
+
+
+class SelfAttention(nn.Module):
+    """Multi-head scaled dot-product self-attention (arXiv 2212.14538, section "Inner Transformer").
+
+    Same parameters, names and results as :class:`torch.nn.MultiheadAttention` with
+    ``batch_first=True``, so that state dicts can be exchanged. Different in that queries are
+    computed only for the positions that are read.
+
+    Args:
+        embed_dim: width D of a token.
+        num_heads: number of heads; must divide ``embed_dim``.
+        causal: whether a position sees only itself and earlier ones.
+        dropout: probability of dropping an attention weight while training.
+
+    Raises:
+        ValueError: if ``num_heads`` does not divide ``embed_dim``.
+
+    Example:
+        >>> attention = SelfAttention(embed_dim=32, num_heads=4, causal=True)
+        >>> x = torch.randn(8, 5, 32)
+        >>> attention(x).shape, attention(x, read="last").shape
+        (torch.Size([8, 5, 32]), torch.Size([8, 1, 32]))
+    """
+
+    def __init__(
+        self, embed_dim: int, num_heads: int, *, causal: bool = False, dropout: float = 0.0
+    ) -> None:
+        super().__init__()
+        if num_heads < 1 or embed_dim % num_heads:
+            raise ValueError(
+                f"the width {embed_dim} cannot be split over {num_heads} attention heads: "
+                "choose a number of heads that divides embed_dim"
+            )
+        self.num_heads = num_heads
+        self.causal = causal
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * embed_dim, embed_dim))
+        self.in_proj_bias = nn.Parameter(torch.empty(3 * embed_dim))
+        self.out_proj = nn.Linear(embed_dim, embed_dim)
+        # A module, not a number: TorchRL's losses look for nn.Dropout to set vmap's randomness.
+        self.dropout = nn.Dropout(dropout)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises as ``nn.MultiheadAttention`` does: Xavier for the input projections."""
+        nn.init.xavier_uniform_(self.in_proj_weight)
+        nn.init.zeros_(self.in_proj_bias)
+        self.out_proj.reset_parameters()
+        nn.init.zeros_(self.out_proj.bias)
+
+    def forward(self, x: Tensor, read: Read = "all") -> Tensor:
+        """Attends over a sequence.
+
+        Args:
+            x: tokens, float [N, S, D].
+            read: which positions to put out.
+
+        Returns:
+            float [N, S or 1, D].
+        """
+        dropping = self.training and self.dropout.p > 0
+        if x.shape[1] == 1 and not dropping:
+            # A softmax over one position is 1: only the value is left.
+            return self.out_proj(self._project(x, 2, 3))
+        query, key, value = self._heads(x, read)  # [N, heads, S or 1, D / heads] each
+        masked = self.causal and read == "all"  # the last position sees everything
+        if dropping:
+            weights = self.dropout(self._weights(query, key, masked))
+            mixed = weights @ value
+        else:
+            mixed = F.scaled_dot_product_attention(query, key, value, is_causal=masked)
+        return self.out_proj(mixed.transpose(1, 2).flatten(2))
+
+    def weights(self, x: Tensor) -> Tensor:
+        """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1."""
+        query, key, _ = self._heads(x, "all")
+        return self._weights(query, key, self.causal)
+
+    def _project(self, x: Tensor, start: int, stop: int) -> Tensor:
+        """Applies the projections from ``start`` to ``stop`` of (query, key, value) at once."""
+        rows = slice(start * x.shape[-1], stop * x.shape[-1])
+        return F.linear(x, self.in_proj_weight[rows], self.in_proj_bias[rows])
+
+    def _heads(self, x: Tensor, read: Read) -> tuple[Tensor, Tensor, Tensor]:
+        if read == "all":
+            query, key, value = self._project(x, 0, 3).chunk(3, dim=-1)
+        else:
+            query = self._project(x[:, READ_SLICES[read]], 0, 1)
+            key, value = self._project(x, 1, 3).chunk(2, dim=-1)
+        return self._split(query), self._split(key), self._split(value)
+
+    def _split(self, x: Tensor) -> Tensor:
+        """[N, S, D] -> [N, heads, S, D / heads]."""
+        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+
+    def _weights(self, query: Tensor, key: Tensor, masked: bool) -> Tensor:
+        scores = query @ key.transpose(-2, -1) / math.sqrt(query.shape[-1])
+        if masked:
+            future = torch.ones(scores.shape[-2:], dtype=torch.bool, device=scores.device).triu(1)
+            scores = scores.masked_fill(future, -math.inf)
+        return scores.softmax(dim=-1)
