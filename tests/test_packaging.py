@@ -1,0 +1,136 @@
+"""What is built from the project: the wheel, its metadata, and the files that repeat them."""
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from email.message import Message
+from email.parser import Parser
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from the sdist, built from a copy, so that the clone stays clean."""
+    source = tmp_path_factory.mktemp("source") / "project"
+    outdir = tmp_path_factory.mktemp("dist")
+    unpublished = shutil.ignore_patterns(
+        ".*", "__pycache__", "*.egg-info", "build", "dist", "docs", "runs"
+    )
+    shutil.copytree(ROOT, source, ignore=unpublished)
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(outdir)]
+    result = subprocess.run(command, cwd=source, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert len(list(outdir.glob("*.tar.gz"))) == 1
+    [path] = outdir.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: Path) -> Message:
+    with ZipFile(wheel) as archive:
+        [name] = [n for n in archive.namelist() if n.endswith(".dist-info/METADATA")]
+        return Parser().parsestr(archive.read(name).decode())
+
+
+def test_wheel_holds_every_module_once_and_nothing_beside_the_library(wheel: Path) -> None:
+    with ZipFile(wheel) as archive:
+        names = {n for n in archive.namelist() if ".dist-info/" not in n}
+    library = {p.relative_to(ROOT).as_posix() for p in (ROOT / "torchrl_tit").rglob("*.py")}
+    recipes = {p.relative_to(ROOT).as_posix() for p in (ROOT / "recipes").rglob("*.py")}
+
+    assert names == library | {f"torchrl_tit/{n}" for n in recipes} | {"torchrl_tit/py.typed"}
+
+
+def test_installed_wheel_starts_the_command_without_a_top_level_recipes(
+    wheel: Path, tmp_path: Path
+) -> None:
+    site = tmp_path / "site"
+    with ZipFile(wheel) as archive:
+        archive.extractall(site)
+    # As the script that pip writes: the entry point of the wheel's metadata, loaded and called.
+    program = """
+import importlib.util, pathlib, sys
+from importlib.metadata import distributions
+
+site = sys.argv[1]
+sys.path.insert(0, site)
+assert importlib.util.find_spec("recipes") is None
+[distribution] = distributions(name="torchrl-tit", path=[site])
+[script] = distribution.entry_points.select(group="console_scripts")
+main = script.load()
+assert pathlib.Path(sys.modules[main.__module__].__file__).is_relative_to(site), main
+sys.argv = [script.name, "list"]
+sys.exit(main())
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(site)], cwd=tmp_path, capture_output=True, text=True
+    )
+
+    assert result.returncode == 0, result.stderr
+    assert "ppo/cartpole/enhanced-tit" in result.stdout
+
+
+def test_metadata_names_licence_python_and_readme(metadata: Message) -> None:
+    assert metadata["Name"] == "torchrl-tit"
+    assert metadata["License-Expression"] == "MIT"
+    assert metadata["License-File"] == "LICENSE"
+    assert metadata["Requires-Python"] == ">=3.11"
+    assert metadata.get_payload() == (ROOT / "README.md").read_text()
+
+
+def test_version_is_the_same_everywhere(metadata: Message) -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    newest = re.search(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+
+    assert newest is not None
+    assert {metadata["Version"], citation["version"], newest[1]} == {PROJECT["version"]}
+
+
+def test_every_direct_dependency_is_pinned_within_its_range() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+    versions = {canonicalize_name(name): version for name, version in pins.items()}
+    extras = PROJECT["optional-dependencies"].values()
+    direct = {
+        canonicalize_name(requirement.name): requirement
+        for requirement in map(Requirement, sum(extras, PROJECT["dependencies"]))
+        if requirement.name != PROJECT["name"]
+    }
+
+    assert versions.keys() == direct.keys()
+    outside = {n: v for n, v in versions.items() if v not in direct[n].specifier}
+    assert not outside
+
+
+@pytest.mark.parametrize("folder", ["recipes", "torchrl_tit"])
+def test_no_module_imports_recipes_by_its_name_in_a_clone(folder: str) -> None:
+    """In the wheel they have another name: they import themselves relatively, the library never."""
+    imports = [
+        (path.relative_to(ROOT).as_posix(), name)
+        for path in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        for name in _absolute_imports(node)
+        if re.match(r"(torchrl_tit\.)?recipes\b", name)
+    ]
+
+    assert imports == []
+
+
+def _absolute_imports(node: ast.AST) -> list[str]:
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if isinstance(node, ast.ImportFrom) and node.level == 0:
+        return [f"{node.module}.{alias.name}" for alias in node.names]
+    return []
