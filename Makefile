@@ -46,7 +46,7 @@ hooks: $(VENV)/installed-test  ## Check every commit and push as `make test` doe
 	$(BIN)/pre-commit install
 
 clean:  ## Remove the environment, builds and caches; runs stay
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .benchmarks
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/created:

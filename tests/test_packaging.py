@@ -14,7 +14,7 @@ from zipfile import ZipFile
 import pytest
 import yaml
 from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
+from packaging.utils import NormalizedName, canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -102,12 +102,7 @@ def test_every_direct_dependency_is_pinned_within_its_range() -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
     versions = {canonicalize_name(name): version for name, version in pins.items()}
-    extras = PROJECT["optional-dependencies"].values()
-    direct = {
-        canonicalize_name(requirement.name): requirement
-        for requirement in map(Requirement, sum(extras, PROJECT["dependencies"]))
-        if requirement.name != PROJECT["name"]
-    }
+    direct = _direct_dependencies()
 
     assert versions.keys() == direct.keys()
     outside = {n: v for n, v in versions.items() if v not in direct[n].specifier}
@@ -115,22 +110,38 @@ def test_every_direct_dependency_is_pinned_within_its_range() -> None:
 
 
 @pytest.mark.parametrize("folder", ["recipes", "torchrl_tit"])
+def test_every_imported_distribution_is_a_direct_dependency(folder: str) -> None:
+    known = {canonicalize_name(n) for n in sys.stdlib_module_names | {"torchrl_tit"}}
+    known |= _direct_dependencies().keys()
+    imported = {(p, name.partition(".")[0]) for p, name in _absolute_imports(folder)}
+
+    assert [(p, name) for p, name in imported if canonicalize_name(name) not in known] == []
+
+
+@pytest.mark.parametrize("folder", ["recipes", "torchrl_tit"])
 def test_no_module_imports_recipes_by_its_name_in_a_clone(folder: str) -> None:
     """In the wheel they have another name: they import themselves relatively, the library never."""
-    imports = [
-        (path.relative_to(ROOT).as_posix(), name)
-        for path in (ROOT / folder).rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
-        for name in _absolute_imports(node)
-        if re.match(r"(torchrl_tit\.)?recipes\b", name)
-    ]
+    names = re.compile(r"(torchrl_tit\.)?recipes\b")
 
-    assert imports == []
+    assert [(p, name) for p, name in _absolute_imports(folder) if names.match(name)] == []
 
 
-def _absolute_imports(node: ast.AST) -> list[str]:
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    if isinstance(node, ast.ImportFrom) and node.level == 0:
-        return [f"{node.module}.{alias.name}" for alias in node.names]
-    return []
+def _direct_dependencies() -> dict[NormalizedName, Requirement]:
+    extras = PROJECT["optional-dependencies"].values()
+    requirements = map(Requirement, sum(extras, PROJECT["dependencies"]))
+    return {canonicalize_name(r.name): r for r in requirements if r.name != PROJECT["name"]}
+
+
+def _absolute_imports(folder: str) -> list[tuple[str, str]]:
+    """(file, full name of what it imports) for all modules under a folder of the project."""
+    found = []
+    for path in (ROOT / folder).rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            else:
+                continue
+            found += [(path.relative_to(ROOT).as_posix(), name) for name in names]
+    return found
