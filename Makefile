@@ -15,6 +15,8 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
+# The tests come last, also under `make -j`: their closing line ends the log.
+.NOTPARALLEL:
 .PHONY: help demo test lint types unit bench format hooks clean
 
 help:  ## List the targets
