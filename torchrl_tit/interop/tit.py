@@ -3,13 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 from torch import Tensor, nn
 
 from torchrl_tit.interop.weights import load_renamed
 from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig, VanillaTIT, VanillaTITConfig
+
+_REQUIRED = (
+    "patch_size",
+    "embed_dim",
+    "num_blocks",
+    "num_heads_inner",
+    "num_heads_outer",
+    "ffn_expansion_inner",
+    "ffn_expansion_outer",
+    "activation_inner",
+    "activation_outer",
+    "activation_head",
+    "position_encoding",
+    "features_dim",
+)
+_OPTIONAL = (
+    "attention_dropout_inner",
+    "attention_dropout_outer",
+    "ffn_dropout_inner",
+    "ffn_dropout_outer",
+)
 
 _RENAMING = [
     (r"obs_patch_embed\.weight", "frame_encoder.patch_embedding.weight"),
@@ -31,10 +51,8 @@ _RENAMING = [
 def tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
     """Builds Vanilla_TIT or Enhanced_TIT; see :func:`~torchrl_tit.interop.from_official`."""
     config_class = _choose(config, "variant", vanilla=VanillaTITConfig, enhanced=EnhancedTITConfig)
-    required = {"patch_size", "embed_dim", "num_blocks", "features_dim"}
-    known = {field.name for field in fields(config_class)}
-    hyperparameters = {name: config[name] for name in sorted(required)}
-    hyperparameters |= {name: value for name, value in config.items() if name in known}
+    hyperparameters = {name: config[name] for name in _REQUIRED}
+    hyperparameters |= {name: config[name] for name in _OPTIONAL if name in config}
     params = _strip_prefix(params)
     # The authors share blocks in Enhanced_TIT only: their Vanilla_TIT ignores the setting.
     shared = any(name.startswith("block.") for name in params)

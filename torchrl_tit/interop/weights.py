@@ -12,7 +12,7 @@ Renaming = Sequence[tuple[str, str]]
 
 
 def load_renamed(network: nn.Module, params: Mapping[str, Tensor], renaming: Renaming) -> None:
-    """Loads parameters of other names into a network, all of them and nothing else.
+    r"""Loads parameters of other names into a network, all of them and nothing else.
 
     Args:
         network: the network, changed in place.
@@ -25,7 +25,7 @@ def load_renamed(network: nn.Module, params: Mapping[str, Tensor], renaming: Ren
     Example:
         >>> import torch
         >>> linear = nn.Linear(2, 1, bias=False)
-        >>> load_renamed(linear, {"old.w": torch.ones(1, 2)}, [(r"old\\.w", "weight")])
+        >>> load_renamed(linear, {"old.w": torch.ones(1, 2)}, [(r"old\.w", "weight")])
         >>> linear.weight.tolist()
         [[1.0, 1.0]]
     """

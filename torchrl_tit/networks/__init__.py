@@ -8,12 +8,8 @@ from torchrl_tit.networks.initialization import init_normal_, init_orthogonal_
 from torchrl_tit.networks.inner import InnerTransformer, LinearFrameEncoder
 from torchrl_tit.networks.outer import PairedOuterTransformer, StackedOuterTransformer
 from torchrl_tit.networks.patches import ArrayPatchEmbedding, ImagePatchEmbedding
-from torchrl_tit.networks.tit import (
-    EnhancedTIT,
-    EnhancedTITConfig,
-    VanillaTIT,
-    VanillaTITConfig,
-)
+from torchrl_tit.networks.tit import EnhancedTIT, VanillaTIT
+from torchrl_tit.networks.tit_config import EnhancedTITConfig, TITConfig, VanillaTITConfig
 
 __all__ = [
     "Activation",
@@ -28,6 +24,7 @@ __all__ = [
     "PairedOuterTransformer",
     "SelfAttention",
     "StackedOuterTransformer",
+    "TITConfig",
     "TransformerBlock",
     "VanillaTIT",
     "VanillaTITConfig",

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 Read = Literal["all", "first", "last"]
-"""Which positions of a sequence are read: all, the first (class token) or the last (newest step)."""
+"""Positions of a sequence that are read: all, the first (class token), the last (newest step)."""
 
 READ_SLICES: dict[Read, slice] = {
     "all": slice(None),
@@ -77,6 +77,8 @@ class SelfAttention(nn.Module):
         Returns:
             float [N, S or 1, D].
         """
+        if self.causal and read == "first":
+            x = x[:, :1]  # it sees itself only
         dropping = self.training and self.dropout.p > 0
         if x.shape[1] == 1 and not dropping:
             # A softmax over one position is 1: only the value is left.
@@ -94,6 +96,10 @@ class SelfAttention(nn.Module):
         """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1."""
         query, key, _ = self._heads(x, "all")
         return self._weights(query, key, self.causal)
+
+    def extra_repr(self) -> str:
+        """Names what the parameters' shapes do not show."""
+        return f"num_heads={self.num_heads}, causal={self.causal}"
 
     def _project(self, x: Tensor, start: int, stop: int) -> Tensor:
         """Applies the projections from ``start`` to ``stop`` of (query, key, value) at once."""

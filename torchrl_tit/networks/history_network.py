@@ -93,10 +93,10 @@ class HistoryNetwork(nn.Module):
         """
         self.check(history)
         if self.frame_encoder is None:
-            return AttentionMaps(self.history_encoder.attention_maps(history), [])
+            return AttentionMaps(_attention_maps(self.history_encoder, history), [])
         return AttentionMaps(
-            self.frame_encoder.attention_maps(history),
-            self.history_encoder.attention_maps(self.frame_encoder(history)),
+            _attention_maps(self.frame_encoder, history),
+            _attention_maps(self.history_encoder, self.frame_encoder(history)),
         )
 
     def check(self, history: Tensor) -> None:
@@ -110,12 +110,21 @@ class HistoryNetwork(nn.Module):
             )
         weights = next(self.parameters()).dtype
         autocast = torch.is_autocast_enabled(history.device.type)
-        floats = history.is_floating_point() and (autocast or history.dtype == weights)
-        if not floats and history.dtype != torch.uint8:
+        # Autocast converts every float type but double.
+        fits = history.dtype == weights or (
+            autocast and history.is_floating_point() and history.dtype != torch.float64
+        )
+        if not fits and history.dtype != torch.uint8:
             raise TypeError(
                 f"a history of {history.dtype} does not fit this network of {weights}: give it "
                 "uint8, or convert it first (TorchRL's DoubleToFloat, say)"
             )
+
+
+def _attention_maps(encoder: nn.Module, x: Tensor) -> list[Tensor]:
+    """Returns an encoder's attention weights: none where it has no attention."""
+    attention_maps = getattr(encoder, "attention_maps", None)
+    return [] if attention_maps is None else attention_maps(x)
 
 
 def check_observation(observation_shape: Sequence[int], history: int) -> None:

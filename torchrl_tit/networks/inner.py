@@ -92,7 +92,7 @@ class InnerTransformer(nn.Module):
             x = self._block(index)(x, read="first" if last else "all")
             if last or self.every_block:
                 class_tokens.append(x[:, 0])
-        return torch.stack(class_tokens, dim=1).reshape(*leading, self.num_tokens, -1)
+        return torch.stack(class_tokens, dim=1).reshape(*leading, self.num_tokens, x.shape[-1])
 
     def attention_maps(self, observation: Tensor) -> list[Tensor]:
         """Returns the attention weights of each block, L x float [..., heads, S, S].
@@ -119,10 +119,11 @@ class InnerTransformer(nn.Module):
         leading = observation.shape[: observation.ndim - frame_ndim]
         shape = observation.shape[observation.ndim - frame_ndim :]
         # Arrays become [N, channels, D], images [N, channels, H, W]: frames are channels too.
-        space = shape[-1:] if self.observation_ndim == 1 else shape[-2:]
-        x = observation.reshape(math.prod(leading), -1, *space)
+        space = 1 if self.observation_ndim == 1 else 2
+        channels = math.prod(shape[:-space])
+        x = observation.reshape(math.prod(leading), channels, *shape[-space:])
         patches = self.patch_embedding(x)
-        x = torch.cat([self.class_token.expand(len(patches), -1, -1), patches], dim=1)
+        x = torch.cat([self.class_token.expand(patches.shape[0], -1, -1), patches], dim=1)
         return x if self.positions is None else x + self.positions, tuple(leading)
 
 
@@ -151,7 +152,3 @@ class LinearFrameEncoder(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """[..., *observation_shape], float or uint8 -> [..., 1, D]."""
         return embed(observation.flatten(-self.observation_ndim).unsqueeze(-2), self.linear.weight)
-
-    def attention_maps(self, observation: Tensor) -> list[Tensor]:
-        """Returns nothing: there is no attention here."""
-        return []

@@ -40,6 +40,10 @@ class ArrayPatchEmbedding(nn.Module):
         """Initialises as ``nn.Conv1d`` does."""
         nn.init.kaiming_uniform_(self.weight, a=math.sqrt(5))
 
+    def extra_repr(self) -> str:
+        """Names the shape of the weight: width, channels, P."""
+        return f"{', '.join(map(str, self.weight.shape))}, padding={self.padding}"
+
     def forward(self, x: Tensor) -> Tensor:
         """[N, channels, D] of any float type or uint8 -> tokens [N, ceil(D / P), embed_dim]."""
         if self.padding:
@@ -96,6 +100,10 @@ class ImagePatchEmbedding(nn.Module):
     def reset_parameters(self) -> None:
         """Initialises as ``nn.Conv2d`` does."""
         nn.init.kaiming_uniform_(self.weight, a=math.sqrt(5))
+
+    def extra_repr(self) -> str:
+        """Names the shape of the weight: width, C, P, P."""
+        return f"{', '.join(map(str, self.weight.shape))}, grid={self.grid}"
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, C, H, W], float or uint8 -> tokens [N, H / P * W / P, embed_dim]."""
