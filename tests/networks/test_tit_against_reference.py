@@ -1,0 +1,265 @@
+"""Every output, gradient and attention map against the independent reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
+
+from tests.networks.reference import (
+    ReferenceTIT,
+    copy_parameters,
+    matched_parameters,
+    randomize,
+)
+from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, VanillaTIT
+
+NETWORKS: dict[str, dict[str, Any]] = {
+    "vanilla": {"variant": "vanilla"},
+    "enhanced": {},
+    "without dense": {"dense": False},
+    "without inner": {"inner": False},
+    "without outer": {"outer": False},
+}
+
+# Name: observation shape, history, hyperparameters.
+CASES: dict[str, tuple[tuple[int, ...], int, dict[str, Any]]] = {
+    "array, K=1": ((4,), 1, {}),
+    "array, K=2": ((4,), 2, {"num_heads_inner": 2, "num_heads_outer": 4}),
+    "array, K=4": ((5,), 4, {"num_heads_inner": 4, "num_heads_outer": 2}),
+    "array of one entry": ((1,), 2, {}),
+    "P divides D": ((8,), 2, {"patch_size": 4}),
+    "D=11, P=4": ((11,), 2, {"patch_size": 4}),
+    "D=7, P=4": ((7,), 2, {"patch_size": 4}),
+    "D=10, P=4": ((10,), 2, {"patch_size": 4}),
+    "D=9, P=4": ((9,), 1, {"patch_size": 4}),
+    "P = D": ((5,), 2, {"patch_size": 5}),
+    "P > D": ((3,), 2, {"patch_size": 8}),
+    "expansions": ((4,), 2, {"ffn_expansion_inner": 1, "ffn_expansion_outer": 2}),
+    "relu, tanh, gelu": (
+        (4,),
+        2,
+        {"activation_inner": "relu", "activation_outer": "tanh", "activation_head": "gelu"},
+    ),
+    "silu, gelu, relu": (
+        (4,),
+        2,
+        {"activation_inner": "silu", "activation_outer": "gelu", "activation_head": "relu"},
+    ),
+    "no positions": ((4,), 2, {"position_encoding": False}),
+    "temporal positions": ((4,), 4, {"temporal_position_encoding": True}),
+    "no positions but temporal": (
+        (4,),
+        2,
+        {"position_encoding": False, "temporal_position_encoding": True},
+    ),
+    "shared blocks": ((4,), 2, {"share_blocks": True, "num_blocks": 3}),
+    "one block": ((4,), 2, {"num_blocks": 1}),
+    "three blocks": ((4,), 3, {"num_blocks": 3}),
+    "image": ((12, 12), 2, {"patch_size": 4, "num_heads_inner": 2}),
+    "image of one patch": ((6, 6), 1, {"patch_size": 6}),
+    "wide image of three channels": ((3, 8, 12), 4, {"patch_size": 4, "num_heads_outer": 2}),
+    "tall image, temporal positions": (
+        (12, 4),
+        2,
+        {"patch_size": 2, "temporal_position_encoding": True},
+    ),
+}
+
+
+def make_pair(
+    network: str, shape: tuple[int, ...], history: int, **settings: Any
+) -> tuple[HistoryNetwork, ReferenceTIT]:
+    kind = NETWORKS[network]
+    settings = {"embed_dim": 16, "features_dim": 12} | settings
+    reference = ReferenceTIT(shape, history, **settings, **kind)
+    ours: HistoryNetwork
+    if kind.get("variant") == "vanilla":
+        ours = VanillaTIT(shape, history, **settings)
+    else:
+        ours = EnhancedTIT(shape, history, **settings, **kind)
+    randomize(ours)
+    copy_parameters(ours, reference)
+    return ours, reference
+
+
+def results(
+    network: HistoryNetwork | ReferenceTIT, history: Tensor, probe: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Features, and the gradient of sum(features * probe) with respect to the input."""
+    history = history.detach().clone().requires_grad_()
+    features = network(history)
+    (features * probe).sum().backward()
+    assert history.grad is not None
+    return features.detach(), history.grad
+
+
+def gradient(parameter: Tensor) -> Tensor:
+    return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_outputs_and_gradients(network: str, case: str) -> None:
+    shape, steps, settings = CASES[case]
+    ours, reference = make_pair(network, shape, steps, **settings)
+    history = torch.randn(5, steps, *shape)
+    probe = torch.randn(5, 12)
+
+    features, input_gradient = results(ours, history, probe)
+    expected, expected_gradient = results(reference, history, probe)
+
+    torch.testing.assert_close(features, expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(input_gradient, expected_gradient, rtol=0, atol=1e-4)
+    assert input_gradient.abs().max() > 1e-3, "a gradient that is no gradient proves nothing"
+    for name, parameter, theirs in matched_parameters(ours, reference):
+        torch.testing.assert_close(
+            gradient(parameter), gradient(theirs), rtol=1e-4, atol=1e-4, msg=lambda m, n=name: n + m
+        )
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("network", NETWORKS)
+def test_in_double_precision_nothing_but_rounding_is_left(network: str, case: str) -> None:
+    shape, steps, settings = CASES[case]
+    ours, reference = make_pair(network, shape, steps, **settings)
+    ours, reference = ours.double(), reference.double()
+    history = torch.randn(2, steps, *shape, dtype=torch.float64)
+    probe = torch.randn(2, 12, dtype=torch.float64)
+
+    features, input_gradient = results(ours, history, probe)
+    expected, expected_gradient = results(reference, history, probe)
+
+    torch.testing.assert_close(features, expected, rtol=0, atol=1e-12)
+    torch.testing.assert_close(input_gradient, expected_gradient, rtol=1e-9, atol=1e-11)
+    for name, parameter, theirs in matched_parameters(ours, reference):
+        torch.testing.assert_close(
+            gradient(parameter),
+            gradient(theirs),
+            rtol=1e-9,
+            atol=1e-10,
+            msg=lambda m, n=name: n + m,
+        )
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("case", ["array, K=4", "wide image of three channels"])
+def test_all_parameters_are_matched(network: str, case: str) -> None:
+    shape, steps, settings = CASES[case]
+    ours, reference = make_pair(network, shape, steps, **settings)
+    matched = {id(theirs) for _, _, theirs in matched_parameters(ours, reference)}
+    unread = {name for name, p in reference.named_parameters() if id(p) not in matched}
+    if network == "without dense":
+        assert all(name.startswith("blocks.0.outer_Transformer_block.") for name in unread)
+    else:
+        assert not unread
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize(("shape", "patch_size"), [((12, 8), 4), ((3, 8, 8), 4), ((7,), 4)])
+def test_bytes(network: str, shape: tuple[int, ...], patch_size: int) -> None:
+    ours, reference = make_pair(network, shape, 2, patch_size=patch_size)
+    history = torch.randint(0, 256, (3, 2, *shape), dtype=torch.uint8)
+
+    torch.testing.assert_close(ours(history), reference(history), rtol=0, atol=1e-5)
+    torch.testing.assert_close(ours(history), ours(history / 255), rtol=0, atol=1e-5)
+
+    ours(history).square().sum().backward()
+    reference(history).square().sum().backward()
+    for name, parameter, theirs in matched_parameters(ours, reference):
+        torch.testing.assert_close(
+            gradient(parameter), gradient(theirs), rtol=1e-4, atol=1e-4, msg=lambda m, n=name: n + m
+        )
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("leading", [(), (3,), (2, 3), (2, 1, 3), (0,), (2, 0)])
+@pytest.mark.parametrize("case", ["array, K=4", "wide image of three channels"])
+def test_leading_dimensions(network: str, leading: tuple[int, ...], case: str) -> None:
+    shape, steps, settings = CASES[case]
+    ours, reference = make_pair(network, shape, steps, **settings)
+    history = torch.randn(*leading, steps, *shape)
+    features = ours(history)
+    assert features.shape == (*leading, 12)
+    if 0 not in leading:
+        torch.testing.assert_close(features, reference(history), rtol=0, atol=1e-5)
+    features.sum().backward()  # an empty batch has a gradient too
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+def test_memory_layout_does_not_matter(network: str) -> None:
+    shape, steps, settings = CASES["wide image of three channels"]
+    ours, _ = make_pair(network, shape, steps, **settings)
+    history = torch.randn(3, steps, *shape)
+    expected = ours(history)
+    channels_last = history.permute(0, 1, 3, 4, 2).contiguous().permute(0, 1, 4, 2, 3)
+    step_last = history.movedim(1, -1).contiguous().movedim(-1, 1)
+    window = torch.randn(3, steps + 3, *shape)[:, 2:-1].copy_(history)
+    for other in (channels_last, step_last, window):
+        assert not other.is_contiguous()
+        torch.testing.assert_close(ours(other), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize("leading", [(), (3,), (2, 3), (0,)])
+@pytest.mark.parametrize(
+    "case", ["array, K=1", "array, K=4", "three blocks", "shared blocks", "image", "P > D"]
+)
+def test_attention_maps(network: str, leading: tuple[int, ...], case: str) -> None:
+    shape, steps, settings = CASES[case]
+    ours, reference = make_pair(network, shape, steps, **settings)
+    history = torch.randn(*leading, steps, *shape)
+    maps = ours.attention_maps(history)
+
+    blocks = settings.get("num_blocks", 2)
+    assert len(maps.inner) == (0 if network == "without inner" else blocks)
+    if network == "without outer":
+        assert not maps.outer
+    else:
+        # Without the dense connection only the last pair's outer block is there.
+        assert len(maps.outer) == (1 if network == "without dense" else blocks)
+    if 0 in leading:
+        assert all(m.shape[: len(leading)] == leading for m in maps.inner + maps.outer)
+        return
+
+    _, inner, outer = reference.with_maps(history)
+    outer = outer[-len(maps.outer) :] if maps.outer else []
+    for weights, expected in zip(maps.inner + maps.outer, inner + outer, strict=True):
+        torch.testing.assert_close(weights, expected, rtol=0, atol=1e-5)
+        torch.testing.assert_close(weights.sum(-1), torch.ones(weights.shape[:-1]))
+    for weights in maps.outer:
+        assert weights.shape == (*leading, settings.get("num_heads_outer", 1), steps, steps)
+        assert not weights.triu(1).any(), "a step sees a later one"
+
+
+def test_usual_pass_computes_no_attention_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    tit = EnhancedTIT((8, 8), 3, patch_size=4)
+
+    def never(*_: object) -> None:
+        raise AssertionError("attention weights were computed")
+
+    for name in ("weights", "_weights"):
+        monkeypatch.setattr(f"torchrl_tit.networks.attention.SelfAttention.{name}", never)
+    tit(torch.randn(2, 3, 8, 8))
+    with pytest.raises(AssertionError, match="were computed"):
+        tit.attention_maps(torch.randn(2, 3, 8, 8))
+
+
+@pytest.mark.parametrize("network", ["vanilla", "enhanced"])
+def test_only_what_is_read_is_computed(network: str) -> None:
+    ours, reference = make_pair(
+        network, (84, 84), 4, patch_size=12, embed_dim=64, num_heads_inner=4, num_heads_outer=4
+    )
+    history = torch.rand(2, 4, 84, 84)
+
+    def flops(module: torch.nn.Module) -> int:
+        with FlopCounterMode(display=False) as counter, torch.no_grad():
+            module(history)
+        return counter.get_total_flops()
+
+    # Of two inner blocks the second needs keys and values of all 50 tokens, but a query, an
+    # output projection and an FFN of the class token only.
+    assert flops(ours) < 0.65 * flops(reference)
