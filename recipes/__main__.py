@@ -1,0 +1,6 @@
+"""The command line: ``python -m recipes``."""
+
+from .cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,389 @@
+"""PPO with any backbone of the house: the settings, and the loop that they drive."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+from tqdm import tqdm
+
+from torchrl_tit.checkpoint import (
+    collector_state,
+    global_rng_state,
+    set_collector_state,
+    set_global_rng_state,
+)
+from torchrl_tit.envs import make_env
+from torchrl_tit.evaluation import evaluate
+from torchrl_tit.modules import Backbone, make_actor, make_value
+from torchrl_tit.networks import init_orthogonal_
+
+from .interrupt import Interrupt
+from .networks import make_network
+from .recipe import Recipe, check_at_least
+from .run import Run
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPO(Recipe):
+    """Proximal policy optimisation (arXiv 1707.06347) as Stable-Baselines3 sets it.
+
+    The defaults are those of the paper's runs on arrays (arXiv 2212.14538, appendix).
+    """
+
+    algorithm: ClassVar[str] = "ppo"
+
+    env: str
+    """Name of a Gymnasium environment."""
+    history: int = 1
+    """Number K of observations that the network sees."""
+    padding: Literal["same", "constant"] = "same"
+    """What stands before an episode's first observation: that observation, or zeros."""
+    num_envs: int = 1
+    """Environments that are stepped side by side; they share the steps of a batch."""
+    total_steps: int = 100_000
+    """Environment steps to train for, rounded up to whole batches."""
+    steps_per_batch: int = 2048
+    """Environment steps that are collected before each update; must be a multiple of num_envs."""
+    minibatch_size: int = 64
+    """Steps in one gradient step."""
+    epochs: int = 10
+    """Passes over each batch."""
+    learning_rate: float = 3e-4
+    """Learning rate of Adam, at the start where it decays."""
+    decay_learning_rate: bool = False
+    """Whether the learning rate falls linearly to 0 over the run."""
+    adam_eps: float = 1e-5
+    """Epsilon of Adam."""
+    max_grad_norm: float = 0.5
+    """Gradients are scaled down to this norm."""
+    clip_epsilon: float = 0.2
+    """How far the probability ratio may move, at the start where it decays."""
+    decay_clip_epsilon: bool = False
+    """Whether the clipping range falls linearly to 0 over the run."""
+    entropy_coeff: float = 0.0
+    """Weight of the entropy bonus."""
+    critic_coeff: float = 0.5
+    """Weight of the mean squared value error."""
+    gamma: float = 0.99
+    """Discount factor."""
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation (arXiv 1506.02438)."""
+    bootstrap_time_limit: bool = True
+    """Whether an episode cut by a time limit goes on in its value. The paper's runs (SB3 1.3.0)
+    took the cut for a termination."""
+    initialization: Literal["orthogonal", "normal"] = "orthogonal"
+    """How the backbone starts: as Stable-Baselines3 does it, which the paper's runs had, or normal
+    with 0.02, as its networks are written."""
+    evaluation_episodes: int = 100
+    """Episodes of the evaluation after training."""
+    evaluation_seed: int = 1_000_000
+    """Seed of the first evaluation episode; the others follow one by one."""
+    checkpoint_interval: int = 10_240
+    """Environment steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(
+            self,
+            history=1,
+            num_envs=1,
+            total_steps=1,
+            minibatch_size=2,  # an advantage alone has no standard deviation
+            epochs=1,
+            learning_rate=0,
+            max_grad_norm=0,
+            clip_epsilon=0,
+            evaluation_episodes=1,
+            checkpoint_interval=1,
+        )
+        if self.steps_per_batch < 2 or self.steps_per_batch % self.num_envs:
+            raise ValueError(
+                f"steps_per_batch {self.steps_per_batch} cannot be shared by {self.num_envs} "
+                "environments: it must be a multiple of num_envs"
+            )
+
+    @property
+    def num_batches(self) -> int:
+        """Whole batches that cover ``total_steps``."""
+        return math.ceil(self.total_steps / self.steps_per_batch)
+
+    def make_env(self, num_envs: int, seed: int) -> EnvBase:
+        """Builds the environment, with the history as part of it."""
+        return make_env(self.env, num_envs, seed=seed, history=self.history, padding=self.padding)
+
+    def train(self, run: Run) -> None:
+        """Trains in a run folder; see :func:`train`."""
+        train(self, run)
+
+    def evaluate(self, run: Run) -> dict[str, Any]:
+        """Evaluates a run's newest checkpoint: full episodes, the most likely action, raw rewards.
+
+        Args:
+            run: a run folder with a checkpoint.
+
+        Returns:
+            ``returns`` of the episodes, their ``mean`` and ``std`` (population), ``episodes``,
+            ``seed`` of the first episode, ``env``, and ``steps`` that the agent was trained for.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+        """
+        loaded = run.load()
+        if loaded is None:
+            raise FileNotFoundError(f"{run.checkpoints} holds no checkpoint: train the run first")
+        step, state = loaded
+        torch.set_num_threads(self.threads)
+        agent = Agent(self, self.make_env(1, self.evaluation_seed))
+        agent.load_state_dict(state["agent"])
+        returns = evaluate(
+            lambda num_envs: self.make_env(num_envs, self.evaluation_seed),
+            agent.policy,
+            self.evaluation_episodes,
+            seed=self.evaluation_seed,
+        )
+        return {
+            "mean": returns.mean().item(),
+            "std": returns.std(correction=0).item(),
+            "episodes": len(returns),
+            "seed": self.evaluation_seed,
+            "env": self.env,
+            "steps": step,
+            "returns": returns.tolist(),
+        }
+
+
+class Agent(nn.Module):
+    """Backbone, actor and critic; the heads read the features that the backbone writes.
+
+    Args:
+        recipe: the settings.
+        env: an environment with a history, for its shapes and its action space.
+    """
+
+    def __init__(self, recipe: PPO, env: EnvBase) -> None:
+        super().__init__()
+        shape = env.observation_spec["history"].shape[env.batch_dims + 1 :]
+        network = make_network(recipe.backbone, shape, recipe.history)
+        if recipe.initialization == "orthogonal":
+            init_orthogonal_(network)
+        self.backbone = Backbone(network)
+        action_spec = env.action_spec_unbatched
+        self.actor = make_actor(network.features_dim, action_spec)
+        self.critic = make_value(network.features_dim)
+        self.to(recipe.torch_device())
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """History in; features, action, its log-probability and the state's value out."""
+        return TensorDictSequential(self.backbone, self.actor, self.critic)
+
+
+def train(recipe: PPO, run: Run) -> None:
+    """Trains an agent, from the newest checkpoint of the run where there is one.
+
+    Args:
+        recipe: the settings.
+        run: an open run folder.
+
+    Raises:
+        FloatingPointError: if a loss or the gradient is not finite.
+    """
+    torch.set_num_threads(recipe.threads)
+    random.seed(recipe.seed)
+    np.random.seed(recipe.seed)
+    torch.manual_seed(recipe.seed)
+
+    env = recipe.make_env(recipe.num_envs, recipe.seed)
+    agent = Agent(recipe, env)
+    loss = ClipPPOLoss(
+        agent.actor,
+        agent.critic,
+        clip_epsilon=recipe.clip_epsilon,
+        entropy_coeff=recipe.entropy_coeff,
+        critic_coeff=recipe.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=True,
+        functional=False,
+    )
+    gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
+    parameters = list(agent.parameters())
+    optimizer = torch.optim.Adam(
+        parameters, lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
+    )
+    collector = Collector(
+        env,
+        agent.policy,
+        frames_per_batch=recipe.steps_per_batch,
+        total_frames=recipe.num_batches * recipe.steps_per_batch,
+        auto_register_policy_transforms=False,
+        device=recipe.torch_device(),
+    )
+    state = TrainingState(agent, optimizer, collector)
+    step = state.load(run)
+    metrics = run.metrics(COLUMNS, last_step=step)
+    saved_step = step
+    progress = tqdm(
+        total=collector.total_frames, initial=step, unit=" steps", desc=recipe.name, smoothing=0.05
+    )
+    with Interrupt() as interrupt, progress:
+        agent.eval()  # no dropout while acting
+        for batch in collector:
+            step += batch.numel()
+            remaining = 1 - (step - batch.numel()) / collector.total_frames
+            if recipe.decay_learning_rate:
+                optimizer.param_groups[0]["lr"] = recipe.learning_rate * remaining
+            if recipe.decay_clip_epsilon:
+                loss.clip_epsilon.fill_(recipe.clip_epsilon * remaining)
+
+            with torch.no_grad():
+                add_advantages(batch, agent, gae, recipe.bootstrap_time_limit)
+            agent.train()
+            losses = []
+            for minibatch in minibatches(batch, recipe):
+                agent.backbone(minibatch)  # once; the heads read its features
+                terms = loss(minibatch)
+                total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+                optimizer.zero_grad()
+                total.backward()
+                norm = nn.utils.clip_grad_norm_(parameters, recipe.max_grad_norm)
+                optimizer.step()
+                losses.append(torch.stack([terms[name].detach() for name in TERMS] + [norm]))
+            agent.eval()
+            means = check_finite(torch.stack(losses), step, saved_step)
+
+            finished = batch["next", "episode_reward"][batch["next", "done"]]
+            mean_return = finished.mean().item()  # NaN where no episode ended
+            metrics.log(
+                step,
+                return_mean=mean_return,
+                episodes=len(finished),
+                learning_rate=optimizer.param_groups[0]["lr"],
+                **means,
+            )
+            progress.update(batch.numel())
+            if len(finished):
+                progress.set_postfix_str(f"return {mean_return:.1f}")
+            last = step >= collector.total_frames
+            if last or interrupt.requested or step - saved_step >= recipe.checkpoint_interval:
+                state.save(run, step)
+                saved_step = step
+            if interrupt.requested and not last:
+                raise KeyboardInterrupt
+    metrics.close()
+    collector.shutdown()
+
+
+TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
+COLUMNS = ["return_mean", "episodes", "learning_rate", *TERMS, "gradient_norm"]
+
+
+def add_advantages(
+    batch: TensorDictBase, agent: Agent, gae: GAE, bootstrap_time_limit: bool
+) -> None:
+    """Writes ``advantage`` and ``value_target`` = advantage + value into a batch.
+
+    The value of the next state is the one that the collector computed a step later, except where
+    the episode or the batch ends: there the critic is asked about the true next observation.
+
+    Args:
+        batch: [envs, time], with the values of its states.
+        agent: the agent whose critic is asked.
+        gae: TorchRL's estimator, which stops at terminations and goes on at time limits.
+        bootstrap_time_limit: if off, a time limit counts as a termination.
+    """
+    value = batch["state_value"]  # [envs, time, 1]
+    ends = batch["next", "done"].squeeze(-1).clone()
+    ends[:, -1] = True
+    next_value = value.roll(-1, dims=1)
+    last = batch["next"][ends].select("history")
+    next_value[ends] = agent.critic(agent.backbone(last))["state_value"]
+    batch["next", "state_value"] = next_value
+    if not bootstrap_time_limit:
+        batch["next", "terminated"] = batch["next", "done"]
+    gae(batch)
+
+
+def minibatches(batch: TensorDictBase, recipe: PPO) -> Iterator[TensorDict]:
+    """Yields shuffled minibatches of a batch, ``recipe.epochs`` times over."""
+    keys = ["history", "action", "action_log_prob", "advantage", "value_target"]
+    steps = batch.select(*keys).reshape(-1)
+    for _ in range(recipe.epochs):
+        for index in torch.randperm(len(steps), device=steps.device).split(recipe.minibatch_size):
+            yield steps[index]
+
+
+def check_finite(losses: Tensor, step: int, saved_step: int) -> dict[str, float]:
+    """Returns the means of a batch's losses, or stops where one is not finite.
+
+    Args:
+        losses: float [minibatches, terms], the gradient's norm last.
+        step: environment steps so far.
+        saved_step: step of the last checkpoint.
+
+    Raises:
+        FloatingPointError: naming the term, the step and the last good checkpoint.
+    """
+    names = [*TERMS, "gradient_norm"]
+    bad = (~losses.isfinite()).nonzero()
+    if len(bad):
+        minibatch, term = bad[0].tolist()
+        saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
+        raise FloatingPointError(
+            f"{names[term]} became {losses[minibatch, term].item()} in the update at step {step} "
+            f"(gradient step {minibatch} of it); {saved}"
+        )
+    return dict(zip(names, losses.mean(0).tolist(), strict=True))
+
+
+class TrainingState:
+    """All that a run needs to go on as if it had never stopped.
+
+    Args:
+        agent: the networks.
+        optimizer: the optimizer of the agent.
+        collector: the collector, with its environment.
+    """
+
+    def __init__(
+        self, agent: Agent, optimizer: torch.optim.Optimizer, collector: Collector
+    ) -> None:
+        self.agent = agent
+        self.optimizer = optimizer
+        self.collector = collector
+
+    def save(self, run: Run, step: int) -> None:
+        """Saves a checkpoint."""
+        run.save(
+            step,
+            {
+                "agent": self.agent.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "collector": collector_state(self.collector),
+                "rng": global_rng_state(),
+            },
+        )
+
+    def load(self, run: Run) -> int:
+        """Loads the newest checkpoint and returns its step, 0 where there is none."""
+        loaded = run.load()
+        if loaded is None:
+            return 0
+        step, state = loaded
+        self.agent.load_state_dict(state["agent"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        set_collector_state(self.collector, state["collector"])
+        set_global_rng_state(state["rng"])
+        return step

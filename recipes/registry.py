@@ -1,0 +1,59 @@
+"""The named recipes: the paper's experiments as data."""
+
+from __future__ import annotations
+
+from torchrl_tit.networks import EnhancedTITConfig, VanillaTITConfig
+
+from .networks import NetworkConfig
+from .ppo import PPO
+from .recipe import Recipe, nearest
+
+# Task name: environment. 100k steps each (arXiv 2212.14538, appendix).
+_CLASSIC_CONTROL = {
+    "acrobot": "Acrobot-v1",
+    "cartpole": "CartPole-v1",
+    "mountaincar": "MountainCar-v0",
+}
+# The paper leaves open which settings were used where, within patch 1, width 32 or 64, two blocks.
+_ARRAY_NETWORKS: dict[str, NetworkConfig] = {
+    "vanilla-tit": VanillaTITConfig(),
+    "enhanced-tit": EnhancedTITConfig(),
+}
+# Published by the authors for this task alone.
+_MOUNTAINCAR_NETWORKS: dict[str, NetworkConfig] = {
+    "vanilla-tit": VanillaTITConfig(
+        embed_dim=32, num_heads_inner=4, num_heads_outer=8, features_dim=64
+    ),
+    "enhanced-tit": EnhancedTITConfig(
+        embed_dim=16, num_heads_inner=4, num_heads_outer=8, features_dim=128
+    ),
+}
+
+
+def _named() -> dict[str, Recipe]:
+    recipes: dict[str, Recipe] = {}
+    for task, env in _CLASSIC_CONTROL.items():
+        networks = _MOUNTAINCAR_NETWORKS if task == "mountaincar" else _ARRAY_NETWORKS
+        for network, backbone in networks.items():
+            name = f"ppo/{task}/{network}"
+            recipes[name] = PPO(name=name, env=env, backbone=backbone)
+    return recipes
+
+
+RECIPES: dict[str, Recipe] = _named()
+"""Every named recipe."""
+
+
+def get_recipe(name: str) -> Recipe:
+    """Looks a recipe up.
+
+    Raises:
+        ValueError: if there is none of that name; the message names the nearest ones.
+
+    Example:
+        >>> get_recipe("ppo/cartpole/enhanced-tit").env
+        'CartPole-v1'
+    """
+    if name not in RECIPES:
+        raise ValueError(f"unknown recipe {name!r}: {nearest(name, RECIPES)}")
+    return RECIPES[name]
