@@ -1,0 +1,83 @@
+"""make_env makes the task that was named, seeded one copy at a time."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from torchrl_tit.envs import make_env
+
+
+@pytest.mark.parametrize(
+    ("name", "observation", "action"),
+    [
+        ("CartPole-v1", (4,), ()),
+        ("Acrobot-v1", (6,), ()),
+        ("MountainCar-v0", (2,), ()),
+        ("HalfCheetah-v5", (17,), (6,)),
+        ("Ant-v5", (105,), (8,)),
+    ],
+)
+def test_tasks(name, observation, action):
+    env = make_env(name, 2, history=3)
+    rollout = env.rollout(4)
+    assert env.batch_size == (2,)
+    assert rollout["observation"].shape == (2, 4, *observation)
+    assert rollout["history"].shape == (2, 4, 3, *observation)
+    assert rollout["history"].dtype is torch.float32
+    assert rollout["action"].shape == (2, 4, *action)
+    env.close()
+
+
+def test_one_copy_has_a_batch_dimension():
+    assert make_env("CartPole-v1").reset()["observation"].shape == (1, 4)
+
+
+def lean(root):
+    """Pushes the cart to the side that the pole leans to; the same rule for every copy."""
+    return root.set("action", (root["observation"][:, 2] > 0).long())
+
+
+def rollout(num_envs, seed):
+    env = make_env("CartPole-v1", num_envs, seed=seed)
+    root, steps = env.reset(), []
+    for _ in range(120):
+        step, root = env.step_and_maybe_reset(lean(root))
+        steps.append(step)
+    return torch.stack(steps, 1)
+
+
+def test_copies_are_seeded_one_after_the_other():
+    together = rollout(3, seed=5)
+    assert together["next", "done"].sum() > 3
+    for i in range(3):
+        alone = rollout(1, seed=5 + i)
+        assert torch.equal(together[i]["observation"], alone[0]["observation"])
+    assert not torch.equal(together[0]["observation"], together[1]["observation"])
+
+
+def test_a_seeded_reset_is_gymnasiums():
+    env = make_env("CartPole-v1", 3)
+    observation = env.reset(seed=11)["observation"]
+    for i in range(3):
+        expected, _ = gymnasium.make("CartPole-v1").reset(seed=11 + i)
+        np.testing.assert_array_equal(observation[i], expected)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("CartPole-v7", "'CartPole-v7'; did you mean one of .*'CartPole-v1'"),
+        ("cartpole-v1", "'cartpole-v1'; did you mean one of .*'CartPole-v1'"),
+        ("Hoper-v5", "'Hoper-v5'; did you mean one of 'Hopper-v5'"),
+        ("xyzzy", "'xyzzy'; is its package imported"),
+    ],
+)
+def test_unknown_names(name, words):
+    with pytest.raises(ValueError, match=words):
+        make_env(name)
+
+
+def test_no_copies():
+    with pytest.raises(ValueError, match="num_envs must be at least 1, but is 0"):
+        make_env("CartPole-v1", 0)

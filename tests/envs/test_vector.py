@@ -1,0 +1,219 @@
+"""VectorEnv does what TorchRL's wrapper and transforms do, and keeps TorchRL's contract."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import MultiDiscrete
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from tensordict import TensorDict, assert_close
+from torchrl.collectors import Collector
+from torchrl.data import Unbounded
+from torchrl.envs import EnvBase, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.envs.reference import ImageTask, wrapped
+from tests.transforms.streams import assert_histories
+from torchrl_tit.envs import VectorEnv, make_env
+
+WRITTEN = (
+    "observation",
+    "history",
+    "episode_reward",
+    "reward",
+    "terminated",
+    "truncated",
+    "done",
+)
+
+
+def vector(task=ImageTask, num_envs=3, mode=AutoresetMode.DISABLED, **kwargs):
+    return VectorEnv(SyncVectorEnv([task] * num_envs, autoreset_mode=mode), **kwargs)
+
+
+def actions(env, seed=0):
+    """An endless stream of actions, the same for the same seed."""
+    generator = torch.Generator().manual_seed(seed)
+    spec = env.action_spec
+    while True:
+        if spec.dtype.is_floating_point:
+            yield torch.randn(spec.shape, generator=generator)
+        else:
+            yield torch.randint(0, int(spec.space.n), spec.shape, generator=generator)
+
+
+def play(env, steps, step=None, extra=None):
+    """The steps one after the other: what each wrote, and what came next."""
+    step = step or env.step_and_maybe_reset
+    root, chosen, written = env.reset(), actions(env), []
+    for _ in range(steps):
+        root.set("action", next(chosen))
+        if extra is not None:
+            root.set("extra", extra)
+        done_step, root = step(root)
+        written.append((done_step.clone(), root.clone()))
+    return written
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("num_frames", [1, 4])
+@pytest.mark.parametrize("num_envs", [1, 3])
+@pytest.mark.parametrize(
+    ("name", "limit"), [("CartPole-v1", 500), ("CartPole-v1", 7), ("Hopper-v5", 12)]
+)
+def test_equals_gym_wrapper_and_transforms(name, limit, num_envs, num_frames, padding):
+    settings = {"max_episode_steps": limit}
+    ours = make_env(
+        name, num_envs, seed=3, history=num_frames, padding=padding, clip_actions=False, **settings
+    )
+    theirs = wrapped(name, num_envs, 3, num_frames, padding, **settings)
+    ended = 0
+    for (step, root), (expected_step, expected_root) in zip(
+        play(ours, 80), play(theirs, 80), strict=True
+    ):
+        ended += int(step["next", "done"].sum())
+        entries = [key for key in WRITTEN if key != "reward"]
+        assert_close(step["next"].select(*WRITTEN), expected_step["next"].select(*WRITTEN), 0, 0)
+        assert_close(root.select(*entries), expected_root.select(*entries), 0, 0)
+    assert ended > num_envs
+
+
+@pytest.mark.parametrize("num_frames", [1, 4])
+@pytest.mark.parametrize("top", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
+def test_specs_tell_the_truth(name, top, num_frames):
+    for clip in (True, False):
+        check_env_specs(top(make_env(name, 2, history=num_frames, clip_actions=clip)))
+    check_env_specs(top(make_env(name, 1, history=num_frames, device="cpu")))
+
+
+def test_short_cut_equals_the_general_way():
+    short, general = (make_env("CartPole-v1", 3, seed=0, history=3) for _ in range(2))
+    extra = torch.arange(3)
+    for (step, root), (expected_step, expected_root) in zip(
+        play(short, 60, extra=extra),
+        play(general, 60, lambda root: EnvBase.step_and_maybe_reset(general, root), extra),
+        strict=True,
+    ):
+        assert set(step.keys(True, True)) == set(expected_step.keys(True, True))
+        assert set(root.keys(True, True)) == set(expected_root.keys(True, True))
+        assert_close(step, expected_step, 0, 0)
+        assert_close(root, expected_root, 0, 0)
+        assert root.get("extra") is not None
+
+
+def test_keeps_what_the_policy_wrote_under_next():
+    env = make_env("CartPole-v1", 2, seed=0)
+    root = env.rand_action(env.reset())
+    root["next", "memory"] = torch.ones(2, 5)
+    step, _ = env.step_and_maybe_reset(root)
+    assert torch.equal(step["next", "memory"], torch.ones(2, 5))
+    assert step["next", "reward"].shape == (2, 1)
+
+
+def test_transforms_on_top_see_the_same():
+    bare = make_env("CartPole-v1", 3, seed=0, history=3)
+    topped = TransformedEnv(make_env("CartPole-v1", 3, seed=0, history=3), StepCounter())
+    for (_, root), (_, expected) in zip(play(bare, 60), play(topped, 60), strict=True):
+        assert_close(root.select(*WRITTEN[:3], "done"), expected.select(*WRITTEN[:3], "done"), 0, 0)
+    assert topped.base_env is topped.base_env.base_env
+
+
+def test_collector_cuts_whole_rollouts():
+    env = make_env("CartPole-v1", 2, seed=0, history=2)
+    collector = Collector(
+        env, frames_per_batch=80, total_frames=160, track_traj_ids=False, policy=env.rand_action
+    )
+    batches = [batch.clone() for batch in collector]
+    collector.shutdown()
+    rollout = TensorDict.cat(batches, 1)
+    assert rollout["history"].shape == (2, 80, 2, 4)
+    going = ~rollout["next", "done"][:, :-1, 0]
+    for key in ("observation", "history", "episode_reward"):
+        assert torch.equal(rollout[key][:, 1:][going], rollout["next", key][:, :-1][going])
+    assert not rollout["episode_reward"][:, 1:][~going].any()
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+def test_images_stay_uint8(padding):
+    env = vector(history=3, padding=padding)
+    check_env_specs(env)
+    assert env.reset()["history"].dtype is torch.uint8
+    assert env.observation_spec["history"].shape == (3, 3, 2, 4, 5)
+    assert_histories(env, 3, padding)
+
+
+def test_what_was_written_is_never_written_again():
+    env = make_env("CartPole-v1", 2, seed=0, history=3)
+    root, kept = env.reset(), []
+    for _ in range(30):
+        step, root = env.step_and_maybe_reset(env.rand_action(root))
+        kept.append((step, step.clone()))
+    for written, copy in kept:
+        assert_close(written, copy, 0, 0)
+
+
+def test_actions_are_clipped_on_their_way_only():
+    env = make_env("Pendulum-v1", 1, clip_actions=True)
+    root = env.reset(seed=0).set("action", torch.full((1, 1), 7.0))
+    step, _ = env.step_and_maybe_reset(root)
+    task = gymnasium.make("Pendulum-v1")
+    task.reset(seed=0)
+    observation, reward, *_ = task.step(np.array([2.0], np.float32))
+    assert step["action"].item() == 7.0
+    np.testing.assert_array_equal(step["next", "observation"][0], observation)
+    assert step["next", "reward"].item() == pytest.approx(float(reward))
+    assert isinstance(env.action_spec, Unbounded)
+
+
+def test_actions_have_bounds_where_they_are_not_clipped():
+    space = make_env("Pendulum-v1", 3, clip_actions=False).action_spec.space
+    assert torch.equal(space.low, torch.full((3, 1), -2.0))
+    assert torch.equal(space.high, torch.full((3, 1), 2.0))
+
+
+def test_a_time_limit_truncates_and_does_not_terminate():
+    env = make_env("Pendulum-v1", 2, max_episode_steps=5)
+    last = env.rollout(5)["next"][:, -1]
+    assert last["truncated"].all()
+    assert last["done"].all()
+    assert not last["terminated"].any()
+
+
+def test_a_fall_terminates_and_does_not_truncate():
+    env = make_env("CartPole-v1", 1, seed=0)
+    last = env.rollout(500)["next"][:, -1]
+    assert last["terminated"].all()
+    assert not last["truncated"].any()
+
+
+def test_state_dict_holds_history_and_return():
+    env = make_env("CartPole-v1", 2, seed=0, history=3)
+    play(env, 5)
+    other = make_env("CartPole-v1", 2, seed=1, history=3)
+    other.load_state_dict(env.state_dict())
+    assert torch.equal(other.get_buffer("_history"), env.get_buffer("_history"))
+    assert torch.equal(other.get_buffer("_return"), env.get_buffer("_return"))
+    assert env.get_buffer("_return").any()
+
+
+def test_refuses_what_it_cannot_do():
+    with pytest.raises(ValueError, match=r"autoreset_mode=AutoresetMode.DISABLED, not .*SAME_STEP"):
+        vector(mode=AutoresetMode.SAME_STEP)
+    with pytest.raises(ValueError, match="num_frames must be at least 1, but is 0"):
+        vector(history=0)
+    with pytest.raises(ValueError, match="padding must be one of"):
+        vector(padding="zeros")
+    with pytest.raises(TypeError, match="Observations must be a Box, but are Discrete"):
+        vector(lambda: gymnasium.make("FrozenLake-v1"))
+
+    class TwoChoices(ImageTask):
+        action_space = MultiDiscrete([2, 3])  # type: ignore[assignment]
+
+    with pytest.raises(TypeError, match="Actions must be Discrete from 0 or a Box, but are Multi"):
+        vector(TwoChoices)
+    env = vector()
+    root = env.rand_action(env.reset())
+    root.set("_step", torch.tensor([True, False, True]))
+    with pytest.raises(NotImplementedError, match="some of its environments only"):
+        env.step(root)
