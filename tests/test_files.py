@@ -1,0 +1,79 @@
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchrl_tit import files
+
+
+def test_writes_and_replaces(tmp_path: Path) -> None:
+    target = tmp_path / "notes.txt"
+    files.write_text_atomic(target, "première\n")
+    assert target.read_bytes() == "première\n".encode()
+    files.write_bytes_atomic(target, b"second")
+    assert target.read_bytes() == b"second"
+    assert os.listdir(tmp_path) == ["notes.txt"]
+
+
+def test_file_is_forced_to_disk_before_it_gets_its_name(tmp_path: Path, monkeypatch) -> None:
+    calls: list[str] = []
+    fsync, replace = os.fsync, os.replace
+
+    def noted_fsync(descriptor: int) -> None:
+        calls.append("fsync")
+        fsync(descriptor)
+
+    def noted_replace(source: Path, target: Path) -> None:
+        calls.append("replace")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", noted_fsync)
+    monkeypatch.setattr(os, "replace", noted_replace)
+    files.write_bytes_atomic(tmp_path / "x", b"x")
+    assert calls == ["fsync", "replace", "fsync"]  # the file, its name, the folder
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_failure_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, monkeypatch, step: str, error: BaseException
+) -> None:
+    target = tmp_path / "notes.txt"
+    target.write_text("old")
+
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(type(error)):
+        files.write_text_atomic(target, "new")
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["notes.txt"]
+
+
+def test_a_limit_of_the_operating_system(tmp_path: Path) -> None:
+    target = tmp_path / "notes.txt"
+    target.write_text("old")
+    script = (
+        "import sys; from torchrl_tit.files import write_bytes_atomic\n"
+        "try: write_bytes_atomic(sys.argv[1], bytes(100_000))\n"
+        "except OSError as error: print('refused', error)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", script, str(target)],
+        capture_output=True,
+        text=True,
+        check=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)),
+    )
+    assert result.stdout.startswith("refused")
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["notes.txt"]
+
+
+def test_missing_folder(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        files.write_text_atomic(tmp_path / "nowhere" / "x", "x")

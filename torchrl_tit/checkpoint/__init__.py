@@ -1,0 +1,36 @@
+"""Checkpoints that survive: whole or not there, never executed, exact to the bit.
+
+save_checkpoint, load_checkpoint    a folder of numbered checkpoints
+encode, decode                      nested state as tensors and JSON
+env_state, collector_state, ...     the state of what TorchRL cannot save
+"""
+
+from torchrl_tit.checkpoint.codec import decode, encode
+from torchrl_tit.checkpoint.collector import collector_state, set_collector_state
+from torchrl_tit.checkpoint.environment import can_save_env, env_state, set_env_state
+from torchrl_tit.checkpoint.errors import CheckpointError, CheckpointNotFoundError
+from torchrl_tit.checkpoint.folder import (
+    checkpoint_steps,
+    latest_step,
+    load_checkpoint,
+    save_checkpoint,
+)
+from torchrl_tit.checkpoint.rng import global_rng_state, set_global_rng_state
+
+__all__ = [
+    "CheckpointError",
+    "CheckpointNotFoundError",
+    "can_save_env",
+    "checkpoint_steps",
+    "collector_state",
+    "decode",
+    "encode",
+    "env_state",
+    "global_rng_state",
+    "latest_step",
+    "load_checkpoint",
+    "save_checkpoint",
+    "set_collector_state",
+    "set_env_state",
+    "set_global_rng_state",
+]

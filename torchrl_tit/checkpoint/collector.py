@@ -1,0 +1,91 @@
+"""The state of TorchRL's synchronous collector, environment included."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+
+from torchrl_tit.checkpoint.environment import can_save_env, env_state, set_env_state
+
+
+def collector_state(collector: Collector) -> dict[str, Any]:
+    """Take down where a collector is, between two of its batches.
+
+    TorchRL's own `state_dict` has neither the environment nor the tensordict that the collector
+    carries from one batch to the next; both are here. The policy is not: save it apart.
+
+    Args:
+        collector: A synchronous collector.
+
+    Returns:
+        A state that a checkpoint can hold; it shares no memory with the collector. Of an
+        environment that :func:`~torchrl_tit.checkpoint.can_save_env` refuses, and of what is
+        carried of it, there is nothing (None): reset the collector right after.
+
+    Example:
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl.envs import GymEnv
+        >>> collector = Collector(GymEnv("CartPole-v1"), frames_per_batch=8, total_frames=16)
+        >>> batch = next(iter(collector))
+        >>> collector_state(collector)["frames"]
+        8
+        >>> collector.shutdown()
+    """
+    savable = can_save_env(collector.env)
+    return {
+        "frames": collector._frames,
+        "iteration": collector._iter,
+        "trajectories": collector._traj_pool.state_dict() if collector.track_traj_ids else None,
+        "env": env_state(collector.env) if savable else None,
+        "carried": collector._carrier.clone() if savable else None,
+    }
+
+
+def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
+    """Bring a new collector to where another one was; iterate over it afterwards.
+
+    Building a collector and its environment draws from the global random generators: set those
+    last.
+
+    Args:
+        collector: A collector made as the saved one was, with the same policy weights.
+        state: What :func:`collector_state` returned.
+
+    Raises:
+        ValueError: The state is that of another kind of environment, or only one of the two
+            collectors tracks trajectories.
+
+    Example:
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl.envs import GymEnv
+        >>> first = Collector(GymEnv("CartPole-v1"), frames_per_batch=8, total_frames=16)
+        >>> batch = next(iter(first))
+        >>> second = Collector(GymEnv("CartPole-v1"), frames_per_batch=8, total_frames=16)
+        >>> set_collector_state(second, collector_state(first))
+        >>> len(list(second))
+        1
+        >>> first.shutdown(); second.shutdown()
+    """
+    if collector.track_traj_ids != (state["trajectories"] is not None):
+        raise ValueError(
+            "of the saved collector and this one only one tracks trajectories; "
+            "make the collector as the saved one was made"
+        )
+    if state["env"] is not None:
+        set_env_state(collector.env, state["env"])
+        collector._carrier = _placed_like(state["carried"], collector._carrier)
+    if collector.track_traj_ids:
+        collector._traj_pool.load_state_dict(state["trajectories"])
+    collector._frames = state["frames"]
+    collector._iter = state["iteration"]
+
+
+def _placed_like(carried: TensorDictBase, present: TensorDictBase) -> TensorDictBase:
+    """Copy a loaded tensordict to the devices of the one whose place it takes."""
+    placed = carried.clone().clear_device_()
+    for key, value in present.items(include_nested=True, leaves_only=True):
+        if key in placed.keys(include_nested=True):
+            placed.set(key, placed.get(key).to(value.device))
+    return placed if present.device is None else placed.to(present.device)

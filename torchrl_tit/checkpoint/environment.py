@@ -1,0 +1,175 @@
+"""The state of a TorchRL environment, from which it continues bit for bit."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from typing import Any
+
+from torch import Tensor
+from torch.nn.parameter import UninitializedBuffer
+from torchrl.envs import EnvBase, GymEnv, GymWrapper, TransformedEnv
+from torchrl.envs.transforms import Transform, VecGymEnvTransform
+
+from torchrl_tit.checkpoint.gymnasium_state import layer_state, layers, set_layer_state
+from torchrl_tit.checkpoint.physics import ATTRIBUTES, class_name
+
+
+def can_save_env(env: EnvBase) -> bool:
+    """Tell whether an environment can be saved and continued.
+
+    It can where every layer is known: Gymnasium's classic control and MuJoCo tasks (v4, v5) with
+    the wrappers that `gymnasium.make` adds and a few more, single or in a `SyncVectorEnv`, inside
+    `GymWrapper` or `GymEnv` and any `TransformedEnv`. An Atari environment, for example, cannot:
+    reset it at each checkpoint instead.
+
+    Args:
+        env: A TorchRL environment.
+
+    Returns:
+        Whether :func:`env_state` takes it.
+
+    Example:
+        >>> from torchrl.envs import GymEnv
+        >>> can_save_env(GymEnv("CartPole-v1"))
+        True
+    """
+    return _obstacle(env) is None
+
+
+def env_state(env: EnvBase) -> dict[str, Any]:
+    """Take down everything that an environment remembers.
+
+    That is physics, random generators, the elapsed steps and flags of wrappers, the buffers of a
+    vector of environments, and the buffers of TorchRL's transforms. A transform with memory outside
+    of its `state_dict` is not known to this function, except the one that TorchRL itself puts
+    around vectors. The tensordict that the caller carries from step to step is not part of it.
+
+    Args:
+        env: An environment that :func:`can_save_env`.
+
+    Returns:
+        A state that a checkpoint can hold; it shares no memory with the environment.
+
+    Raises:
+        TypeError: The environment, or a wrapper in it, cannot be saved; the message names it.
+
+    Example:
+        >>> from torchrl.envs import GymEnv
+        >>> env, other = GymEnv("CartPole-v1"), GymEnv("CartPole-v1")
+        >>> carried = env.rand_action(env.reset())
+        >>> set_env_state(other, env_state(env))
+        >>> ours, theirs = env.step(carried.clone()), other.step(carried.clone())
+        >>> bool((ours["next", "observation"] == theirs["next", "observation"]).all())
+        True
+    """
+    if obstacle := _obstacle(env):
+        raise TypeError(
+            f"an environment with {obstacle} in it cannot be saved; reset it at each checkpoint "
+            "instead, with a seed that follows from the run's seed and the step"
+        )
+    transforms, base = _unwrap(env)
+    return {
+        "transforms": [_transform_state(transform) for transform in transforms],
+        "layers": [layer_state(layer) for layer in layers(base._env)],
+    }
+
+
+def set_env_state(env: EnvBase, state: dict[str, Any]) -> None:
+    """Bring an environment, which need not have been reset, to where another one was.
+
+    Args:
+        env: An environment made as the saved one was.
+        state: What :func:`env_state` returned.
+
+    Raises:
+        TypeError: The environment cannot be saved.
+        ValueError: The state is that of another kind of environment.
+
+    Example:
+        >>> from torchrl.envs import GymEnv
+        >>> env, other = GymEnv("Pendulum-v1"), GymEnv("CartPole-v1")
+        >>> set_env_state(other, env_state(env))  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: the state is that of ...PendulumEnv, ...
+    """
+    if obstacle := _obstacle(env):
+        raise TypeError(f"an environment with {obstacle} in it cannot be continued from a state")
+    transforms, base = _unwrap(env)
+    present = list(layers(base._env))
+    names = [class_name(layer) for layer in present]
+    saved = [layer["class"] for layer in state["layers"]]
+    if names != saved:
+        raise ValueError(
+            f"the state is that of {', '.join(saved)}, but the environment is {', '.join(names)}; "
+            "make it as the saved one was made"
+        )
+    if len(transforms) != len(state["transforms"]):
+        raise ValueError(
+            f"the state is that of an environment with {len(state['transforms'])} levels of "
+            f"transforms, but this one has {len(transforms)}; make it as the saved one was made"
+        )
+    for transform, saved_transform in zip(transforms, state["transforms"], strict=True):
+        _set_transform_state(transform, saved_transform)
+    for layer, saved_layer in zip(present, state["layers"], strict=True):
+        set_layer_state(layer, saved_layer)
+
+
+def _unwrap(env: EnvBase) -> tuple[list[Transform], EnvBase]:
+    transforms = []
+    while isinstance(env, TransformedEnv):
+        transforms.append(env.transform)
+        env = env.base_env
+    return transforms, env
+
+
+def _obstacle(env: EnvBase) -> str | None:
+    """The class that keeps an environment from being saved."""
+    _, base = _unwrap(env)
+    if type(base) not in (GymWrapper, GymEnv):
+        return class_name(base)
+    names = map(class_name, layers(base._env))
+    return next((name for name in names if name not in ATTRIBUTES), None)
+
+
+def _transform_state(transform: Transform) -> dict[str, Any]:
+    return {
+        # None stands for a buffer that is only made when the first data come.
+        "buffers": {
+            key: None if isinstance(value, UninitializedBuffer) else _copy(value)
+            for key, value in _buffers(transform).items()
+        },
+        # TorchRL keeps here what a vector of environments returned from its automatic resets.
+        "resets": {
+            name: {key: _copy(value) for key, value in module._memo.items()}
+            for name, module in transform.named_modules()
+            if isinstance(module, VecGymEnvTransform)
+        },
+    }
+
+
+def _set_transform_state(transform: Transform, state: dict[str, Any]) -> None:
+    buffers, present = state["buffers"], _buffers(transform)
+    if buffers.keys() != present.keys():
+        raise ValueError(
+            f"the state is that of transforms with the buffers {sorted(buffers)}, but these have "
+            f"{sorted(present)}; make the environment as the saved one was made"
+        )
+    known = {key: value for key, value in buffers.items() if value is not None}
+    for key, value in known.items():
+        if isinstance(present[key], UninitializedBuffer):
+            # load_state_dict fills buffers, it does not make them.
+            module, _, leaf = key.rpartition(".")
+            transform.get_submodule(module).register_buffer(leaf, value.clone())
+    transform.load_state_dict(known, strict=False)
+    for name, memo in state["resets"].items():
+        module = transform.get_submodule(name)
+        module._memo = {key: _copy(value) for key, value in memo.items()}
+
+
+def _buffers(transform: Transform) -> dict[str, Any]:
+    # Without keep_vars PyTorch detaches, and a buffer that has no data yet cannot be detached.
+    return dict(transform.state_dict(keep_vars=True))
+
+
+def _copy(value: Any) -> Any:
+    return value.detach().clone() if isinstance(value, Tensor) else deepcopy(value)

@@ -1,0 +1,215 @@
+"""A folder of numbered checkpoints: written whole or not at all, the newest one loaded.
+
+folder/
+000000018432/           one checkpoint, named after its step
+tensors.safetensors
+state.json            format, step, checksums, and the tree of codec.py
+000000020480/
+000000020480.new/       only for a moment, while a step is saved a second time
+.tmp-.../               being written or being removed; left behind by a killed process
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import shutil
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+
+from torchrl_tit.checkpoint.codec import encode
+from torchrl_tit.checkpoint.contents import read_contents, write_contents
+from torchrl_tit.checkpoint.errors import CheckpointError, CheckpointNotFoundError
+from torchrl_tit.files import fsync_directory
+
+_NAME = re.compile(r"(\d{12,})(\.new)?")
+_TEMPORARY = ".tmp-"
+
+
+def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep: int = 3) -> Path:
+    """Save a state as a new numbered checkpoint and remove the oldest ones.
+
+    The checkpoint is written into a hidden folder beside, forced to the disk and renamed, so a
+    process that is killed at any moment leaves either all of it or none. Saving a step that is
+    there already replaces it, and never without a whole one in place. One process at a time may
+    save into a folder.
+
+    Args:
+        folder: Where the run keeps its checkpoints; made where missing.
+        step: Environment steps or updates done so far; the checkpoint's number.
+        state: A nested state as :func:`~torchrl_tit.checkpoint.encode` takes it.
+        keep: How many checkpoints to leave: this one and the ones before it. Checkpoints of later
+            steps (of a run that was continued from an earlier one) are left alone.
+
+    Returns:
+        The checkpoint's own folder.
+
+    Raises:
+        ValueError: `step` is negative or `keep` is not positive.
+        TypeError: The state holds something that a checkpoint cannot hold.
+        CheckpointError: It could not be written, a full disk for example. What was there before is
+            still there.
+
+    Example:
+        >>> import tempfile
+        >>> folder = tempfile.mkdtemp()
+        >>> save_checkpoint(folder, 2048, {"frames": 2048}).name
+        '000000002048'
+        >>> load_checkpoint(folder)
+        (2048, {'frames': 2048})
+    """
+    if step < 0:
+        raise ValueError(f"step must not be negative, got {step}")
+    if keep < 1:
+        raise ValueError(f"keep must be at least 1, got {keep}")
+    tensors, tree = encode(state)  # what cannot be saved fails before the disk is touched
+    folder = Path(folder)
+    try:
+        if not folder.is_dir():
+            folder.mkdir(parents=True)
+            fsync_directory(folder.parent)
+        _tidy(folder)
+        path = _add(folder, step, tensors, tree)
+        for old in [other for other in checkpoint_steps(folder) if other <= step][:-keep]:
+            _remove(folder / _name(old))
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(
+            f"the checkpoint of step {step} could not be saved in {folder}: {error}. "
+            "Checkpoints saved before are still there"
+        ) from error
+    return path
+
+
+def load_checkpoint(folder: str | os.PathLike[str], step: int | None = None) -> tuple[int, Any]:
+    """Load the newest checkpoint, or that of one step.
+
+    Nothing in a checkpoint is ever executed, and both its files are held against their checksums.
+
+    Args:
+        folder: Where the run keeps its checkpoints.
+        step: The checkpoint's number; the newest one by default.
+
+    Returns:
+        The step and the state, its tensors on the CPU.
+
+    Raises:
+        CheckpointNotFoundError: There is no checkpoint, or none of this step.
+        CheckpointError: The checkpoint is damaged, of another program or version, or has a file in
+            it that does not belong there. The message names its folder.
+
+    Example:
+        >>> import tempfile, torch
+        >>> folder = tempfile.mkdtemp()
+        >>> _ = save_checkpoint(folder, 10, {"weight": torch.zeros(2)})
+        >>> _ = save_checkpoint(folder, 20, {"weight": torch.ones(2)})
+        >>> load_checkpoint(folder)
+        (20, {'weight': tensor([1., 1.])})
+        >>> load_checkpoint(folder, step=10)
+        (10, {'weight': tensor([0., 0.])})
+    """
+    folder = Path(folder)
+    paths = _checkpoints(folder)
+    if not paths:
+        raise CheckpointNotFoundError(
+            f"there is no checkpoint in {folder}: the run was stopped before its first one, "
+            "or this is not a run's checkpoint folder"
+        )
+    if step is None:
+        step = max(paths)
+    elif step not in paths:
+        raise CheckpointNotFoundError(
+            f"there is no checkpoint of step {step} in {folder}, only of "
+            f"{', '.join(map(str, sorted(paths)))}"
+        )
+    return step, read_contents(paths[step], step)
+
+
+def checkpoint_steps(folder: str | os.PathLike[str]) -> list[int]:
+    """List the checkpoints in a folder.
+
+    Args:
+        folder: Where the run keeps its checkpoints; it need not exist.
+
+    Returns:
+        Their steps, the oldest first.
+
+    Example:
+        >>> checkpoint_steps("nowhere")
+        []
+    """
+    return sorted(_checkpoints(Path(folder)))
+
+
+def latest_step(folder: str | os.PathLike[str]) -> int | None:
+    """Find the newest checkpoint in a folder.
+
+    Args:
+        folder: Where the run keeps its checkpoints; it need not exist.
+
+    Returns:
+        Its step, or None where there is none.
+
+    Example:
+        >>> latest_step("nowhere") is None
+        True
+    """
+    return max(_checkpoints(Path(folder)), default=None)
+
+
+def _name(step: int) -> str:
+    return f"{step:012d}"
+
+
+def _checkpoints(folder: Path) -> dict[int, Path]:
+    """Every checkpoint's folder by its step; of two of one step the one saved last."""
+    found: dict[int, Path] = {}
+    # Sorted, "NAME.new" comes after "NAME" and takes its place.
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        if match := _NAME.fullmatch(path.name):
+            found[int(match[1])] = path
+    return found
+
+
+def _add(folder: Path, step: int, tensors: dict[str, Any], tree: Any) -> Path:
+    path = folder / _name(step)
+    temporary = folder / f"{_TEMPORARY}{path.name}-{secrets.token_hex(4)}"
+    temporary.mkdir()
+    try:
+        write_contents(temporary, step, tensors, tree)
+        complete = path.with_name(f"{path.name}.new") if path.exists() else path
+        os.rename(temporary, complete)
+    except BaseException:  # Ctrl-C as well must leave nothing behind
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    fsync_directory(folder)
+    if complete != path:
+        _promote(complete)
+    return path
+
+
+def _promote(new: Path) -> None:
+    """Let a complete checkpoint of a step saved twice take the place of the first one."""
+    path = new.with_suffix("")
+    if path.exists():
+        _remove(path)
+    os.rename(new, path)
+    fsync_directory(path.parent)
+
+
+def _remove(path: Path) -> None:
+    # Under a hidden name first: a folder that is half removed must not look like a checkpoint.
+    hidden = path.with_name(f"{_TEMPORARY}{path.name}-{secrets.token_hex(4)}")
+    os.rename(path, hidden)
+    shutil.rmtree(hidden)
+
+
+def _tidy(folder: Path) -> None:
+    """Finish or remove what a killed process left behind."""
+    for path in list(folder.iterdir()):
+        if path.name.startswith(_TEMPORARY):
+            shutil.rmtree(path)
+        elif (match := _NAME.fullmatch(path.name)) and match[2]:
+            _promote(path)

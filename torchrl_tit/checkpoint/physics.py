@@ -1,0 +1,135 @@
+"""What each Gymnasium environment and wrapper remembers between two steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+_WRAPPERS = "gymnasium.wrappers"
+_CLASSIC = "gymnasium.envs.classic_control"
+_MUJOCO = "gymnasium.envs.mujoco"
+
+_EPISODE_QUEUES = ("time_queue", "return_queue", "length_queue")
+
+# The attributes that change after construction, by the full name of the class. Whatever is not
+# listed here cannot be saved: a subclass or an unknown wrapper may remember more than we know.
+ATTRIBUTES: dict[str, tuple[str, ...]] = {
+    f"{_CLASSIC}.acrobot.AcrobotEnv": ("state",),
+    f"{_CLASSIC}.cartpole.CartPoleEnv": ("state", "steps_beyond_terminated"),
+    f"{_CLASSIC}.continuous_mountain_car.Continuous_MountainCarEnv": ("state",),
+    f"{_CLASSIC}.mountain_car.MountainCarEnv": ("state",),
+    f"{_CLASSIC}.pendulum.PendulumEnv": ("state", "last_u"),
+    # Of a MuJoCo environment all that changes is its mjData, see mujoco_state.
+    **{
+        f"{_MUJOCO}.{module}_{version}.{name}": ()
+        for version in ("v4", "v5")
+        for module, name in {
+            "ant": "AntEnv",
+            "half_cheetah": "HalfCheetahEnv",
+            "hopper": "HopperEnv",
+            "humanoid": "HumanoidEnv",
+            "humanoidstandup": "HumanoidStandupEnv",
+            "inverted_double_pendulum": "InvertedDoublePendulumEnv",
+            "inverted_pendulum": "InvertedPendulumEnv",
+            "pusher": "PusherEnv",
+            "reacher": "ReacherEnv",
+            "swimmer": "SwimmerEnv",
+            "walker2d": "Walker2dEnv",
+        }.items()
+    },
+    "gymnasium.vector.sync_vector_env.SyncVectorEnv": (
+        *("_env_obs", "_observations", "_rewards"),
+        *("_terminations", "_truncations", "_autoreset_envs"),
+    ),
+    f"{_WRAPPERS}.common.TimeLimit": ("_elapsed_steps",),
+    f"{_WRAPPERS}.common.OrderEnforcing": ("_has_reset",),
+    f"{_WRAPPERS}.common.PassiveEnvChecker": (
+        *("checked_reset", "checked_step", "checked_render", "checked_data_reuse"),
+        *("close_called", "_previous_data"),
+    ),
+    # When an episode began is left out: the clock of another process means nothing here.
+    f"{_WRAPPERS}.common.RecordEpisodeStatistics": (
+        *("episode_count", "episode_returns", "episode_lengths"),
+        *_EPISODE_QUEUES,
+    ),
+    f"{_WRAPPERS}.vector.common.RecordEpisodeStatistics": (
+        *("episode_count", "episode_returns", "episode_lengths", "prev_dones"),
+        *_EPISODE_QUEUES,
+    ),
+    f"{_WRAPPERS}.transform_action.ClipAction": (),
+    f"{_WRAPPERS}.transform_action.RescaleAction": (),
+    f"{_WRAPPERS}.transform_observation.DtypeObservation": (),
+    f"{_WRAPPERS}.transform_observation.FlattenObservation": (),
+    f"{_WRAPPERS}.transform_observation.RescaleObservation": (),
+    f"{_WRAPPERS}.transform_reward.ClipReward": (),
+}
+
+# Positions that MuJoCo derives from the state, but one substep late: after a step they belong to
+# the state before its last substep. Ant, Humanoid and Reacher read them before they step, so they
+# cannot be computed anew from the state.
+_LATE_POSITIONS = ("xpos", "xipos")
+
+
+def class_name(env: object) -> str:
+    """Give the full name of an object's class.
+
+    Args:
+        env: An environment or a wrapper.
+
+    Returns:
+        Module and class.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> class_name(gym.make("CartPole-v1").unwrapped)
+        'gymnasium.envs.classic_control.cartpole.CartPoleEnv'
+    """
+    return f"{type(env).__module__}.{type(env).__qualname__}"
+
+
+def mujoco_state(env: Any) -> dict[str, np.ndarray]:
+    """Take down the physics of a MuJoCo environment.
+
+    Args:
+        env: An unwrapped Gymnasium MuJoCo environment.
+
+    Returns:
+        MuJoCo's integration state (float64), which includes the solver's warm start, and body
+        positions that are not a function of it.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> sorted(mujoco_state(gym.make("Hopper-v5").unwrapped))
+        ['integration', 'xipos', 'xpos']
+    """
+    import mujoco  # only for those who have one of its environments
+
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    integration = np.empty(mujoco.mj_stateSize(env.model, kind))
+    mujoco.mj_getState(env.model, env.data, integration, kind)
+    late = {name: getattr(env.data, name).copy() for name in _LATE_POSITIONS}
+    return {"integration": integration, **late}
+
+
+def set_mujoco_state(env: Any, state: dict[str, np.ndarray]) -> None:
+    """Set the physics of a MuJoCo environment, see :func:`mujoco_state`.
+
+    Args:
+        env: An unwrapped environment of the same model.
+        state: What :func:`mujoco_state` returned.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> hopper, other = gym.make("Hopper-v5").unwrapped, gym.make("Hopper-v5").unwrapped
+        >>> _ = hopper.reset(seed=0)
+        >>> set_mujoco_state(other, mujoco_state(hopper))
+        >>> bool((other.data.qpos == hopper.data.qpos).all())
+        True
+    """
+    import mujoco
+
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    mujoco.mj_setState(env.model, env.data, state["integration"], kind)
+    for name in _LATE_POSITIONS:
+        getattr(env.data, name)[:] = state[name]

@@ -1,0 +1,110 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from pathlib import Path
+
+
+def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file so that a reader sees the old content or all of the new, never a part.
+
+    The bytes go to a hidden file beside the target, are forced to the disk, and take the target's
+    name in one rename. Where anything fails (a full disk, say) the hidden file is removed and what
+    was at `path` is still there.
+
+    Args:
+        path: The file to write; its folder must exist.
+        data: All of its new content.
+
+    Raises:
+        OSError: The file could not be written.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> target = Path(tempfile.mkdtemp()) / "notes.bin"
+        >>> write_bytes_atomic(target, b"all of it")
+        >>> target.read_bytes()
+        b'all of it'
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:  # Ctrl-C as well must leave nothing behind
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
+    fsync_directory(path.parent)
+
+
+def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
+    """Write a UTF-8 text file whole or not at all, see :func:`write_bytes_atomic`.
+
+    Args:
+        path: The file to write; its folder must exist.
+        text: All of its new content; line ends are written as they are.
+
+    Raises:
+        OSError: The file could not be written.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> target = Path(tempfile.mkdtemp()) / "notes.txt"
+        >>> write_text_atomic(target, "all of it")
+        >>> target.read_text(encoding="utf-8")
+        'all of it'
+    """
+    write_bytes_atomic(path, text.encode("utf-8"))
+
+
+def fsync_file(path: str | os.PathLike[str]) -> None:
+    """Force a file's content to the disk.
+
+    Args:
+        path: An existing file.
+
+    Raises:
+        OSError: The disk refused it.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.NamedTemporaryFile() as file:
+        ...     fsync_file(file.name)
+    """
+    # Windows only lets a file be flushed that is open for writing.
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def fsync_directory(path: str | os.PathLike[str]) -> None:
+    """Force a folder's list of names to the disk, so that a rename outlives a power cut.
+
+    Args:
+        path: An existing folder.
+
+    Raises:
+        OSError: The disk refused it.
+
+    Example:
+        >>> import tempfile
+        >>> fsync_directory(tempfile.mkdtemp())
+    """
+    if os.name == "nt":  # Windows has no such call
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
