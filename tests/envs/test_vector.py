@@ -1,4 +1,4 @@
-"""VectorEnv does what TorchRL's wrapper and transforms do, and keeps TorchRL's contract."""
+"""GymVectorEnv does what TorchRL's wrapper and transforms do, and keeps TorchRL's contract."""
 
 import gymnasium
 import numpy as np
@@ -14,7 +14,7 @@ from torchrl.envs.utils import check_env_specs
 
 from tests.envs.reference import ImageTask, wrapped
 from tests.transforms.streams import assert_histories
-from torchrl_tit.envs import VectorEnv, make_env
+from torchrl_tit.envs import GymVectorEnv, make_env
 
 WRITTEN = (
     "observation",
@@ -28,7 +28,7 @@ WRITTEN = (
 
 
 def vector(task=ImageTask, num_envs=3, mode=AutoresetMode.DISABLED, **kwargs):
-    return VectorEnv(SyncVectorEnv([task] * num_envs, autoreset_mode=mode), **kwargs)
+    return GymVectorEnv(SyncVectorEnv([task] * num_envs, autoreset_mode=mode), **kwargs)
 
 
 def actions(env, seed=0):
@@ -109,6 +109,17 @@ def test_keeps_what_the_policy_wrote_under_next():
     step, _ = env.step_and_maybe_reset(root)
     assert torch.equal(step["next", "memory"], torch.ones(2, 5))
     assert step["next", "reward"].shape == (2, 1)
+
+
+@pytest.mark.parametrize("num_frames", [1, 3])
+def test_a_partial_reset_keeps_the_others(num_frames):
+    env = make_env("CartPole-v1", 3, seed=0, history=num_frames)
+    before = play(env, 5)[-1][1]
+    request = before.clone().set("_reset", torch.tensor([[False], [True], [False]]))
+    after = env._reset(request)
+    for key in WRITTEN[:3]:
+        assert torch.equal(after[key][[0, 2]], before[key][[0, 2]])
+        assert not torch.equal(after[key][1], before[key][1])
 
 
 def test_transforms_on_top_see_the_same():
@@ -215,5 +226,23 @@ def test_refuses_what_it_cannot_do():
     env = vector()
     root = env.rand_action(env.reset())
     root.set("_step", torch.tensor([True, False, True]))
-    with pytest.raises(NotImplementedError, match="some of its environments only"):
+    with pytest.raises(NotImplementedError, match="only some of its environments"):
         env.step(root)
+    root.set("_step", torch.ones(3, dtype=torch.bool))
+    assert env.step(root)["next", "observation"].shape == (3, 2, 4, 5)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_on_a_gpu():
+    ours, expected = (
+        make_env("Pendulum-v1", 3, seed=0, history=3, max_episode_steps=9, device=device)
+        for device in ("cuda", None)
+    )
+    check_env_specs(ours)
+    ours.set_seed(0)
+    for (step, root), (expected_step, expected_root) in zip(
+        play(ours, 30), play(expected, 30), strict=True
+    ):
+        assert step["next", "history"].is_cuda
+        assert_close(step.cpu(), expected_step, 0, 1e-6)
+        assert_close(root.cpu(), expected_root, 0, 1e-6)

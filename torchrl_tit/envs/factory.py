@@ -8,7 +8,7 @@ import gymnasium
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from torchrl_tit.envs.vector import VectorEnv
+from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.transforms.history import Padding
 
 
@@ -22,7 +22,7 @@ def make_env(
     clip_actions: bool = True,
     device: torch.device | str | None = None,
     **kwargs: Any,
-) -> VectorEnv:
+) -> GymVectorEnv:
     """Makes copies of a Gymnasium task, stepped one after the other in this process.
 
     Args:
@@ -30,13 +30,13 @@ def make_env(
         num_envs: N, the number of copies; the batch size is [N], for N = 1 too.
         seed: Copy i is seeded with ``seed + i``; without one, each differs from run to run.
         history: K, the number of observations in a history.
-        padding: How histories begin: see :class:`~torchrl_tit.envs.VectorEnv`.
+        padding: How histories begin: see :class:`~torchrl_tit.envs.GymVectorEnv`.
         clip_actions: Whether continuous actions are clipped on their way to the task: see there.
         device: Where the tensors go; by default they stay on the CPU without a stated device.
         **kwargs: Passed to `gymnasium.make`, as ``max_episode_steps=200``.
 
     Returns:
-        The environment, whose keys and shapes stand in :class:`~torchrl_tit.envs.VectorEnv`.
+        The environment, whose keys and shapes stand in :class:`~torchrl_tit.envs.GymVectorEnv`.
 
     Raises:
         ValueError: If the name is unknown, ``num_envs`` is less than 1, or history or padding are
@@ -59,7 +59,7 @@ def make_env(
     # the vector environment returns is copied at once, so it need not make copies of its own.
     make = partial(gymnasium.make, name, disable_env_checker=True, **kwargs)
     tasks = SyncVectorEnv([make] * num_envs, copy=False, autoreset_mode=AutoresetMode.DISABLED)
-    env = VectorEnv(
+    env = GymVectorEnv(
         tasks, history=history, padding=padding, clip_actions=clip_actions, device=device
     )
     if seed is not None:

@@ -1,7 +1,5 @@
 """A Gymnasium vector environment as a TorchRL environment that adds little time to a step."""
 
-from typing import Any
-
 import gymnasium
 import numpy as np
 import torch
@@ -15,7 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl_tit.transforms.history import Padding, check_history
 
 
-class VectorEnv(EnvBase):
+class GymVectorEnv(EnvBase):
     """N copies of a Gymnasium task, with history and return, as one TorchRL environment.
 
     It writes what TorchRL's `GymWrapper` under the transforms `DoubleToFloat`,
@@ -58,7 +56,7 @@ class VectorEnv(EnvBase):
     Example:
         >>> from gymnasium.vector import SyncVectorEnv
         >>> tasks = [lambda: gymnasium.make("CartPole-v1")] * 8
-        >>> env = VectorEnv(SyncVectorEnv(tasks, autoreset_mode="Disabled"), history=4)
+        >>> env = GymVectorEnv(SyncVectorEnv(tasks, autoreset_mode="Disabled"), history=4)
         >>> env.rollout(max_steps=2)["next", "history"].shape
         torch.Size([8, 2, 4, 4])
     """
@@ -85,6 +83,7 @@ class VectorEnv(EnvBase):
             )
         super().__init__(device=device, batch_size=torch.Size([env.num_envs]))
         self._env = env
+        self.is_closed = False
         self._padding = padding
         self._observation_dtype = np.dtype("f4") if space.dtype.kind == "f" else space.dtype
         action = env.single_action_space
@@ -109,7 +108,7 @@ class VectorEnv(EnvBase):
         self.done_spec = Composite(flags, shape=(n,), device=self.device)
 
     @property
-    def base_env(self) -> "VectorEnv":
+    def base_env(self) -> "GymVectorEnv":
         """Itself: what `TransformedEnv.base_env` is once transforms are on top."""
         return self
 
@@ -135,8 +134,9 @@ class VectorEnv(EnvBase):
         return tensordict, self.maybe_reset(self._step_mdp(tensordict))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if "_step" in tensordict.keys():  # noqa: SIM118 (a tensordict iterates over its rows)
-            raise NotImplementedError("VectorEnv cannot step some of its environments only.")
+        stepped = tensordict.get("_step", None)
+        if stepped is not None and not stepped.all():
+            raise NotImplementedError("GymVectorEnv cannot step only some of its environments.")
         action = tensordict.get("action").numpy(force=True)
         if self._bounds is not None:
             action = action.clip(*self._bounds)
@@ -155,7 +155,7 @@ class VectorEnv(EnvBase):
         )
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any
+        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None
     ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         return self._restart(None if mask is None else mask.reshape(self.batch_size), seed)
@@ -186,9 +186,9 @@ class VectorEnv(EnvBase):
 
     def _push(self, observation: Tensor) -> Tensor:
         """The histories [N, K, *obs] with one more observation [N, *obs]."""
-        if self._history.shape[1] == 1:
-            return observation.unsqueeze(1)
-        history = torch.cat((self._history[:, 1:], observation.unsqueeze(1)), 1)
+        history = observation.unsqueeze(1)
+        if self._history.shape[1] > 1:
+            history = torch.cat((self._history[:, 1:], history), 1)
         self._history.copy_(history)
         return history
 

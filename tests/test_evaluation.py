@@ -1,0 +1,149 @@
+"""Evaluation plays whole episodes, deterministically, and leaves no trace in training."""
+
+import random
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
+from tensordict.nn import TensorDictModule as Module
+from torch import nn
+from torchrl.envs import GymEnv
+from torchrl.modules import IndependentNormal
+
+from tests.envs.reference import wrapped
+from torchrl_tit.envs import make_env
+from torchrl_tit.evaluation import evaluate
+
+
+def lean(tensordict):
+    """Pushes the cart to the side that the pole leans to."""
+    return tensordict.set("action", (tensordict["observation"][..., 2] > 0).long())
+
+
+def played_by_hand(name, act, seed, episodes):
+    """The same episodes, one after the other, in plain Gymnasium."""
+    returns = []
+    for i in range(episodes):
+        task = gymnasium.make(name)
+        observation, _ = task.reset(seed=seed + i)
+        total, done = 0.0, False
+        while not done:
+            observation, reward, terminated, truncated, _ = task.step(act(observation))
+            total, done = total + float(reward), terminated or truncated
+        returns.append(total)
+    return torch.tensor(returns, dtype=torch.float64)
+
+
+def test_equals_episodes_played_by_hand():
+    expected = played_by_hand("CartPole-v1", lambda x: int(x[2] > 0), seed=7, episodes=9)
+    assert expected.unique().numel() > 3
+    returns = evaluate(lambda n: make_env("CartPole-v1", n), lean, episodes=9, seed=7)
+    assert torch.equal(returns, expected)
+
+
+@pytest.mark.parametrize("num_envs", [1, 4, 9, 20])
+def test_the_number_of_environments_does_not_matter(num_envs):
+    expected = played_by_hand("CartPole-v1", lambda x: int(x[2] > 0), seed=7, episodes=9)
+    env = make_env("CartPole-v1", num_envs, seed=1)
+    env.rollout(5)
+    assert torch.equal(evaluate(env, lean, episodes=9, seed=7), expected)
+
+
+def test_torchrls_own_environments():
+    expected = played_by_hand("CartPole-v1", lambda x: int(x[2] > 0), seed=7, episodes=4)
+    single = GymEnv("CartPole-v1", categorical_action_encoding=True)
+    assert torch.equal(evaluate(single, lean, episodes=4, seed=7), expected)
+    batch = wrapped("CartPole-v1", 3, 0, 2, "same")
+    assert torch.equal(evaluate(batch, lean, episodes=4, seed=7), expected)
+
+
+def gaussian_policy(dropout=0.0):
+    """A linear Gaussian policy for Pendulum-v1; [N, 3] to an unclipped action [N, 1]."""
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Dropout(dropout), nn.Linear(3, 1), nn.Tanh())
+    mean = Module(network, ["observation"], ["loc"])
+    scale = Module(lambda loc: torch.full_like(loc, 0.7), ["loc"], ["scale"])
+    sample = ProbabilisticTensorDictModule(
+        ["loc", "scale"], ["action"], distribution_class=IndependentNormal, return_log_prob=True
+    )
+    return ProbabilisticTensorDictSequential(mean, scale, sample), network
+
+
+def test_the_policy_acts_its_mean_in_evaluation_mode_and_without_gradients():
+    policy, network = gaussian_policy(dropout=0.5)
+    gradients = []
+    network.register_forward_hook(lambda *_: gradients.append(torch.is_grad_enabled()))
+
+    def mean(observation):
+        with torch.no_grad():
+            return network[1:](torch.as_tensor(observation, dtype=torch.float32)).numpy()
+
+    expected = played_by_hand("Pendulum-v1", mean, seed=3, episodes=3)
+    returns = evaluate(lambda n: make_env("Pendulum-v1", n), policy, episodes=3, seed=3)
+    torch.testing.assert_close(returns, expected, rtol=1e-4, atol=1e-3)
+    assert gradients == [False] * 200
+
+
+def test_leaves_modes_and_generators_as_they_were():
+    policy, network = gaussian_policy(dropout=0.5)
+    policy.train()
+    network[1].eval()
+    modes = [module.training for module in policy.modules()]
+
+    def draw():
+        return torch.rand(1).item(), np.random.rand(), random.random()
+
+    def seed():
+        torch.manual_seed(5)
+        np.random.seed(5)
+        random.seed(5)
+
+    def drawing(tensordict):
+        draw()
+        return policy(tensordict)
+
+    def factory(count):
+        draw()
+        return make_env("Pendulum-v1", count, max_episode_steps=5)
+
+    seed()
+    expected = draw()
+    seed()
+    evaluate(factory, policy, episodes=2)
+    evaluate(factory, drawing, episodes=2)
+    assert draw() == expected
+    assert [module.training for module in policy.modules()] == modes
+
+
+def test_modes_and_generators_come_back_after_an_error():
+    policy, network = gaussian_policy()
+    policy.train()
+    network[1].register_forward_hook(lambda *_: 1 / 0)
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
+    with pytest.raises(ZeroDivisionError):
+        evaluate(make_env("Pendulum-v1", 2), policy, episodes=2)
+    assert policy.training
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_closes_what_it_made_and_nothing_else():
+    made = []
+
+    def factory(count):
+        made.append(make_env("CartPole-v1", count))
+        return made[-1]
+
+    evaluate(factory, lean, episodes=3)
+    assert made[0].batch_size == (3,)
+    assert made[0].is_closed
+    env = make_env("CartPole-v1", 3)
+    evaluate(env, lean, episodes=3)
+    assert not env.is_closed
+
+
+def test_no_episodes():
+    with pytest.raises(ValueError, match="episodes must be at least 1, but is 0"):
+        evaluate(make_env("CartPole-v1"), lean, episodes=0)

@@ -1,0 +1,125 @@
+"""Returns of a policy over whole episodes, as the paper measures them."""
+
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+
+def evaluate(
+    env: EnvBase | Callable[[int], EnvBase],
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    episodes: int = 100,
+    *,
+    seed: int = 0,
+    reward_key: NestedKey = "reward",
+) -> Tensor:
+    """Plays whole episodes with a deterministic policy.
+
+    Episode i starts from the seed ``seed + i``, in an environment of its own, so the same policy
+    gets the same returns whatever the number of environments. As many episodes as there are
+    environments run side by side, until the last of them ends: which episodes count does not depend
+    on how long they take. Training goes on afterwards as if nothing had been evaluated: the policy
+    gets its training mode back, and the global random generators of PyTorch, NumPy and Python their
+    states.
+
+    Args:
+        env: An environment of any batch size, whose `reset` takes a seed as those of
+            :func:`~torchrl_tit.envs.make_env` and TorchRL's `GymWrapper` do, and which pays the
+            task's own rewards, not clipped ones. Its episodes are cut off by a reset. Or a function
+            that makes one from the number of environments; it is called with ``episodes``, and what
+            it made is closed at the end.
+        policy: Writes the action into the tensordict it is given. It acts in evaluation mode and
+            takes the distribution's deterministic action (argmax, or the mean).
+        episodes: Number of episodes.
+        seed: Seed of the first episode.
+        reward_key: Where the reward stands in "next".
+
+    Returns:
+        The undiscounted return of each episode; float64 [episodes], on the environment's device.
+
+    Raises:
+        ValueError: If ``episodes`` is less than 1.
+
+    Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
+    2212.14538), section 4: the final model over 100 episodes.
+
+    Example:
+        >>> from torchrl.data import Categorical
+        >>> from torchrl.modules import RandomPolicy
+        >>> from torchrl_tit.envs import make_env
+        >>> policy = RandomPolicy(Categorical(2, shape=(20,)))
+        >>> evaluate(lambda n: make_env("CartPole-v1", n), policy, episodes=20).shape
+        torch.Size([20])
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, but is {episodes}.")
+    with _acting(policy, seed):
+        if isinstance(env, EnvBase):
+            return _play_all(env, policy, episodes, seed, reward_key)
+        made = env(episodes)
+        try:
+            return _play_all(made, policy, episodes, seed, reward_key)
+        finally:
+            made.close()
+
+
+def _play_all(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    episodes: int,
+    seed: int,
+    reward_key: NestedKey,
+) -> Tensor:
+    """The return of each episode; as many run at once as there are environments; [episodes]."""
+    starts = range(seed, seed + episodes, env.batch_size.numel())
+    return torch.cat([_play(env, policy, start, reward_key) for start in starts])[:episodes]
+
+
+def _play(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    seed: int,
+    reward_key: NestedKey,
+) -> Tensor:
+    """The return of one episode in each of the environments; float64 [N]."""
+    tensordict = env.reset(seed=seed)
+    returns = torch.zeros(env.batch_size.numel(), dtype=torch.float64, device=env.device)
+    playing = torch.ones_like(returns, dtype=torch.bool)
+    while playing.any():
+        step, tensordict = env.step_and_maybe_reset(policy(tensordict))
+        # An environment whose episode has ended plays on, but nothing of that counts.
+        returns += step["next", reward_key].flatten() * playing
+        playing &= ~step["next", "done"].flatten()
+    return returns
+
+
+@contextmanager
+def _acting(policy: Callable[[TensorDictBase], TensorDictBase], seed: int) -> Iterator[None]:
+    """Deterministic actions without gradients, and everything as it was before at the end."""
+    modules = list(policy.modules()) if isinstance(policy, nn.Module) else []
+    modes = [module.training for module in modules]
+    python_state, numpy_state = random.getstate(), np.random.get_state()
+    devices = range(torch.cuda.device_count())
+    try:
+        with (
+            torch.random.fork_rng(devices),
+            torch.no_grad(),
+            set_exploration_type(ExplorationType.DETERMINISTIC),
+        ):
+            # A policy that draws numbers all the same draws the same ones each time.
+            torch.manual_seed(seed)
+            if isinstance(policy, nn.Module):
+                policy.eval()
+            yield
+    finally:
+        for module, mode in zip(modules, modes, strict=True):
+            module.training = mode
+        random.setstate(python_state)
+        np.random.set_state(numpy_state)
