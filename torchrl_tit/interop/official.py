@@ -7,9 +7,18 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from torchrl_tit.interop.arrays import d2rl_from_official, ofenet_from_official
+from torchrl_tit.interop.decision_transformer import dt_from_official, dt_tit_from_official
+from torchrl_tit.interop.images import catformer_from_official, resnet_from_official
 from torchrl_tit.interop.tit import tit_from_official
 
 _BUILDERS: dict[str, Callable[[Mapping[str, Any], Mapping[str, Tensor]], nn.Module]] = {
+    "catformer": catformer_from_official,
+    "d2rl": d2rl_from_official,
+    "dt": dt_from_official,
+    "dt_tit": dt_tit_from_official,
+    "ofenet": ofenet_from_official,
+    "resnet": resnet_from_official,
     "tit": tit_from_official,
 }
 
@@ -20,21 +29,32 @@ def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Modul
     The network computes what the authors' computes from the same input, to float precision.
 
     Args:
-        config: what the network is. ``kind`` is ``"tit"``; the other entries of that kind are
-            ``variant`` ("vanilla" or "enhanced"), ``observation`` ("array" or "image"),
-            ``observation_shape`` ((D,) or (K, H, W)), ``patch_size``, ``num_blocks``,
-            ``features_dim``, ``embed_dim``, ``num_heads_inner``, ``num_heads_outer``,
-            ``activation_inner``, ``activation_outer``, ``activation_head``,
-            ``ffn_expansion_inner``, ``ffn_expansion_outer``, ``position_encoding`` and
-            ``share_blocks``; dropout probabilities (``attention_dropout_inner``, ...) are 0 where
-            missing.
+        config: what the network is. Its entry ``kind`` is one of
+
+            - ``"tit"``, with ``variant`` ("vanilla" or "enhanced"), ``observation`` ("array" or
+              "image"), ``observation_shape`` ((D,) or (K, H, W)), ``patch_size``, ``num_blocks``,
+              ``features_dim``, ``embed_dim``, and any of ``num_heads_inner``, ``num_heads_outer``,
+              ``activation_inner``, ``activation_outer``, ``activation_head``,
+              ``ffn_expansion_inner``, ``ffn_expansion_outer``, ``position_encoding`` and dropout
+              probabilities (``attention_dropout_inner``, ...);
+            - ``"resnet"`` and ``"catformer"``, with ``observation_shape`` (K, H, W), and for
+              Catformer ``num_heads`` where there are not 5;
+            - ``"ofenet"`` and ``"d2rl"``;
+            - ``"dt"`` and ``"dt_tit"``, with ``n_head`` (and ``num_heads_inner``) where there is
+              not one head, ``activation`` where it is not relu, and ``context``.
+
+            Sizes that the parameters tell (``features_dim``, ``hidden_dim``, ``embed_dim``,
+            ``n_layer``, ``n_inner``, ``max_ep_len``, ...) can be left out where the kind is not
+            "tit"; where they are given they are checked.
         params: the parameters under the authors' names, those of ``state_dict()``; with or without
             a prefix such as ``features_extractor.pure_transformer_backbone.``.
 
     Returns:
         A module that takes what the authors' takes: arrays [B, D] without a history axis, images
         [B, K, H, W]; floats are taken as they are (the authors divide images by 255 before the
-        network), only uint8 is divided by 255.
+        network), only uint8 is divided by 255. ``"ofenet"`` and ``"d2rl"`` put out features for
+        policy and value. The ``"dt"`` kinds are called with states, actions, returns_to_go,
+        timesteps and attention_mask, and put out the actions.
 
     Raises:
         ValueError: if the kind is not known, an entry is missing, or parameters are missing, left

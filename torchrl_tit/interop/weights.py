@@ -43,6 +43,51 @@ def load_renamed(network: nn.Module, params: Mapping[str, Tensor], renaming: Ren
     network.load_state_dict(renamed)
 
 
+def strip_prefix(params: Mapping[str, Tensor], marker: str) -> dict[str, Tensor]:
+    """Drops the prefix that one parameter's name has, and whatever else lies outside it.
+
+    Args:
+        params: parameters by name.
+        marker: the name of a parameter without its prefix.
+
+    Raises:
+        ValueError: if there is no such parameter.
+
+    Example:
+        >>> import torch
+        >>> w = torch.ones(1)
+        >>> sorted(strip_prefix({"net.a.w": w, "net.b": w, "other": w}, "a.w"))
+        ['a.w', 'b']
+    """
+    names = [name for name in params if name == marker or name.endswith(f".{marker}")]
+    if not names:
+        raise ValueError(f"there is no parameter {marker!r}: these are not of the authors' network")
+    prefix = names[0].removesuffix(marker)
+    return {n.removeprefix(prefix): p for n, p in params.items() if n.startswith(prefix)}
+
+
+def count_layers(params: Mapping[str, Tensor], pattern: str) -> int:
+    r"""Counts the layers whose parameters match an expression with the index as its group.
+
+    Example:
+        >>> count_layers({"h.0.w": Tensor(), "h.1.w": Tensor(), "h.1.b": Tensor()}, r"h\.(\d+)\..*")
+        2
+    """
+    matches = (re.fullmatch(pattern, name) for name in params)
+    return len({match.group(1) for match in matches if match})
+
+
+def size_of(params: Mapping[str, Tensor], name: str, axis: int = 0) -> int:
+    """Returns the size of a parameter along an axis.
+
+    Raises:
+        ValueError: if there is no such parameter.
+    """
+    if name not in params:
+        raise ValueError(f"there is no parameter {name!r}: these are not of the authors' network")
+    return params[name].shape[axis]
+
+
 def _rename(name: str, renaming: Renaming) -> str:
     for pattern, replacement in renaming:
         if re.fullmatch(pattern, name):

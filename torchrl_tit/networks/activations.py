@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Literal, get_args
 
 from torch import nn
 
-Activation = Literal["gelu", "relu", "silu", "tanh"]
+Activation = Literal["gelu", "gelu_tanh", "relu", "silu", "tanh"]
 
-_ACTIVATIONS: dict[str, type[nn.Module]] = {
+_ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
     "gelu": nn.GELU,
+    "gelu_tanh": partial(nn.GELU, approximate="tanh"),
     "relu": nn.ReLU,
     "silu": nn.SiLU,
     "tanh": nn.Tanh,
@@ -20,7 +23,8 @@ def make_activation(name: Activation) -> nn.Module:
     """Builds an activation function from its name.
 
     Args:
-        name: one of ``"gelu"`` (the exact one, with erf), ``"relu"``, ``"silu"``, ``"tanh"``.
+        name: one of ``"gelu"`` (the exact one, with erf), ``"gelu_tanh"`` (its approximation in
+            GPT-2), ``"relu"``, ``"silu"``, ``"tanh"``.
 
     Returns:
         A parameterless module, elementwise on any shape.

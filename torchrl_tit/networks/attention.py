@@ -31,6 +31,7 @@ class SelfAttention(nn.Module):
         num_heads: number of heads; must divide ``embed_dim``.
         causal: whether a position sees only itself and earlier ones.
         dropout: probability of dropping an attention weight while training.
+        out_dim: width of what is put out; that of the input where not given.
 
     Raises:
         ValueError: if ``num_heads`` does not divide ``embed_dim``.
@@ -43,7 +44,13 @@ class SelfAttention(nn.Module):
     """
 
     def __init__(
-        self, embed_dim: int, num_heads: int, *, causal: bool = False, dropout: float = 0.0
+        self,
+        embed_dim: int,
+        num_heads: int,
+        *,
+        causal: bool = False,
+        dropout: float = 0.0,
+        out_dim: int | None = None,
     ) -> None:
         super().__init__()
         if num_heads < 1 or embed_dim % num_heads:
@@ -55,7 +62,7 @@ class SelfAttention(nn.Module):
         self.causal = causal
         self.in_proj_weight = nn.Parameter(torch.empty(3 * embed_dim, embed_dim))
         self.in_proj_bias = nn.Parameter(torch.empty(3 * embed_dim))
-        self.out_proj = nn.Linear(embed_dim, embed_dim)
+        self.out_proj = nn.Linear(embed_dim, out_dim or embed_dim)
         # A module, not a number: TorchRL's losses look for nn.Dropout to set vmap's randomness.
         self.dropout = nn.Dropout(dropout)
         self.reset_parameters()
@@ -67,15 +74,17 @@ class SelfAttention(nn.Module):
         self.out_proj.reset_parameters()
         nn.init.zeros_(self.out_proj.bias)
 
-    def forward(self, x: Tensor, read: Read = "all") -> Tensor:
+    def forward(self, x: Tensor, read: Read | slice = "all", mask: Tensor | None = None) -> Tensor:
         """Attends over a sequence.
 
         Args:
             x: tokens, float [N, S, D].
-            read: which positions to put out.
+            read: which positions to put out, by name or as a slice of S.
+            mask: bool [..., S, S], to be broadcast to [N, heads, S, S]: True where a position (row)
+                sees another (column). Each must see one. Instead of the causal mask, if any.
 
         Returns:
-            float [N, S or 1, D].
+            float [N, positions read, D].
         """
         if self.causal and read == "first":
             x = x[:, :1]  # it sees itself only
@@ -83,19 +92,24 @@ class SelfAttention(nn.Module):
         if x.shape[1] == 1 and not dropping:
             # A softmax over one position is 1: only the value is left.
             return self.out_proj(self._project(x, 2, 3))
-        query, key, value = self._heads(x, read)  # [N, heads, S or 1, D / heads] each
-        masked = self.causal and read == "all"  # the last position sees everything
+        positions = read if isinstance(read, slice) else READ_SLICES[read]
+        query, key, value = self._heads(x, positions)  # [N, heads, positions, D / heads] each
+        masked = mask is None and self.causal and read != "last"  # the last sees everything
+        fused = masked and read == "all" and not dropping
+        if masked and not fused:
+            mask = self._past(x)
+        if mask is not None:
+            mask = mask[..., positions, :]
         if dropping:
-            weights = self.dropout(self._weights(query, key, masked))
-            mixed = weights @ value
+            mixed = self.dropout(self._weights(query, key, mask)) @ value
         else:
-            mixed = F.scaled_dot_product_attention(query, key, value, is_causal=masked)
+            mixed = F.scaled_dot_product_attention(query, key, value, mask, is_causal=fused)
         return self.out_proj(mixed.transpose(1, 2).flatten(2))
 
     def weights(self, x: Tensor) -> Tensor:
         """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1."""
-        query, key, _ = self._heads(x, "all")
-        return self._weights(query, key, self.causal)
+        query, key, _ = self._heads(x, READ_SLICES["all"])
+        return self._weights(query, key, self._past(x) if self.causal else None)
 
     def extra_repr(self) -> str:
         """Names what the parameters' shapes do not show."""
@@ -106,11 +120,11 @@ class SelfAttention(nn.Module):
         rows = slice(start * x.shape[-1], stop * x.shape[-1])
         return F.linear(x, self.in_proj_weight[rows], self.in_proj_bias[rows])
 
-    def _heads(self, x: Tensor, read: Read) -> tuple[Tensor, Tensor, Tensor]:
-        if read == "all":
+    def _heads(self, x: Tensor, positions: slice) -> tuple[Tensor, Tensor, Tensor]:
+        if positions == READ_SLICES["all"]:
             query, key, value = self._project(x, 0, 3).chunk(3, dim=-1)
         else:
-            query = self._project(x[:, READ_SLICES[read]], 0, 1)
+            query = self._project(x[:, positions], 0, 1)
             key, value = self._project(x, 1, 3).chunk(2, dim=-1)
         return self._split(query), self._split(key), self._split(value)
 
@@ -118,9 +132,12 @@ class SelfAttention(nn.Module):
         """[N, S, D] -> [N, heads, S, D / heads]."""
         return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 
-    def _weights(self, query: Tensor, key: Tensor, masked: bool) -> Tensor:
+    def _past(self, x: Tensor) -> Tensor:
+        """The causal mask: bool [S, S], lower triangular."""
+        return torch.ones(x.shape[1], x.shape[1], dtype=torch.bool, device=x.device).tril()
+
+    def _weights(self, query: Tensor, key: Tensor, mask: Tensor | None) -> Tensor:
         scores = query @ key.transpose(-2, -1) / math.sqrt(query.shape[-1])
-        if masked:
-            future = torch.ones(scores.shape[-2:], dtype=torch.bool, device=scores.device).triu(1)
-            scores = scores.masked_fill(future, -math.inf)
+        if mask is not None:
+            scores = scores.masked_fill(~mask, -math.inf)
         return scores.softmax(dim=-1)

@@ -101,30 +101,44 @@ class HistoryNetwork(nn.Module):
 
     def check(self, history: Tensor) -> None:
         """Raises ValueError or TypeError where a history does not fit this network."""
-        expected = (self.history, *self.observation_shape)
-        if tuple(history.shape[-len(expected) :]) != expected:
-            raise ValueError(
-                f"a history of shape {tuple(history.shape)} does not fit this network: expected "
-                f"[..., {', '.join(map(str, expected))}], which is {self.history} observations of "
-                f"shape {self.observation_shape}, oldest first (torchrl_tit.History stacks them)"
-            )
-        weights = next(self.parameters()).dtype
-        autocast = torch.is_autocast_enabled(history.device.type)
-        # Autocast converts every float type but double.
-        fits = history.dtype == weights or (
-            autocast and history.is_floating_point() and history.dtype != torch.float64
-        )
-        if not fits and history.dtype != torch.uint8:
-            raise TypeError(
-                f"a history of {history.dtype} does not fit this network of {weights}: give it "
-                "uint8, or convert it first (TorchRL's DoubleToFloat, say)"
-            )
+        dtype = next(self.parameters()).dtype
+        check_history(history, self.history, self.observation_shape, dtype)
 
 
 def _attention_maps(encoder: nn.Module, x: Tensor) -> list[Tensor]:
     """Returns an encoder's attention weights: none where it has no attention."""
     attention_maps = getattr(encoder, "attention_maps", None)
     return [] if attention_maps is None else attention_maps(x)
+
+
+def check_history(
+    history: Tensor, steps: int, observation_shape: tuple[int, ...], dtype: torch.dtype
+) -> None:
+    """Raises ValueError or TypeError where a history does not fit a network.
+
+    Args:
+        history: what the network is given.
+        steps: number of observations K that it reads.
+        observation_shape: shape of one of them.
+        dtype: type of the network's weights.
+    """
+    expected = (steps, *observation_shape)
+    if tuple(history.shape[-len(expected) :]) != expected:
+        raise ValueError(
+            f"a history of shape {tuple(history.shape)} does not fit this network: expected "
+            f"[..., {', '.join(map(str, expected))}], which is {steps} observations of "
+            f"shape {observation_shape}, oldest first (torchrl_tit.History stacks them)"
+        )
+    autocast = torch.is_autocast_enabled(history.device.type)
+    # Autocast converts every float type but double.
+    fits = history.dtype == dtype or (
+        autocast and history.is_floating_point() and history.dtype != torch.float64
+    )
+    if not fits and history.dtype != torch.uint8:
+        raise TypeError(
+            f"a history of {history.dtype} does not fit this network of {dtype}: give it "
+            "uint8, or convert it first (TorchRL's DoubleToFloat, say)"
+        )
 
 
 def check_observation(observation_shape: Sequence[int], history: int) -> None:

@@ -131,11 +131,12 @@ class LinearFrameEncoder(nn.Module):
     """Maps a whole observation to one token with a linear layer.
 
     The observation embedding of the ablation without inner blocks (arXiv 2212.14538, appendix
-    "Ablation Study").
+    "Ablation Study"); with a bias, that of Decision Transformer.
 
     Args:
         observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
         embed_dim: width of the token.
+        bias: whether the linear layer has a bias.
 
     Example:
         >>> LinearFrameEncoder((84, 84), 32)(torch.zeros(8, 4, 84, 84, dtype=torch.uint8)).shape
@@ -144,11 +145,15 @@ class LinearFrameEncoder(nn.Module):
 
     num_tokens = 1
 
-    def __init__(self, observation_shape: Sequence[int], embed_dim: int) -> None:
+    def __init__(
+        self, observation_shape: Sequence[int], embed_dim: int, *, bias: bool = False
+    ) -> None:
         super().__init__()
         self.observation_ndim = len(observation_shape)
-        self.linear = nn.Linear(math.prod(observation_shape), embed_dim, bias=False)
+        self.linear = nn.Linear(math.prod(observation_shape), embed_dim, bias=bias)
 
     def forward(self, observation: Tensor) -> Tensor:
         """[..., *observation_shape], float or uint8 -> [..., 1, D]."""
-        return embed(observation.flatten(-self.observation_ndim).unsqueeze(-2), self.linear.weight)
+        x = observation.flatten(-self.observation_ndim).unsqueeze(-2)  # [..., 1, entries]
+        token = embed(x, self.linear.weight)
+        return token if self.linear.bias is None else token + self.linear.bias

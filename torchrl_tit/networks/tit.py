@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any
 
 from torch import Tensor, nn
 
+from torchrl_tit.networks.config import override_config
 from torchrl_tit.networks.history_network import HistoryNetwork, check_observation, make_head
 from torchrl_tit.networks.initialization import init_normal_
 from torchrl_tit.networks.inner import InnerTransformer, LinearFrameEncoder
-from torchrl_tit.networks.tit_config import EnhancedTITConfig, TITConfig, VanillaTITConfig
-
-_Config = TypeVar("_Config", bound=TITConfig)
+from torchrl_tit.networks.tit_config import EnhancedTITConfig, VanillaTITConfig
 
 
 class VanillaTIT(HistoryNetwork):
@@ -46,7 +44,7 @@ class VanillaTIT(HistoryNetwork):
         config: VanillaTITConfig | None = None,
         **hyperparameters: Any,
     ) -> None:
-        config = _override(VanillaTITConfig, config, hyperparameters)
+        config = override_config(VanillaTITConfig, config, hyperparameters)
         check_observation(observation_shape, history)
         super().__init__(
             observation_shape,
@@ -98,7 +96,7 @@ class EnhancedTIT(HistoryNetwork):
         config: EnhancedTITConfig | None = None,
         **hyperparameters: Any,
     ) -> None:
-        config = _override(EnhancedTITConfig, config, hyperparameters)
+        config = override_config(EnhancedTITConfig, config, hyperparameters)
         check_observation(observation_shape, history)
         frame_encoder: nn.Module | None
         history_encoder: nn.Module
@@ -144,14 +142,3 @@ class StackedFramesTransformer(nn.Module):
     def attention_maps(self, history: Tensor) -> list[Tensor]:
         """Returns the attention weights of each block, L x float [..., heads, S, S]."""
         return self.inner.attention_maps(history)
-
-
-def _override(
-    kind: type[_Config], config: TITConfig | None, hyperparameters: dict[str, Any]
-) -> _Config:
-    """Returns the config, by default one of that kind, with hyperparameters replaced."""
-    if config is None:
-        return kind(**hyperparameters)
-    if not isinstance(config, kind):
-        raise TypeError(f"config is of type {type(config).__name__}: expected {kind.__name__}")
-    return replace(config, **hyperparameters)

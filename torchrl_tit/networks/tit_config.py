@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torchrl_tit.networks.activations import Activation
 from torchrl_tit.networks.block import TransformerBlock
+from torchrl_tit.networks.config import check_positive, check_probability
 from torchrl_tit.networks.inner import InnerTransformer
 from torchrl_tit.networks.outer import PairedOuterTransformer, StackedOuterTransformer
 
@@ -53,23 +54,22 @@ class TITConfig:
     """Activation of the head: LayerNorm, linear, activation, LayerNorm."""
 
     def __post_init__(self) -> None:
-        for name in (
+        check_positive(
+            self,
             "patch_size",
             "embed_dim",
             "num_blocks",
             "ffn_expansion_inner",
             "ffn_expansion_outer",
             "features_dim",
-        ):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be >= 1, not {getattr(self, name)}")
-        for kind in ("attention", "ffn"):
-            for part in ("inner", "outer"):
-                probability = getattr(self, f"{kind}_dropout_{part}")
-                if not 0 <= probability < 1:
-                    raise ValueError(
-                        f"{kind}_dropout_{part} is a probability in [0, 1), not {probability}"
-                    )
+        )
+        check_probability(
+            self,
+            "attention_dropout_inner",
+            "attention_dropout_outer",
+            "ffn_dropout_inner",
+            "ffn_dropout_outer",
+        )
 
     def make_inner_block(self) -> TransformerBlock:
         """Builds an inner block."""

@@ -1,0 +1,120 @@
+"""Decision Transformer and DT_TIT of the authors' release."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_tit.interop.weights import count_layers, load_renamed, size_of, strip_prefix
+from torchrl_tit.networks import DecisionTransformer, DecisionTransformerConfig
+
+_RENAMING = [
+    (r"embed_return\.(.*)", r"return_embedding.\1"),
+    (r"embed_action\.(.*)", r"action_embedding.\1"),
+    (r"embed_timestep\.(.*)", r"timestep_embedding.\1"),
+    (r"embed_ln\.(.*)", r"embedding_norm.\1"),
+    (r"transformer\.h\.(\d+)\.ln_(\d)\.(.*)", r"blocks.\1.norm\2.\3"),
+    (r"transformer\.h\.(\d+)\.attn\.c_attn\.(.*)", r"blocks.\1.attention.in_proj_\2"),
+    (r"transformer\.h\.(\d+)\.attn\.c_proj\.(.*)", r"blocks.\1.attention.out_proj.\2"),
+    (r"transformer\.h\.(\d+)\.mlp\.c_fc\.(.*)", r"blocks.\1.ffn.0.\2"),
+    (r"transformer\.h\.(\d+)\.mlp\.c_proj\.(.*)", r"blocks.\1.ffn.2.\2"),
+    (r"transformer\.ln_f\.(.*)", r"norm.\1"),
+    (r"predict_action\.0\.(.*)", r"action_head.0.\1"),
+]
+_LINEAR = [(r"embed_state\.(.*)", r"state_encoder.linear.\1")]
+_INNER = [
+    (r"obs_patch_embed\.weight", "state_encoder.patch_embedding.weight"),
+    (r"class_token_encoding", "state_encoder.class_token"),
+    (r"obs_patch_pos_encoding", "state_encoder.positions"),
+    (r"inner_blocks\.(\d+)\.ln(\d)\.(.*)", r"state_encoder.blocks.\1.norm\2.\3"),
+    (r"inner_blocks\.(\d+)\.(.*)", r"state_encoder.blocks.\1.\2"),
+]
+# What the authors' network holds and does not use: predictions of states and returns that are not
+# trained, token and position embeddings of GPT-2, and causal masks.
+_UNUSED = re.compile(
+    r"predict_(state|return)\..*|transformer\.w[tp]e\..*|.*\.attn\.(masked_)?bias|.*mask.*"
+)
+_CONV1D = re.compile(r".*\.(c_attn|c_proj|c_fc)\.weight")
+# The activations' names in GPT-2 configurations that differ from ours.
+_ACTIVATIONS = {"gelu_new": "gelu_tanh", "gelu_pytorch_tanh": "gelu_tanh", "swish": "silu"}
+
+
+def dt_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
+    """Builds Decision Transformer; see :func:`~torchrl_tit.interop.from_official`."""
+    params = _prepare(params)
+    size = config.get("state_dim", size_of(params, "embed_state.weight", axis=1))
+    return _build(config, params, size, {"state_encoder": "linear"}, _LINEAR)
+
+
+def dt_tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
+    """Builds DT_TIT; see :func:`~torchrl_tit.interop.from_official`."""
+    params = _prepare(params)
+    width = size_of(params, "obs_patch_embed.weight")
+    patch_size = size_of(params, "obs_patch_embed.weight", axis=-1)
+    hyperparameters = {
+        "state_encoder": "inner_transformer",
+        "patch_size": patch_size,
+        "num_blocks_inner": count_layers(params, r"inner_blocks\.(\d+)\..*"),
+        "num_heads_inner": config.get("num_heads_inner", 1),
+        "ffn_expansion_inner": size_of(params, "inner_blocks.0.ffn.0.weight") // width,
+        "activation_inner": _activation(config.get("activation_inner", "relu")),
+        "position_encoding": "obs_patch_pos_encoding" in params,
+    }
+    return _build(config, params, config.get("state_dim", patch_size), hyperparameters, _INNER)
+
+
+def _build(
+    config: Mapping[str, Any],
+    params: Mapping[str, Tensor],
+    state_dim: int,
+    hyperparameters: Mapping[str, Any],
+    renaming: list[tuple[str, str]],
+) -> DecisionTransformer:
+    embed_dim = config.get("embed_dim", size_of(params, "embed_ln.weight"))
+    max_ep_len = config.get("max_ep_len", size_of(params, "embed_timestep.weight"))
+    context = config.get("context", min(DecisionTransformerConfig.context, max_ep_len))
+    network = DecisionTransformer(
+        (state_dim,),
+        config.get("act_dim", size_of(params, "predict_action.0.weight")),
+        embed_dim=embed_dim,
+        num_blocks=config.get("n_layer", count_layers(params, r"transformer\.h\.(\d+)\..*")),
+        num_heads=config.get("n_head", 1),
+        ffn_dim=config.get("n_inner", size_of(params, "transformer.h.0.mlp.c_fc.bias")),
+        activation=_activation(config.get("activation", "relu")),
+        max_ep_len=max_ep_len,
+        context=context,
+        **hyperparameters,
+    )
+    load_renamed(network, params, [*_RENAMING, *renaming])
+    return network
+
+
+def _prepare(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Drops prefix and unused parameters, and turns GPT-2's weights [in, out] to [out, in]."""
+    params = strip_prefix(params, "embed_ln.weight")
+    used = {name: value for name, value in params.items() if not _UNUSED.fullmatch(name)}
+    prepared = {n: value.T if _CONV1D.fullmatch(n) else value for n, value in used.items()}
+    missing = [
+        name
+        for name in (n.replace(".weight", ".bias") for n in prepared if n.endswith("c_attn.weight"))
+        if name not in prepared
+    ]
+    if missing:
+        warnings.warn(
+            f"the parameters have no {', '.join(missing)}: zeros are taken instead, which is right "
+            'only for untrained weights. Perhaps a filter for causal masks ("attn.bias") took them',
+            stacklevel=4,
+        )
+    for name in missing:
+        weight = prepared[name.replace(".bias", ".weight")]
+        prepared[name] = torch.zeros(len(weight), dtype=weight.dtype)
+    return prepared
+
+
+def _activation(name: str) -> str:
+    return _ACTIVATIONS.get(name, name)
