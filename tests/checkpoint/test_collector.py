@@ -1,5 +1,6 @@
 """A collector that is saved and put into a new one returns the same batches."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from torchrl_tit.checkpoint import (
     set_collector_state,
     set_global_rng_state,
 )
+from torchrl_tit.envs import make_env
 
 
 def make_policy(env: EnvBase) -> ProbabilisticActor:
@@ -37,9 +39,18 @@ def make_policy(env: EnvBase) -> ProbabilisticActor:
     return ProbabilisticActor(module, ["loc", "scale"], distribution_class=TanhNormal)
 
 
-def make_collector(name: str, track: bool = True, init_random_frames: int = 0) -> Collector:
+def make_own_vector(name: str, num_envs: int, max_episode_steps: int) -> EnvBase:
+    return make_env(name, num_envs, history=4, max_episode_steps=max_episode_steps)
+
+
+def make_collector(
+    name: str,
+    track: bool = True,
+    init_random_frames: int = 0,
+    make: Callable[..., EnvBase] = make_vector,
+) -> Collector:
     torch.manual_seed(0)
-    env = make_vector(name, 3, max_episode_steps=21)
+    env = make(name, 3, max_episode_steps=21)
     env.set_seed(1)
     return Collector(
         env,
@@ -59,14 +70,17 @@ def collect(collector: Collector, batches: int) -> list[TensorDictBase]:
 
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "Hopper-v5"])
 @pytest.mark.parametrize("track", [True, False], ids=["tracked", "untracked"])
-def test_goes_on_bit_for_bit(tmp_path: Path, name: str, track: bool) -> None:
-    first = make_collector(name, track)
+@pytest.mark.parametrize("make", [make_vector, make_own_vector])
+def test_goes_on_bit_for_bit(
+    tmp_path: Path, name: str, track: bool, make: Callable[..., EnvBase]
+) -> None:
+    first = make_collector(name, track, make=make)
     collect(first, 2)
     save_checkpoint(tmp_path, 96, {"collector": collector_state(first), "rng": global_rng_state()})
     expected = collect(first, 4)
     assert any(batch["next", "done"].any() for batch in expected)
 
-    second = make_collector(name, track)
+    second = make_collector(name, track, make=make)
     torch.manual_seed(123)
     step, state = load_checkpoint(tmp_path)
     assert step == 96

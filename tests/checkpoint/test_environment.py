@@ -32,6 +32,7 @@ from torchrl_tit.checkpoint import (
     save_checkpoint,
     set_env_state,
 )
+from torchrl_tit.envs import make_env
 
 CLASSIC = {
     # A limit that is no divisor of the number of steps, so that time limits fall on both sides.
@@ -149,6 +150,17 @@ def test_mujoco_vector(tmp_path: Path, name: str) -> None:
     )
     assert steps["next", "done"].any()
     assert steps["next", "reward"].unique().numel() > 50
+
+
+@pytest.mark.parametrize("reset_first", [False, True], ids=["new", "used"])
+@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "Ant-v5"])
+def test_our_own_vector(tmp_path: Path, name: str, reset_first: bool) -> None:
+    def make() -> EnvBase:
+        env = make_env(name, 3, history=4, padding="constant", max_episode_steps=13)
+        return TransformedEnv(env, StepCounter())
+
+    steps = check_continues(tmp_path, make, before=20, after=30, reset_first=reset_first)
+    assert steps["next", "done"].sum() >= 6
 
 
 @pytest.mark.parametrize("name", OTHER_MUJOCO)

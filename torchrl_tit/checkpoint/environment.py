@@ -5,13 +5,14 @@ from __future__ import annotations
 from copy import deepcopy
 from typing import Any
 
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.parameter import UninitializedBuffer
 from torchrl.envs import EnvBase, GymEnv, GymWrapper, TransformedEnv
-from torchrl.envs.transforms import Transform, VecGymEnvTransform
+from torchrl.envs.transforms import VecGymEnvTransform
 
 from torchrl_tit.checkpoint.gymnasium_state import layer_state, layers, set_layer_state
 from torchrl_tit.checkpoint.physics import ATTRIBUTES, class_name
+from torchrl_tit.envs import GymVectorEnv
 
 
 def can_save_env(env: EnvBase) -> bool:
@@ -67,9 +68,9 @@ def env_state(env: EnvBase) -> dict[str, Any]:
             f"an environment with {obstacle} in it cannot be saved; reset it at each checkpoint "
             "instead, with a seed that follows from the run's seed and the step"
         )
-    transforms, base = _unwrap(env)
+    modules, base = _unwrap(env)
     return {
-        "transforms": [_transform_state(transform) for transform in transforms],
+        "modules": [_module_state(module) for module in modules],
         "layers": [layer_state(layer) for layer in layers(base._env)],
     }
 
@@ -94,7 +95,7 @@ def set_env_state(env: EnvBase, state: dict[str, Any]) -> None:
     """
     if obstacle := _obstacle(env):
         raise TypeError(f"an environment with {obstacle} in it cannot be continued from a state")
-    transforms, base = _unwrap(env)
+    modules, base = _unwrap(env)
     present = list(layers(base._env))
     names = [class_name(layer) for layer in present]
     saved = [layer["class"] for layer in state["layers"]]
@@ -103,72 +104,73 @@ def set_env_state(env: EnvBase, state: dict[str, Any]) -> None:
             f"the state is that of {', '.join(saved)}, but the environment is {', '.join(names)}; "
             "make it as the saved one was made"
         )
-    if len(transforms) != len(state["transforms"]):
+    if len(modules) != len(state["modules"]):
         raise ValueError(
-            f"the state is that of an environment with {len(state['transforms'])} levels of "
-            f"transforms, but this one has {len(transforms)}; make it as the saved one was made"
+            f"the state is that of an environment with {len(state['modules']) - 1} levels of "
+            f"transforms, but this one has {len(modules) - 1}; make it as the saved one was made"
         )
-    for transform, saved_transform in zip(transforms, state["transforms"], strict=True):
-        _set_transform_state(transform, saved_transform)
+    for module, saved_module in zip(modules, state["modules"], strict=True):
+        _set_module_state(module, saved_module)
     for layer, saved_layer in zip(present, state["layers"], strict=True):
         set_layer_state(layer, saved_layer)
 
 
-def _unwrap(env: EnvBase) -> tuple[list[Transform], EnvBase]:
-    transforms = []
+def _unwrap(env: EnvBase) -> tuple[list[nn.Module], EnvBase]:
+    """All that has buffers, from the outermost transform to the core, and the core itself."""
+    transforms: list[nn.Module] = []
     while isinstance(env, TransformedEnv):
         transforms.append(env.transform)
         env = env.base_env
-    return transforms, env
+    return [*transforms, env], env
 
 
 def _obstacle(env: EnvBase) -> str | None:
     """The class that keeps an environment from being saved."""
     _, base = _unwrap(env)
-    if type(base) not in (GymWrapper, GymEnv):
+    if type(base) not in (GymVectorEnv, GymWrapper, GymEnv):
         return class_name(base)
     names = map(class_name, layers(base._env))
     return next((name for name in names if name not in ATTRIBUTES), None)
 
 
-def _transform_state(transform: Transform) -> dict[str, Any]:
+def _module_state(module: nn.Module) -> dict[str, Any]:
     return {
         # None stands for a buffer that is only made when the first data come.
         "buffers": {
             key: None if isinstance(value, UninitializedBuffer) else _copy(value)
-            for key, value in _buffers(transform).items()
+            for key, value in _buffers(module).items()
         },
         # TorchRL keeps here what a vector of environments returned from its automatic resets.
         "resets": {
-            name: {key: _copy(value) for key, value in module._memo.items()}
-            for name, module in transform.named_modules()
-            if isinstance(module, VecGymEnvTransform)
+            name: {key: _copy(value) for key, value in part._memo.items()}
+            for name, part in module.named_modules()
+            if isinstance(part, VecGymEnvTransform)
         },
     }
 
 
-def _set_transform_state(transform: Transform, state: dict[str, Any]) -> None:
-    buffers, present = state["buffers"], _buffers(transform)
+def _set_module_state(module: nn.Module, state: dict[str, Any]) -> None:
+    buffers, present = state["buffers"], _buffers(module)
     if buffers.keys() != present.keys():
         raise ValueError(
-            f"the state is that of transforms with the buffers {sorted(buffers)}, but these have "
-            f"{sorted(present)}; make the environment as the saved one was made"
+            f"the state is that of an environment with the buffers {sorted(buffers)}, but this one "
+            f"has {sorted(present)}; make it as the saved one was made"
         )
     known = {key: value for key, value in buffers.items() if value is not None}
     for key, value in known.items():
         if isinstance(present[key], UninitializedBuffer):
             # load_state_dict fills buffers, it does not make them.
-            module, _, leaf = key.rpartition(".")
-            transform.get_submodule(module).register_buffer(leaf, value.clone())
-    transform.load_state_dict(known, strict=False)
+            path, _, leaf = key.rpartition(".")
+            module.get_submodule(path).register_buffer(leaf, value.clone())
+    module.load_state_dict(known, strict=False)
     for name, memo in state["resets"].items():
-        module = transform.get_submodule(name)
-        module._memo = {key: _copy(value) for key, value in memo.items()}
+        part: Any = module.get_submodule(name)
+        part._memo = {key: _copy(value) for key, value in memo.items()}
 
 
-def _buffers(transform: Transform) -> dict[str, Any]:
+def _buffers(module: nn.Module) -> dict[str, Any]:
     # Without keep_vars PyTorch detaches, and a buffer that has no data yet cannot be detached.
-    return dict(transform.state_dict(keep_vars=True))
+    return dict(module.state_dict(keep_vars=True))
 
 
 def _copy(value: Any) -> Any:
