@@ -1,0 +1,152 @@
+"""What is wrong is refused early, with what was given, what was expected and what to do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from torchrl_tit.networks import (
+    EnhancedTIT,
+    EnhancedTITConfig,
+    SelfAttention,
+    VanillaTIT,
+    VanillaTITConfig,
+    make_activation,
+)
+
+BOTH = pytest.mark.parametrize("kind", [EnhancedTIT, VanillaTIT])
+
+WRONG_SETTINGS: list[tuple[tuple[int, ...], int, dict[str, Any], str]] = [
+    ((4,), 0, {}, r"history .* must be >= 1, not 0"),
+    ((4,), -1, {}, r"history .* must be >= 1, not -1"),
+    ((), 1, {}, r"observation_shape \(\) is not that of an array \(D,\) or an image"),
+    ((0,), 1, {}, r"observation_shape \(0,\) is not"),
+    ((1, 2, 3, 4), 1, {}, r"observation_shape \(1, 2, 3, 4\) is not"),
+    ((4,), 1, {"num_heads_inner": 3}, r"width 32 cannot be split over 3 attention heads: choose"),
+    ((4,), 1, {"num_heads_outer": 5}, r"width 32 cannot be split over 5 attention heads: choose"),
+    ((4,), 1, {"num_heads_outer": 0}, r"width 32 cannot be split over 0 attention heads"),
+    ((8, 8), 1, {"patch_size": 9}, r"patch_size 9 is larger than the image of 8 x 8"),
+    ((8, 4), 1, {"patch_size": 8}, r"patch_size 8 is larger than the image of 8 x 4"),
+    ((9, 8), 1, {"patch_size": 4}, r"4 does not divide the image of 9 x 8 pixels: .* \[1\]"),
+    ((3, 8, 18), 1, {"patch_size": 4}, r"4 does not divide the image of 8 x 18 .* \[1, 2\]"),
+    ((4,), 1, {"activation_inner": "swish"}, r"unknown activation 'swish'.*'gelu'"),
+    ((4,), 1, {"activation_outer": "gelo"}, r"unknown activation 'gelo'.*'gelu'"),
+    ((4,), 1, {"activation_head": "Tanh"}, r"unknown activation 'Tanh'.*'tanh'"),
+    *(
+        ((4,), 1, {f"{kind}_dropout_{part}": p}, rf"{kind}_dropout_{part} .* \[0, 1\), not {p}")
+        for kind in ("attention", "ffn")
+        for part in ("inner", "outer")
+        for p in (-0.1, 1.0, float("nan"))
+    ),
+    *(
+        ((4,), 1, {name: 0}, rf"{name} must be >= 1, not 0")
+        for name in (
+            "patch_size",
+            "embed_dim",
+            "num_blocks",
+            "ffn_expansion_inner",
+            "ffn_expansion_outer",
+            "features_dim",
+        )
+    ),
+]
+
+
+@BOTH
+@pytest.mark.parametrize(("shape", "history", "settings", "message"), WRONG_SETTINGS)
+def test_wrong_settings(
+    kind: type[Any], shape: tuple[int, ...], history: int, settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        kind(shape, history, **settings)
+
+
+def test_nothing_left() -> None:
+    with pytest.raises(ValueError, match="inner and outer cannot both be off"):
+        EnhancedTIT((4,), 2, inner=False, outer=False)
+
+
+@BOTH
+def test_unknown_hyperparameter_is_named(kind: type[Any]) -> None:
+    with pytest.raises(TypeError, match=r"TITConfig.* unexpected keyword argument 'embed_dims'"):
+        kind((4,), embed_dims=64)
+    config = VanillaTITConfig() if kind is VanillaTIT else EnhancedTITConfig()
+    with pytest.raises(TypeError, match=r"TITConfig.* unexpected keyword argument 'embed_dims'"):
+        kind((4,), config=config, embed_dims=64)
+
+
+def test_config_of_the_other_network() -> None:
+    with pytest.raises(TypeError, match="type EnhancedTITConfig: expected VanillaTITConfig"):
+        VanillaTIT((4,), config=EnhancedTITConfig(dense=False))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="type VanillaTITConfig: expected EnhancedTITConfig"):
+        EnhancedTIT((4,), config=VanillaTITConfig())  # type: ignore[arg-type]
+
+
+def test_hyperparameters_override_those_of_the_config() -> None:
+    config = EnhancedTITConfig(embed_dim=16, features_dim=8)
+    tit = EnhancedTIT((4,), 2, config, features_dim=24)
+    assert tit.config == EnhancedTITConfig(embed_dim=16, features_dim=24)
+    assert config.features_dim == 8
+    with pytest.raises(ValueError, match=r"width 16 cannot be split over 3"):
+        EnhancedTIT((4,), 2, config, num_heads_inner=3)
+
+
+@pytest.mark.parametrize(
+    "shape", [(3, 4), (3, 5), (2, 5, 3), (4,), (), (5, 3), (2, 4, 4), (2, 3, 5)]
+)
+@BOTH
+def test_history_of_another_shape(kind: type[Any], shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"expected \[\.\.\., 4, 3\]") as error:
+        kind((3,), 4)(torch.zeros(shape))
+    assert str(tuple(shape)) in str(error.value)
+
+
+@BOTH
+def test_image_of_another_shape(kind: type[Any]) -> None:
+    tit = kind((8, 8), 2, patch_size=4)
+    for call in (tit, tit.attention_maps):
+        with pytest.raises(ValueError, match=r"\(5, 2, 8, 9\).* expected \[\.\.\., 2, 8, 8\]"):
+            call(torch.zeros(5, 2, 8, 9))
+
+
+@BOTH
+@pytest.mark.parametrize("dtype", [torch.float64, torch.int64, torch.bool, torch.bfloat16])
+def test_history_of_another_dtype(kind: type[Any], dtype: torch.dtype) -> None:
+    tit = kind((3,), 2)
+    for call in (tit, tit.attention_maps):
+        with pytest.raises(TypeError, match=rf"{dtype} .* network of torch.float32: give it uint8"):
+            call(torch.zeros(5, 2, 3, dtype=dtype))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.int64])
+def test_autocast_does_not_convert_these(dtype: torch.dtype) -> None:
+    tit = EnhancedTIT((3,), 2)
+    with torch.autocast("cpu", torch.bfloat16), pytest.raises(TypeError, match=f"{dtype}"):
+        tit(torch.zeros(5, 2, 3, dtype=dtype))
+
+
+def test_float32_into_a_network_of_float64() -> None:
+    with pytest.raises(TypeError, match=r"torch.float32 .* network of torch.float64"):
+        EnhancedTIT((3,), 2).double()(torch.zeros(5, 2, 3))
+
+
+def test_attention_heads() -> None:
+    with pytest.raises(ValueError, match=r"width 10 cannot be split over 4 attention heads"):
+        SelfAttention(10, 4)
+
+
+def test_activation() -> None:
+    with pytest.raises(ValueError, match=r"unknown activation 'swish': choose one of \('gelu'"):
+        make_activation("swish")  # type: ignore[arg-type]
+
+
+def test_representation_shows_what_the_network_is() -> None:
+    text = repr(EnhancedTIT((8, 8), 4, patch_size=4, num_heads_inner=2, embed_dim=16))
+    assert "ImagePatchEmbedding(16, 1, 4, 4, grid=(2, 2))" in text
+    assert "num_heads=2, causal=False" in text
+    assert "num_heads=1, causal=True" in text
+    assert "ArrayPatchEmbedding(16, 1, 4, padding=1)" in repr(
+        VanillaTIT((11,), 4, patch_size=4, embed_dim=16)
+    )
