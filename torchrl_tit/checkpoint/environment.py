@@ -20,8 +20,8 @@ def can_save_env(env: EnvBase) -> bool:
 
     It can where every layer is known: Gymnasium's classic control and MuJoCo tasks (v4, v5) with
     the wrappers that `gymnasium.make` adds and a few more, single or in a `SyncVectorEnv`, inside
-    `GymWrapper` or `GymEnv` and any `TransformedEnv`. An Atari environment, for example, cannot:
-    reset it at each checkpoint instead.
+    `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`. An Atari environment, for
+    example, cannot: reset it at each checkpoint instead.
 
     Args:
         env: A TorchRL environment.
