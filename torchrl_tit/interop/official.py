@@ -33,10 +33,11 @@ def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Modul
 
             - ``"tit"``, with ``variant`` ("vanilla" or "enhanced"), ``observation`` ("array" or
               "image"), ``observation_shape`` ((D,) or (K, H, W)), ``patch_size``, ``num_blocks``,
-              ``features_dim``, ``embed_dim``, and any of ``num_heads_inner``, ``num_heads_outer``,
+              ``features_dim``, ``embed_dim``, ``num_heads_inner``, ``num_heads_outer``,
               ``activation_inner``, ``activation_outer``, ``activation_head``,
-              ``ffn_expansion_inner``, ``ffn_expansion_outer``, ``position_encoding`` and dropout
-              probabilities (``attention_dropout_inner``, ...);
+              ``ffn_expansion_inner``, ``ffn_expansion_outer``, ``position_encoding``, and dropout
+              probabilities where there are any (``attention_dropout_inner``, ...); whether blocks
+              are shared is told by the parameters;
             - ``"resnet"`` and ``"catformer"``, with ``observation_shape`` (K, H, W), and for
               Catformer ``num_heads`` where there are not 5;
             - ``"ofenet"`` and ``"d2rl"``;
@@ -62,11 +63,15 @@ def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Modul
 
     Example:
         >>> import torch
-        >>> from safetensors import safe_open
-        >>> def load(path: str) -> nn.Module:
-        ...     with safe_open(path, "pt") as file:
-        ...         config = json.loads(file.metadata()["config"])
-        ...         return from_official(config, {k: file.get_tensor(k) for k in file.keys()})
+        >>> params = {}
+        >>> for trunk in ("policy", "value"):
+        ...     for layer, size in ((1, 11), (2, 11 + 64)):
+        ...         params[f"linear{layer}_{trunk}.0.weight"] = torch.randn(64, size)
+        ...         params[f"linear{layer}_{trunk}.0.bias"] = torch.randn(64)
+        >>> network = from_official({"kind": "d2rl", "observation_shape": [11]}, params)
+        >>> policy_features, value_features = network(torch.randn(3, 11))
+        >>> policy_features.shape
+        torch.Size([3, 75])
     """
     kind = config.get("kind")
     if kind not in _BUILDERS:

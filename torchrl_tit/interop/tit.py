@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from torchrl_tit.interop.weights import load_renamed
+from torchrl_tit.interop.weights import load_renamed, strip_prefix
 from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig, VanillaTIT, VanillaTITConfig
 
 _REQUIRED = (
@@ -53,7 +53,7 @@ def tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -
     config_class = _choose(config, "variant", vanilla=VanillaTITConfig, enhanced=EnhancedTITConfig)
     hyperparameters = {name: config[name] for name in _REQUIRED}
     hyperparameters |= {name: config[name] for name in _OPTIONAL if name in config}
-    params = _strip_prefix(params)
+    params = strip_prefix(params, "class_token_encoding")
     # The authors share blocks in Enhanced_TIT only: their Vanilla_TIT ignores the setting.
     shared = any(name.startswith("block.") for name in params)
     hyperparameters["share_blocks"] = shared
@@ -74,10 +74,3 @@ def _choose(config: Mapping[str, Any], entry: str, **choices: Any) -> Any:
     if config[entry] not in choices:
         raise ValueError(f"{entry} is {config[entry]!r}: expected one of {sorted(choices)}")
     return choices[config[entry]]
-
-
-def _strip_prefix(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Drops the prefix that the class token's name has, and whatever else lies outside it."""
-    marker = "class_token_encoding"
-    prefix = next((n.removesuffix(marker) for n in params if n.endswith(marker)), "")
-    return {n.removeprefix(prefix): p for n, p in params.items() if n.startswith(prefix)}

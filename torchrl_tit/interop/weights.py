@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 from torch import Tensor, nn
@@ -29,9 +30,12 @@ def load_renamed(network: nn.Module, params: Mapping[str, Tensor], renaming: Ren
         >>> linear.weight.tolist()
         [[1.0, 1.0]]
     """
-    renamed = {_rename(name, renaming): value for name, value in params.items()}
+    new_names = {name: _rename(name, renaming) for name in params}
+    renamed = {new_names[name]: value for name, value in params.items()}
     own = network.state_dict()
-    problems = [f"missing {name}" for name in own.keys() - renamed.keys()]
+    counts = Counter(new_names.values())
+    problems = [f"{count} parameters for {name}" for name, count in counts.items() if count > 1]
+    problems += [f"missing {name}" for name in own.keys() - renamed.keys()]
     problems += [f"left over {name}" for name in renamed.keys() - own.keys()]
     problems += [
         f"{name} has shape {tuple(renamed[name].shape)} instead of {tuple(own[name].shape)}"
