@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import io
 import sys
 import time
+from contextlib import redirect_stderr
 from dataclasses import make_dataclass, replace
+from itertools import takewhile
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import tyro
-
-from torchrl_tit.checkpoint import CheckpointError
 
 from .recipe import Recipe, recipe_from_json, recipe_to_json
 from .registry import RECIPES, get_recipe
@@ -51,12 +52,12 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
     except BrokenPipeError:  # `list | head`: nobody reads on
         sys.stdout = None
-    except (ValueError, OSError, RuntimeError, FloatingPointError, CheckpointError) as error:
+    except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
         _fail(str(error))
 
 
 def _list(words: list[str]) -> None:
-    parser = argparse.ArgumentParser(f"{_program()} list")
+    parser = _Parser(f"{_program()} list")
     parser.add_argument("pattern", nargs="?", default="", help="part of a name")
     pattern = parser.parse_args(words).pattern
     names = [name for name in RECIPES if pattern in name]
@@ -66,31 +67,51 @@ def _list(words: list[str]) -> None:
 
 
 def _show(words: list[str]) -> None:
-    parser = argparse.ArgumentParser(f"{_program()} show")
+    parser = _Parser(f"{_program()} show")
     parser.add_argument("name", help="name of a recipe, or a JSON file")
     print(recipe_to_json(_find(parser.parse_args(words).name)), end="")
 
 
 def _train(words: list[str]) -> None:
-    if words and words[0] == "--resume":
-        parser = argparse.ArgumentParser(f"{_program()} train")
-        parser.add_argument("--resume", type=Path, required=True, help="run folder to go on with")
-        run = Run.open(parser.parse_args(words).resume)
-        if changes := run.version_changes():
-            print(f"note: other versions than at the start: {'; '.join(changes)}", file=sys.stderr)
-    else:
-        if not words or words[0].startswith("-"):
-            print(_USAGE.format(program=_program()), file=sys.stderr)
-            _fail("train needs a recipe's name, or --resume RUN")
-        recipe, out = _parse(_find(words[0]), words[1:])
-        run = Run.create(out or _default_folder(recipe), recipe)
+    run = _resume(words) if words and words[0].startswith("--resume") else _start(words)
     with run:
-        run.recipe.train(run)
-        evaluation = run.recipe.evaluate(run)
+        if run.is_complete():
+            print(f"{run.folder} is complete: trained for {run.recipe.final_step} steps, evaluated")
+            return
+        try:
+            run.recipe.train(run)
+            evaluation = run.recipe.evaluate(run)
+        except KeyboardInterrupt:
+            print(f"stopped; go on: {_program()} train --resume {run.folder}", file=sys.stderr)
+            raise
         run.save_evaluation(evaluation)
         curve = run.plot()
     print(_summary(run.recipe, evaluation))
     print(f"run folder: {run.folder}\nlearning curve: {curve}")
+
+
+def _start(words: list[str]) -> Run:
+    """A new run; nothing is written where its recipe cannot be run."""
+    if words and words[0] in ("-h", "--help"):
+        print(_USAGE.format(program=_program()))
+        sys.exit(0)
+    if not words or words[0].startswith("-"):
+        _fail("train needs a recipe's name first, or --resume RUN")
+    recipe, out = _parse(_find(words[0]), words[1:])
+    recipe.check()
+    return Run.create(out or _default_folder(recipe), recipe)
+
+
+def _resume(words: list[str]) -> Run:
+    parser = _Parser(f"{_program()} train")
+    parser.add_argument("--resume", type=Path, required=True, help="run folder to go on with")
+    _add_machine_options(parser)
+    options = parser.parse_args(words)
+    run = Run.open(options.resume)
+    run.recipe = _override(run.recipe, device=options.device, threads=options.threads)
+    if changes := run.version_changes():
+        print(f"note: other versions than at the start: {'; '.join(changes)}", file=sys.stderr)
+    return run
 
 
 def _summary(recipe: Recipe, evaluation: dict[str, Any]) -> str:
@@ -110,37 +131,63 @@ def _parse(recipe: Recipe, words: list[str]) -> tuple[Recipe, Path | None]:
             ("out", Annotated[Path | None, out], None),
         ],
     )
-    parsed: Any = tyro.cli(
-        tyro.conf.AvoidSubcommands[settings],  # type: ignore[misc, valid-type]
-        args=words,
-        prog=f"{_program()} train {recipe.name}",
-        description=type(recipe).__doc__,
-    )
+    errors = io.StringIO()
+    try:
+        with redirect_stderr(errors):
+            parsed: Any = tyro.cli(
+                tyro.conf.AvoidSubcommands[settings],  # type: ignore[misc, valid-type]
+                args=words,
+                prog=f"{_program()} train {recipe.name}",
+                description=type(recipe).__doc__,
+            )
+    except SystemExit as stop:
+        if stop.code:
+            _fail(_unboxed(errors.getvalue()))
+        raise
     return parsed.recipe, parsed.out
 
 
+def _unboxed(message: str) -> str:
+    """What tyro says in a box, as a sentence: the reason, and the options that are like it."""
+    lines = [line.strip("│ ") for line in message.splitlines()]
+    reason = " ".join(takewhile(lambda line: line[:1] not in "─╰", lines[1:]))
+    similar = [line.split()[0] for line in lines if line.startswith("--") and line != "--help"]
+    hint = f"; did you mean {' or '.join(similar)}?" if "Perhaps you meant" in message else ""
+    return (reason or message) + hint
+
+
 def _evaluate(words: list[str]) -> None:
-    parser = argparse.ArgumentParser(f"{_program()} evaluate")
+    parser = _Parser(f"{_program()} evaluate")
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("--episodes", type=int, help="episodes; the recipe's if missing")
     parser.add_argument(
         "--seed", type=int, help="seed of the first episode; the recipe's if missing"
     )
     parser.add_argument("--out", type=Path, help="file to write; RUN/evaluation.json if missing")
-    parser.add_argument("--device", choices=["cpu", "cuda", "auto"], help="the recipe's if missing")
-    parser.add_argument("--threads", type=int, help="the recipe's if missing")
+    _add_machine_options(parser)
     options = parser.parse_args(words)
     run = Run.open(options.run)
-    overrides = {
-        "evaluation_episodes": options.episodes,
-        "evaluation_seed": options.seed,
-        "device": options.device,
-        "threads": options.threads,
-    }
-    given = {field: value for field, value in overrides.items() if value is not None}
-    evaluation = replace(run.recipe, **given).evaluate(run)
+    recipe = _override(
+        run.recipe,
+        evaluation_episodes=options.episodes,
+        evaluation_seed=options.seed,
+        device=options.device,
+        threads=options.threads,
+    )
+    if options.out is not None and not options.out.absolute().parent.is_dir():
+        _fail(f"--out {options.out} cannot be written: there is no folder {options.out.parent}")
+    evaluation = recipe.evaluate(run)
     path = run.save_evaluation(evaluation, options.out)
-    print(f"{_summary(run.recipe, evaluation)}\nwritten to {path}")
+    print(f"{_summary(recipe, evaluation)}\nwritten to {path}")
+
+
+def _add_machine_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--device", choices=["cpu", "cuda", "auto"], help="the recipe's if missing")
+    parser.add_argument("--threads", type=int, help="the recipe's if missing")
+
+
+def _override(recipe: Recipe, **fields: Any) -> Recipe:
+    return replace(recipe, **{key: value for key, value in fields.items() if value is not None})
 
 
 def _find(name: str) -> Recipe:
@@ -152,8 +199,18 @@ def _find(name: str) -> Recipe:
 
 
 def _default_folder(recipe: Recipe) -> Path:
+    """A new folder, made at once: runs that start in the same second get one each."""
     name = recipe.name or recipe.algorithm
-    return Path("runs", name, f"seed-{recipe.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
+    base = Path("runs", name, f"seed-{recipe.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
+    base.parent.mkdir(parents=True, exist_ok=True)
+    folder, number = base, 1
+    while True:
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            number += 1
+            folder = base.with_name(f"{base.name}-{number}")
 
 
 def _program() -> str:
@@ -161,6 +218,13 @@ def _program() -> str:
     return "python -m recipes" if name == "__main__.py" else name
 
 
-def _fail(message: str) -> None:
-    print(f"error: {message}", file=sys.stderr)
+class _Parser(argparse.ArgumentParser):
+    """A parser that reports errors as the other parts of the command line do."""
+
+    def error(self, message: str) -> NoReturn:
+        _fail(f"{message} (`{self.prog} --help` tells more)")
+
+
+def _fail(message: str) -> NoReturn:
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
@@ -29,37 +31,46 @@ class Metrics:
     def __init__(self, folder: Path, columns: list[str], last_step: int) -> None:
         self.path = folder / "metrics.csv"
         self._columns = ["step", "time", *columns]
-        rows = [row for row in read_metrics(self.path) if row["step"] <= last_step]
-        write_text_atomic(self.path, self._lines([self._columns]))
+        kept = [row for row in read_metrics(self.path) if row["step"] <= last_step]
+        # All in one go: a process that is killed here loses no row.
+        lines = [self._line(self._columns), *(self._line(self._cells(row)) for row in kept)]
+        write_text_atomic(self.path, "".join(lines))
         shutil.rmtree(folder / "tensorboard", ignore_errors=True)
         self._tensorboard = TensorboardLogger(exp_name="tensorboard", log_dir=str(folder))
-        self._file = self.path.open("a", newline="")
-        for row in rows:
-            self._write(row)
+        for row in kept:
+            self._draw(row)
+        self._file = self.path.open("a", encoding="utf-8", newline="")
 
     def log(self, step: int, **values: float) -> None:
         """Adds a row; NaN stands for a number that does not exist at this step."""
-        self._write({"step": step, "time": time.time(), **values})
+        row = {"step": step, "time": time.time(), **values}
+        self._file.write(self._line(self._cells(row)))
+        self._file.flush()
+        self._draw(row)
 
     def close(self) -> None:
         """Closes the files."""
         self._file.close()
         self._tensorboard.experiment.close()
 
-    def _write(self, row: dict[str, float]) -> None:
-        self._file.write(self._lines([[row[column] for column in self._columns]]))
-        self._file.flush()
+    def _cells(self, row: dict[str, float]) -> list[float]:
+        try:
+            return [int(row["step"]), *(float(row[column]) for column in self._columns[1:])]
+        except KeyError as error:
+            raise ValueError(f"{self.path} has no column {error}: it is not of this run") from error
+
+    @staticmethod
+    def _line(cells: list[Any]) -> str:
+        buffer = io.StringIO()
+        csv.writer(buffer, lineterminator="\n").writerow(cells)
+        return buffer.getvalue()
+
+    def _draw(self, row: dict[str, float]) -> None:
         for name in self._columns[2:]:
-            if row[name] == row[name]:  # NaN is not: nothing to draw
+            if not math.isnan(row[name]):
                 self._tensorboard.experiment.add_scalar(
                     name, row[name], int(row["step"]), walltime=row["time"]
                 )
-
-    @staticmethod
-    def _lines(rows: list[list[object]] | list[list[str]] | list[list[float]]) -> str:
-        buffer = io.StringIO()
-        csv.writer(buffer, lineterminator="\n").writerows(rows)
-        return buffer.getvalue()
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:
@@ -70,9 +81,18 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
 
     Returns:
         A dict of numbers for each row, ``step`` among them.
+
+    Raises:
+        ValueError: if a row is damaged.
     """
     if not path.exists():
         return []
     # A row that a killed process left without its line end is no row.
-    complete = [line for line in path.read_text().splitlines(keepends=True) if line.endswith("\n")]
-    return [{name: float(value) for name, value in row.items()} for row in csv.DictReader(complete)]
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    rows = []
+    for row in csv.DictReader(line for line in lines if line.endswith("\n")):
+        try:
+            rows.append({name: float(value) for name, value in row.items()})
+        except (TypeError, ValueError) as error:  # too few or too many cells, or no numbers
+            raise ValueError(f"{path} has a damaged row for step {row.get('step')}") from error
+    return rows

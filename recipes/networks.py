@@ -5,26 +5,58 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from torchrl_tit.networks import (
+    D2RL,
+    MLP,
+    Catformer,
+    CatformerConfig,
+    CoBERL,
+    CoBERLConfig,
+    D2RLConfig,
     EnhancedTIT,
     EnhancedTITConfig,
     HistoryNetwork,
+    MLPConfig,
+    NatureCNN,
+    NatureCNNConfig,
+    OFENet,
+    OFENetConfig,
+    ResNet,
+    ResNetConfig,
+    TwoTrunkNetwork,
     VanillaTIT,
     VanillaTITConfig,
 )
 
-NetworkConfig = EnhancedTITConfig | VanillaTITConfig
+NetworkConfig = (
+    EnhancedTITConfig
+    | VanillaTITConfig
+    | NatureCNNConfig
+    | ResNetConfig
+    | CatformerConfig
+    | CoBERLConfig
+    | MLPConfig
+    | OFENetConfig
+    | D2RLConfig
+)
 """Settings of a network: a recipe's field ``backbone``."""
 
-NETWORKS: dict[str, tuple[type[NetworkConfig], Callable[..., HistoryNetwork]]] = {
-    "vanilla-tit": (VanillaTITConfig, VanillaTIT),
+Network = HistoryNetwork | TwoTrunkNetwork
+
+NETWORKS: dict[str, tuple[type[NetworkConfig], Callable[..., Network]]] = {
     "enhanced-tit": (EnhancedTITConfig, EnhancedTIT),
+    "vanilla-tit": (VanillaTITConfig, VanillaTIT),
+    "nature-cnn": (NatureCNNConfig, NatureCNN),
+    "resnet": (ResNetConfig, ResNet),
+    "catformer": (CatformerConfig, Catformer),
+    "coberl": (CoBERLConfig, CoBERL),
+    "mlp": (MLPConfig, MLP),
+    "ofenet": (OFENetConfig, OFENet),
+    "d2rl": (D2RLConfig, D2RL),
 }
 """Settings and network by the name that recipes use."""
 
 
-def make_network(
-    config: NetworkConfig, observation_shape: Sequence[int], history: int
-) -> HistoryNetwork:
+def make_network(config: NetworkConfig, observation_shape: Sequence[int], history: int) -> Network:
     """Builds the network that settings describe, for observations of a shape and K of them."""
     network = next(network for kind, network in NETWORKS.values() if kind is type(config))
     return network(observation_shape, history, config)

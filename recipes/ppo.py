@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -20,6 +21,7 @@ from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from torchrl_tit.checkpoint import (
+    can_save_env,
     collector_state,
     global_rng_state,
     set_collector_state,
@@ -28,11 +30,11 @@ from torchrl_tit.checkpoint import (
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.modules import Backbone, make_actor, make_value
-from torchrl_tit.networks import init_orthogonal_
+from torchrl_tit.networks import TwoTrunkNetwork, init_orthogonal_
 
 from .interrupt import Interrupt
 from .networks import make_network
-from .recipe import Recipe, check_at_least
+from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
 
 
@@ -84,9 +86,9 @@ class PPO(Recipe):
     bootstrap_time_limit: bool = True
     """Whether an episode cut by a time limit goes on in its value. The paper's runs (SB3 1.3.0)
     took the cut for a termination."""
-    initialization: Literal["orthogonal", "normal"] = "orthogonal"
-    """How the backbone starts: as Stable-Baselines3 does it, which the paper's runs had, or normal
-    with 0.02, as its networks are written."""
+    initialization: Literal["orthogonal", "own"] = "orthogonal"
+    """How the backbone starts: orthogonal, as Stable-Baselines3 made every network that the paper
+    trained online, or as the network's own paper says (TIT: normal with 0.02)."""
     evaluation_episodes: int = 100
     """Episodes of the evaluation after training."""
     evaluation_seed: int = 1_000_000
@@ -104,11 +106,16 @@ class PPO(Recipe):
             minibatch_size=2,  # an advantage alone has no standard deviation
             epochs=1,
             learning_rate=0,
+            adam_eps=0,
             max_grad_norm=0,
             clip_epsilon=0,
+            gamma=0,
+            gae_lambda=0,
             evaluation_episodes=1,
+            evaluation_seed=0,
             checkpoint_interval=1,
         )
+        check_at_most(self, clip_epsilon=1, gamma=1, gae_lambda=1, evaluation_seed=2**31)
         if self.steps_per_batch < 2 or self.steps_per_batch % self.num_envs:
             raise ValueError(
                 f"steps_per_batch {self.steps_per_batch} cannot be shared by {self.num_envs} "
@@ -116,13 +123,34 @@ class PPO(Recipe):
             )
 
     @property
-    def num_batches(self) -> int:
-        """Whole batches that cover ``total_steps``."""
-        return math.ceil(self.total_steps / self.steps_per_batch)
+    def final_step(self) -> int:
+        """``total_steps``, rounded up to whole batches."""
+        return math.ceil(self.total_steps / self.steps_per_batch) * self.steps_per_batch
 
     def make_env(self, num_envs: int, seed: int) -> EnvBase:
         """Builds the environment, with the history as part of it."""
-        return make_env(self.env, num_envs, seed=seed, history=self.history, padding=self.padding)
+        device = self.torch_device()
+        return make_env(
+            self.env,
+            num_envs,
+            seed=seed,
+            history=self.history,
+            padding=self.padding,
+            device=None if device.type == "cpu" else device,
+        )
+
+    def check(self) -> None:
+        """Builds environment and agent once and lets it act.
+
+        Raises:
+            ValueError: if they cannot be built as the fields say, or do not fit each other.
+        """
+        try:
+            env = self.make_env(1, self.seed)
+            Agent(self, env).policy(env.reset())
+        except TypeError as error:  # a kind of observation, say, that no network here reads
+            raise ValueError(str(error)) from error
+        env.close()
 
     def train(self, run: Run) -> None:
         """Trains in a run folder; see :func:`train`."""
@@ -147,7 +175,8 @@ class PPO(Recipe):
         step, state = loaded
         torch.set_num_threads(self.threads)
         agent = Agent(self, self.make_env(1, self.evaluation_seed))
-        agent.load_state_dict(state["agent"])
+        with run.restoring(step):
+            agent.load_state_dict(state["agent"])
         returns = evaluate(
             lambda num_envs: self.make_env(num_envs, self.evaluation_seed),
             agent.policy,
@@ -179,10 +208,11 @@ class Agent(nn.Module):
         network = make_network(recipe.backbone, shape, recipe.history)
         if recipe.initialization == "orthogonal":
             init_orthogonal_(network)
-        self.backbone = Backbone(network)
-        action_spec = env.action_spec_unbatched
-        self.actor = make_actor(network.features_dim, action_spec)
-        self.critic = make_value(network.features_dim)
+        separate = isinstance(network, TwoTrunkNetwork)  # trunks for policy and value
+        out_keys = ["policy_features", "value_features"] if separate else ["features"]
+        self.backbone = Backbone(network, out_keys=out_keys)
+        self.actor = make_actor(network.features_dim, env.action_spec_unbatched, in_key=out_keys[0])
+        self.critic = make_value(network.features_dim, in_key=out_keys[-1])
         self.to(recipe.torch_device())
 
     @property
@@ -227,22 +257,24 @@ def train(recipe: PPO, run: Run) -> None:
         env,
         agent.policy,
         frames_per_batch=recipe.steps_per_batch,
-        total_frames=recipe.num_batches * recipe.steps_per_batch,
-        auto_register_policy_transforms=False,
+        total_frames=recipe.final_step,
         device=recipe.torch_device(),
+        trust_policy=True,  # ours is on the right device already
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
     )
-    state = TrainingState(agent, optimizer, collector)
+    state = TrainingState(agent, optimizer, collector, recipe.seed)
     step = state.load(run)
     metrics = run.metrics(COLUMNS, last_step=step)
     saved_step = step
     progress = tqdm(
-        total=collector.total_frames, initial=step, unit=" steps", desc=recipe.name, smoothing=0.05
+        total=recipe.final_step, initial=step, unit=" steps", desc=recipe.name, smoothing=0.05
     )
-    with Interrupt() as interrupt, progress:
+    with Interrupt() as interrupt, progress, closing(metrics):
         agent.eval()  # no dropout while acting
         for batch in collector:
             step += batch.numel()
-            remaining = 1 - (step - batch.numel()) / collector.total_frames
+            remaining = 1 - (step - batch.numel()) / recipe.final_step
             if recipe.decay_learning_rate:
                 optimizer.param_groups[0]["lr"] = recipe.learning_rate * remaining
             if recipe.decay_clip_epsilon:
@@ -262,7 +294,7 @@ def train(recipe: PPO, run: Run) -> None:
                 optimizer.step()
                 losses.append(torch.stack([terms[name].detach() for name in TERMS] + [norm]))
             agent.eval()
-            means = check_finite(torch.stack(losses), step, saved_step)
+            means = check_finite(torch.stack(losses), parameters, step, saved_step)
 
             finished = batch["next", "episode_reward"][batch["next", "done"]]
             mean_return = finished.mean().item()  # NaN where no episode ended
@@ -276,13 +308,15 @@ def train(recipe: PPO, run: Run) -> None:
             progress.update(batch.numel())
             if len(finished):
                 progress.set_postfix_str(f"return {mean_return:.1f}")
-            last = step >= collector.total_frames
-            if last or interrupt.requested or step - saved_step >= recipe.checkpoint_interval:
+            # Counted from the start, so that a run that was stopped saves at the same steps.
+            due = step // recipe.checkpoint_interval > (step - batch.numel()) // (
+                recipe.checkpoint_interval
+            )
+            if due or interrupt.requested or step == recipe.final_step:
                 state.save(run, step)
                 saved_step = step
-            if interrupt.requested and not last:
+            if interrupt.requested:
                 raise KeyboardInterrupt
-    metrics.close()
     collector.shutdown()
 
 
@@ -325,11 +359,14 @@ def minibatches(batch: TensorDictBase, recipe: PPO) -> Iterator[TensorDict]:
             yield steps[index]
 
 
-def check_finite(losses: Tensor, step: int, saved_step: int) -> dict[str, float]:
-    """Returns the means of a batch's losses, or stops where one is not finite.
+def check_finite(
+    losses: Tensor, parameters: list[nn.Parameter], step: int, saved_step: int
+) -> dict[str, float]:
+    """Returns the means of a batch's losses, or stops where one or a weight is not finite.
 
     Args:
         losses: float [minibatches, terms], the gradient's norm last.
+        parameters: the weights after the update.
         step: environment steps so far.
         saved_step: step of the last checkpoint.
 
@@ -337,13 +374,21 @@ def check_finite(losses: Tensor, step: int, saved_step: int) -> dict[str, float]
         FloatingPointError: naming the term, the step and the last good checkpoint.
     """
     names = [*TERMS, "gradient_norm"]
+    saved = (
+        f"the last good checkpoint is that of step {saved_step}"
+        if saved_step
+        else "there is no checkpoint yet"
+    )
     bad = (~losses.isfinite()).nonzero()
     if len(bad):
         minibatch, term = bad[0].tolist()
-        saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
         raise FloatingPointError(
             f"{names[term]} became {losses[minibatch, term].item()} in the update at step {step} "
-            f"(gradient step {minibatch} of it); {saved}"
+            f"(gradient step {minibatch + 1} of it); {saved}"
+        )
+    if not all(parameter.isfinite().all() for parameter in parameters):
+        raise FloatingPointError(
+            f"a weight became infinite or NaN in the update at step {step}; {saved}"
         )
     return dict(zip(names, losses.mean(0).tolist(), strict=True))
 
@@ -355,17 +400,20 @@ class TrainingState:
         agent: the networks.
         optimizer: the optimizer of the agent.
         collector: the collector, with its environment.
+        seed: the recipe's seed.
     """
 
     def __init__(
-        self, agent: Agent, optimizer: torch.optim.Optimizer, collector: Collector
+        self, agent: Agent, optimizer: torch.optim.Optimizer, collector: Collector, seed: int
     ) -> None:
         self.agent = agent
         self.optimizer = optimizer
         self.collector = collector
+        self.seed = seed
 
     def save(self, run: Run, step: int) -> None:
         """Saves a checkpoint."""
+        self._reset_unsavable_env(step)
         run.save(
             step,
             {
@@ -382,8 +430,22 @@ class TrainingState:
         if loaded is None:
             return 0
         step, state = loaded
-        self.agent.load_state_dict(state["agent"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        set_collector_state(self.collector, state["collector"])
+        # Its settings are the recipe's, also where those were changed since.
+        settings = self.optimizer.state_dict()["param_groups"]
+        with run.restoring(step):
+            self.agent.load_state_dict(state["agent"])
+            self.optimizer.load_state_dict({**state["optimizer"], "param_groups": settings})
+            set_collector_state(self.collector, state["collector"])
+        self._reset_unsavable_env(step)
         set_global_rng_state(state["rng"])
         return step
+
+    def _reset_unsavable_env(self, step: int) -> None:
+        """Starts new episodes where an environment cannot be saved.
+
+        That happens at each checkpoint, whether or not the run is stopped there, and with a seed
+        that follows from the run's and the step: so both go on alike.
+        """
+        if not can_save_env(self.collector.env):
+            seed = np.random.SeedSequence([self.seed, step]).generate_state(1).item()
+            self.collector.reset(seed=seed)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,9 @@ ALGORITHMS: dict[str, type[Recipe]] = {}
 """Recipe classes by the name of their algorithm."""
 
 T = TypeVar("T")
+
+# NumPy takes 32 bits, and environments are seeded with this seed and those that follow.
+_MAX_SEED = 2**31
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +52,20 @@ class Recipe:
 
     def __post_init__(self) -> None:
         check_at_least(self, threads=1, seed=0)
+        check_at_most(self, seed=_MAX_SEED)
+        if self.name and not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", self.name):
+            raise ValueError(
+                f"name must be words joined by '/', such as ppo/cartpole/mine, not {self.name!r}"
+            )
+
+    @property
+    def final_step(self) -> int:
+        """Environment steps, or updates, at which training is complete."""
+        raise NotImplementedError
+
+    def check(self) -> None:
+        """Raises ValueError where environment or networks cannot be built as the fields say."""
+        raise NotImplementedError
 
     def train(self, run: Run) -> None:
         """Trains in a run folder, from its newest checkpoint where there is one."""
@@ -76,6 +94,14 @@ def check_at_least(recipe: object, **minima: float) -> None:
         value = getattr(recipe, field)
         if not value >= minimum:
             raise ValueError(f"{field} must be at least {minimum}, not {value}")
+
+
+def check_at_most(recipe: object, **maxima: float) -> None:
+    """Raises ValueError where a field of a recipe is above its maximum."""
+    for field, maximum in maxima.items():
+        value = getattr(recipe, field)
+        if not value <= maximum:
+            raise ValueError(f"{field} must be at most {maximum}, not {value}")
 
 
 def recipe_to_json(recipe: Recipe) -> str:

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from torchrl_tit.networks import EnhancedTITConfig, VanillaTITConfig
+from torchrl_tit.networks import (
+    D2RLConfig,
+    EnhancedTITConfig,
+    MLPConfig,
+    OFENetConfig,
+    VanillaTITConfig,
+)
 
 from .networks import NetworkConfig
 from .ppo import PPO
@@ -14,8 +20,12 @@ _CLASSIC_CONTROL = {
     "cartpole": "CartPole-v1",
     "mountaincar": "MountainCar-v0",
 }
-# The paper leaves open which settings were used where, within patch 1, width 32 or 64, two blocks.
+# The paper leaves open which settings of TIT were used where, within patch 1, width 32 or 64, two
+# blocks; these are the networks' defaults.
 _ARRAY_NETWORKS: dict[str, NetworkConfig] = {
+    "mlp": MLPConfig(),
+    "ofenet": OFENetConfig(),
+    "d2rl": D2RLConfig(),
     "vanilla-tit": VanillaTITConfig(),
     "enhanced-tit": EnhancedTITConfig(),
 }
@@ -33,10 +43,17 @@ _MOUNTAINCAR_NETWORKS: dict[str, NetworkConfig] = {
 def _named() -> dict[str, Recipe]:
     recipes: dict[str, Recipe] = {}
     for task, env in _CLASSIC_CONTROL.items():
-        networks = _MOUNTAINCAR_NETWORKS if task == "mountaincar" else _ARRAY_NETWORKS
+        networks = _ARRAY_NETWORKS | (_MOUNTAINCAR_NETWORKS if task == "mountaincar" else {})
         for network, backbone in networks.items():
             name = f"ppo/{task}/{network}"
             recipes[name] = PPO(name=name, env=env, backbone=backbone)
+            if network in ("vanilla-tit", "enhanced-tit"):
+                # The network's own initialisation, which docs/results/cartpole.md compares, and
+                # environments side by side.
+                name += "-tuned"
+                recipes[name] = PPO(
+                    name=name, env=env, backbone=backbone, initialization="own", num_envs=8
+                )
     return recipes
 
 

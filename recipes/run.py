@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from .metrics import Metrics
 from .plot import plot_learning_curve
 from .recipe import Recipe, recipe_from_json, recipe_to_json
 
+_CURVE = "learning_curve.png"
 _PACKAGES = ["torchrl-tit", "torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy"]
 
 
@@ -102,6 +105,17 @@ class Run:
         """
         return load_checkpoint(self.checkpoints) if checkpoint_steps(self.checkpoints) else None
 
+    @contextmanager
+    def restoring(self, step: int) -> Iterator[None]:
+        """Says what is wrong where a checkpoint's state does not fit what the recipe builds."""
+        try:
+            yield
+        except (LookupError, RuntimeError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"the checkpoint of step {step} in {self.checkpoints} does not fit "
+                f"{self.folder / 'recipe.json'}; was that changed since? ({error})"
+            ) from error
+
     def metrics(self, columns: list[str], last_step: int) -> Metrics:
         """Opens the metrics, keeping the rows up to a step."""
         return Metrics(self.folder, columns, last_step)
@@ -112,16 +126,28 @@ class Run:
         write_text_atomic(path, json.dumps(evaluation, indent=2) + "\n")
         return path
 
+    def is_complete(self) -> bool:
+        """Whether the run is trained, evaluated and drawn: there is nothing left to do."""
+        try:
+            evaluation = json.loads((self.folder / "evaluation.json").read_text(encoding="utf-8"))
+            evaluated = evaluation["steps"]
+        except (OSError, ValueError, LookupError, TypeError):
+            return False
+        return evaluated == self.recipe.final_step and (self.folder / _CURVE).is_file()
+
     def plot(self) -> Path:
         """Draws ``learning_curve.png`` from the metrics and returns its path."""
-        path = self.folder / "learning_curve.png"
+        path = self.folder / _CURVE
         plot_learning_curve(self.folder / "metrics.csv", path, title=self.recipe.name)
         return path
 
     def version_changes(self) -> list[str]:
         """What differs between the versions the run began with and those of this process."""
         path = self.folder / "versions.json"
-        before = json.loads(path.read_text()) if path.is_file() else {}
+        try:
+            before = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError):  # lost or damaged: nothing to compare with
+            return []
         now = _versions()
         return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
 
