@@ -39,8 +39,8 @@ def make_env(
         The environment, whose keys and shapes stand in :class:`~torchrl_tit.envs.GymVectorEnv`.
 
     Raises:
-        ValueError: If the name is unknown, ``num_envs`` is less than 1, or history or padding are
-            wrong.
+        ValueError: If the name is unknown or a package that the task needs is missing,
+            ``num_envs`` is less than 1, or history or padding are wrong.
         TypeError: If the task's observations or actions are of a kind that is not supported.
 
     Example:
@@ -58,7 +58,10 @@ def make_env(
     # The specs are checked once, in tests; Gymnasium's checker would cost time at every step. What
     # the vector environment returns is copied at once, so it need not make copies of its own.
     make = partial(gymnasium.make, name, disable_env_checker=True, **kwargs)
-    tasks = SyncVectorEnv([make] * num_envs, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+    try:
+        tasks = SyncVectorEnv([make] * num_envs, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+    except (gymnasium.error.Error, ImportError) as error:  # a package is missing, say
+        raise ValueError(f"Task {name!r} cannot be made: {error}") from error
     env = GymVectorEnv(
         tasks, history=history, padding=padding, clip_actions=clip_actions, device=device
     )
