@@ -23,7 +23,7 @@ help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: $(VENV)/installed-run  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 10 minutes) into runs/
-	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit --out $(OUT) $(ARGS)
+	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit-tuned --out $(OUT) $(ARGS)
 
 test: lint types unit  ## Check style, types and behaviour: all that must pass
 
