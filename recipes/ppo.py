@@ -237,7 +237,7 @@ def train(recipe: PPO, run: Run) -> None:
     torch.manual_seed(recipe.seed)
 
     env = recipe.make_env(recipe.num_envs, recipe.seed)
-    agent = Agent(recipe, env)
+    agent = Agent(recipe, env).eval()  # no dropout while acting
     loss = ClipPPOLoss(
         agent.actor,
         agent.critic,
@@ -271,7 +271,6 @@ def train(recipe: PPO, run: Run) -> None:
         total=recipe.final_step, initial=step, unit=" steps", desc=recipe.name, smoothing=0.05
     )
     with Interrupt() as interrupt, progress, closing(metrics):
-        agent.eval()  # no dropout while acting
         for batch in collector:
             step += batch.numel()
             remaining = 1 - (step - batch.numel()) / recipe.final_step
@@ -291,10 +290,11 @@ def train(recipe: PPO, run: Run) -> None:
                 optimizer.zero_grad()
                 total.backward()
                 norm = nn.utils.clip_grad_norm_(parameters, recipe.max_grad_norm)
+                losses.append(torch.stack([*(terms[name].detach() for name in TERMS), norm]))
+                check_finite(losses[-1], step, saved_step)
                 optimizer.step()
-                losses.append(torch.stack([terms[name].detach() for name in TERMS] + [norm]))
             agent.eval()
-            means = check_finite(torch.stack(losses), parameters, step, saved_step)
+            means = dict(zip(LOSSES, torch.stack(losses).mean(0).tolist(), strict=True))
 
             finished = batch["next", "episode_reward"][batch["next", "done"]]
             mean_return = finished.mean().item()  # NaN where no episode ended
@@ -321,7 +321,8 @@ def train(recipe: PPO, run: Run) -> None:
 
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
-COLUMNS = ["return_mean", "episodes", "learning_rate", *TERMS, "gradient_norm"]
+LOSSES = [*TERMS, "gradient_norm"]
+COLUMNS = ["return_mean", "episodes", "learning_rate", *LOSSES]
 
 
 def add_advantages(
@@ -359,38 +360,24 @@ def minibatches(batch: TensorDictBase, recipe: PPO) -> Iterator[TensorDict]:
             yield steps[index]
 
 
-def check_finite(
-    losses: Tensor, parameters: list[nn.Parameter], step: int, saved_step: int
-) -> dict[str, float]:
-    """Returns the means of a batch's losses, or stops where one or a weight is not finite.
+def check_finite(losses: Tensor, step: int, saved_step: int) -> None:
+    """Stops a run whose losses or gradient are not finite, before they reach the weights.
 
     Args:
-        losses: float [minibatches, terms], the gradient's norm last.
-        parameters: the weights after the update.
+        losses: the terms of one gradient step and the gradient's norm, float [terms].
         step: environment steps so far.
         saved_step: step of the last checkpoint.
 
     Raises:
         FloatingPointError: naming the term, the step and the last good checkpoint.
     """
-    names = [*TERMS, "gradient_norm"]
-    saved = (
-        f"the last good checkpoint is that of step {saved_step}"
-        if saved_step
-        else "there is no checkpoint yet"
-    )
-    bad = (~losses.isfinite()).nonzero()
-    if len(bad):
-        minibatch, term = bad[0].tolist()
+    finite = losses.isfinite()
+    if not finite.all():
+        index = int(finite.logical_not().nonzero()[0])
+        saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
         raise FloatingPointError(
-            f"{names[term]} became {losses[minibatch, term].item()} in the update at step {step} "
-            f"(gradient step {minibatch + 1} of it); {saved}"
+            f"{LOSSES[index]} became {losses[index].item()} in the update at step {step}; {saved}"
         )
-    if not all(parameter.isfinite().all() for parameter in parameters):
-        raise FloatingPointError(
-            f"a weight became infinite or NaN in the update at step {step}; {saved}"
-        )
-    return dict(zip(names, losses.mean(0).tolist(), strict=True))
 
 
 class TrainingState:

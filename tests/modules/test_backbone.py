@@ -1,0 +1,79 @@
+"""The backbone as a TensorDictModule."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Categorical
+from torchrl.objectives import ClipPPOLoss
+
+from torchrl_tit import Backbone, EnhancedTIT, VanillaTIT
+from torchrl_tit.modules import make_actor, make_value
+from torchrl_tit.networks import MLP
+
+
+@pytest.mark.parametrize("network_class", [EnhancedTIT, VanillaTIT])
+@pytest.mark.parametrize("leading", [(), (3,), (2, 3)])
+def test_writes_what_the_network_puts_out(network_class, leading):
+    network = network_class((4,), history=3)
+    history = torch.randn(*leading, 3, 4)
+    td = Backbone(network)(TensorDict({"history": history}, leading))
+    assert td["features"].shape == (*leading, 64)
+    assert torch.equal(td["features"], network(history))
+
+
+def test_nested_keys():
+    backbone = Backbone(
+        EnhancedTIT((4,), history=2),
+        in_keys=[("agent", "history")],
+        out_keys=[("agent", "features")],
+    )
+    td = backbone(TensorDict({"agent": {"history": torch.randn(5, 2, 4)}}, [5]))
+    assert td["agent", "features"].shape == (5, 64)
+
+
+def test_two_trunks_write_two_keys():
+    backbone = Backbone(MLP((4,), history=1), out_keys=["policy", "value"])
+    td = backbone(TensorDict({"history": torch.randn(5, 1, 4)}, [5]))
+    assert td["policy"].shape == td["value"].shape == (5, 64)
+    assert not torch.equal(td["policy"], td["value"])
+
+
+def test_a_missing_history_says_what_is_there():
+    backbone = Backbone(EnhancedTIT((4,), history=2))
+    with pytest.raises(KeyError, match=r"no history under 'history', only \['observation'\]"):
+        backbone(TensorDict({"observation": torch.randn(5, 4)}, [5]))
+
+
+@pytest.mark.parametrize("keys", [{"in_keys": []}, {"in_keys": ["a", "b"]}, {"out_keys": []}])
+def test_wrong_keys(keys):
+    with pytest.raises(ValueError, match="one history"):
+        Backbone(EnhancedTIT((4,)), **keys)
+
+
+def test_wrong_shape_names_what_fits():
+    backbone = Backbone(EnhancedTIT((4,), history=2))
+    with pytest.raises(ValueError, match=r"expected \[\.\.\., 2, 4\]"):
+        backbone(TensorDict({"history": torch.randn(5, 3, 4)}, [5]))
+
+
+def test_gradients_of_a_loss_on_heads_reach_the_backbone():
+    network = EnhancedTIT((4,), history=2)
+    backbone = Backbone(network)
+    actor, critic = make_actor(64, Categorical(2)), make_value(64)
+    loss = ClipPPOLoss(actor, critic)
+    td = TensorDict(
+        {
+            "history": torch.randn(16, 2, 4),
+            "action": torch.randint(0, 2, (16,)),
+            "action_log_prob": torch.full((16,), -0.7),
+            "advantage": torch.randn(16, 1),
+            "value_target": torch.randn(16, 1),
+        },
+        [16],
+    )
+    terms = loss(backbone(td))
+    (terms["loss_objective"] + terms["loss_critic"]).backward()
+    gradients = [p.grad for p in network.parameters() if p.grad is not None]
+    assert len(gradients) == len(list(network.parameters()))
+    assert all(gradient.isfinite().all() for gradient in gradients)
+    assert all(gradient.any() for gradient in gradients)

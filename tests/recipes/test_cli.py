@@ -1,0 +1,140 @@
+"""The command line, and recipes as JSON."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from recipes.cli import main
+from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.registry import RECIPES, get_recipe
+
+SHORT = [
+    "--total-steps", "64", "--steps-per-batch", "64", "--minibatch-size", "32", "--epochs", "1",
+    "--evaluation-episodes", "2",
+]  # fmt: skip
+
+
+def fails(capsys, *words: str) -> str:
+    """Runs a command that must fail with one line, and returns that line."""
+    with pytest.raises(SystemExit) as exit_:
+        main(list(words))
+    assert exit_.value.code == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_list_and_show(capsys):
+    main(["list", "cartpole"])
+    names = capsys.readouterr().out.split()
+    assert "ppo/cartpole/enhanced-tit" in names
+    assert all("cartpole" in name for name in names)
+    main(["show", "ppo/cartpole/enhanced-tit"])
+    assert json.loads(capsys.readouterr().out)["backbone"]["network"] == "enhanced-tit"
+
+
+def test_train_evaluate_and_resume(capsys, tmp_path):
+    run = tmp_path / "run"
+    words = ["train", "ppo/cartpole/enhanced-tit", "--out", str(run), "--num-envs", "2"]
+    main([*words, "--backbone.embed-dim", "16", "--seed", "3", *SHORT])
+    out = capsys.readouterr().out
+    assert f"learning curve: {run / 'learning_curve.png'}" in out.splitlines()[-1]
+    recipe = json.loads((run / "recipe.json").read_text())
+    assert (recipe["backbone"]["embed_dim"], recipe["seed"], recipe["num_envs"]) == (16, 3, 2)
+
+    other = tmp_path / "other.json"
+    main(["evaluate", str(run), "--episodes", "3", "--seed", "7", "--out", str(other)])
+    evaluation = json.loads(other.read_text())
+    assert (evaluation["episodes"], evaluation["seed"], evaluation["steps"]) == (3, 7, 64)
+    assert json.loads((run / "evaluation.json").read_text())["episodes"] == 2
+
+    capsys.readouterr()
+    main(["train", "--resume", str(run)])  # there is nothing left to do
+    assert "complete" in capsys.readouterr().out
+
+    again = tmp_path / "again"  # a run can be started again from its recipe
+    main(["train", str(run / "recipe.json"), "--out", str(again)])
+    assert json.loads((again / "recipe.json").read_text()) == recipe
+    first, second = ((r / "evaluation.json").read_text() for r in (run, again))
+    assert first == second
+
+    line = fails(capsys, *words)
+    assert "exists already" in line
+    assert "--resume" in line
+
+
+def test_help_explains_every_field(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", "ppo/cartpole/enhanced-tit", "--help"])
+    assert exit_.value.code == 0
+    out = capsys.readouterr().out
+    for option in ("--seed", "--out", "--device", "--threads", "--backbone.embed-dim"):
+        assert option in out
+    assert "Width of a token" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["train", "ppo/cartpole/enhanced-tt"], "did you mean ppo/cartpole/enhanced-tit"),
+        (["train", "NAME", "--env", "CartPole-v7"], "CartPole-v1"),
+        (["train", "NAME", "--history", "0"], "history must be at least 1, not 0"),
+        (["train", "NAME", "--backbone.num-heads-inner", "3"], "width 32"),
+        (["train", "NAME", "--num-envs", "3"], "multiple of num_envs"),
+        (["train", "NAME", "--backbone.patch-size", "0"], "patch_size"),
+        (["train"], "train needs a recipe's name"),
+        (["train", "--resume", "nowhere"], "no run folder"),
+        (["evaluate", "nowhere"], "no run folder"),
+        (["show", "nothing.json"], "nothing.json"),
+        (["list", "atlantis"], "no recipe contains 'atlantis'"),
+        (["fly"], "unknown command 'fly'"),
+    ],
+)
+def test_bad_words_are_one_line_and_leave_nothing(words, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["ppo/cartpole/enhanced-tit" if word == "NAME" else word for word in words]
+    assert message in fails(capsys, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("option", [["--backbone.embed-dim", "wide"], ["--no-such-field", "1"]])
+def test_wrong_types_and_unknown_options(option, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", "ppo/cartpole/enhanced-tit", *option])
+    assert exit_.value.code == 2
+    captured = capsys.readouterr()
+    assert option[0] in captured.err + captured.out
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipes_come_back_from_json(name):
+    recipe = replace(get_recipe(name), seed=5)
+    assert recipe_from_json(recipe_to_json(recipe), "recipe.json") == recipe
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"num_envz": 2}, r"unknown field 'num_envz'.*did you mean num_envs"),
+        ({"num_envs": "2"}, r"field 'num_envs' is '2'.*int"),
+        ({"learning_rate": None}, r"field 'learning_rate'"),
+        ({"algorithm": "pppo"}, r"unknown algorithm 'pppo'.*ppo"),
+        ({"backbone": {"network": "enhanced-tit", "embed_dim": 1.5}}, r"backbone\.embed_dim"),
+        ({"backbone": {"network": "tat"}}, r"unknown network 'tat'"),
+        ({"backbone": 3}, r"field 'backbone'"),
+        ({"device": "tpu"}, r"field 'device' is 'tpu'"),
+    ],
+)
+def test_json_with_wrong_fields_is_refused(change, message):
+    fields = json.loads(recipe_to_json(get_recipe("ppo/cartpole/enhanced-tit"))) | change
+    with pytest.raises(ValueError, match=message):
+        recipe_from_json(json.dumps(fields), "recipe.json")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"algorithm": 1}'])
+def test_text_that_is_no_recipe_is_refused(text):
+    with pytest.raises(ValueError, match=r"here\.json is not a recipe"):
+        recipe_from_json(text, "here.json")

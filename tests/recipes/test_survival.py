@@ -1,0 +1,231 @@
+"""Runs that are killed, interrupted, damaged or poisoned."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from recipes.metrics import read_metrics
+from recipes.ppo import PPO
+from recipes.recipe import recipe_to_json
+from recipes.registry import get_recipe
+from recipes.run import Run
+from torchrl_tit.checkpoint import CheckpointError, latest_step, load_checkpoint
+from torchrl_tit.networks import EnhancedTITConfig
+
+ROOT = Path(__file__).parents[2]
+SMALL = PPO(
+    name="ppo/cartpole/small",
+    env="CartPole-v1",
+    history=3,
+    num_envs=2,
+    # Active dropout draws from the global generator too.
+    backbone=EnhancedTITConfig(embed_dim=8, features_dim=8, ffn_dropout_inner=0.1),
+    total_steps=64 * 24,
+    steps_per_batch=64,
+    minibatch_size=32,
+    epochs=2,
+    checkpoint_interval=64,
+    evaluation_episodes=2,
+)
+HOPPER = replace(SMALL, name="ppo/hopper/small", env="Hopper-v5", total_steps=64 * 12)
+
+
+def start(*words: object, **options) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-m", "recipes", "train", *map(str, words)],
+        cwd=ROOT,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        **options,
+    )
+
+
+def wait_for_step(process: subprocess.Popen, run: Path, step: int) -> None:
+    """Waits until a run has saved a step, or ended."""
+    while process.poll() is None and (latest_step(run / "checkpoints") or 0) < step:
+        time.sleep(0.005)
+
+
+def final(run: Path) -> tuple[int, dict]:
+    return load_checkpoint(run / "checkpoints")
+
+
+def assert_same(left: Any, right: Any) -> None:
+    assert type(left) is type(right)
+    if isinstance(left, dict):
+        assert left.keys() == right.keys()
+        for key in left:
+            assert_same(left[key], right[key])
+    elif isinstance(left, list | tuple):
+        for a, b in zip(left, right, strict=True):
+            assert_same(a, b)
+    elif isinstance(left, torch.Tensor):
+        assert torch.equal(left, right)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", [SMALL, HOPPER], ids=["cartpole", "hopper"])
+def test_killed_and_resumed_is_bit_for_bit_the_same(recipe, tmp_path):
+    with Run.create(tmp_path / "whole", recipe) as run:
+        recipe.train(run)
+    (tmp_path / "recipe.json").write_text(recipe_to_json(recipe))
+    killed = tmp_path / "killed"
+    generator = random.Random(0)
+    process = start(tmp_path / "recipe.json", "--out", killed)
+    kills = 0
+    while True:
+        wait_for_step(process, killed, (latest_step(killed / "checkpoints") or 0) + 2 * 64)
+        time.sleep(generator.uniform(0, 0.3))
+        if process.poll() is not None or kills == 3:
+            break
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        kills += 1
+        process = start("--resume", killed)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert kills >= 2
+    step, state = final(killed)
+    expected_step, expected = final(tmp_path / "whole")
+    assert step == expected_step == recipe.final_step
+    assert_same(state["agent"], expected["agent"])
+    assert_same(state["optimizer"], expected["optimizer"])
+    assert torch.equal(state["rng"]["torch"], expected["rng"]["torch"])
+    rows, expected_rows = (
+        [{k: str(v) for k, v in row.items() if k != "time"} for row in read_metrics(path)]
+        for path in (killed / "metrics.csv", tmp_path / "whole" / "metrics.csv")
+    )
+    assert rows == expected_rows
+
+
+def test_ctrl_c_saves_and_resume_goes_on(tmp_path):
+    (tmp_path / "recipe.json").write_text(
+        recipe_to_json(replace(SMALL, checkpoint_interval=10**6, total_steps=64 * 400))
+    )
+    run = tmp_path / "run"
+    process = start(tmp_path / "recipe.json", "--out", run)
+    while len(read_metrics(run / "metrics.csv")) < 2:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert f"train --resume {run}" in errors
+    step, _ = final(run)
+    assert step == read_metrics(run / "metrics.csv")[-1]["step"]
+    assert not (run / "evaluation.json").exists()
+
+
+def test_rows_past_the_checkpoint_are_cut(tmp_path):
+    recipe = replace(SMALL, total_steps=64 * 4, checkpoint_interval=10**6)
+    with Run.create(tmp_path / "run", recipe) as run:
+        recipe.train(run)
+        metrics = run.metrics(["return_mean"], last_step=10**6)
+        metrics.close()
+        path = run.folder / "metrics.csv"
+        path.write_text("step,time,return_mean\n64,1.0,5.0\n128,2.0,6.0\n192,3.0,7.0\n256,4.")
+        metrics = run.metrics(["return_mean"], last_step=128)
+        metrics.log(192, return_mean=9.0)
+        metrics.close()
+    assert [row["return_mean"] for row in read_metrics(path)] == [5.0, 6.0, 9.0]
+    events = EventAccumulator(str(run.folder / "tensorboard")).Reload()
+    scalars = events.Scalars("return_mean")
+    assert [(event.step, event.value) for event in scalars] == [(64, 5.0), (128, 6.0), (192, 9.0)]
+
+
+def test_a_run_in_use_is_refused(tmp_path):
+    other = Run.create(tmp_path / "run", SMALL)
+    with other, pytest.raises(RuntimeError, match="in use by another process"):
+        Run.open(tmp_path / "run").__enter__()
+
+
+@pytest.mark.parametrize("damage", ["truncate", "flip", "pickle", "json"])
+def test_a_damaged_or_foreign_checkpoint_runs_nothing(damage, tmp_path):
+    recipe = replace(SMALL, total_steps=64)
+    with Run.create(tmp_path / "run", recipe) as run:
+        recipe.train(run)
+    (folder,) = run.checkpoints.iterdir()
+    tensors = folder / "tensors.safetensors"
+    content = tensors.read_bytes()
+    if damage == "truncate":
+        tensors.write_bytes(content[:-10])
+    elif damage == "flip":
+        tensors.write_bytes(content[:-10] + bytes([content[-10] ^ 1]) + content[-9:])
+    elif damage == "pickle":
+        (folder / "extra.pkl").write_bytes(b"cos\nsystem\n(S'touch owned'\ntR.")
+    else:
+        (folder / "state.json").write_text("{")
+    before = sorted(p.name for p in run.folder.rglob("*"))
+    with run, pytest.raises(CheckpointError, match=str(folder)):
+        recipe.train(run)
+    assert sorted(p.name for p in run.folder.rglob("*")) == before
+
+
+def test_not_finite_stops_with_step_term_and_checkpoint(tmp_path):
+    recipe = replace(SMALL, total_steps=64 * 4)
+    with Run.create(tmp_path / "run", recipe) as run:
+        replace(recipe, total_steps=64 * 2).train(run)
+        poisoned = replace(recipe, critic_coeff=float("inf"))
+        with pytest.raises(FloatingPointError, match=r"loss_critic .*step 192.*step 128 is good"):
+            poisoned.train(run)
+    assert latest_step(run.checkpoints) == 128
+
+
+def test_a_full_disk_leaves_the_old_checkpoints(tmp_path, monkeypatch):
+    recipe = replace(SMALL, total_steps=64 * 4)
+    with Run.create(tmp_path / "run", recipe) as run:
+        replace(recipe, total_steps=64 * 2).train(run)
+
+        def full(*_args, **_kwargs):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr("os.fsync", full)
+        with pytest.raises(OSError, match="No space left"):
+            recipe.train(run)
+    monkeypatch.undo()
+    assert latest_step(run.checkpoints) == 128
+    assert final(run.folder)[0] == 128
+
+
+def test_another_recipe_than_the_checkpoint_is_refused(tmp_path):
+    recipe = replace(SMALL, total_steps=64)
+    with Run.create(tmp_path / "run", recipe) as run:
+        recipe.train(run)
+        wider = replace(recipe, backbone=EnhancedTITConfig(embed_dim=16))
+        with pytest.raises(ValueError, match="does not fit"):
+            wider.train(run)
+
+
+def test_run_folder_holds_what_it_says(tmp_path):
+    recipe = replace(SMALL, total_steps=64 * 2)
+    with Run.create(tmp_path / "run", recipe) as run:
+        recipe.train(run)
+        run.save_evaluation(recipe.evaluate(run))
+        run.plot()
+        assert run.is_complete()
+    evaluation = json.loads((run.folder / "evaluation.json").read_text())
+    assert len(evaluation["returns"]) == evaluation["episodes"] == 2
+    assert evaluation["mean"] == pytest.approx(sum(evaluation["returns"]) / 2)
+    assert (evaluation["env"], evaluation["steps"]) == ("CartPole-v1", 128)
+    assert evaluation["seed"] == recipe.evaluation_seed
+    assert (run.folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((run.folder / "versions.json").read_text())["torch"] == torch.__version__
+    assert Run.open(run.folder).recipe == recipe
+
+
+def test_every_named_recipe_builds_its_agent():
+    for name in ("ppo/acrobot/vanilla-tit", "ppo/mountaincar/enhanced-tit", "ppo/cartpole/d2rl"):
+        get_recipe(name).check()
