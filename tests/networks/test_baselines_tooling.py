@@ -20,12 +20,10 @@ from torchrl_tit.networks import (
     CatformerConfig,
     CoBERL,
     EnhancedTIT,
-    EnhancedTITConfig,
     MLPConfig,
     NatureCNN,
     OFENet,
     ResNet,
-    VanillaTIT,
     init_normal_,
     init_orthogonal_,
 )
@@ -223,4 +221,3 @@ def test_configs_and_hyperparameters() -> None:
         EnhancedTIT((5,), 1, CatformerConfig())  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="unexpected keyword argument 'width'"):
         MLP((5,), width=3)
-    assert VanillaTIT((5,)).config != EnhancedTITConfig()

@@ -99,10 +99,10 @@ def test_padding_is_not_seen_and_stays_finite(case: str) -> None:
 @every_case
 def test_newest_step_alone_equals_the_last_of_all(case: str) -> None:
     network, inputs = make(case), make_inputs(case, 2)
-    states, *others = inputs
+    states, actions, returns_to_go, timesteps = inputs
     tokens = network.encode_states(states)
     mask = torch.tensor([[0, 1, 1, 1, 1], [1, 1, 1, 1, 1]])
-    features = network.encode(tokens, *others, mask, newest=True)
+    features = network.encode(tokens, actions, returns_to_go, timesteps, mask, newest=True)
     assert features.shape == (2, 1, network.features_dim)
     expected = network(*inputs, mask)[:, -1:]
     torch.testing.assert_close(network.action_head(features), expected)
@@ -146,7 +146,9 @@ def test_defaults_are_the_protocols() -> None:
     assert "blocks.3.ffn.0.weight" not in shapes
     drops = [module.p for module in network.modules() if isinstance(module, nn.Dropout)]
     assert drops == [0.1] * 10  # tokens; weights, attention's and FFN's output of three blocks
-    assert network.blocks[0].attention.num_heads == 1
+    block = network.blocks[0]
+    assert isinstance(block, GPT2Block)
+    assert block.attention.num_heads == 1
     tit = DecisionTransformer((11,), 3, state_encoder="inner_transformer")
     inner = {n: tuple(p.shape) for n, p in tit.state_encoder.named_parameters()}
     assert inner["patch_embedding.weight"] == (128, 1, 11)
@@ -167,7 +169,8 @@ def test_gpt2_blocks_start_as_gpt2_and_the_rest_as_pytorch() -> None:
     assert network.timestep_embedding is not None
     assert abs(network.timestep_embedding.weight.std().item() - 1) < 0.01
     bound = 1 / 11**0.5
-    assert bound / 2 < network.state_encoder.linear.weight.abs().max() <= bound
+    weight = network.state_encoder.get_parameter("linear.weight")
+    assert bound / 2 < weight.abs().max() <= bound
 
 
 def test_dropout_only_while_training() -> None:
