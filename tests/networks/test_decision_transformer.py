@@ -178,13 +178,24 @@ def test_dropout_only_while_training() -> None:
     assert torch.equal(network(*inputs), network(*inputs))
     network.train()
     assert not torch.equal(network(*inputs), network(*inputs))
+
+
+@pytest.mark.parametrize("part", ["attention", "ffn"])
+def test_both_residuals_of_a_block_are_dropped(part: str) -> None:
     torch.manual_seed(0)
-    block = GPT2Block(8, 2, 16, dropout=0.5)
-    mask = torch.ones(1, 1, dtype=torch.bool)
-    x = torch.randn(4000, 1, 8)
+    block = GPT2Block(8, 2, 16, dropout=0.25)
+    randomize(block)
+    other = block.ffn.get_submodule("2") if part == "attention" else block.attention.out_proj
+    for parameter in other.parameters():
+        nn.init.zeros_(parameter)
+    block.attention.dropout.p = 0.0
+    x, mask = torch.randn(2000, 2, 8), torch.ones(2, 2, dtype=torch.bool).tril()
     with torch.no_grad():
-        expected = block.eval()(x, mask).mean(0)
-        torch.testing.assert_close(block.train()(x, mask).mean(0), expected, rtol=0, atol=0.1)
+        kept = block.eval()(x, mask) - x
+        update = block.train()(x, mask) - x
+    dropped = update == 0
+    assert abs(dropped.float().mean() - 0.25) < 0.02
+    torch.testing.assert_close(update[~dropped], kept[~dropped] / 0.75, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("case", ["dt", "dt_tit on images"])
