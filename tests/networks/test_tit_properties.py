@@ -145,7 +145,26 @@ def test_attention_equals_multihead_attention_and_exchanges_state_dicts(
     torch.testing.assert_close(ours(x), expected, rtol=0, atol=1e-6)
     torch.testing.assert_close(ours(x, read="first"), expected[:, :1], rtol=0, atol=1e-6)
     torch.testing.assert_close(ours(x, read="last"), expected[:, -1:], rtol=0, atol=1e-6)
+    for positions in (slice(None), slice(-2, None), slice(0, None, 2)):
+        torch.testing.assert_close(ours(x, positions), expected[:, positions], rtol=0, atol=1e-6)
     torch.testing.assert_close(ours.weights(x), weights, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("causal", [False, True])
+@pytest.mark.parametrize("training", [False, True])
+def test_a_mask_takes_the_place_of_the_causal_one(causal: bool, training: bool) -> None:
+    ours = SelfAttention(8, 2, causal=causal, dropout=1e-12).train(training)
+    theirs = nn.MultiheadAttention(8, 2, batch_first=True)
+    randomize(ours)
+    theirs.load_state_dict(ours.state_dict())
+    x = torch.randn(3, 5, 8)
+    sees = torch.rand(3, 1, 5, 5) < 0.5
+    sees |= torch.eye(5, dtype=torch.bool)
+    expected, _ = theirs(x, x, x, attn_mask=~sees.repeat_interleave(2, dim=0).flatten(0, 1))
+    for read, positions in (("all", slice(None)), ("first", slice(0, 1)), ("last", slice(4, 5))):
+        actual = ours(x, read, sees)
+        torch.testing.assert_close(actual, expected[:, positions], rtol=0, atol=1e-6)
+    torch.testing.assert_close(ours(x, slice(1, 3), sees), expected[:, 1:3], rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("length", [1, 3])

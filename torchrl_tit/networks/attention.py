@@ -86,8 +86,6 @@ class SelfAttention(nn.Module):
         Returns:
             float [N, positions read, D].
         """
-        if self.causal and read == "first":
-            x = x[:, :1]  # it sees itself only
         dropping = self.training and self.dropout.p > 0
         if x.shape[1] == 1 and not dropping:
             # A softmax over one position is 1: only the value is left.

@@ -49,7 +49,7 @@ def init_orthogonal_(module: nn.Module, gain: float = math.sqrt(2)) -> None:
     Example:
         >>> head = nn.Linear(64, 2)
         >>> init_orthogonal_(head, gain=0.01)
-        >>> round(float(head.weight[0].norm()), 4)
+        >>> round(head.weight[0].norm().item(), 4)
         0.01
     """
     for child in module.modules():
