@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -285,15 +285,20 @@ def train(recipe: PPO, run: Run) -> None:
             losses = []
             for minibatch in minibatches(batch, recipe):
                 agent.backbone(minibatch)  # once; the heads read its features
-                terms = loss(minibatch)
+                try:
+                    terms = loss(minibatch)
+                except RuntimeError:  # TorchRL draws samples where an entropy is not finite
+                    check_agent(agent, minibatch, step, saved_step)
+                    raise
                 total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
                 optimizer.zero_grad()
                 total.backward()
                 norm = nn.utils.clip_grad_norm_(parameters, recipe.max_grad_norm)
                 losses.append(torch.stack([*(terms[name].detach() for name in TERMS), norm]))
-                check_finite(losses[-1], step, saved_step)
+                check_finite(LOSSES, losses[-1], step, saved_step)
                 optimizer.step()
             agent.eval()
+            check_agent(agent, minibatch, step, saved_step)  # before it is saved
             means = dict(zip(LOSSES, torch.stack(losses).mean(0).tolist(), strict=True))
 
             finished = batch["next", "episode_reward"][batch["next", "done"]]
@@ -360,24 +365,39 @@ def minibatches(batch: TensorDictBase, recipe: PPO) -> Iterator[TensorDict]:
             yield steps[index]
 
 
-def check_finite(losses: Tensor, step: int, saved_step: int) -> None:
-    """Stops a run whose losses or gradient are not finite, before they reach the weights.
+def check_finite(terms: Sequence[str], values: Tensor, step: int, saved_step: int) -> None:
+    """Stops a run where a loss, say, is not finite.
 
     Args:
-        losses: the terms of one gradient step and the gradient's norm, float [terms].
+        terms: names of the values.
+        values: float [terms].
         step: environment steps so far.
         saved_step: step of the last checkpoint.
 
     Raises:
         FloatingPointError: naming the term, the step and the last good checkpoint.
     """
-    finite = losses.isfinite()
+    finite = values.isfinite()
     if not finite.all():
         index = int(finite.logical_not().nonzero()[0])
         saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
         raise FloatingPointError(
-            f"{LOSSES[index]} became {losses[index].item()} in the update at step {step}; {saved}"
+            f"{terms[index]} became {values[index].item()} in the update at step {step}; {saved}"
         )
+
+
+def check_agent(agent: Agent, minibatch: TensorDictBase, step: int, saved_step: int) -> None:
+    """Stops a run whose weights, or the values they give to a minibatch, are not finite.
+
+    A step that was too long shows in the next forward pass only, not in its own losses.
+
+    Raises:
+        FloatingPointError: as :func:`check_finite`.
+    """
+    with torch.no_grad():
+        value = agent.critic(agent.backbone(minibatch))["state_value"].mean()
+        weights = nn.utils.get_total_norm(agent.parameters())
+    check_finite(["weights", "value"], torch.stack([weights, value]), step, saved_step)
 
 
 class TrainingState:
