@@ -1,4 +1,4 @@
-"""The command line: list, show, train, evaluate."""
+"""The command line: list, show, train, evaluate, compare."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import Annotated, Any, NoReturn
 
 import tyro
 
+from .plot import plot_comparison
 from .recipe import Recipe, recipe_from_json, recipe_to_json
 from .registry import RECIPES, get_recipe
 from .run import Run
@@ -27,6 +28,7 @@ usage: {program} COMMAND ...
                               `train NAME --help` explains every field
   train --resume RUN          go on with a run that was stopped or killed
   evaluate RUN                evaluate a run's newest checkpoint
+  compare RUN [RUN ...]       learning curves of several runs, seeds of a recipe as one band
 
 Everywhere: --seed, --out, --device, --threads where they apply; COMMAND --help tells.
 """
@@ -39,7 +41,13 @@ def main(arguments: list[str] | None = None) -> None:
         arguments: the words after the program's name; those of this process where None.
     """
     words = sys.argv[1:] if arguments is None else arguments
-    commands = {"list": _list, "show": _show, "train": _train, "evaluate": _evaluate}
+    commands = {
+        "list": _list,
+        "show": _show,
+        "train": _train,
+        "evaluate": _evaluate,
+        "compare": _compare,
+    }
     if not words or words[0] not in commands:
         asked = not words or words[0] in ("-h", "--help")
         print(_USAGE.format(program=_program()), file=sys.stdout if asked else sys.stderr)
@@ -179,6 +187,20 @@ def _evaluate(words: list[str]) -> None:
     evaluation = recipe.evaluate(run)
     path = run.save_evaluation(evaluation, options.out)
     print(f"{_summary(recipe, evaluation)}\nwritten to {path}")
+
+
+def _compare(words: list[str]) -> None:
+    parser = _Parser(f"{_program()} compare")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders")
+    parser.add_argument("--out", type=Path, default=Path("comparison.png"), help="PNG to write")
+    parser.add_argument("--title", default="", help="title of the picture")
+    options = parser.parse_args(words)
+    curves: dict[str, list[Path]] = {}
+    for folder in options.runs:
+        run = Run.open(folder)
+        curves.setdefault(run.recipe.name or str(folder), []).append(folder / "metrics.csv")
+    plot_comparison(curves, options.out, title=options.title)
+    print(f"written to {options.out}")
 
 
 def _add_machine_options(parser: argparse.ArgumentParser) -> None:

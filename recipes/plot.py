@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from torchrl_tit.files import write_bytes_atomic
 
 from .metrics import read_metrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def plot_learning_curve(metrics: Path, picture: Path, *, title: str, window: int = 5) -> None:
@@ -21,22 +26,65 @@ def plot_learning_curve(metrics: Path, picture: Path, *, title: str, window: int
         title: title of the picture.
         window: batches over which the bold line is averaged.
     """
-    # Not at the top: Matplotlib takes a second that only this function should cost.
+    steps, returns = _curve(metrics)
+    smooth = np.array([returns[max(0, i - window + 1) : i + 1].mean() for i in range(len(returns))])
+    figure = _figure(title)
+    (axes,) = figure.axes
+    axes.plot(steps, returns, color="C0", alpha=0.35, linewidth=1, label="mean of a batch")
+    axes.plot(steps, smooth, color="C0", linewidth=2, label=f"mean of {window} batches")
+    _write(figure, picture)
+
+
+def plot_comparison(
+    curves: Mapping[str, Sequence[Path]], picture: Path, *, title: str, points: int = 200
+) -> None:
+    """Draws learning curves of several groups of runs: mean over the runs, band of one deviation.
+
+    Args:
+        curves: ``metrics.csv`` files of the runs (seeds) of each group, by the group's name.
+        picture: the PNG file to write.
+        title: title of the picture.
+        points: steps at which the runs are compared; between batches, returns are interpolated.
+    """
+    figure = _figure(title)
+    (axes,) = figure.axes
+    for name, runs in curves.items():
+        known = [(steps, returns) for steps, returns in map(_curve, runs) if len(steps)]
+        if not known:
+            continue
+        grid = np.linspace(
+            max(steps[0] for steps, _ in known), min(steps[-1] for steps, _ in known), points
+        )
+        returns = np.stack([np.interp(grid, *run) for run in known])
+        mean, deviation = returns.mean(0), returns.std(0)
+        (line,) = axes.plot(grid, mean, linewidth=2, label=f"{name} ({len(known)} runs)")
+        axes.fill_between(
+            grid, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.2, linewidth=0
+        )
+    _write(figure, picture)
+
+
+def _curve(metrics: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and returns of the batches in which an episode ended."""
+    rows = [row for row in read_metrics(metrics) if not np.isnan(row["return_mean"])]
+    return np.array([row["step"] for row in rows]), np.array([row["return_mean"] for row in rows])
+
+
+def _figure(title: str) -> Figure:
+    # Not at the top: Matplotlib takes a second that only drawing should cost.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-
-    rows = [row for row in read_metrics(metrics) if not np.isnan(row["return_mean"])]
-    steps = np.array([row["step"] for row in rows])
-    returns = np.array([row["return_mean"] for row in rows])
-    smooth = np.array([returns[max(0, i - window + 1) : i + 1].mean() for i in range(len(rows))])
 
     figure = Figure(figsize=(7, 4), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    axes.plot(steps, returns, color="C0", alpha=0.35, linewidth=1, label="mean of a batch")
-    axes.plot(steps, smooth, color="C0", linewidth=2, label=f"mean of {window} batches")
     axes.set(title=title, xlabel="environment steps", ylabel="return of training episodes")
     axes.grid(alpha=0.3)
+    return figure
+
+
+def _write(figure: Figure, picture: Path) -> None:
+    (axes,) = figure.axes
     axes.legend(frameon=False)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")

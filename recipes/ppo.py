@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 import random
-from collections.abc import Iterator, Sequence
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -36,6 +38,8 @@ from .interrupt import Interrupt
 from .networks import make_network
 from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
+
+_COMPILERS = [os.environ.get("CXX", "c++"), "g++", "clang++", "cl"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +99,9 @@ class PPO(Recipe):
     """Seed of the first evaluation episode; the others follow one by one."""
     checkpoint_interval: int = 10_240
     """Environment steps between checkpoints."""
+    compile: bool = False
+    """Whether the update runs through torch.compile: needs a C++ compiler and about a minute at the
+    start, and is then 1.5 to 2 times as fast for small networks on a CPU."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -145,6 +152,11 @@ class PPO(Recipe):
         Raises:
             ValueError: if they cannot be built as the fields say, or do not fit each other.
         """
+        if self.compile and not any(map(shutil.which, _COMPILERS)):
+            raise ValueError(
+                f"compile needs a C++ compiler, but none of {', '.join(_COMPILERS)} is there: "
+                "install one or leave compile off"
+            )
         try:
             env = self.make_env(1, self.seed)
             Agent(self, env).policy(env.reset())
@@ -248,6 +260,7 @@ def train(recipe: PPO, run: Run) -> None:
         normalize_advantage=True,
         functional=False,
     )
+    objective = make_objective(agent, loss, recipe.compile)
     gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
     parameters = list(agent.parameters())
     optimizer = torch.optim.Adam(
@@ -284,17 +297,15 @@ def train(recipe: PPO, run: Run) -> None:
             agent.train()
             losses = []
             for minibatch in minibatches(batch, recipe):
-                agent.backbone(minibatch)  # once; the heads read its features
                 try:
-                    terms = loss(minibatch)
+                    total, terms = objective(minibatch)
                 except RuntimeError:  # TorchRL draws samples where an entropy is not finite
                     check_agent(agent, minibatch, step, saved_step)
                     raise
-                total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
                 optimizer.zero_grad()
                 total.backward()
                 norm = nn.utils.clip_grad_norm_(parameters, recipe.max_grad_norm)
-                losses.append(torch.stack([*(terms[name].detach() for name in TERMS), norm]))
+                losses.append(torch.cat([terms, norm.unsqueeze(0)]))
                 check_finite(LOSSES, losses[-1], step, saved_step)
                 optimizer.step()
             agent.eval()
@@ -328,6 +339,31 @@ def train(recipe: PPO, run: Run) -> None:
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
 LOSSES = [*TERMS, "gradient_norm"]
 COLUMNS = ["return_mean", "episodes", "learning_rate", *LOSSES]
+
+
+def make_objective(
+    agent: Agent, loss: ClipPPOLoss, compiled: bool
+) -> Callable[[TensorDict], tuple[Tensor, Tensor]]:
+    """Builds the function of a minibatch that is minimised.
+
+    Args:
+        agent: the agent whose backbone writes the features.
+        loss: TorchRL's loss on the heads, which read them.
+        compiled: whether it runs through ``torch.compile``.
+
+    Returns:
+        A function of a minibatch [N]: the total, float [], and its ``TERMS``, float [terms].
+    """
+
+    def objective(minibatch: TensorDict) -> tuple[Tensor, Tensor]:
+        agent.backbone(minibatch)  # once; the heads read its features
+        terms = loss(minibatch)
+        total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+        return total, torch.stack([terms[name].detach() for name in TERMS])
+
+    # Static shapes: which kernels run must not depend on the sizes seen before, or a resumed run
+    # would differ in the last bit.
+    return torch.compile(objective, dynamic=False) if compiled else objective
 
 
 def add_advantages(

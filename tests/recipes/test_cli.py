@@ -59,6 +59,10 @@ def test_train_evaluate_and_resume(capsys, tmp_path):
     first, second = ((r / "evaluation.json").read_text() for r in (run, again))
     assert first == second
 
+    picture = tmp_path / "comparison.png"
+    main(["compare", str(run), str(again), "--out", str(picture)])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
     line = fails(capsys, *words)
     assert "exists already" in line
     assert "--resume" in line

@@ -101,14 +101,23 @@ class HistoryNetwork(nn.Module):
 
     def check(self, history: Tensor) -> None:
         """Raises ValueError or TypeError where a history does not fit this network."""
-        dtype = next(self.parameters()).dtype
-        check_history(history, self.history, self.observation_shape, dtype)
+        check_history(history, self.history, self.observation_shape, weights_dtype(self))
 
 
 def _attention_maps(encoder: nn.Module, x: Tensor) -> list[Tensor]:
     """Returns an encoder's attention weights: none where it has no attention."""
     attention_maps = getattr(encoder, "attention_maps", None)
     return [] if attention_maps is None else attention_maps(x)
+
+
+def weights_dtype(network: nn.Module) -> torch.dtype:
+    """Returns the float type of a network's weights.
+
+    Not that of ``parameters()``, which is empty where TorchRL's losses have put plain tensors
+    (target weights, a stack of critics) in their places.
+    """
+    weights = (getattr(module, "weight", None) for module in network.modules())
+    return next(weight.dtype for weight in weights if isinstance(weight, Tensor))
 
 
 def check_history(

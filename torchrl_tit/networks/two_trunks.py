@@ -10,7 +10,11 @@ from torch import Tensor, nn
 
 from torchrl_tit.networks.activations import Activation
 from torchrl_tit.networks.config import check_positive
-from torchrl_tit.networks.history_network import check_history, check_observation
+from torchrl_tit.networks.history_network import (
+    check_history,
+    check_observation,
+    weights_dtype,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +71,7 @@ class TwoTrunkNetwork(nn.Module):
         Returns:
             Features for the policy and for the value, float [..., F] each.
         """
-        dtype = next(self.parameters()).dtype
+        dtype = weights_dtype(self)
         check_history(history, self.history, self.observation_shape, dtype)
         if history.dtype == torch.uint8:
             history = history.to(dtype) / 255

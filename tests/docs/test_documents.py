@@ -1,0 +1,31 @@
+"""The documents: their links lead somewhere, and their Python runs."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+
+
+def name(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name)
+def test_links_lead_somewhere(document):
+    text = re.sub(r"```.*?```", "", document.read_text(), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if not re.match(r"[a-z]+:", target):
+            path = document.parent / target.split("#")[0]
+            assert path.exists(), f"{name(document)} links to {target}"
+
+
+@pytest.mark.parametrize(
+    "document", [d for d in DOCUMENTS if "```python" in d.read_text()], ids=name
+)
+def test_python_runs(document):
+    namespace: dict[str, object] = {}
+    for block in re.findall(r"```python\n(.*?)```", document.read_text(), flags=re.DOTALL):
+        exec(compile(block, name(document), "exec"), namespace)

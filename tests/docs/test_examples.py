@@ -1,0 +1,57 @@
+"""The worked examples: TorchRL's losses train the backbone that stands in them."""
+
+import pytest
+import torch
+
+from docs.examples import dqn, iql, sac
+
+
+def parameters_of_backbones(loss):
+    """Trained parameters that belong to a frame or history encoder, by name."""
+    return {
+        name: parameter
+        for name, parameter in loss.named_parameters()
+        if "frame_encoder" in name or "history_encoder" in name
+    }
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.1])
+@pytest.mark.parametrize(
+    ("example", "short"),
+    [(dqn, {"steps": 100}), (sac, {"steps": 100}), (iql, {"updates": 3})],
+    ids=["dqn", "sac", "iql"],
+)
+def test_gradients_reach_the_backbone_and_targets_follow(example, short, dropout):
+    loss = example.main(**short, dropout=dropout)
+    trained = parameters_of_backbones(loss)
+    assert trained
+    for name, parameter in trained.items():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any() or "in_proj" in name, name
+    targets = {
+        name: buffer
+        for name, buffer in loss.named_buffers()
+        if name.startswith("target_") and "frame_encoder" in name
+    }
+    assert targets
+    for name, target in targets.items():
+        online = dict(loss.named_parameters())[name.removeprefix("target_")]
+        assert target.shape == online.shape
+        assert not target.requires_grad
+    assert any(
+        not torch.equal(target, dict(loss.named_parameters())[name.removeprefix("target_")])
+        for name, target in targets.items()
+    )
+
+
+def test_critics_are_stacked():
+    loss = sac.main(steps=50)
+    stacked = [
+        parameter
+        for name, parameter in loss.named_parameters()
+        if name.startswith("qvalue_network_params") and "frame_encoder" in name
+    ]
+    assert stacked
+    assert all(parameter.shape[0] == 2 for parameter in stacked)
+    assert any(not torch.equal(parameter[0], parameter[1]) for parameter in stacked)
