@@ -153,7 +153,10 @@ class Run:
 
 
 def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version(), "platform": platform.platform()}
+    versions = {
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}",
+    }
     for package in _PACKAGES:
         try:
             versions[package] = importlib.metadata.version(package)
