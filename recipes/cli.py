@@ -216,7 +216,7 @@ def _find(name: str) -> Recipe:
     """A recipe by name, or from a JSON file such as a run's recipe.json."""
     path = Path(name)
     if path.suffix == ".json":
-        return recipe_from_json(path.read_text(), path)
+        return recipe_from_json(path.read_bytes(), path)
     return get_recipe(name)
 
 

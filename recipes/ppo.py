@@ -328,7 +328,7 @@ def train(recipe: PPO, run: Run) -> None:
             due = step // recipe.checkpoint_interval > (step - batch.numel()) // (
                 recipe.checkpoint_interval
             )
-            if due or interrupt.requested or step == recipe.final_step:
+            if due or interrupt.requested or step >= recipe.final_step:
                 state.save(run, step)
                 saved_step = step
             if interrupt.requested:

@@ -112,7 +112,7 @@ def recipe_to_json(recipe: Recipe) -> str:
     return json.dumps({"algorithm": recipe.algorithm, **fields}, indent=2) + "\n"
 
 
-def recipe_from_json(text: str, source: str | Path) -> Recipe:
+def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
     """Makes a recipe from JSON.
 
     Args:
@@ -132,7 +132,7 @@ def recipe_from_json(text: str, source: str | Path) -> Recipe:
             raise ValueError(f"field 'backbone': expected an object, not {backbone!r}")
         network = _take(backbone, "network", {name: kind for name, (kind, _) in NETWORKS.items()})
         return _convert(recipe, fields, backbone=_convert(network, backbone, "backbone."))
-    except ValueError as error:  # json.JSONDecodeError is one
+    except (RecursionError, ValueError) as error:  # json.JSONDecodeError is one
         raise ValueError(f"{source} is not a recipe: {error}") from error
 
 

@@ -74,7 +74,7 @@ class Run:
         path = folder / "recipe.json"
         if not path.is_file():
             raise FileNotFoundError(f"{folder} is no run folder: there is no {path}")
-        return cls(folder, recipe_from_json(path.read_text(), path))
+        return cls(folder, recipe_from_json(path.read_bytes(), path))
 
     def __enter__(self) -> Run:
         try:
@@ -130,10 +130,10 @@ class Run:
         """Whether the run is trained, evaluated and drawn: there is nothing left to do."""
         try:
             evaluation = json.loads((self.folder / "evaluation.json").read_text(encoding="utf-8"))
-            evaluated = evaluation["steps"]
+            evaluated = evaluation["steps"] >= self.recipe.final_step
         except (OSError, ValueError, LookupError, TypeError):
             return False
-        return evaluated == self.recipe.final_step and (self.folder / _CURVE).is_file()
+        return evaluated and (self.folder / _CURVE).is_file()
 
     def plot(self) -> Path:
         """Draws ``learning_curve.png`` from the metrics and returns its path."""
