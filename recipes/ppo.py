@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 import random
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -34,12 +32,11 @@ from torchrl_tit.evaluation import evaluate
 from torchrl_tit.modules import Backbone, make_actor, make_value
 from torchrl_tit.networks import TwoTrunkNetwork, init_orthogonal_
 
+from .compilation import Compile, should_compile
 from .interrupt import Interrupt
 from .networks import make_network
 from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
-
-_COMPILERS = [os.environ.get("CXX", "c++"), "g++", "clang++", "cl"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,9 +96,9 @@ class PPO(Recipe):
     """Seed of the first evaluation episode; the others follow one by one."""
     checkpoint_interval: int = 10_240
     """Environment steps between checkpoints."""
-    compile: bool = False
-    """Whether the update runs through torch.compile: needs a C++ compiler and about a minute at the
-    start, and is then 1.5 to 2 times as fast for small networks on a CPU."""
+    compile: Compile = "auto"
+    """Whether the update runs through torch.compile, which needs a C++ compiler and about a minute
+    at the start: "auto" is on where it works and the run is long enough to earn that back."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -134,6 +131,12 @@ class PPO(Recipe):
         """``total_steps``, rounded up to whole batches."""
         return math.ceil(self.total_steps / self.steps_per_batch) * self.steps_per_batch
 
+    @property
+    def gradient_steps(self) -> int:
+        """Gradient steps of the whole run."""
+        batches = self.final_step // self.steps_per_batch
+        return batches * self.epochs * math.ceil(self.steps_per_batch / self.minibatch_size)
+
     def make_env(self, num_envs: int, seed: int) -> EnvBase:
         """Builds the environment, with the history as part of it."""
         device = self.torch_device()
@@ -152,11 +155,7 @@ class PPO(Recipe):
         Raises:
             ValueError: if they cannot be built as the fields say, or do not fit each other.
         """
-        if self.compile and not any(map(shutil.which, _COMPILERS)):
-            raise ValueError(
-                f"compile needs a C++ compiler, but none of {', '.join(_COMPILERS)} is there: "
-                "install one or leave compile off"
-            )
+        should_compile(self.compile, self.gradient_steps)
         try:
             env = self.make_env(1, self.seed)
             Agent(self, env).policy(env.reset())
@@ -260,7 +259,8 @@ def train(recipe: PPO, run: Run) -> None:
         normalize_advantage=True,
         functional=False,
     )
-    objective = make_objective(agent, loss, recipe.compile)
+    compiled = should_compile(recipe.compile, recipe.gradient_steps)
+    objective = make_objective(agent, loss, compiled)
     gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
     parameters = list(agent.parameters())
     optimizer = torch.optim.Adam(

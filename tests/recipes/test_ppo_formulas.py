@@ -1,5 +1,6 @@
 """PPO's settings against the formulas, computed by other means."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from recipes.ppo import PPO, Agent, add_advantages, minibatches
+from recipes.compilation import should_compile
+from recipes.ppo import PPO, Agent, add_advantages, make_objective, minibatches
 from recipes.registry import get_recipe
 from recipes.run import Run
 
@@ -138,6 +140,68 @@ def test_loss_and_gradient_are_those_of_the_formulas():
         torch.testing.assert_close(grad, expected_grad, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("c++"), reason="torch.compile needs a C++ compiler")
+def test_compiled_objective_is_the_eager_one():
+    _, agent = build()
+    loss = ClipPPOLoss(
+        agent.actor, agent.critic, loss_critic_type="l2", normalize_advantage=True, functional=False
+    )
+    minibatch = TensorDict(
+        {
+            "history": torch.randn(16, 1, 4),
+            "action": torch.randint(0, 2, (16,)),
+            "action_log_prob": -torch.rand(16) * 1.5,
+            "advantage": torch.randn(16, 1),
+            "value_target": torch.randn(16, 1),
+        },
+        [16],
+    )
+    results = []
+    for compiled in (False, True):
+        total, terms = make_objective(agent, loss, compiled)(minibatch.copy())
+        results.append((total, terms, *torch.autograd.grad(total, list(agent.parameters()))))
+    for eager, fast in zip(*results, strict=True):
+        torch.testing.assert_close(fast, eager, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("setting", "steps", "compiler", "expected"),
+    [
+        ("off", 10**6, True, False),
+        ("auto", 100, True, False),
+        ("auto", 10**6, False, False),
+        ("auto", 10**6, True, True),
+        ("on", 1, True, True),
+    ],
+)
+def test_compiling_pays_in_long_runs(setting, steps, compiler, expected, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: name if compiler else None)
+    monkeypatch.setattr("recipes.compilation._works", lambda: True)
+    assert should_compile(setting, steps) is expected
+
+
+def test_compiling_without_a_compiler_is_refused(monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(ValueError, match=r"no C\+\+ compiler"):
+        should_compile("on", 1)
+
+
+def test_adam_gets_its_settings(monkeypatch, tmp_path):
+    seen = {}
+    original = torch.optim.Adam.__init__
+
+    def spy(self, parameters, **settings):
+        seen.update(settings)
+        original(self, parameters, **settings)
+
+    monkeypatch.setattr(torch.optim.Adam, "__init__", spy)
+    with Run.create(tmp_path / "run", SMALL) as run:
+        SMALL.train(run)
+    assert (seen["lr"], seen["eps"]) == (3e-4, 1e-5)
+    assert seen.get("weight_decay", 0) == 0
+
+
 def test_whole_rollouts_cover_the_steps():
     assert RECIPE.final_step == 100_352  # 49 batches of 2048 cover 100k
 
@@ -217,8 +281,8 @@ def test_backbone_runs_once_a_step_and_once_a_minibatch(monkeypatch, tmp_path):
     batches, minibatches_each, epochs = 2, 2, 2
     assert len(updates) == batches * minibatches_each * epochs
     # 16 steps of 2 environments in each batch, and the true next observations of its ends.
-    # TorchRL's collector asks once when it is made.
-    assert len(acts) == 1 + batches * (16 + 1)
+    # TorchRL's collector asks once when it is made, and each update ends with a check of the values.
+    assert len(acts) == 1 + batches * (16 + 1 + 1)
     assert all(training for _, training, _ in updates)
     assert not any(training for _, training, _ in acts)
 
