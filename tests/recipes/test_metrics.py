@@ -1,0 +1,83 @@
+"""Metrics as CSV and TensorBoard, over the end and the new start of a process."""
+
+import math
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from recipes.metrics import Metrics, read_metrics
+
+
+def scalars(folder, name):
+    events = EventAccumulator(str(folder / "tensorboard")).Reload()
+    return [(event.step, event.value) for event in events.Scalars(name)]
+
+
+def write(folder, rows, last_step=0):
+    metrics = Metrics(folder, ["loss", "return"], last_step)
+    for step, loss, value in rows:
+        metrics.log(step, **{"loss": loss, "return": value})
+    metrics.close()
+
+
+def test_numbers_come_back_exactly_and_nan_is_not_drawn(tmp_path):
+    write(tmp_path, [(64, 1 / 3, math.nan), (128, 1e-30, 9.0)])
+    first, second = read_metrics(tmp_path / "metrics.csv")
+    assert (first["step"], first["loss"]) == (64, 1 / 3)
+    assert math.isnan(first["return"])
+    assert (second["step"], second["loss"], second["return"]) == (128, 1e-30, 9.0)
+    assert [step for step, _ in scalars(tmp_path, "loss")] == [64, 128]
+    assert scalars(tmp_path, "return") == [(128, 9.0)]
+
+
+def test_rows_that_stay_are_not_changed_and_later_ones_are_cut(tmp_path):
+    write(tmp_path, [(64, 1 / 3, math.nan), (128, 2, 9.0), (192, 0.5, 8.0)])
+    before = (tmp_path / "metrics.csv").read_text().splitlines()
+    write(tmp_path, [(192, 0.25, 7.0)], last_step=128)
+    after = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert after[:3] == before[:3]
+    assert [row["loss"] for row in read_metrics(tmp_path / "metrics.csv")] == [1 / 3, 2, 0.25]
+    assert scalars(tmp_path, "return") == [(128, 9.0), (192, 7.0)]
+
+
+def test_a_process_killed_while_it_opens_loses_no_row(tmp_path, monkeypatch):
+    write(tmp_path, [(64, 1.0, 2.0), (128, 3.0, 4.0)])
+    before = (tmp_path / "metrics.csv").read_bytes()
+
+    def killed(*_):
+        raise SystemExit
+
+    monkeypatch.setattr(Metrics, "_draw", killed)
+    with pytest.raises(SystemExit):
+        Metrics(tmp_path, ["loss", "return"], last_step=128)
+    assert (tmp_path / "metrics.csv").read_bytes() == before
+
+
+def test_a_torn_last_row_is_no_row(tmp_path):
+    write(tmp_path, [(64, 1.0, 2.0)])
+    with (tmp_path / "metrics.csv").open("a") as file:
+        file.write("128,17000")
+    assert len(read_metrics(tmp_path / "metrics.csv")) == 1
+    write(tmp_path, [(128, 5.0, 6.0)], last_step=64)
+    assert [row["loss"] for row in read_metrics(tmp_path / "metrics.csv")] == [1.0, 5.0]
+
+
+@pytest.mark.parametrize("row", ["128,1.0", "128,1.0,high,3", "128,1.0,2,3,4"])
+def test_a_damaged_row_is_named(row, tmp_path):
+    write(tmp_path, [(64, 1.0, 2.0)])
+    path = tmp_path / "metrics.csv"
+    path.write_text(path.read_text() + row + "\n")
+    with pytest.raises(ValueError, match=r"metrics\.csv has a damaged row for step 128"):
+        read_metrics(path)
+
+
+def test_metrics_of_another_run_are_refused_and_stay(tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text("step,time,loss\n64,1.0,2.0\n")
+    with pytest.raises(ValueError, match=r"no column 'return'"):
+        Metrics(tmp_path, ["loss", "return"], last_step=64)
+    assert path.read_text() == "step,time,loss\n64,1.0,2.0\n"
+
+
+def test_no_file_is_no_rows(tmp_path):
+    assert read_metrics(tmp_path / "metrics.csv") == []

@@ -1,0 +1,266 @@
+"""Run folders: made, continued, refused; and runs at the edges of what a recipe can say."""
+
+import json
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.envs.classic_control import CartPoleEnv
+
+from recipes.cli import main
+from recipes.metrics import read_metrics
+from recipes.ppo import PPO
+from recipes.run import Run
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.networks import EnhancedTITConfig
+
+ROOT = Path(__file__).parents[2]
+SMALL = PPO(
+    name="ppo/cartpole/small",
+    env="CartPole-v1",
+    backbone=EnhancedTITConfig(embed_dim=8, features_dim=8),
+    total_steps=128,
+    steps_per_batch=64,
+    num_envs=2,
+    minibatch_size=32,
+    epochs=1,
+    checkpoint_interval=64,
+    evaluation_episodes=2,
+)
+
+
+class UnknownCartPole(CartPoleEnv):
+    """A task that no checkpoint can hold: a subclass may remember anything."""
+
+
+gymnasium.register(
+    "tests/UnknownCartPole-v0", lambda **kwargs: UnknownCartPole(**kwargs), max_episode_steps=40
+)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name != ".lock"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def trained(folder: Path, recipe: PPO = SMALL) -> Run:
+    with Run.create(folder, recipe) as run:
+        recipe.train(run)
+    return run
+
+
+def edit(path: Path, **fields: object) -> None:
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+
+
+def fails(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    with pytest.raises(SystemExit) as exit_:
+        main(list(map(str, words)))
+    assert exit_.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_only_a_new_or_empty_folder_becomes_a_run(tmp_path):
+    (tmp_path / "empty").mkdir()
+    assert Run.create(tmp_path / "empty", SMALL).folder == tmp_path / "empty"
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("years of work")
+    (tmp_path / "file").write_text("a file")
+    for name in ("full", "file", "empty"):
+        with pytest.raises(FileExistsError, match=r"exists already.*--resume.*--out"):
+            Run.create(tmp_path / name, SMALL)
+    assert contents(tmp_path / "full") == {"thesis.tex": b"years of work"}
+
+
+def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(time, "strftime", lambda _: "20260101-000000")
+    monkeypatch.setattr(PPO, "train", lambda *_: None)
+    monkeypatch.setattr(Run, "plot", lambda run: run.folder)
+    monkeypatch.setattr(
+        PPO, "evaluate", lambda *_: {"mean": 0, "std": 0, "episodes": 1, "steps": 0}
+    )
+    for _ in range(3):
+        main(["train", "ppo/cartpole/enhanced-tit"])
+    folders = sorted(path.name for path in Path("runs/ppo/cartpole/enhanced-tit").iterdir())
+    name = "seed-0-20260101-000000"
+    assert folders == [name, f"{name}-2", f"{name}-3"]
+
+
+def test_is_complete_only_when_trained_evaluated_and_drawn(tmp_path):
+    run = trained(tmp_path / "run")
+    assert not run.is_complete()
+    run.save_evaluation({"steps": 64})  # of a checkpoint on the way
+    run.plot()
+    assert not run.is_complete()
+    run.save_evaluation({"steps": 128})
+    assert run.is_complete()
+    (run.folder / "evaluation.json").write_text("{")
+    assert not run.is_complete()
+    (run.folder / "evaluation.json").write_text("[]")
+    assert not run.is_complete()
+    run.save_evaluation({"steps": 128})
+    (run.folder / "learning_curve.png").unlink()
+    assert not run.is_complete()
+
+
+def test_a_run_that_was_stopped_in_its_evaluation_is_evaluated_then(tmp_path, monkeypatch, capsys):
+    def ctrl_c(*_):
+        raise KeyboardInterrupt
+
+    arguments = ["train", "ppo/cartpole/enhanced-tit", "--out", str(tmp_path / "run")]
+    arguments += ["--total-steps", "64", "--steps-per-batch", "64", "--epochs", "1"]
+    with monkeypatch.context() as patch:
+        patch.setattr(PPO, "evaluate", ctrl_c)
+        with pytest.raises(SystemExit) as exit_:
+            main([*arguments, "--evaluation-episodes", "2"])
+    assert exit_.value.code == 130
+    assert f"train --resume {tmp_path / 'run'}" in capsys.readouterr().err
+    metrics = (tmp_path / "run" / "metrics.csv").read_text()
+    main(["train", "--resume", str(tmp_path / "run")])
+    assert (tmp_path / "run" / "metrics.csv").read_text() == metrics
+    assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["steps"] == 64
+    assert (tmp_path / "run" / "learning_curve.png").is_file()
+
+
+def test_version_changes(tmp_path):
+    run = Run.create(tmp_path / "run", SMALL)
+    assert run.version_changes() == []
+    edit(run.folder / "versions.json", torch="1.0")
+    assert run.version_changes() == [f"torch 1.0 -> {torch.__version__}"]
+    (run.folder / "versions.json").write_text("{")
+    assert run.version_changes() == []
+
+
+def test_an_edited_recipe_takes_effect(tmp_path):
+    run = trained(tmp_path / "run")
+    edit(run.folder / "recipe.json", total_steps=192, learning_rate=0.01)
+    with Run.open(run.folder) as again:
+        again.recipe.train(again)
+    rows = read_metrics(run.folder / "metrics.csv")
+    assert [row["learning_rate"] for row in rows] == [3e-4, 3e-4, 0.01]
+    _, state = load_checkpoint(run.checkpoints)
+    assert state["optimizer"]["param_groups"][0]["lr"] == 0.01
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"env": "Acrobot-v1"},
+        {"num_envs": 4},
+        {"history": 2},
+        {"backbone": {"network": "enhanced-tit", "embed_dim": 16}},
+        {"backbone": {"network": "mlp"}},
+    ],
+    ids=str,
+)
+def test_an_edited_recipe_that_no_longer_fits_changes_nothing(fields, tmp_path, capsys):
+    run = trained(tmp_path / "run")
+    edit(run.folder / "recipe.json", total_steps=192, **fields)
+    before = contents(run.folder)
+    line = fails(capsys, "train", "--resume", run.folder)
+    assert "the checkpoint of step 128" in line
+    assert "does not fit" in line
+    assert "recipe.json" in line
+    assert contents(run.folder) == before
+
+
+@pytest.mark.parametrize("text", [b"\xff\xfe{", b"[" * 100_000, b"{}", b"null"])
+def test_a_damaged_recipe_is_named(text, tmp_path, capsys):
+    run = trained(tmp_path / "run")
+    (run.folder / "recipe.json").write_bytes(text)
+    before = contents(run.folder)
+    for words in (["train", "--resume"], ["evaluate"]):
+        assert "recipe.json is not a recipe" in fails(capsys, *words, run.folder)
+    assert contents(run.folder) == before
+
+
+def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(tmp_path):
+    run = trained(tmp_path / "run")
+    recipe = replace(SMALL, total_steps=192, steps_per_batch=96, checkpoint_interval=10**6)
+    with run:
+        recipe.train(run)
+    assert run.load()[0] == 224  # type: ignore[index]
+
+
+def test_a_task_that_cannot_be_saved_starts_anew_at_each_checkpoint(tmp_path):
+    recipe = replace(SMALL, env="tests/UnknownCartPole-v0", total_steps=320)
+    whole = trained(tmp_path / "whole", recipe)
+    with Run.create(tmp_path / "parts", recipe) as parts:
+        for steps in (64, 192, 320):
+            replace(recipe, total_steps=steps).train(parts)
+    (_, expected), (_, state) = (load_checkpoint(run.checkpoints) for run in (whole, parts))
+    assert state["collector"]["env"] is None
+    for name, weight in expected["agent"].items():
+        assert torch.equal(state["agent"][name], weight), name
+    rows, expected_rows = (
+        [list(row.values())[2:] for row in read_metrics(run.folder / "metrics.csv")]
+        for run in (parts, whole)
+    )
+    np.testing.assert_array_equal(rows, expected_rows)
+    # Each checkpoint has a seed of its own: batches do not repeat.
+    assert len({tuple(row[3:]) for row in rows}) == len(rows)
+
+
+def test_no_episode_ends_at_all(tmp_path):
+    run = trained(tmp_path / "run", replace(SMALL, env="Pendulum-v1"))
+    rows = read_metrics(run.folder / "metrics.csv")
+    assert [row["episodes"] for row in rows] == [0, 0]
+    assert np.isnan([row["return_mean"] for row in rows]).all()
+    assert run.plot().read_bytes().startswith(b"\x89PNG")
+
+
+def test_fewer_steps_than_a_batch_are_one_batch(tmp_path):
+    run = trained(tmp_path / "run", replace(SMALL, total_steps=1))
+    assert run.load()[0] == 64  # type: ignore[index]
+
+
+@pytest.mark.parametrize("minibatch_size", [32, 64], ids=["in the update", "after it"])
+def test_weights_that_explode_are_never_saved(minibatch_size, tmp_path):
+    recipe = replace(SMALL, total_steps=192, minibatch_size=minibatch_size)
+    run = trained(tmp_path / "run", replace(recipe, total_steps=64))
+    message = r"weights became (inf|nan) in the update at step 128; the checkpoint of step 64 is"
+    with run, pytest.raises(FloatingPointError, match=message):
+        replace(recipe, learning_rate=1e30).train(run)
+    assert run.load()[0] == 64  # type: ignore[index]
+    assert len(read_metrics(run.folder / "metrics.csv")) == 1
+
+
+def test_unicode_and_relative_paths(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["--total-steps", "64", "--steps-per-batch", "64", "--evaluation-episodes", "1"]
+    main(["train", "ppo/cartpole/enhanced-tit", "--out", "läufe/一 号", "--epochs", "1", *words])
+    assert "run folder: läufe/一 号" in capsys.readouterr().out
+    monkeypatch.chdir("läufe")
+    main(["evaluate", "一 号", "--out", "wertung.json"])
+    assert json.loads(Path("wertung.json").read_text())["episodes"] == 1
+
+
+def test_a_disk_that_is_full_stops_the_process_with_one_line(tmp_path):
+    """The limit on a file's size stands for the disk; the metrics still fit, a checkpoint not."""
+    program = """
+import resource, sys
+from recipes.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+main(sys.argv[1:])
+"""
+    run = trained(tmp_path / "run")
+    edit(run.folder / "recipe.json", total_steps=256)
+    before = contents(run.checkpoints)
+    result = subprocess.run(
+        [sys.executable, "-c", program, "train", "--resume", str(run.folder)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert result.returncode == 2
+    line = result.stderr.splitlines()[-1]
+    assert line.startswith("error: the checkpoint of step 192 could not be saved")
+    assert "Traceback" not in result.stderr
+    assert contents(run.checkpoints) == before
