@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from torchrl_tit.networks import (
     D2RLConfig,
     EnhancedTITConfig,
@@ -14,12 +16,17 @@ from .networks import NetworkConfig
 from .ppo import PPO
 from .recipe import Recipe, nearest
 
-# Task name: environment. 100k steps each (arXiv 2212.14538, appendix).
-_CLASSIC_CONTROL = {
-    "acrobot": "Acrobot-v1",
-    "cartpole": "CartPole-v1",
-    "mountaincar": "MountainCar-v0",
+# Task name: environment and steps (arXiv 2212.14538, appendix). The paper ran MuJoCo's v3.
+_TASKS = {
+    "acrobot": ("Acrobot-v1", 100_000),
+    "cartpole": ("CartPole-v1", 100_000),
+    "mountaincar": ("MountainCar-v0", 100_000),
+    "ant": ("Ant-v5", 1_000_000),
+    "halfcheetah": ("HalfCheetah-v5", 1_000_000),
+    "hopper": ("Hopper-v5", 1_000_000),
+    "walker2d": ("Walker2d-v5", 1_000_000),
 }
+_CLASSIC_CONTROL = ("acrobot", "cartpole", "mountaincar")
 # The paper leaves open which settings of TIT were used where, within patch 1, width 32 or 64, two
 # blocks; these are the networks' defaults.
 _ARRAY_NETWORKS: dict[str, NetworkConfig] = {
@@ -42,18 +49,17 @@ _MOUNTAINCAR_NETWORKS: dict[str, NetworkConfig] = {
 
 def _named() -> dict[str, Recipe]:
     recipes: dict[str, Recipe] = {}
-    for task, env in _CLASSIC_CONTROL.items():
+    for task, (env, total_steps) in _TASKS.items():
         networks = _ARRAY_NETWORKS | (_MOUNTAINCAR_NETWORKS if task == "mountaincar" else {})
         for network, backbone in networks.items():
             name = f"ppo/{task}/{network}"
-            recipes[name] = PPO(name=name, env=env, backbone=backbone)
-            if network in ("vanilla-tit", "enhanced-tit"):
+            recipe = PPO(name=name, env=env, total_steps=total_steps, backbone=backbone)
+            recipes[name] = recipe
+            if task in _CLASSIC_CONTROL and network.endswith("-tit"):
                 # Policy and value share TIT's backbone: at 0.5 the value's gradient drowns the
                 # policy's (docs/results/cartpole.md). And environments side by side, for speed.
                 name += "-tuned"
-                recipes[name] = PPO(
-                    name=name, env=env, backbone=backbone, critic_coeff=0.02, num_envs=8
-                )
+                recipes[name] = replace(recipe, name=name, critic_coeff=0.02, num_envs=8)
     return recipes
 
 

@@ -281,7 +281,7 @@ def test_backbone_runs_once_a_step_and_once_a_minibatch(monkeypatch, tmp_path):
     batches, minibatches_each, epochs = 2, 2, 2
     assert len(updates) == batches * minibatches_each * epochs
     # 16 steps of 2 environments in each batch, and the true next observations of its ends.
-    # TorchRL's collector asks once when it is made, and each update ends with a check of the values.
+    # TorchRL's collector asks once when it is made; each update ends with a check of the values.
     assert len(acts) == 1 + batches * (16 + 1 + 1)
     assert all(training for _, training, _ in updates)
     assert not any(training for _, training, _ in acts)

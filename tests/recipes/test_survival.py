@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO
 from recipes.recipe import recipe_to_json
-from recipes.registry import get_recipe
+from recipes.registry import RECIPES, get_recipe
 from recipes.run import Run
 from torchrl_tit.checkpoint import CheckpointError, latest_step, load_checkpoint
 from torchrl_tit.networks import EnhancedTITConfig
@@ -227,5 +227,5 @@ def test_run_folder_holds_what_it_says(tmp_path):
 
 
 def test_every_named_recipe_builds_its_agent():
-    for name in ("ppo/acrobot/vanilla-tit", "ppo/mountaincar/enhanced-tit", "ppo/cartpole/d2rl"):
+    for name in RECIPES:
         get_recipe(name).check()
