@@ -5,6 +5,7 @@ from copy import deepcopy
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from recipes import ppo
 from recipes.ppo import PPO, Agent
@@ -34,8 +35,8 @@ RECIPE = PPO(
 @pytest.fixture
 def batches(monkeypatch):
     """For each batch: a copy of the agent before the update, and the minibatches of the update."""
-    recorded = []
-    agents = []
+    recorded: list[tuple[Agent, list[TensorDict]]] = []
+    agents: list[Agent] = []
     original_init, original_minibatches = Agent.__init__, ppo.minibatches
 
     def init(agent, *args):
@@ -80,7 +81,11 @@ def loss_by_hand(agent, minibatch, recipe, clip):
     ratio = (log_prob - minibatch["action_log_prob"]).exp()
     surrogate = torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
     error = agent.critic.module(features) - minibatch["value_target"]
-    return -surrogate.mean() + recipe.critic_coeff * (error**2).mean() - recipe.entropy_coeff * entropy.mean()
+    return (
+        -surrogate.mean()
+        + recipe.critic_coeff * (error**2).mean()
+        - recipe.entropy_coeff * entropy.mean()
+    )
 
 
 def updates_by_hand(recipe, batches):

@@ -1,6 +1,8 @@
 """Run folders: made, continued, refused; and runs at the edges of what a recipe can say."""
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -14,10 +16,10 @@ import torch
 from gymnasium.envs.classic_control import CartPoleEnv
 
 from recipes.cli import main
-from recipes.metrics import read_metrics
+from recipes.metrics import Metrics, read_metrics
 from recipes.ppo import PPO
 from recipes.run import Run
-from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.networks import EnhancedTITConfig
 
 ROOT = Path(__file__).parents[2]
@@ -127,6 +129,41 @@ def test_a_run_that_was_stopped_in_its_evaluation_is_evaluated_then(tmp_path, mo
     assert (tmp_path / "run" / "metrics.csv").read_text() == metrics
     assert json.loads((tmp_path / "run" / "evaluation.json").read_text())["steps"] == 64
     assert (tmp_path / "run" / "learning_curve.png").is_file()
+
+
+def test_ctrl_c_saves_and_the_resumed_run_is_the_same(tmp_path, monkeypatch):
+    recipe = replace(SMALL, total_steps=256, checkpoint_interval=10**6)
+    whole = trained(tmp_path / "whole", recipe)
+    log = Metrics.log
+
+    def ctrl_c(metrics, step, **values):
+        log(metrics, step, **values)
+        if step == 128:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with Run.create(tmp_path / "run", recipe) as run:
+        with monkeypatch.context() as patch:
+            patch.setattr(Metrics, "log", ctrl_c)
+            with pytest.raises(KeyboardInterrupt):
+                recipe.train(run)
+        assert checkpoint_steps(run.checkpoints) == [128]
+        recipe.train(run)
+    (_, expected), (_, state) = (load_checkpoint(r.checkpoints) for r in (whole, run))
+    for name, weight in expected["agent"].items():
+        assert torch.equal(state["agent"][name], weight), name
+
+
+def test_a_second_ctrl_c_stops_at_once(tmp_path, monkeypatch):
+    def twice(*_):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("recipes.ppo.add_advantages", twice)
+    with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
+        SMALL.train(run)
+    assert checkpoint_steps(run.checkpoints) == []
+    assert read_metrics(run.folder / "metrics.csv") == []
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_version_changes(tmp_path):
