@@ -1,4 +1,4 @@
-"""The command line: list, show, train, evaluate, compare."""
+"""The command line: list, show, train, evaluate, sweep, compare."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from .plot import plot_comparison
 from .recipe import Recipe, recipe_from_json, recipe_to_json
 from .registry import RECIPES, get_recipe
 from .run import Run
+from .sweep import make_jobs, run_jobs
 
 _USAGE = """\
 usage: {program} COMMAND ...
@@ -28,6 +29,7 @@ usage: {program} COMMAND ...
                               `train NAME --help` explains every field
   train --resume RUN          go on with a run that was stopped or killed
   evaluate RUN                evaluate a run's newest checkpoint
+  sweep NAME [NAME ...]       train many recipes and seeds side by side; names can be patterns
   compare RUN [RUN ...]       learning curves of several runs, seeds of a recipe as one band
 
 Everywhere: --seed, --out, --device, --threads where they apply; COMMAND --help tells.
@@ -46,6 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
         "show": _show,
         "train": _train,
         "evaluate": _evaluate,
+        "sweep": _sweep,
         "compare": _compare,
     }
     if not words or words[0] not in commands:
@@ -187,6 +190,30 @@ def _evaluate(words: list[str]) -> None:
     evaluation = recipe.evaluate(run)
     path = run.save_evaluation(evaluation, options.out)
     print(f"{_summary(recipe, evaluation)}\nwritten to {path}")
+
+
+def _sweep(words: list[str]) -> None:
+    parser = _Parser(f"{_program()} sweep")
+    parser.add_argument(
+        "names", nargs="+", help="names of recipes, or patterns such as 'ppo/*/mlp'"
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each recipe")
+    parser.add_argument("--workers", type=int, default=1, help="runs at a time, a process each")
+    parser.add_argument("--out", type=Path, default=Path("runs/sweep"), help="folder of the runs")
+    options = parser.parse_args(words)
+    if options.workers < 1:
+        _fail(f"--workers must be at least 1, not {options.workers}")
+    jobs = make_jobs(options.names, options.seeds, options.out)
+    try:
+        failed = run_jobs(jobs, options.workers)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on", file=sys.stderr)
+        raise
+    if failed:
+        _fail(
+            f"{len(failed)} of {len(jobs)} runs failed, see {', '.join(str(j.log) for j in failed)}"
+        )
+    print(f"{len(jobs)} runs are complete in {options.out}")
 
 
 def _compare(words: list[str]) -> None:

@@ -1,0 +1,112 @@
+"""Sweeps: complete runs stay, killed ones go on, other settings are refused."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from recipes import sweep
+from recipes.cli import main
+from recipes.ppo import PPO
+from recipes.registry import RECIPES
+from recipes.run import Run
+from torchrl_tit.networks import MLPConfig
+
+ROOT = Path(__file__).parents[2]
+TINY = PPO(
+    name="ppo/cartpole/mlp",
+    env="CartPole-v1",
+    backbone=MLPConfig(hidden_dim=8),
+    total_steps=128,
+    steps_per_batch=64,
+    minibatch_size=32,
+    epochs=1,
+    checkpoint_interval=64,
+    evaluation_episodes=2,
+)
+
+
+def create(job, recipe):
+    """Begins a run as a worker would, so that workers resume it with these small settings."""
+    Run.create(job.folder, recipe)
+
+
+def test_patterns_and_seeds_make_the_runs(tmp_path):
+    jobs = sweep.make_jobs(["ppo/*/mlp", "ppo/cartpole/mlp"], [3, 3, 4], tmp_path)
+    tasks = {name.split("/")[1] for name in RECIPES}
+    assert len(jobs) == 2 * len(tasks)
+    assert {job.recipe.seed for job in jobs} == {3, 4}
+    assert all(job.folder == tmp_path / job.recipe.name / f"seed-{job.recipe.seed}" for job in jobs)
+
+
+@pytest.mark.slow
+def test_sweep_resumes_runs_and_leaves_complete_ones(tmp_path, capsys):
+    jobs = [
+        sweep.Job(replace(TINY, seed=seed), tmp_path / TINY.name / f"seed-{seed}")
+        for seed in range(3)
+    ]
+    for job in jobs:
+        create(job, job.recipe)
+    with Run.open(jobs[0].folder) as run:  # complete already
+        run.recipe.train(run)
+        run.save_evaluation(run.recipe.evaluate(run))
+        run.plot()
+    before = (jobs[0].folder / "evaluation.json").stat().st_mtime_ns
+    assert [job.is_complete() for job in jobs] == [True, False, False]
+    assert sweep.run_jobs(jobs, workers=2) == []
+    assert all(job.is_complete() for job in jobs)
+    assert (jobs[0].folder / "evaluation.json").stat().st_mtime_ns == before
+    assert not jobs[0].log.exists()
+
+
+@pytest.mark.slow
+def test_failures_are_named(tmp_path):
+    job = sweep.Job(TINY, tmp_path / "seed-0")
+    create(job, TINY)
+    (job.folder / "checkpoints" / "000000000064").mkdir(parents=True)  # no checkpoint of ours
+    assert sweep.run_jobs([job], workers=1) == [job]
+    assert "error: " in job.log.read_text()
+
+
+def test_other_settings_under_the_same_name_are_refused(tmp_path, capsys):
+    job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], tmp_path)[0]
+    create(job, TINY)
+    with pytest.raises(SystemExit) as exit_:
+        main(["sweep", "ppo/acrobot/mlp", "ppo/cartpole/mlp", "--out", str(tmp_path)])
+    assert exit_.value.code == 2
+    assert "with other settings" in capsys.readouterr().err
+    assert not (tmp_path / "ppo/acrobot").exists()
+
+
+def test_unknown_names_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"called 'ppo/cartpole/mpl'.*ppo/cartpole/mlp"):
+        sweep.make_jobs(["ppo/cartpole/mpl"], [0], tmp_path)
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_every_worker(tmp_path):
+    out = tmp_path / "sweep"
+    job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], out)[0]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "recipes", "sweep", "ppo/cartpole/mlp", "--out", str(out)],
+        cwd=ROOT,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    metrics = job.folder / "metrics.csv"
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=90)
+    assert process.returncode == 130
+    assert "the same command goes on" in errors
+    assert list((job.folder / "checkpoints").iterdir())
+    with Run.open(job.folder):  # nobody is at work there any more
+        pass
