@@ -184,8 +184,9 @@ def measure(out: Path | None) -> None:
             ],
         )
         + f"\nCompiling took {compile_seconds[0]:.0f} seconds the first time, in the batch that is "
-        "left out, with nothing\ncached on the disk. It is on by default in runs of 10,000 gradient "
-        "steps or more (this recipe's 100k\nsteps have 15,680), where there is a C++ compiler.\n"
+        "left out, with nothing\ncached on the disk. It is on by default in runs of 10,000 "
+        "gradient steps or more (this recipe's 100k\nsteps have 15,680), where there is a C++ "
+        "compiler.\n"
         "\nWhere our time goes (a run of its own, with the timers in it):\n\n"
         + table(
             ["part", "share"],
