@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 
@@ -64,6 +66,50 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
         'all of it'
     """
     write_bytes_atomic(path, text.encode("utf-8"))
+
+
+@contextlib.contextmanager
+def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Let something be made under a hidden name, which takes its own name once it is whole.
+
+    Args:
+        path: The file or folder to make, where none is yet; its parent folder must exist.
+
+    Yields:
+        The hidden name beside it, to make the file or folder under.
+
+    Raises:
+        FileExistsError: There is one already; it stays as it is.
+        OSError: It could not be written.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> target = Path(tempfile.mkdtemp()) / "notes"
+        >>> with whole_or_not_at_all(target) as hidden:
+        ...     hidden.mkdir()
+        ...     target.exists()
+        False
+        >>> target.exists()
+        True
+    """
+    path = Path(path)
+    hidden = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        if path.exists():
+            raise FileExistsError(f"{path} exists already; choose another name or delete it.")
+        yield hidden
+        for made in [hidden, *hidden.rglob("*")]:
+            (fsync_directory if made.is_dir() else fsync_file)(made)
+        if path.exists():  # made by someone else in the meantime
+            raise FileExistsError(f"{path} exists already; choose another name or delete it.")
+        os.replace(hidden, path)
+    except BaseException:  # Ctrl-C as well must leave nothing behind
+        shutil.rmtree(hidden, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            hidden.unlink(missing_ok=True)
+        raise
+    fsync_directory(path.parent)
 
 
 def fsync_file(path: str | os.PathLike[str]) -> None:

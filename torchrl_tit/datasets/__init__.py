@@ -1,0 +1,43 @@
+"""Data sets for offline RL: D4RL, Minari, HDF5 files and arrays into TorchRL replay buffers."""
+
+from torchrl_tit.datasets.checks import TaskSpaces, task_spaces
+from torchrl_tit.datasets.d4rl import download_d4rl
+from torchrl_tit.datasets.episodes import Episodes
+from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.hdf5 import read_hdf5, write_hdf5
+from torchrl_tit.datasets.histories import HistoryStorage
+from torchrl_tit.datasets.minari import read_minari
+from torchrl_tit.datasets.minari_writer import write_minari
+from torchrl_tit.datasets.replay_buffer import make_replay_buffer
+from torchrl_tit.datasets.scores import (
+    REFERENCE_RETURNS,
+    has_reference,
+    normalized_score,
+    normalized_spread,
+)
+from torchrl_tit.datasets.sequences import SequenceStorage
+from torchrl_tit.datasets.sources import load_episodes
+from torchrl_tit.datasets.storage import EpisodeStorage
+from torchrl_tit.datasets.transitions import episodes_from_arrays
+
+__all__ = [
+    "REFERENCE_RETURNS",
+    "DatasetError",
+    "EpisodeStorage",
+    "Episodes",
+    "HistoryStorage",
+    "SequenceStorage",
+    "TaskSpaces",
+    "download_d4rl",
+    "episodes_from_arrays",
+    "has_reference",
+    "load_episodes",
+    "make_replay_buffer",
+    "normalized_score",
+    "normalized_spread",
+    "read_hdf5",
+    "read_minari",
+    "task_spaces",
+    "write_hdf5",
+    "write_minari",
+]

@@ -1,0 +1,203 @@
+"""What data must be before they are trained on."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import Space
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrl_tit.datasets.errors import DatasetError
+
+FLAGS = ("terminals", "timeouts", "terminated", "truncated")
+_REWARDS = ("rewards", "reward")
+
+# Actions of a squashed policy stand at the bounds, and rounding puts some a little beyond.
+_ACTION_TOLERANCE = 1e-5
+
+
+class TaskSpaces(NamedTuple):
+    """What the observations and actions of a task look like.
+
+    Args:
+        observation: Gymnasium's space of one observation.
+        action: Gymnasium's space of one action.
+        name: The task's name, for messages.
+    """
+
+    observation: Space
+    action: Space
+    name: str = "the task"
+
+
+def task_spaces(env_name: str) -> TaskSpaces:
+    """Asks a Gymnasium task for its spaces.
+
+    Args:
+        env_name: A name that Gymnasium has registered, such as "Hopper-v5".
+
+    Returns:
+        Its spaces.
+
+    Raises:
+        ValueError: If the task cannot be made.
+
+    Example:
+        >>> task_spaces("Pendulum-v1").action.shape
+        (1,)
+    """
+    try:
+        env = gymnasium.make(env_name, disable_env_checker=True)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ValueError(f"Task {env_name!r} cannot be made: {error}") from error
+    try:
+        return TaskSpaces(env.observation_space, env.action_space, env_name)
+    finally:
+        env.close()
+
+
+def check_shape(
+    source: str, field: str, shape: tuple[int, ...], space: Space, task: TaskSpaces
+) -> None:
+    """Checks that observations or actions have the size that a task's have.
+
+    Args:
+        source: What the data came from, for messages.
+        field: Name of the field.
+        shape: Shape of one row.
+        space: The space of that field.
+        task: The task, for messages.
+
+    Raises:
+        DatasetError: If they have another.
+
+    Example:
+        >>> task = task_spaces("Pendulum-v1")
+        >>> check_shape("a.hdf5", "actions", (1,), task.action, task)
+    """
+    expected = space.shape or ()
+    # One discrete action may stand in a column of its own.
+    if shape != expected and not (expected == () and shape == (1,)):
+        raise DatasetError(
+            source,
+            f"one row has the shape {list(shape)}, but in {task.name} it is {list(expected)}; "
+            f"these data are of another task.",
+            field,
+        )
+
+
+def check_finite(source: str, field: str, values: NDArray, first_row: int = 0) -> None:
+    """Checks that there is no NaN and no infinity.
+
+    Args:
+        source: What the data came from, for messages.
+        field: Name of the field.
+        values: Some rows of it.
+        first_row: The number of the first of them.
+
+    Raises:
+        DatasetError: If there is one; names the first row that has one.
+
+    Example:
+        >>> check_finite("a.hdf5", "rewards", np.array([0.0, np.nan]), first_row=100)
+        Traceback (most recent call last):
+        ...
+        torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'rewards', row 101: is nan, but...
+    """
+    if not np.issubdtype(values.dtype, np.floating):
+        return
+    wrong = ~np.isfinite(values)
+    if wrong.any():
+        row = int(wrong.reshape(len(values), -1).any(1).argmax())
+        value = values[row][wrong[row]].flat[0] if values.ndim > 1 else values[row]
+        raise DatasetError(
+            source, f"is {value}, but all values must be finite.", field, first_row + row
+        )
+
+
+def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0) -> None:
+    """Checks that actions lie in the action space.
+
+    Args:
+        source: What the data came from, for messages.
+        values: Some rows of the actions.
+        space: A `Box` or `Discrete` action space; others are not looked into.
+        first_row: The number of the first of the rows.
+
+    Raises:
+        DatasetError: If one lies outside; names the first.
+
+    Example:
+        >>> check_actions("a.hdf5", np.array([[1.5]]), Box(-1.0, 1.0, (1,)))
+        Traceback (most recent call last):
+        ...
+        torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'actions', row 0: is 1.5, but...
+    """
+    low: NDArray | float
+    high: NDArray | float
+    if isinstance(space, Box):
+        low, high = space.low - _ACTION_TOLERANCE, space.high + _ACTION_TOLERANCE
+        bounds = f"from {space.low.min()} to {space.high.max()}"
+    elif isinstance(space, Discrete):
+        low, high = float(space.start), float(space.start + space.n - 1)
+        bounds = f"from {low:.0f} to {high:.0f}"
+    else:
+        return
+    wrong = (values < low) | (values > high)
+    if wrong.any():
+        row = int(wrong.reshape(len(values), -1).any(1).argmax())
+        value = np.asarray(values[row])[np.asarray(wrong[row])].flat[0]
+        raise DatasetError(
+            source, f"is {value}, but the task's actions go {bounds}.", "actions", first_row + row
+        )
+
+
+def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | None) -> torch.dtype:
+    """Says what dtype a field is kept in.
+
+    Args:
+        source: What the data came from, for messages.
+        field: Name of the field.
+        dtype: The dtype it has there.
+        floats: What floats are turned into; None keeps theirs.
+
+    Returns:
+        The dtype: bool for flags, floating for rewards, uint8 or int64 for other integers.
+
+    Raises:
+        DatasetError: If it holds no numbers.
+
+    Example:
+        >>> kept_dtype("a.hdf5", "rewards", np.dtype("float64"), torch.float32)
+        torch.float32
+    """
+    if dtype.kind not in "biuf":
+        raise DatasetError(source, f"holds {dtype}, but must hold numbers.", field)
+    if field in FLAGS:
+        return torch.bool
+    if dtype.kind == "f":
+        return floats or plain_tensor(np.empty(0, dtype)).dtype
+    if field in _REWARDS:
+        return floats or torch.float32
+    return torch.uint8 if dtype == np.uint8 else torch.int64
+
+
+def plain_tensor(values: NDArray) -> Tensor:
+    """Turns an array of any layout into a tensor.
+
+    Args:
+        values: The array, in any byte order and memory layout.
+
+    Returns:
+        A tensor of its shape, dtype and values.
+
+    Example:
+        >>> plain_tensor(np.array([1.0, 2.0], dtype=">f8"))
+        tensor([1., 2.], dtype=torch.float64)
+    """
+    return torch.from_numpy(np.ascontiguousarray(values, values.dtype.newbyteorder("=")))

@@ -1,0 +1,131 @@
+"""HDF5 files in D4RL's layout."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from torch import Tensor
+
+from torchrl_tit.datasets.episodes import Episodes, check_final_observations, rows_per_chunk
+from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.transitions import episodes_from_transitions
+from torchrl_tit.files import whole_or_not_at_all
+
+
+def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
+    """Reads a file with one row a transition, in chunks: it may be larger than the memory.
+
+    Args:
+        path: The file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
+            "terminals" [N], and where it has them "timeouts" [N] and "next_observations" [N, *obs].
+            Other fields are not read.
+        **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
+            where the rules for what is missing stand too.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        DatasetError: If it is not a whole HDF5 file, or its data cannot be used.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "a.hdf5"
+        >>> with h5py.File(path, "w") as file:
+        ...     for name, size in {"observations": 3, "actions": 1, "rewards": 1}.items():
+        ...         file[name] = np.zeros((4, size), np.float32)
+        ...     file["terminals"] = np.array([False, True, False, True])
+        >>> read_hdf5(path).lengths
+        tensor([2, 2])
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"There is no data file {path}.")
+    try:
+        file = h5py.File(path, "r")
+    except OSError as error:
+        raise DatasetError(str(path), f"is not a whole HDF5 file ({error}).") from error
+    with file:
+        return episodes_from_transitions(
+            _datasets(file), source=str(path), attributes=_attributes(file), **settings
+        )
+
+
+def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
+    """Writes episodes as one row a transition, in chunks.
+
+    Every field has the dtype it has in memory, and every next observation must be known.
+
+    Args:
+        episodes: The data. Only the last episode may be unfinished.
+        path: The file to write, whole or not at all; there may be none yet.
+
+    Raises:
+        FileExistsError: If there is one already.
+        ValueError: If an episode before the last is unfinished, or the observation in which one was
+            cut off is unknown: the file could not say so.
+        OSError: If the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> path = Path(tempfile.mkdtemp()) / "a.hdf5"
+        >>> ends = np.array([False, True, False, True])
+        >>> episodes = episodes_from_arrays(np.ones((4, 2)), np.ones((4, 1)), np.ones(4), ends)
+        >>> write_hdf5(episodes, path)
+        >>> read_hdf5(path).returns
+        tensor([2., 2.], dtype=torch.float64)
+    """
+    if not episodes.finished[:-1].all():
+        number = int((~episodes.finished).int().argmax())
+        raise ValueError(
+            f"{episodes.source}: episode {number} is neither terminated nor truncated, which the "
+            f"layout of D4RL's files cannot say of any but the last."
+        )
+    check_final_observations(episodes)
+    steps = episodes.step_rows
+    fields = {
+        "observations": (episodes.rows["observation"], steps),
+        "actions": (episodes.rows["action"], steps),
+        "rewards": (episodes.rows["reward"].squeeze(-1), steps),
+        "terminals": (episodes.rows["terminated"].squeeze(-1), steps),
+        "timeouts": (episodes.rows["truncated"].squeeze(-1), steps),
+        "next_observations": (episodes.rows["observation"], steps + 1),
+    }
+    with whole_or_not_at_all(path) as hidden, h5py.File(hidden, "w") as file:
+        file.attrs.update(episodes.attributes)
+        for name, (values, rows) in fields.items():
+            _write(file, name, values, rows)
+
+
+def _write(file: h5py.File, name: str, values: Tensor, rows: Tensor) -> None:
+    """Writes some rows of a field, in chunks."""
+    array = values.numpy()
+    shape = (len(rows), *array.shape[1:])
+    dataset = file.create_dataset(name, shape, array.dtype, chunks=True, compression="gzip")
+    size = rows_per_chunk(array[0].nbytes)
+    for start in range(0, len(rows), size):
+        dataset[start : start + size] = array[rows[start : start + size].numpy()]
+
+
+def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """All arrays of the file, by their full names."""
+    found: dict[str, h5py.Dataset] = {}
+
+    def note(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            found[name] = item
+
+    file.visititems(note)
+    return found
+
+
+def _attributes(file: h5py.File) -> dict[str, Any]:
+    """What the file says about itself, as plain text, numbers and lists of them."""
+    values = {name: np.asarray(value) for name, value in file.attrs.items()}
+    return {name: value.tolist() for name, value in values.items() if value.dtype.kind in "OUSbiuf"}

@@ -1,0 +1,61 @@
+"""Tensors that lie on the disk and are read and written as if they were in memory."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from math import prod
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+
+def memory_mapped_rows(
+    num_rows: int,
+    fields: Mapping[str, tuple[tuple[int, ...], torch.dtype]],
+    directory: str | os.PathLike[str] | None = None,
+) -> TensorDict:
+    """Makes rows of zeros in memory-mapped files, so that they may be larger than the memory.
+
+    The files have no name once they are mapped (where the system allows that), so nothing is left
+    of them when the tensors are gone, however the program ends.
+
+    Args:
+        num_rows: R, the number of rows.
+        fields: The shape of one row of each field, and its dtype.
+        directory: A folder on the disk that the files go to; the system's for temporary files where
+            None, which may be a small one.
+
+    Returns:
+        Tensors [R, *shape] by name.
+
+    Raises:
+        OSError: If the disk has no room for them, or the folder cannot be written.
+
+    Example:
+        >>> memory_mapped_rows(5, {"reward": ((1,), torch.float32)})["reward"].shape
+        torch.Size([5, 1])
+    """
+    with tempfile.TemporaryDirectory(
+        prefix="torchrl-tit-", dir=directory, ignore_cleanup_errors=True
+    ) as folder:
+        tensors = {
+            name: _map(Path(folder, name), (num_rows, *shape), dtype)
+            for name, (shape, dtype) in fields.items()
+        }
+    return TensorDict(tensors, [num_rows])
+
+
+def _map(file: Path, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    size = prod(shape)
+    if hasattr(os, "posix_fallocate"):
+        # Room is taken now: a disk that is full later would kill the program instead of raising.
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT)
+        try:
+            os.posix_fallocate(descriptor, 0, max(1, size * dtype.itemsize))
+        finally:
+            os.close(descriptor)
+    return torch.from_file(str(file), shared=True, size=size, dtype=dtype).view(shape)

@@ -1,0 +1,204 @@
+"""Reads Minari data sets."""
+
+from __future__ import annotations
+
+import os
+from itertools import pairwise
+from pathlib import Path
+
+import minari
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Discrete
+from minari.dataset.minari_dataset import parse_dataset_id
+from minari.storage.datasets_root_dir import get_dataset_path
+from numpy.typing import NDArray
+from tensordict import TensorDict
+
+from torchrl_tit.datasets.checks import (
+    TaskSpaces,
+    check_actions,
+    check_finite,
+    check_shape,
+    kept_dtype,
+    plain_tensor,
+)
+from torchrl_tit.datasets.episodes import Episodes
+from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.memory import memory_mapped_rows
+
+# What a damaged data set, or one that cannot be downloaded, makes Minari raise.
+_FAILURES = (AssertionError, ImportError, KeyError, OSError, TypeError, ValueError)
+ATTRIBUTES = "attributes"  # our entry in Minari's metadata
+
+# Minari's name of each field, and how many rows an episode has beside its steps.
+FIELDS = {
+    "observation": ("observations", 1),
+    "action": ("actions", 0),
+    "reward": ("rewards", 0),
+    "terminated": ("terminations", 0),
+    "truncated": ("truncations", 0),
+}
+
+
+def read_minari(
+    name: str | os.PathLike[str],
+    *,
+    task: TaskSpaces | None = None,
+    dtype: torch.dtype | None = torch.float32,
+    directory: str | os.PathLike[str] | None = None,
+) -> Episodes:
+    """Reads a Minari data set, one episode at a time: it may be larger than the memory.
+
+    Args:
+        name: A folder with a data set, or a data set's name such as "mujoco/hopper/medium-v0",
+            which Minari downloads where it is not in its own folder yet.
+        task: The task whose sizes and action bounds the data must have; not checked where None.
+        dtype: What floats are turned into; each field keeps its own where None. Integers stay.
+        directory: Where the memory-mapped rows go on the disk; see
+            :func:`~torchrl_tit.datasets.memory.memory_mapped_rows`.
+
+    Returns:
+        The episodes. One that ends without a flag is unfinished.
+
+    Raises:
+        FileNotFoundError: If Minari has no such data set, or cannot download it.
+        DatasetError: If it is damaged, or a field is missing, of the wrong length, shape or dtype,
+            or holds NaN, infinity, or actions out of bounds.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_tit.datasets import episodes_from_arrays, write_minari
+        >>> folder = Path(tempfile.mkdtemp()) / "walk-v0"
+        >>> ends = np.array([False, True, False, True])
+        >>> episodes = episodes_from_arrays(np.ones((4, 2)), np.ones((4, 1)), np.ones(4), ends)
+        >>> write_minari(episodes, folder)
+        >>> read_minari(folder).lengths
+        tensor([2, 2])
+    """
+    source = str(name)
+    dataset = _open(name)
+    for kind, space in (
+        ("observation", dataset.observation_space),
+        ("action", dataset.action_space),
+    ):
+        if not isinstance(space, Box | Discrete):
+            raise DatasetError(
+                source, f"its {kind}s are a {type(space).__name__} space, but must be one array."
+            )
+    lengths = _lengths(dataset, source)
+    bounds = [0, *(lengths + 1).cumsum(0).tolist()]
+    rows = TensorDict({}, [0])
+    has_infos = False
+    for number, (start, stop) in enumerate(pairwise(bounds)):
+        place = f"{source}: episode {number}"
+        episode = _episode(dataset, number, place)
+        has_infos |= bool(episode.infos)
+        fields = _checked(place, episode, stop - start - 1, task)
+        if number == 0:
+            kept = {
+                field: (array.shape[1:], kept_dtype(place, field, array.dtype, dtype))
+                for field, array in fields.items()
+            }
+            rows = memory_mapped_rows(bounds[-1], kept, directory)
+        for field, array in fields.items():
+            if array.shape[1:] != (shape := tuple(rows[field].shape[1:])):
+                problem = f"one row has the shape {list(array.shape[1:])}, not {list(shape)}."
+                raise DatasetError(place, problem, FIELDS[field][0])
+            rows[field][start : start + len(array)] = plain_tensor(array)
+    return Episodes(
+        rows=rows,
+        lengths=lengths,
+        final_known=torch.ones(len(lengths), dtype=torch.bool),
+        source=source,
+        attributes=dataset.storage.metadata.get(ATTRIBUTES, {}),
+        left_out=("infos",) if has_infos else (),
+    )
+
+
+def is_minari_name(name: str) -> bool:
+    """Says whether Minari takes a name for a data set's, such as "mujoco/hopper/medium-v0".
+
+    Args:
+        name: The name.
+
+    Returns:
+        Whether it does.
+
+    Example:
+        >>> is_minari_name("mujoco/hopper/medium-v0"), is_minari_name("./data.hdf5")
+        (True, False)
+    """
+    try:
+        parse_dataset_id(name)
+    except (TypeError, ValueError):  # no version in it; not of that form
+        return False
+    return True
+
+
+def _open(name: str | os.PathLike[str]) -> minari.MinariDataset:
+    folder = Path(name)
+    if folder.is_dir():
+        data = folder / "data" if (folder / "data").is_dir() else folder
+    else:
+        data = get_dataset_path(str(name)) / "data"
+        if not data.is_dir():
+            try:
+                minari.download_dataset(str(name))
+            except Exception as error:  # whatever the network and its client raise
+                raise FileNotFoundError(
+                    f"There is no Minari data set {str(name)!r} in {data.parent}, and it cannot be "
+                    f"downloaded: {error}"
+                ) from error
+    try:
+        return minari.MinariDataset(data)
+    except _FAILURES as error:
+        raise DatasetError(
+            str(name), f"is not a whole Minari data set ({error}); see or delete {data}."
+        ) from error
+
+
+def _lengths(dataset: minari.MinariDataset, source: str) -> torch.Tensor:
+    try:
+        metadata = dataset.storage.get_episode_metadata(dataset.episode_indices)
+        lengths = torch.tensor([int(episode["total_steps"]) for episode in metadata])
+    except _FAILURES as error:
+        raise DatasetError(source, f"its episodes cannot be listed ({error}).") from error
+    if not len(lengths):
+        raise DatasetError(source, "has no episodes.")
+    if lengths.min() < 1:
+        raise DatasetError(source, f"episode {int(lengths.argmin())} has no steps.")
+    return lengths
+
+
+def _episode(dataset: minari.MinariDataset, number: int, place: str) -> minari.EpisodeData:
+    try:
+        return dataset[number]
+    except _FAILURES as error:
+        raise DatasetError(place, f"cannot be read ({error}).") from error
+
+
+def _checked(
+    place: str, episode: minari.EpisodeData, length: int, task: TaskSpaces | None
+) -> dict[str, NDArray]:
+    """An episode's fields under the names of our rows, with a row beside each observation."""
+    fields = {}
+    for field, (name, more) in FIELDS.items():
+        array = np.asarray(getattr(episode, name))
+        if array.shape[:1] != (length + more,):
+            raise DatasetError(
+                place, f"has the shape {list(array.shape)}, but needs {length + more} rows.", name
+            )
+        check_finite(place, name, array)
+        # One number a row is one column, but for actions, which are then discrete.
+        fields[field] = array[:, None] if array.ndim == 1 and field != "action" else array
+    if task is not None:
+        check_shape(place, "observations", fields["observation"].shape[1:], task.observation, task)
+        check_shape(place, "actions", fields["action"].shape[1:], task.action, task)
+        check_actions(place, fields["action"], task.action)
+    inside = ((fields["terminated"] != 0) | (fields["truncated"] != 0))[:-1].any(1)
+    if inside.any():
+        raise DatasetError(
+            place, "ends the episode, but it goes on.", "terminations", int(inside.argmax())
+        )
+    return fields

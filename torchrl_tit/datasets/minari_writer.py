@@ -1,0 +1,119 @@
+"""Writes Minari data sets."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import gymnasium
+import minari
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Discrete
+from minari.data_collector import EpisodeBuffer
+from minari.dataset.minari_storage import MinariStorage
+from minari.storage.datasets_root_dir import get_dataset_path
+
+from torchrl_tit.datasets.episodes import Episodes, check_final_observations
+from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, is_minari_name
+from torchrl_tit.files import whole_or_not_at_all
+
+
+def write_minari(
+    episodes: Episodes, name: str | os.PathLike[str], env_name: str | None = None
+) -> None:
+    """Writes episodes as a Minari data set, one at a time.
+
+    Every field has the dtype it has in memory. It is written from Minari's episode buffers, since
+    Minari's collector needs packages that a conversion does not.
+
+    Args:
+        episodes: The data.
+        name: The folder to make, an absolute path or one that begins with a dot, whose last part
+            ends in a version such as "-v0"; or else a data set's name for Minari's own folder.
+        env_name: The Gymnasium task that the data are from, for Minari to recover.
+
+    Raises:
+        FileExistsError: If there is such a data set already.
+        ValueError: If the name is none that Minari takes, or Gymnasium does not know the task.
+        DatasetError: If an episode was cut off in an observation that is unknown.
+        OSError: If it cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> folder = Path(tempfile.mkdtemp()) / "walk-v0"
+        >>> episodes = episodes_from_arrays(np.ones((2, 2)), np.ones((2, 1)), np.ones(2), [0, 1])
+        >>> write_minari(episodes, folder)
+        >>> minari.MinariDataset(folder / "data")[0].observations.shape
+        (3, 2)
+    """
+    check_final_observations(episodes)
+    folder, dataset_id = _target(name)
+    env_spec = None
+    if env_name is not None:
+        try:
+            env_spec = gymnasium.spec(env_name)
+        except gymnasium.error.Error as error:
+            raise ValueError(f"Task {env_name!r} is unknown: {error}") from error
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with whole_or_not_at_all(folder) as hidden:
+        hidden.mkdir()
+        storage = MinariStorage.new(
+            hidden / "data",
+            observation_space=_box(episodes.rows["observation"]),
+            action_space=_action_space(episodes),
+            env_spec=env_spec,
+            jpeg_encoding=False,  # images as they are
+        )
+        storage.update_metadata(
+            {
+                "dataset_id": dataset_id,
+                "minari_version": minari.__version__,
+                ATTRIBUTES: dict(episodes.attributes),
+            }
+        )
+        storage.update_episodes(_buffers(episodes))
+
+
+def _target(name: str | os.PathLike[str]) -> tuple[Path, str]:
+    """The folder that a data set is written to, and its name."""
+    path = Path(name)
+    if path.is_absolute() or str(name).startswith("."):
+        folder, dataset_id = path, path.name
+    else:
+        folder, dataset_id = get_dataset_path(str(name)), str(name)
+    if not is_minari_name(dataset_id):
+        raise ValueError(
+            f"{dataset_id!r} is no name for a Minari data set: it must end in a version, as "
+            f"'medium-v0' does."
+        )
+    return folder, dataset_id
+
+
+def _action_space(episodes: Episodes) -> gymnasium.Space:
+    actions = episodes.rows["action"]
+    if actions.ndim == 1:
+        return Discrete(int(actions.max()) + 1)
+    return _box(actions)
+
+
+def _box(values: torch.Tensor) -> Box:
+    """The space of arrays without known bounds."""
+    array = values[:1].numpy()
+    floating = np.issubdtype(array.dtype, np.floating)
+    low = -np.inf if floating else np.iinfo(array.dtype).min
+    high = np.inf if floating else np.iinfo(array.dtype).max
+    return Box(low, high, array.shape[1:], array.dtype.type)
+
+
+def _buffers(episodes: Episodes) -> Iterator[EpisodeBuffer]:
+    for first, last in zip(episodes.first_rows.tolist(), episodes.last_rows.tolist(), strict=True):
+        steps = {
+            name: episodes.rows[field][first : last + 1 + more].numpy()
+            for field, (name, more) in FIELDS.items()
+        }
+        for name in ("rewards", "terminations", "truncations"):
+            steps[name] = steps[name].squeeze(-1)
+        yield EpisodeBuffer(**steps)

@@ -1,0 +1,60 @@
+"""TorchRL replay buffers over data sets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
+from torchrl.data.replay_buffers.samplers import RandomSampler
+
+from torchrl_tit.datasets.storage import EpisodeStorage
+
+
+def make_replay_buffer(
+    storage: EpisodeStorage, batch_size: int, *, seed: int = 0, **settings: Any
+) -> ReplayBuffer:
+    """Makes a replay buffer that draws items uniformly, with replacement.
+
+    It draws from a random generator of its own, which is part of its ``state_dict()``: a buffer
+    that loads it goes on with the same batches. The data are not part of it.
+
+    Args:
+        storage: What is drawn from: transitions with histories
+            (:class:`~torchrl_tit.datasets.HistoryStorage`) or subsequences
+            (:class:`~torchrl_tit.datasets.SequenceStorage`).
+        batch_size: Items in a batch.
+        seed: Seed of the generator.
+        **settings: Passed to `torchrl.data.ReplayBuffer`: ``transform``, ``prefetch``, another
+            ``sampler``.
+
+    Returns:
+        The buffer; ``buffer.sample()`` gives a tensordict [batch_size].
+
+    Raises:
+        ValueError: If ``batch_size`` is less than 1.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays
+        >>> ends = np.array([False, True, False, True])
+        >>> episodes = episodes_from_arrays(np.ones((4, 2)), np.ones((4, 1)), np.ones(4), ends)
+        >>> buffer = make_replay_buffer(HistoryStorage(episodes, num_frames=3), batch_size=8)
+        >>> buffer.sample()["next", "history"].shape
+        torch.Size([8, 3, 2])
+    """
+    if batch_size < 1:
+        raise ValueError(f"batch_size must be at least 1, but is {batch_size}.")
+    return ReplayBuffer(
+        storage=storage,
+        writer=ImmutableDatasetWriter(),
+        collate_fn=_as_it_is,
+        batch_size=batch_size,
+        generator=torch.Generator(storage.device).manual_seed(seed),
+        **{"sampler": RandomSampler(), **settings},
+    )
+
+
+def _as_it_is(batch: TensorDict) -> TensorDict:
+    return batch

@@ -1,0 +1,104 @@
+"""Subsequences of episodes, as Decision Transformer is trained on."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from torchrl_tit.datasets.episodes import Episodes
+from torchrl_tit.datasets.storage import EpisodeStorage
+
+
+class SequenceStorage(EpisodeStorage):
+    """Up to K steps from any step of a finished episode on, padded on the left.
+
+    An item has "observation" [K, *obs], "action" [K, *action], "return_to_go" [K, 1], "timestep"
+    int64 [K] and "mask" bool [K], which is False at padding. Drawing indices uniformly draws an
+    episode with a probability proportional to its length, and then a uniform start inside it.
+
+    Args:
+        episodes: The data.
+        context: K, the number of steps, at least 1.
+        mean: Subtracted from observations; [*obs], as of
+            :meth:`~torchrl_tit.datasets.Episodes.observation_statistics`.
+        std: Observations are divided by it; [*obs].
+        return_scale: Returns-to-go are divided by it.
+        action_padding: What stands for the actions of padding; all else is 0 there.
+
+    Raises:
+        ValueError: If ``context`` is less than 1, ``return_scale`` is not positive, or one of
+            ``mean`` and ``std`` is missing.
+        DatasetError: If no episode is finished.
+
+    Source: "Decision Transformer" (arXiv 2106.01345), section 3 and its authors' code.
+
+    Example:
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> ends = np.array([False, True, False, True])
+        >>> episodes = episodes_from_arrays(np.ones((4, 2)), np.ones((4, 1)), np.arange(4), ends)
+        >>> item = SequenceStorage(episodes, context=3, return_scale=1.0)[2]
+        >>> item["mask"], item["return_to_go"].flatten()
+        (tensor([False,  True,  True]), tensor([0., 5., 3.]))
+    """
+
+    def __init__(
+        self,
+        episodes: Episodes,
+        context: int = 20,
+        *,
+        mean: Tensor | None = None,
+        std: Tensor | None = None,
+        return_scale: float = 1000.0,
+        action_padding: float = -10.0,
+    ) -> None:
+        if context < 1:
+            raise ValueError(f"context must be at least 1, but is {context}.")
+        if not return_scale > 0:
+            raise ValueError(f"return_scale must be positive, but is {return_scale}.")
+        if (mean is None) != (std is None):
+            raise ValueError("mean and std go together: give both, or neither.")
+        super().__init__(episodes, episodes.lengths * episodes.finished)
+        self._last_rows = episodes.last_rows
+        self._returns_to_go = _returns_to_go(episodes).div_(return_scale).float()  # [R]
+        self._mean = None if mean is None else mean.to(self.device)
+        self._std = None if std is None else std.to(self.device)
+        self._action_padding = action_padding
+        self._steps = torch.arange(context, device=self.device)
+
+    def _cut(self, row: Tensor, episode: Tensor) -> TensorDict:
+        row, last = row.unsqueeze(-1), self._last_rows[episode].unsqueeze(-1)
+        length = (last - row + 1).clamp(max=len(self._steps))  # [..., 1]
+        step = self._steps - (len(self._steps) - length)  # [..., K]: below 0 at padding
+        mask = step >= 0
+        rows = row + step.clamp(min=0)
+        observation = self._take("observation", rows)  # [..., K, *obs]
+        if self._mean is not None and self._std is not None:
+            observation = (observation - self._mean) / self._std
+        return_to_go = self._returns_to_go[rows]
+        timestep = rows - self._first_rows[episode].unsqueeze(-1)
+        return TensorDict(
+            {
+                "observation": _fill(observation, mask, 0),
+                "action": _fill(self._take("action", rows), mask, self._action_padding),
+                "return_to_go": _fill(return_to_go, mask, 0).unsqueeze(-1),
+                "timestep": _fill(timestep, mask, 0),
+                "mask": mask,
+            },
+            mask.shape[:-1],
+        )
+
+
+def _fill(values: Tensor, mask: Tensor, padding: float) -> Tensor:
+    return values.masked_fill(~mask.view(*mask.shape, *[1] * (values.ndim - mask.ndim)), padding)
+
+
+def _returns_to_go(episodes: Episodes) -> Tensor:
+    """Sum of the rewards from each row to its episode's end; float64 [R]."""
+    rewards = episodes.rows["reward"].squeeze(-1).cpu().double().numpy()
+    total = np.cumsum(rewards[::-1])[::-1]
+    # Beside an episode's final observation stands no reward: the sum there is that of later ones.
+    later = torch.from_numpy(total.copy()).to(episodes.lengths.device)
+    after = later[episodes.last_rows + 1]
+    return later - after.repeat_interleave(episodes.lengths + 1)

@@ -1,0 +1,77 @@
+"""One way in for data of every kind."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
+
+from torchrl_tit.datasets.checks import TaskSpaces, task_spaces
+from torchrl_tit.datasets.d4rl import download_d4rl
+from torchrl_tit.datasets.episodes import Episodes
+from torchrl_tit.datasets.hdf5 import read_hdf5
+from torchrl_tit.datasets.minari import is_minari_name, read_minari
+
+HDF5_SUFFIXES = (".hdf5", ".h5")
+
+
+def load_episodes(
+    source: str | os.PathLike[str],
+    *,
+    task: str | TaskSpaces | None = None,
+    max_episode_steps: int | None = None,
+    dtype: torch.dtype | None = torch.float32,
+    directory: str | os.PathLike[str] | None = None,
+    cache_dir: str | os.PathLike[str] | None = None,
+) -> Episodes:
+    """Reads a data set from wherever it is, in chunks, into memory-mapped rows.
+
+    Args:
+        source: An HDF5 file in D4RL's layout (".hdf5" or ".h5"); a folder with a Minari data set;
+            D4RL's name of a data set, such as "hopper-medium-replay-v0"; or Minari's, such as
+            "mujoco/hopper/medium-v0". What has a name is downloaded once.
+        task: The task whose sizes and action bounds the data must have: a name that Gymnasium has
+            registered, such as "Hopper-v5", or its spaces. Not checked where None.
+        max_episode_steps: The time limit of an HDF5 file that does not say where it struck: see
+            :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
+        dtype: What floats are turned into; each field keeps its own where None. Integers stay.
+        directory: A folder on a disk with room for the rows, which leave nothing there; the
+            system's for temporary files where None.
+        cache_dir: Where D4RL's files are kept: see :func:`~torchrl_tit.datasets.download_d4rl`.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        ValueError: If the source is none of these, or the task is unknown.
+        FileNotFoundError: If there is no such file or data set.
+        OSError: If it cannot be downloaded, or the disk has no room.
+        DatasetError: If its data cannot be used; says which file, field and row.
+
+    Example:
+        >>> load_episodes("hopper")
+        Traceback (most recent call last):
+        ...
+        ValueError: 'hopper' is no data set: give an HDF5 file, a Minari folder, D4RL's name (as ...
+    """
+    spaces = task_spaces(task) if isinstance(task, str) else task
+    name = os.fspath(source)
+    path = Path(source)
+    if name in D4RL_DATASETS and not path.exists():
+        path = download_d4rl(name, cache_dir)
+    if path.is_file() or path.suffix in HDF5_SUFFIXES:
+        return read_hdf5(
+            path,
+            task=spaces,
+            max_episode_steps=max_episode_steps,
+            dtype=dtype,
+            directory=directory,
+        )
+    if path.is_dir() or is_minari_name(name):
+        return read_minari(source, task=spaces, dtype=dtype, directory=directory)
+    raise ValueError(
+        f"{name!r} is no data set: give an HDF5 file, a Minari folder, D4RL's name (as "
+        f"'hopper-medium-replay-v0') or Minari's (as 'mujoco/hopper/medium-v0')."
+    )

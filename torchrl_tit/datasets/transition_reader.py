@@ -1,0 +1,150 @@
+"""Reads D4RL's fields in chunks, and says clearly what is wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchrl_tit.datasets.checks import (
+    FLAGS,
+    TaskSpaces,
+    check_actions,
+    check_finite,
+    check_shape,
+    kept_dtype,
+    plain_tensor,
+)
+from torchrl_tit.datasets.episodes import rows_per_chunk
+from torchrl_tit.datasets.errors import DatasetError
+
+FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
+_REQUIRED = FIELDS[:4]
+
+
+class TransitionReader:
+    """The fields of one source, whose names, lengths and shapes are checked at once.
+
+    Args:
+        fields: Arrays by D4RL's names: NumPy arrays or HDF5 data sets, whose slices are read.
+        source: What the data came from, for messages.
+        task: The task whose sizes and action bounds they must have; not checked where None.
+        dtype: What floats are turned into; each field keeps its own where None.
+
+    Raises:
+        DatasetError: If a field is missing, empty, or of the wrong length, shape or dtype.
+
+    Example:
+        >>> arrays = {name: np.zeros((3, 1)) for name in FIELDS}
+        >>> [(start, len(chunk)) for start, chunk in TransitionReader(arrays).chunks("rewards")]
+        [(0, 3)]
+    """
+
+    def __init__(
+        self,
+        fields: Mapping[str, Any],
+        source: str = "the data",
+        task: TaskSpaces | None = None,
+        dtype: torch.dtype | None = torch.float32,
+    ) -> None:
+        self.fields, self.source, self.task, self.dtype = fields, source, task, dtype
+        for name in _REQUIRED:
+            if name not in fields:
+                found = ", ".join(sorted(fields)) or "nothing"
+                raise DatasetError(source, f"is missing; there is {found}.", name)
+        self.shapes = {name: self._shape(name) for name in FIELDS if name in fields}
+        self.num_rows = len(fields["observations"])
+        if self.num_rows == 0:
+            raise DatasetError(source, "has no rows.", "observations")
+        self._check_sizes()
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """Shape of one row."""
+        shape = getattr(self.fields[name], "shape", None)
+        if not shape:
+            raise DatasetError(self.source, "is not an array with a row a transition.", name)
+        row = tuple(shape[1:])
+        return () if row == (1,) and name in (*FLAGS, "rewards") else row
+
+    def _check_sizes(self) -> None:
+        for name, shape in self.shapes.items():
+            if (length := len(self.fields[name])) != self.num_rows:
+                raise DatasetError(
+                    self.source, f"has {length} rows, but 'observations' has {self.num_rows}.", name
+                )
+            if name in (*FLAGS, "rewards") and shape != ():
+                raise DatasetError(
+                    self.source, f"one row has the shape {list(shape)}, but is one number.", name
+                )
+            self.torch_dtype(name)
+        if self.shapes["observations"] == ():
+            raise DatasetError(
+                self.source, "one row is one number; give it [N, 1].", "observations"
+            )
+        if (
+            self.shapes.get("next_observations", self.shapes["observations"])
+            != (self.shapes["observations"])
+        ):
+            raise DatasetError(
+                self.source,
+                f"one row has the shape {list(self.shapes['next_observations'])}, but one of "
+                f"'observations' has {list(self.shapes['observations'])}.",
+                "next_observations",
+            )
+        if self.task is not None:
+            spaces = {"observations": self.task.observation, "actions": self.task.action}
+            for name, space in spaces.items():
+                check_shape(self.source, name, self.shapes[name], space, self.task)
+
+    def torch_dtype(self, name: str) -> torch.dtype:
+        """What a field is kept as."""
+        return kept_dtype(self.source, name, np.dtype(self.fields[name].dtype), self.dtype)
+
+    def row_fields(self) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+        """Shapes and dtypes of the rows to make."""
+        return {
+            "observation": (self.shapes["observations"], self.torch_dtype("observations")),
+            "action": (self.shapes["actions"], self.torch_dtype("actions")),
+            "reward": ((1,), self.torch_dtype("rewards")),
+            "terminated": ((1,), torch.bool),
+            "truncated": ((1,), torch.bool),
+        }
+
+    def flags(self, name: str) -> NDArray:
+        """All of a field of flags; bool [N]."""
+        values = self._slice(name, 0, self.num_rows).reshape(self.num_rows)
+        wrong = (values != 0) & (values != 1)
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise DatasetError(self.source, f"is {values[row]}, but must be 0 or 1.", name, row)
+        return values.astype(bool)
+
+    def chunks(self, name: str) -> Iterator[tuple[int, Tensor]]:
+        """A field in pieces, each with the number of its first row."""
+        dtype = self.fields[name].dtype
+        size = rows_per_chunk(dtype.itemsize * int(np.prod(self.shapes[name])))
+        for start in range(0, self.num_rows, size):
+            yield start, self.read(name, start, start + size)
+
+    def read(self, name: str, start: int, stop: int) -> Tensor:
+        """Checked rows as they are kept; [n, *row]."""
+        values = self._slice(name, start, stop)
+        check_finite(self.source, name, values, start)
+        if name == "actions" and self.task is not None:
+            check_actions(self.source, values, self.task.action, start)
+        shape = (1,) if name == "rewards" else self.shapes[name]
+        tensor = plain_tensor(values)
+        kept_as = "observations" if name == "next_observations" else name
+        return tensor.reshape(len(values), *shape).to(self.torch_dtype(kept_as))
+
+    def _slice(self, name: str, start: int, stop: int) -> NDArray:
+        try:
+            return np.asarray(self.fields[name][start:stop])
+        except OSError as error:  # a file that is damaged further in
+            raise DatasetError(
+                self.source, f"rows from here on cannot be read ({error}).", name, start
+            ) from error

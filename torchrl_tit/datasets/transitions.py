@@ -1,0 +1,189 @@
+"""Episodes from transitions that stand in arrays, one row each, as D4RL keeps them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from torchrl_tit.datasets.checks import TaskSpaces
+from torchrl_tit.datasets.episodes import Episodes
+from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.memory import memory_mapped_rows
+from torchrl_tit.datasets.transition_reader import FIELDS, TransitionReader
+
+
+def episodes_from_arrays(
+    observations: ArrayLike,
+    actions: ArrayLike,
+    rewards: ArrayLike,
+    terminals: ArrayLike,
+    timeouts: ArrayLike | None = None,
+    next_observations: ArrayLike | None = None,
+    **settings: Any,
+) -> Episodes:
+    """Makes episodes from transitions in arrays, one row each, in the order they happened.
+
+    Args:
+        observations: [N, *obs]; floats, or integers such as the uint8 of images, one frame each.
+        actions: [N, A] floats, or [N] integers.
+        rewards: [N].
+        terminals: Whether the transition led into a terminal state; bool [N].
+        timeouts: Whether the episode was cut off after it; bool [N].
+        next_observations: [N, *obs].
+        **settings: As for :func:`episodes_from_transitions`, where the rules for what is missing
+            stand too.
+
+    Returns:
+        The episodes.
+
+    Raises:
+        DatasetError: If the data cannot be used.
+
+    Example:
+        >>> frames = np.zeros((6, 84, 84), dtype=np.uint8)
+        >>> ends = np.array([False, False, True] * 2)
+        >>> episodes_from_arrays(frames, np.zeros(6, int), np.ones(6), ends).lengths
+        tensor([3, 3])
+    """
+    given = (observations, actions, rewards, terminals, timeouts, next_observations)
+    fields = {
+        name: np.asarray(array)
+        for name, array in zip(FIELDS, given, strict=True)
+        if array is not None
+    }
+    return episodes_from_transitions(fields, **settings)
+
+
+def episodes_from_transitions(
+    fields: Mapping[str, Any],
+    *,
+    source: str = "the data",
+    task: TaskSpaces | None = None,
+    max_episode_steps: int | None = None,
+    dtype: torch.dtype | None = torch.float32,
+    directory: str | os.PathLike[str] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+) -> Episodes:
+    """Makes episodes from transitions in D4RL's layout, read in chunks.
+
+    An episode ends at a row that ``terminals`` or ``timeouts`` marks. Without ``timeouts``, it also
+    ends where ``next_observations`` is not the observation of the row after, and after
+    ``max_episode_steps`` steps. Without ``next_observations``, the observation in which an episode
+    ended is unknown: zeros stand for it at a terminal, where nothing is learned from it, and the
+    last transition before a time limit is there for returns and sequences, but never drawn as a
+    transition.
+
+    Args:
+        fields: Arrays by D4RL's names, whose slices are read once: NumPy arrays or HDF5 data sets.
+            See :func:`episodes_from_arrays` for what they hold.
+        source: What the data came from, for messages.
+        task: The task whose sizes and action bounds the data must have; not checked where None.
+        max_episode_steps: The time limit of data that do not say where it struck.
+        dtype: What floats are turned into; each field keeps its own where None. Integers stay.
+        directory: Where the memory-mapped rows go on the disk; see
+            :func:`~torchrl_tit.datasets.memory.memory_mapped_rows`.
+        attributes: What the source says about itself.
+
+    Returns:
+        The episodes. The last one may be unfinished, where the data break off.
+
+    Raises:
+        DatasetError: If a field is missing, empty, of another length, shape or dtype than it must
+            be, holds NaN, infinity, or actions out of bounds, if no episode ends, or an episode
+            goes on with another observation than ``next_observations`` says.
+
+    Example:
+        >>> fields = {"observations": np.zeros((2, 3)), "rewards": np.zeros(2)}
+        >>> episodes_from_transitions(fields, source="a.hdf5")
+        Traceback (most recent call last):
+        ...
+        torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'actions': is missing; there...
+    """
+    reader = TransitionReader(fields, source, task, dtype)
+    terminated = reader.flags("terminals")
+    truncated, ends = _ends(reader, terminated, max_episode_steps)
+    last_steps = np.flatnonzero(ends)
+    if last_steps.size == 0:
+        hint = "" if "timeouts" in fields else "; give max_episode_steps if there is a time limit"
+        raise DatasetError(source, f"no episode ends in its {reader.num_rows} rows{hint}.")
+    if last_steps[-1] != reader.num_rows - 1:
+        last_steps = np.append(last_steps, reader.num_rows - 1)
+
+    rows = memory_mapped_rows(reader.num_rows + len(last_steps), reader.row_fields(), directory)
+    # An episode's final observation is one more row, so what comes after it moves by one.
+    row_of = np.arange(reader.num_rows)
+    row_of[1:] += ends[:-1].cumsum()
+    for name in ("observations", "actions", "rewards"):
+        for start, values in reader.chunks(name):
+            target = torch.from_numpy(row_of[start : start + len(values)])
+            rows[_ROW_NAMES[name]][target] = values
+    flags = {"terminated": terminated, "truncated": truncated}
+    for name, flag in flags.items():
+        rows[name][torch.from_numpy(row_of)] = torch.from_numpy(flag).unsqueeze(-1)
+    has_next = "next_observations" in fields
+    if has_next:
+        _place_next_observations(reader, rows["observation"], row_of, ends)
+    return Episodes(
+        rows=rows,
+        lengths=torch.from_numpy(np.diff(last_steps, prepend=-1)),
+        final_known=torch.full((len(last_steps),), has_next),
+        source=source,
+        attributes=attributes or {},
+        left_out=tuple(sorted(set(fields) - set(FIELDS))),
+    )
+
+
+_ROW_NAMES = {"observations": "observation", "actions": "action", "rewards": "reward"}
+
+
+def _ends(
+    reader: TransitionReader, terminated: NDArray, max_episode_steps: int | None
+) -> tuple[NDArray, NDArray]:
+    """Where episodes were cut off, and where they end at all; bool [N] each."""
+    if "timeouts" in reader.fields:
+        truncated = reader.flags("timeouts")
+        return truncated, terminated | truncated
+    truncated = np.zeros_like(terminated)
+    if "next_observations" in reader.fields:
+        for start, following in reader.chunks("next_observations"):
+            # The last row has no row after it to compare with.
+            after = reader.read("observations", start + 1, start + 1 + len(following))
+            differs = (following[: len(after)] != after).flatten(1).any(1).numpy()
+            truncated[start : start + len(after)] = differs
+        truncated &= ~terminated
+    ends = terminated | truncated
+    if max_episode_steps is not None:
+        bounds = [-1, *np.flatnonzero(ends), len(ends) - 1]
+        for before, last in pairwise(bounds):
+            truncated[before + max_episode_steps : last + 1 : max_episode_steps] = True
+        truncated &= ~terminated
+    return truncated, terminated | truncated
+
+
+def _place_next_observations(
+    reader: TransitionReader, observations: Tensor, row_of: NDArray, ends: NDArray
+) -> None:
+    """Writes the observation that each episode ended in, and checks the others; row_of [N]."""
+    for start, following in reader.chunks("next_observations"):
+        part = slice(start, start + len(following))
+        target = torch.from_numpy(row_of[part] + 1)
+        # Where an episode ends, and after the very last row, there is nothing to compare with.
+        is_final = torch.from_numpy(ends[part].copy())
+        is_final[reader.num_rows - 1 - start :] = True
+        observations[target[is_final]] = following[is_final]
+        differs = (observations[target] != following).flatten(1).any(1)
+        if differs.any():
+            raise DatasetError(
+                reader.source,
+                "is not the observation of the row after, but the episode goes on there; mark its "
+                "end in 'timeouts', or leave 'timeouts' out to end it where they differ.",
+                "next_observations",
+                start + int(differs.int().argmax()),
+            )
