@@ -38,6 +38,10 @@ from .networks import make_network
 from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
 
+# How torch.compile is called: which kernels run must not depend on the sizes seen before, or a
+# resumed run would differ in the last bit.
+_STATIC_SHAPES = {"dynamic": False}
+
 
 @dataclass(frozen=True, kw_only=True)
 class PPO(Recipe):
@@ -97,8 +101,9 @@ class PPO(Recipe):
     checkpoint_interval: int = 10_240
     """Environment steps between checkpoints."""
     compile: Compile = "auto"
-    """Whether the update runs through torch.compile, which needs a C++ compiler and about a minute
-    at the start: "auto" is on where it works and the run is long enough to earn that back."""
+    """Whether acting and the update run through torch.compile, which needs a C++ compiler and about
+    a minute at the start: "auto" is on where it works and the run is long enough to earn that
+    back."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -257,6 +262,7 @@ def train(recipe: PPO, run: Run) -> None:
         critic_coeff=recipe.critic_coeff,
         loss_critic_type="l2",
         normalize_advantage=True,
+        log_explained_variance=False,
         functional=False,
     )
     compiled = should_compile(recipe.compile, recipe.gradient_steps)
@@ -273,6 +279,7 @@ def train(recipe: PPO, run: Run) -> None:
         total_frames=recipe.final_step,
         device=recipe.torch_device(),
         trust_policy=True,  # ours is on the right device already
+        compile_policy=_STATIC_SHAPES if compiled else None,
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )
@@ -361,9 +368,7 @@ def make_objective(
         total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
         return total, torch.stack([terms[name].detach() for name in TERMS])
 
-    # Static shapes: which kernels run must not depend on the sizes seen before, or a resumed run
-    # would differ in the last bit.
-    return torch.compile(objective, dynamic=False) if compiled else objective
+    return torch.compile(objective, **_STATIC_SHAPES) if compiled else objective
 
 
 def add_advantages(
