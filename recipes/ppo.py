@@ -40,7 +40,7 @@ from .run import Run
 
 # How torch.compile is called: which kernels run must not depend on the sizes seen before, or a
 # resumed run would differ in the last bit.
-_STATIC_SHAPES = {"dynamic": False}
+_STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
 
 
 @dataclass(frozen=True, kw_only=True)
