@@ -5,11 +5,15 @@ from __future__ import annotations
 import os
 import shutil
 from functools import cache
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
 Compile = Literal["auto", "on", "off"]
+
+STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
+"""How torch.compile is called: which kernels run must not depend on the sizes seen before, or a
+resumed run would differ in the last bit."""
 
 # About a minute of compiling is earned back by gradient steps that each save a few milliseconds.
 _PAYS_FROM = 10_000

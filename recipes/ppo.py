@@ -4,43 +4,38 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import Tensor, nn
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
-from torchrl_tit.checkpoint import (
-    can_save_env,
-    collector_state,
-    global_rng_state,
-    set_collector_state,
-    set_global_rng_state,
-)
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.modules import Backbone, make_actor, make_value
-from torchrl_tit.networks import TwoTrunkNetwork, init_orthogonal_
 
-from .compilation import Compile, should_compile
+from .compilation import STATIC_SHAPES, Compile, should_compile
 from .interrupt import Interrupt
-from .networks import make_network
+from .ppo_agent import Agent
+from .ppo_state import TrainingState
+from .ppo_update import (
+    LOSSES,
+    add_advantages,
+    check_agent,
+    check_finite,
+    make_objective,
+    minibatches,
+)
 from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
 
-# How torch.compile is called: which kernels run must not depend on the sizes seen before, or a
-# resumed run would differ in the last bit.
-_STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
+COLUMNS = ["return_mean", "episodes", "learning_rate", *LOSSES]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,33 +205,6 @@ class PPO(Recipe):
         }
 
 
-class Agent(nn.Module):
-    """Backbone, actor and critic; the heads read the features that the backbone writes.
-
-    Args:
-        recipe: the settings.
-        env: an environment with a history, for its shapes and its action space.
-    """
-
-    def __init__(self, recipe: PPO, env: EnvBase) -> None:
-        super().__init__()
-        shape = env.observation_spec["history"].shape[env.batch_dims + 1 :]
-        network = make_network(recipe.backbone, shape, recipe.history)
-        if recipe.initialization == "orthogonal":
-            init_orthogonal_(network)
-        separate = isinstance(network, TwoTrunkNetwork)  # trunks for policy and value
-        out_keys = ["policy_features", "value_features"] if separate else ["features"]
-        self.backbone = Backbone(network, out_keys=out_keys)
-        self.actor = make_actor(network.features_dim, env.action_spec_unbatched, in_key=out_keys[0])
-        self.critic = make_value(network.features_dim, in_key=out_keys[-1])
-        self.to(recipe.torch_device())
-
-    @property
-    def policy(self) -> TensorDictModuleBase:
-        """History in; features, action, its log-probability and the state's value out."""
-        return TensorDictSequential(self.backbone, self.actor, self.critic)
-
-
 def train(recipe: PPO, run: Run) -> None:
     """Trains an agent, from the newest checkpoint of the run where there is one.
 
@@ -279,7 +247,7 @@ def train(recipe: PPO, run: Run) -> None:
         total_frames=recipe.final_step,
         device=recipe.torch_device(),
         trust_policy=True,  # ours is on the right device already
-        compile_policy=_STATIC_SHAPES if compiled else None,
+        compile_policy=STATIC_SHAPES if compiled else None,
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )
@@ -341,159 +309,3 @@ def train(recipe: PPO, run: Run) -> None:
             if interrupt.requested:
                 raise KeyboardInterrupt
     collector.shutdown()
-
-
-TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
-LOSSES = [*TERMS, "gradient_norm"]
-COLUMNS = ["return_mean", "episodes", "learning_rate", *LOSSES]
-
-
-def make_objective(
-    agent: Agent, loss: ClipPPOLoss, compiled: bool
-) -> Callable[[TensorDict], tuple[Tensor, Tensor]]:
-    """Builds the function of a minibatch that is minimised.
-
-    Args:
-        agent: the agent whose backbone writes the features.
-        loss: TorchRL's loss on the heads, which read them.
-        compiled: whether it runs through ``torch.compile``.
-
-    Returns:
-        A function of a minibatch [N]: the total, float [], and its ``TERMS``, float [terms].
-    """
-
-    def objective(minibatch: TensorDict) -> tuple[Tensor, Tensor]:
-        agent.backbone(minibatch)  # once; the heads read its features
-        terms = loss(minibatch)
-        total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
-        return total, torch.stack([terms[name].detach() for name in TERMS])
-
-    return torch.compile(objective, **_STATIC_SHAPES) if compiled else objective
-
-
-def add_advantages(
-    batch: TensorDictBase, agent: Agent, gae: GAE, bootstrap_time_limit: bool
-) -> None:
-    """Writes ``advantage`` and ``value_target`` = advantage + value into a batch.
-
-    The value of the next state is the one that the collector computed a step later, except where
-    the episode or the batch ends: there the critic is asked about the true next observation.
-
-    Args:
-        batch: [envs, time], with the values of its states.
-        agent: the agent whose critic is asked.
-        gae: TorchRL's estimator, which stops at terminations and goes on at time limits.
-        bootstrap_time_limit: if off, a time limit counts as a termination.
-    """
-    value = batch["state_value"]  # [envs, time, 1]
-    ends = batch["next", "done"].squeeze(-1).clone()
-    ends[:, -1] = True
-    next_value = value.roll(-1, dims=1)
-    last = batch["next"][ends].select("history")
-    next_value[ends] = agent.critic(agent.backbone(last))["state_value"]
-    batch["next", "state_value"] = next_value
-    if not bootstrap_time_limit:
-        batch["next", "terminated"] = batch["next", "done"]
-    gae(batch)
-
-
-def minibatches(batch: TensorDictBase, recipe: PPO) -> Iterator[TensorDict]:
-    """Yields shuffled minibatches of a batch, ``recipe.epochs`` times over."""
-    keys = ["history", "action", "action_log_prob", "advantage", "value_target"]
-    steps = batch.select(*keys).reshape(-1)
-    for _ in range(recipe.epochs):
-        for index in torch.randperm(len(steps), device=steps.device).split(recipe.minibatch_size):
-            yield steps[index]
-
-
-def check_finite(terms: Sequence[str], values: Tensor, step: int, saved_step: int) -> None:
-    """Stops a run where a loss, say, is not finite.
-
-    Args:
-        terms: names of the values.
-        values: float [terms].
-        step: environment steps so far.
-        saved_step: step of the last checkpoint.
-
-    Raises:
-        FloatingPointError: naming the term, the step and the last good checkpoint.
-    """
-    finite = values.isfinite()
-    if not finite.all():
-        index = int(finite.logical_not().nonzero()[0])
-        saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
-        raise FloatingPointError(
-            f"{terms[index]} became {values[index].item()} in the update at step {step}; {saved}"
-        )
-
-
-def check_agent(agent: Agent, minibatch: TensorDictBase, step: int, saved_step: int) -> None:
-    """Stops a run whose weights, or the values they give to a minibatch, are not finite.
-
-    A step that was too long shows in the next forward pass only, not in its own losses.
-
-    Raises:
-        FloatingPointError: as :func:`check_finite`.
-    """
-    with torch.no_grad():
-        value = agent.critic(agent.backbone(minibatch))["state_value"].mean()
-        weights = nn.utils.get_total_norm(agent.parameters())
-    check_finite(["weights", "value"], torch.stack([weights, value]), step, saved_step)
-
-
-class TrainingState:
-    """All that a run needs to go on as if it had never stopped.
-
-    Args:
-        agent: the networks.
-        optimizer: the optimizer of the agent.
-        collector: the collector, with its environment.
-        seed: the recipe's seed.
-    """
-
-    def __init__(
-        self, agent: Agent, optimizer: torch.optim.Optimizer, collector: Collector, seed: int
-    ) -> None:
-        self.agent = agent
-        self.optimizer = optimizer
-        self.collector = collector
-        self.seed = seed
-
-    def save(self, run: Run, step: int) -> None:
-        """Saves a checkpoint."""
-        self._reset_unsavable_env(step)
-        run.save(
-            step,
-            {
-                "agent": self.agent.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "collector": collector_state(self.collector),
-                "rng": global_rng_state(),
-            },
-        )
-
-    def load(self, run: Run) -> int:
-        """Loads the newest checkpoint and returns its step, 0 where there is none."""
-        loaded = run.load()
-        if loaded is None:
-            return 0
-        step, state = loaded
-        # Its settings are the recipe's, also where those were changed since.
-        settings = self.optimizer.state_dict()["param_groups"]
-        with run.restoring(step):
-            self.agent.load_state_dict(state["agent"])
-            self.optimizer.load_state_dict({**state["optimizer"], "param_groups": settings})
-            set_collector_state(self.collector, state["collector"])
-        self._reset_unsavable_env(step)
-        set_global_rng_state(state["rng"])
-        return step
-
-    def _reset_unsavable_env(self, step: int) -> None:
-        """Starts new episodes where an environment cannot be saved.
-
-        That happens at each checkpoint, whether or not the run is stopped there, and with a seed
-        that follows from the run's and the step: so both go on alike.
-        """
-        if not can_save_env(self.collector.env):
-            seed = np.random.SeedSequence([self.seed, step]).generate_state(1).item()
-            self.collector.reset(seed=seed)

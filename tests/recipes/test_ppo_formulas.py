@@ -16,7 +16,9 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from recipes.compilation import should_compile
-from recipes.ppo import PPO, Agent, add_advantages, make_objective, minibatches
+from recipes.ppo import PPO
+from recipes.ppo_agent import Agent
+from recipes.ppo_update import add_advantages, make_objective, minibatches
 from recipes.registry import get_recipe
 from recipes.run import Run
 

@@ -8,7 +8,8 @@ import torch
 from tensordict import TensorDict
 
 from recipes import ppo
-from recipes.ppo import PPO, Agent
+from recipes.ppo import PPO
+from recipes.ppo_agent import Agent
 from recipes.run import Run
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.networks import EnhancedTITConfig

@@ -1,0 +1,76 @@
+"""What a PPO run needs to go on as if it had never stopped."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torchrl.collectors import Collector
+
+from torchrl_tit.checkpoint import (
+    can_save_env,
+    collector_state,
+    global_rng_state,
+    set_collector_state,
+    set_global_rng_state,
+)
+
+from .ppo_agent import Agent
+from .run import Run
+
+
+class TrainingState:
+    """All that a run needs to go on as if it had never stopped.
+
+    Args:
+        agent: the networks.
+        optimizer: the optimizer of the agent.
+        collector: the collector, with its environment.
+        seed: the recipe's seed.
+    """
+
+    def __init__(
+        self, agent: Agent, optimizer: torch.optim.Optimizer, collector: Collector, seed: int
+    ) -> None:
+        self.agent = agent
+        self.optimizer = optimizer
+        self.collector = collector
+        self.seed = seed
+
+    def save(self, run: Run, step: int) -> None:
+        """Saves a checkpoint."""
+        self._reset_unsavable_env(step)
+        run.save(
+            step,
+            {
+                "agent": self.agent.state_dict(),
+                "optimizer": self.optimizer.state_dict(),
+                "collector": collector_state(self.collector),
+                "rng": global_rng_state(),
+            },
+        )
+
+    def load(self, run: Run) -> int:
+        """Loads the newest checkpoint and returns its step, 0 where there is none."""
+        loaded = run.load()
+        if loaded is None:
+            return 0
+        step, state = loaded
+        # Its settings are the recipe's, also where those were changed since.
+        settings = self.optimizer.state_dict()["param_groups"]
+        with run.restoring(step):
+            self.agent.load_state_dict(state["agent"])
+            self.optimizer.load_state_dict({**state["optimizer"], "param_groups": settings})
+            set_collector_state(self.collector, state["collector"])
+        self._reset_unsavable_env(step)
+        set_global_rng_state(state["rng"])
+        return step
+
+    def _reset_unsavable_env(self, step: int) -> None:
+        """Starts new episodes where an environment cannot be saved.
+
+        That happens at each checkpoint, whether or not the run is stopped there, and with a seed
+        that follows from the run's and the step: so both go on alike.
+        """
+        if not can_save_env(self.collector.env):
+            seed = np.random.SeedSequence([self.seed, step]).generate_state(1).item()
+            self.collector.reset(seed=seed)

@@ -1,0 +1,115 @@
+"""The parts of PPO's update: advantages, minibatches, the objective, and what may stop it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from .compilation import STATIC_SHAPES
+from .ppo_agent import Agent
+
+if TYPE_CHECKING:
+    from .ppo import PPO
+
+TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
+"""What TorchRL's loss gives, of which a row of metrics has the means."""
+LOSSES = [*TERMS, "gradient_norm"]
+
+
+def make_objective(
+    agent: Agent, loss: ClipPPOLoss, compiled: bool
+) -> Callable[[TensorDict], tuple[Tensor, Tensor]]:
+    """Builds the function of a minibatch that is minimised.
+
+    Args:
+        agent: the agent whose backbone writes the features.
+        loss: TorchRL's loss on the heads, which read them.
+        compiled: whether it runs through ``torch.compile``.
+
+    Returns:
+        A function of a minibatch [N]: the total, float [], and its ``TERMS``, float [terms].
+    """
+
+    def objective(minibatch: TensorDict) -> tuple[Tensor, Tensor]:
+        agent.backbone(minibatch)  # once; the heads read its features
+        terms = loss(minibatch)
+        total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+        return total, torch.stack([terms[name].detach() for name in TERMS])
+
+    return torch.compile(objective, **STATIC_SHAPES) if compiled else objective
+
+
+def add_advantages(
+    batch: TensorDictBase, agent: Agent, gae: GAE, bootstrap_time_limit: bool
+) -> None:
+    """Writes ``advantage`` and ``value_target`` = advantage + value into a batch.
+
+    The value of the next state is the one that the collector computed a step later, except where
+    the episode or the batch ends: there the critic is asked about the true next observation.
+
+    Args:
+        batch: [envs, time], with the values of its states.
+        agent: the agent whose critic is asked.
+        gae: TorchRL's estimator, which stops at terminations and goes on at time limits.
+        bootstrap_time_limit: if off, a time limit counts as a termination.
+    """
+    value = batch["state_value"]  # [envs, time, 1]
+    ends = batch["next", "done"].squeeze(-1).clone()
+    ends[:, -1] = True
+    next_value = value.roll(-1, dims=1)
+    last = batch["next"][ends].select("history")
+    next_value[ends] = agent.critic(agent.backbone(last))["state_value"]
+    batch["next", "state_value"] = next_value
+    if not bootstrap_time_limit:
+        batch["next", "terminated"] = batch["next", "done"]
+    gae(batch)
+
+
+def minibatches(batch: TensorDictBase, recipe: PPO) -> Iterator[TensorDict]:
+    """Yields shuffled minibatches of a batch, ``recipe.epochs`` times over."""
+    keys = ["history", "action", "action_log_prob", "advantage", "value_target"]
+    steps = batch.select(*keys).reshape(-1)
+    for _ in range(recipe.epochs):
+        for index in torch.randperm(len(steps), device=steps.device).split(recipe.minibatch_size):
+            yield steps[index]
+
+
+def check_finite(terms: Sequence[str], values: Tensor, step: int, saved_step: int) -> None:
+    """Stops a run where a loss, say, is not finite.
+
+    Args:
+        terms: names of the values.
+        values: float [terms].
+        step: environment steps so far.
+        saved_step: step of the last checkpoint.
+
+    Raises:
+        FloatingPointError: naming the term, the step and the last good checkpoint.
+    """
+    finite = values.isfinite()
+    if not finite.all():
+        index = int(finite.logical_not().nonzero()[0])
+        saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
+        raise FloatingPointError(
+            f"{terms[index]} became {values[index].item()} in the update at step {step}; {saved}"
+        )
+
+
+def check_agent(agent: Agent, minibatch: TensorDictBase, step: int, saved_step: int) -> None:
+    """Stops a run whose weights, or the values they give to a minibatch, are not finite.
+
+    A step that was too long shows in the next forward pass only, not in its own losses.
+
+    Raises:
+        FloatingPointError: as :func:`check_finite`.
+    """
+    with torch.no_grad():
+        value = agent.critic(agent.backbone(minibatch))["state_value"].mean()
+        weights = nn.utils.get_total_norm(agent.parameters())
+    check_finite(["weights", "value"], torch.stack([weights, value]), step, saved_step)
