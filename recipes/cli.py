@@ -1,4 +1,4 @@
-"""The command line: list, show, train, evaluate, sweep, compare."""
+"""The command line: list, show, train, evaluate, sweep, compare, data."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ usage: {program} COMMAND ...
   evaluate RUN                evaluate a run's newest checkpoint
   sweep NAME [NAME ...]       train many recipes and seeds side by side; names can be patterns
   compare RUN [RUN ...]       learning curves of several runs, seeds of a recipe as one band
+  data info SOURCE            what is in a data set: an HDF5 file, D4RL's or Minari's name
+  data convert SOURCE TARGET  between HDF5 in D4RL's layout and Minari
 
 Everywhere: --seed, --out, --device, --threads where they apply; COMMAND --help tells.
 """
@@ -50,6 +52,7 @@ def main(arguments: list[str] | None = None) -> None:
         "evaluate": _evaluate,
         "sweep": _sweep,
         "compare": _compare,
+        "data": _data,
     }
     if not words or words[0] not in commands:
         asked = not words or words[0] in ("-h", "--help")
@@ -228,6 +231,14 @@ def _compare(words: list[str]) -> None:
         curves.setdefault(run.recipe.name or str(folder), []).append(folder / "metrics.csv")
     plot_comparison(curves, options.out, title=options.title)
     print(f"written to {options.out}")
+
+
+def _data(words: list[str]) -> None:
+    from .data import add_data_commands, run_data_command  # takes a second that others save
+
+    parser = _Parser(f"{_program()} data")
+    add_data_commands(parser)
+    print(run_data_command(parser.parse_args(words)))
 
 
 def _add_machine_options(parser: argparse.ArgumentParser) -> None:

@@ -77,3 +77,36 @@ def test_a_limit_of_the_operating_system(tmp_path: Path) -> None:
 def test_missing_folder(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         files.write_text_atomic(tmp_path / "nowhere" / "x", "x")
+
+
+@pytest.mark.parametrize("step", ["fsync", "replace"])
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_what_fails_half_way_is_not_there_at_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, kind: str
+) -> None:
+    def fail(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def make() -> None:
+        with files.whole_or_not_at_all(tmp_path / "made") as hidden:
+            if kind == "folder":
+                hidden.mkdir()
+            (hidden / "inside" if kind == "folder" else hidden).write_text("half")
+
+    monkeypatch.setattr(os, step, fail)
+    with pytest.raises(KeyboardInterrupt):
+        make()
+    assert os.listdir(tmp_path) == []
+
+
+def test_what_is_there_already_stays(tmp_path: Path) -> None:
+    target = tmp_path / "made"
+    with files.whole_or_not_at_all(target) as hidden:
+        hidden.write_text("first")
+    with (
+        pytest.raises(FileExistsError, match="exists already"),
+        files.whole_or_not_at_all(target) as hidden,
+    ):
+        hidden.write_text("second")
+    assert target.read_text() == "first"
+    assert os.listdir(tmp_path) == ["made"]

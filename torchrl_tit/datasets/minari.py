@@ -137,7 +137,7 @@ def is_minari_name(name: str) -> bool:
 
 
 def _open(name: str | os.PathLike[str]) -> minari.MinariDataset:
-    folder = Path(name)
+    folder = Path(name).absolute()  # Minari loses itself in relative paths
     if folder.is_dir():
         data = folder / "data" if (folder / "data").is_dir() else folder
     else:

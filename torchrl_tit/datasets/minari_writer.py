@@ -15,6 +15,7 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
+from torchrl_tit.datasets.checks import task_spaces
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
 from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, is_minari_name
 from torchrl_tit.files import whole_or_not_at_all
@@ -51,20 +52,15 @@ def write_minari(
     """
     check_final_observations(episodes)
     folder, dataset_id = _target(name)
-    env_spec = None
-    if env_name is not None:
-        try:
-            env_spec = gymnasium.spec(env_name)
-        except gymnasium.error.Error as error:
-            raise ValueError(f"Task {env_name!r} is unknown: {error}") from error
+    action_space = _action_space(episodes) if env_name is None else task_spaces(env_name).action
     folder.parent.mkdir(parents=True, exist_ok=True)
     with whole_or_not_at_all(folder) as hidden:
         hidden.mkdir()
         storage = MinariStorage.new(
             hidden / "data",
             observation_space=_box(episodes.rows["observation"]),
-            action_space=_action_space(episodes),
-            env_spec=env_spec,
+            action_space=action_space,
+            env_spec=None if env_name is None else gymnasium.spec(env_name),
             jpeg_encoding=False,  # images as they are
         )
         storage.update_metadata(
@@ -81,7 +77,7 @@ def _target(name: str | os.PathLike[str]) -> tuple[Path, str]:
     """The folder that a data set is written to, and its name."""
     path = Path(name)
     if path.is_absolute() or str(name).startswith("."):
-        folder, dataset_id = path, path.name
+        folder, dataset_id = path.absolute(), path.name  # Minari loses itself in relative ones
     else:
         folder, dataset_id = get_dataset_path(str(name)), str(name)
     if not is_minari_name(dataset_id):

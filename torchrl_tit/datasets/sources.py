@@ -71,6 +71,8 @@ def load_episodes(
         )
     if path.is_dir() or is_minari_name(name):
         return read_minari(source, task=spaces, dtype=dtype, directory=directory)
+    if path.is_absolute() or name.startswith("."):
+        raise FileNotFoundError(f"There is no data set {name}.")
     raise ValueError(
         f"{name!r} is no data set: give an HDF5 file, a Minari folder, D4RL's name (as "
         f"'hopper-medium-replay-v0') or Minari's (as 'mujoco/hopper/medium-v0')."

@@ -37,7 +37,7 @@ class EpisodeStorage(Storage):
                 f"the transitions of all are left out.",
             )
         self.device = episodes.lengths.device
-        self._rows = episodes.rows
+        self._fields = dict(episodes.rows.items())  # [R, ...]
         self._first_rows = episodes.first_rows
         self._ends = counts.cumsum(0)  # [E]: the index after each episode's last item
         self._shifts = episodes.first_rows - (self._ends - counts)  # [E]: from index to row
@@ -64,18 +64,19 @@ class EpisodeStorage(Storage):
 
     def _take(self, name: str, rows: Tensor) -> Tensor:
         """Rows of a field; index_select is several times as fast as indexing."""
-        field = self._rows[name]
+        field = self._fields[name]
         return field.index_select(0, rows.flatten()).view(*rows.shape, *field.shape[1:])
 
     def _as_tensor(self, index: Any) -> Tensor:
         if isinstance(index, slice):
             return torch.arange(*index.indices(len(self)), device=self.device)
         index = torch.as_tensor(index, device=self.device)
-        if index.device.type == "cpu" and index.numel():
-            low, high = index.aminmax()
-            if low < -len(self) or high >= len(self):
-                raise IndexError(f"there are {len(self)} items, and none at {low} or {high}")
-        return torch.where(index < 0, index + len(self), index)
+        if index.device.type != "cpu":  # where looking at the values would wait for the device
+            return torch.where(index < 0, index + len(self), index)
+        low, high = (int(index.min()), int(index.max())) if index.numel() else (0, 0)
+        if low < -len(self) or high >= len(self):
+            raise IndexError(f"There are {len(self)} items, and none at {low} or {high}.")
+        return torch.where(index < 0, index + len(self), index) if low < 0 else index
 
     def __len__(self) -> int:
         return self.max_size

@@ -1,0 +1,53 @@
+"""Transitions of Gymnasium tasks in D4RL's layout, and files made of them."""
+
+from pathlib import Path
+
+import gymnasium
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+Transitions = dict[str, NDArray]
+
+
+def roll(steps: int = 300, max_episode_steps: int = 15, seed: int = 0) -> Transitions:
+    """Random actions in Hopper-v5: some episodes fall (terminal), some meet the time limit.
+
+    Ends with an episode's end.
+    """
+    env = gymnasium.make("Hopper-v5", max_episode_steps=max_episode_steps)
+    env.action_space.seed(seed)
+    rows: dict[str, list] = {name: [] for name in NAMES}
+    observation, _ = env.reset(seed=seed)
+    ended = False
+    while len(rows["rewards"]) < steps or not ended:
+        action = env.action_space.sample()
+        following, reward, terminal, timeout, _ = env.step(action)
+        values = (observation, action, reward, terminal, timeout, following)
+        for name, value in zip(NAMES, values, strict=True):
+            rows[name].append(value)
+        ended = terminal or timeout
+        observation = env.reset()[0] if ended else following
+    env.close()
+    arrays = {name: np.array(values) for name, values in rows.items()}
+    assert arrays["terminals"].any()
+    assert arrays["timeouts"].any()
+    return {n: a if a.dtype == bool else a.astype(np.float32) for n, a in arrays.items()}
+
+
+NAMES = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
+
+
+def write(path: Path, arrays: Transitions, **attributes: str) -> Path:
+    """An HDF5 file with these arrays."""
+    with h5py.File(path, "w") as file:
+        file.attrs.update(attributes)
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array)
+    return path
+
+
+def spans(arrays: Transitions) -> list[tuple[int, int]]:
+    """First row, and row after the last, of each finished episode."""
+    stops = np.flatnonzero(arrays["terminals"] | arrays["timeouts"]) + 1
+    return list(zip([0, *stops[:-1].tolist()], stops.tolist(), strict=True))

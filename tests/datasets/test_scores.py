@@ -1,0 +1,34 @@
+"""Normalised scores against the reference values."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_tit.datasets import has_reference, normalized_score, normalized_spread
+
+
+@pytest.mark.parametrize(
+    ("name", "random", "expert"),
+    [
+        ("halfcheetah-medium-replay-v0", -280.178953, 12135.0),
+        ("HalfCheetah-v5", -280.178953, 12135.0),
+        ("hopper-medium-v2", -20.272305, 3234.3),
+        ("mujoco/hopper/medium-v0", -20.272305, 3234.3),
+        ("walker2d-medium-v0", 1.629008, 4592.3),
+        ("Walker2d-v5", 1.629008, 4592.3),
+    ],
+)
+def test_scores(name: str, random: float, expert: float) -> None:
+    returns = torch.tensor([random, expert, (random + expert) / 2], dtype=torch.float64)
+    expected = torch.tensor([0.0, 100.0, 50.0], dtype=torch.float64)
+    torch.testing.assert_close(normalized_score(returns, name), expected)
+    np.testing.assert_allclose(normalized_score(returns.numpy(), name), expected, atol=1e-12)
+    # The standard deviation of scores is the score of a standard deviation, without the offset.
+    spread = normalized_spread(returns.std(), name)
+    torch.testing.assert_close(spread, normalized_score(returns, name).std())
+
+
+def test_unknown_names() -> None:
+    assert not has_reference("CartPole-v1")
+    with pytest.raises(ValueError, match="no reference returns for 'hopp-v0'; a name must begin"):
+        normalized_score(1.0, "hopp-v0")

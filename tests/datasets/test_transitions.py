@@ -1,0 +1,93 @@
+"""The rules for data that lack a field."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.datasets.rollouts import Transitions, spans
+from torchrl_tit.datasets import DatasetError, HistoryStorage, episodes_from_arrays, write_hdf5
+
+
+def test_without_timeouts_an_episode_ends_where_the_next_observation_is_another(
+    arrays: Transitions,
+) -> None:
+    timeouts = arrays.pop("timeouts")
+
+    episodes = episodes_from_arrays(**arrays)
+
+    steps = episodes.step_rows
+    # After the last row there is nothing to tell a time limit from the data's end.
+    expected = timeouts & (np.arange(len(timeouts)) < len(timeouts) - 1)
+    np.testing.assert_array_equal(episodes.rows["truncated"][steps, 0].numpy(), expected)
+    np.testing.assert_array_equal(
+        episodes.rows["observation"][steps + 1].numpy(), arrays["next_observations"]
+    )
+
+
+def test_without_timeouts_and_next_observations_the_time_limit_must_be_given(
+    arrays: Transitions,
+) -> None:
+    timeouts = arrays.pop("timeouts")
+    del arrays["next_observations"]
+
+    episodes = episodes_from_arrays(**arrays, max_episode_steps=15)
+
+    truncated = episodes.rows["truncated"][episodes.step_rows, 0].numpy()
+    np.testing.assert_array_equal(truncated, timeouts & ~arrays["terminals"])
+
+
+def test_no_end_hints_at_the_time_limit(arrays: Transitions) -> None:
+    del arrays["timeouts"], arrays["next_observations"]
+    arrays["terminals"][:] = False
+    with pytest.raises(DatasetError, match=r"no episode ends.*give max_episode_steps"):
+        episodes_from_arrays(**arrays)
+
+
+def test_without_next_observations_those_of_time_limits_are_never_drawn(
+    arrays: Transitions,
+) -> None:
+    following = arrays.pop("next_observations")
+
+    episodes = episodes_from_arrays(**arrays)
+    sample = HistoryStorage(episodes)[:]
+
+    drawn = ~arrays["timeouts"] | arrays["terminals"]
+    expected = np.where(arrays["terminals"][:, None], 0, following)[drawn]
+    np.testing.assert_array_equal(sample["observation"].numpy(), arrays["observations"][drawn])
+    np.testing.assert_array_equal(sample["next", "observation"].numpy(), expected)
+    # Their rewards count all the same.
+    returns = [arrays["rewards"][a:b].sum(dtype=np.float64) for a, b in spans(arrays)]
+    np.testing.assert_allclose(episodes.returns.numpy(), returns)
+    with pytest.raises(DatasetError, match=r"episode \d+ was cut off in an observation"):
+        write_hdf5(episodes, "never-written.hdf5")
+
+
+def test_a_trailing_step_without_a_next_observation_is_never_drawn(arrays: Transitions) -> None:
+    del arrays["next_observations"]
+    start, stop = spans(arrays)[-1]
+    cut = {name: array[: stop - 1] for name, array in arrays.items()}
+    whole = {name: array[:start] for name, array in arrays.items()}
+
+    kept = HistoryStorage(episodes_from_arrays(**cut), unfinished="keep")
+
+    assert len(kept) == len(HistoryStorage(episodes_from_arrays(**whole))) + stop - 1 - start - 1
+
+
+def test_images_and_discrete_actions_stay_integers() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (6, 8, 8), dtype=np.uint8)
+    ends = np.array([False, False, True] * 2)
+
+    sample = HistoryStorage(
+        episodes_from_arrays(frames, np.arange(6, dtype=np.int32), np.ones(6, int), ends), 2
+    )[:]
+
+    assert sample["history"].dtype == torch.uint8
+    assert sample["history"].shape == (6, 2, 8, 8)
+    assert sample["action"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert sample["next", "reward"].dtype == torch.float32
+
+
+def test_other_byte_orders_are_read(arrays: Transitions) -> None:
+    expected = episodes_from_arrays(**arrays).rows
+    swapped = {n: a.astype(a.dtype.newbyteorder(">")) for n, a in arrays.items()}
+    assert (episodes_from_arrays(**swapped).rows == expected).all()

@@ -1,0 +1,83 @@
+"""`data info` and `data convert`, as they are typed."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from recipes.cli import main
+from tests.datasets.rollouts import Transitions, roll, spans, write
+from torchrl_tit.datasets import normalized_score
+
+
+@pytest.fixture(scope="module")
+def rolled() -> Transitions:
+    return roll()
+
+
+def test_info(tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]) -> None:
+    unfinished = {name: array[:-1] for name, array in rolled.items()}
+    path = write(tmp_path / "hopper-random.hdf5", unfinished, policy="random")
+
+    main(["data", "info", str(path), "--env", "Hopper-v5"])
+
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    finished = spans(rolled)[:-1]
+    terminated = sum(bool(rolled["terminals"][stop - 1]) for _, stop in finished)
+    returns = np.array([rolled["rewards"][a:b].sum(dtype=np.float64) for a, b in finished])
+    scores = normalized_score(returns, "hopper")
+    assert lines["source"] == str(path)
+    assert lines["transitions"] == str(len(rolled["rewards"]) - 1)
+    assert lines["episodes"] == (
+        f"{len(finished) + 1} ({terminated} terminated, "
+        f"{len(finished) - terminated} truncated, 1 unfinished)"
+    )
+    for name, values in (("return", returns), ("score", scores)):
+        low, mean, high = values.min(), values.mean(), values.max()
+        assert lines[name] == f"min {low:.3f}, mean {mean:.3f}, max {high:.3f}"
+    assert lines["observation"] == "[11] float32"
+    assert lines["policy"] == "random"
+
+
+def test_convert_there_and_back(
+    tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / "a.hdf5", {**rolled, "infos/qpos": rolled["rewards"]})
+
+    main(["data", "convert", str(path), str(tmp_path / "hopper-v0"), "--env", "Hopper-v5"])
+    assert "not converted: infos/qpos" in capsys.readouterr().out
+    main(["data", "convert", str(tmp_path / "hopper-v0"), str(tmp_path / "new" / "b.hdf5")])
+
+    with h5py.File(tmp_path / "new" / "b.hdf5") as file:
+        assert set(file) == set(rolled)
+        for name, array in rolled.items():
+            np.testing.assert_array_equal(file[name][:], array)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["info", "{file}", "--env", "Walker2d-v5"], "field 'observations': one row has the shape"),
+        (["info", "hopper"], "'hopper' is no data set"),
+        (["convert", "{file}", "{file}"], "exists already"),
+        (["convert", "{file}", "unnumbered"], "'unnumbered' is no name for a Minari data set"),
+        (["info"], "the following arguments are required: source"),
+        (["inspect"], "invalid choice: 'inspect'"),
+    ],
+)
+def test_errors_are_one_line(
+    tmp_path: Path,
+    rolled: Transitions,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    message: str,
+) -> None:
+    path = write(tmp_path / "a.hdf5", rolled)
+    with pytest.raises(SystemExit) as stop:
+        main(["data", *(word.format(file=path) for word in words)])
+    errors = capsys.readouterr().err
+    assert stop.value.code == 2
+    assert errors.startswith("error: ")
+    assert message in errors
+    assert errors.count("\n") == 1
