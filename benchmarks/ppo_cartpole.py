@@ -12,11 +12,12 @@ import statistics
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from stable_baselines3 import PPO
@@ -25,11 +26,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 from torchrl.collectors import Collector
-from torchrl.objectives import ClipPPOLoss
 
 from recipes import ppo
 from recipes.compilation import Compile
-from recipes.metrics import read_metrics
+from recipes.metrics import Metrics, read_metrics
 from recipes.registry import get_recipe
 from recipes.run import Run
 from torchrl_tit.envs import GymVectorEnv
@@ -38,7 +38,29 @@ from torchrl_tit.modules import Backbone
 from .report import publish, spread, table
 from .straightforward import StraightforwardTIT
 
-BATCHES, STEPS, ENVS, REPEATS = 4, 2048, 8, 5
+BATCHES, STEPS, ENVS, REPEATS = 5, 2048, 8, 5
+
+
+@dataclass
+class Outcome:
+    """What a run shows."""
+
+    laps: list[tuple[float, float]]
+    """At the end of each batch: seconds on the wall, and of this process."""
+    first_batch: float
+    """Seconds on the wall."""
+    training_return: float
+    """Mean return of the episodes that ended in the last batch."""
+    parameters: int
+
+    def speed(self, clock: int = 0) -> float:
+        """Environment steps a second on the wall (0) or of this process (1)."""
+        seconds = self.laps[-1][clock] - self.laps[0][clock]
+        return (len(self.laps) - 1) * STEPS / seconds
+
+
+def lap() -> tuple[float, float]:
+    return time.perf_counter(), time.process_time()
 
 
 class Extractor(BaseFeaturesExtractor):
@@ -52,26 +74,32 @@ class Extractor(BaseFeaturesExtractor):
         return self.network(observation.unsqueeze(1))
 
 
-class Clock(BaseCallback):
-    """Notes when each rollout begins."""
+class Batches(BaseCallback):
+    """Notes when each batch ends, its update included, and the returns of the last one."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.times: list[float] = []
+        self.laps: list[tuple[float, float]] = []
+        self.returns: list[float] = []
 
     def _on_rollout_start(self) -> None:
-        self.times.append(time.perf_counter())
+        if self.num_timesteps:
+            self.laps.append(lap())
+        self.returns.clear()
 
     def _on_step(self) -> bool:
+        self.returns += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
         return True
 
+    def _on_training_end(self) -> None:
+        self.laps.append(lap())
 
-def run_sb3(seed: int) -> tuple[float, int]:
-    """Steps a second, and the number of parameters."""
-    env = make_vec_env("CartPole-v1", ENVS, seed=seed)
+
+def run_sb3(seed: int) -> Outcome:
+    """Stable-Baselines3 with the straightforward network."""
     agent = PPO(
         "MlpPolicy",
-        env,
+        make_vec_env("CartPole-v1", ENVS, seed=seed),
         n_steps=STEPS // ENVS,
         batch_size=64,
         n_epochs=10,
@@ -79,129 +107,179 @@ def run_sb3(seed: int) -> tuple[float, int]:
         device="cpu",
         policy_kwargs={"features_extractor_class": Extractor, "net_arch": []},
     )
-    clock = Clock()
-    agent.learn(BATCHES * STEPS, callback=clock)
-    clock.times.append(time.perf_counter())
+    batches = Batches()
+    start, _ = lap()
+    agent.learn(BATCHES * STEPS, callback=batches)
     parameters = sum(parameter.numel() for parameter in agent.policy.parameters())
-    return (BATCHES - 1) * STEPS / (clock.times[-1] - clock.times[1]), parameters
+    first = batches.laps[0][0] - start
+    return Outcome(batches.laps, first, statistics.mean(batches.returns), parameters)
 
 
-def run_ours(seed: int, compile: Compile = "off") -> tuple[float, int, float]:
-    """Steps a second, the number of parameters, and how long the first batch took, in seconds."""
+def run_ours(seed: int, compile: Compile, timers: Timers | None = None) -> Outcome:
+    """The recipe as the command line runs it, with its checkpoints and metrics."""
     named = get_recipe("ppo/cartpole/enhanced-tit")
     assert isinstance(named, ppo.PPO)
-    recipe = replace(named, num_envs=ENVS, total_steps=BATCHES * STEPS, seed=seed, compile=compile)
-    with tempfile.TemporaryDirectory() as folder, Run.create(Path(folder, "run"), recipe) as run:
-        start = time.time()
+    recipe = replace(
+        named,
+        num_envs=ENVS,
+        steps_per_batch=STEPS,
+        total_steps=BATCHES * STEPS,
+        seed=seed,
+        compile=compile,
+    )
+    laps: list[tuple[float, float]] = []
+    log = Metrics.log
+
+    def log_lap(metrics: Metrics, step: int, **values: float) -> None:
+        log(metrics, step, **values)
+        laps.append(lap())
+        if timers is not None and len(laps) == 1:
+            timers.seconds.clear()
+
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Run.create(Path(folder, "run"), recipe) as run,
+        patch.object(Metrics, "log", log_lap),
+    ):
+        start, _ = lap()
         recipe.train(run)
-        times = [row["time"] for row in read_metrics(run.folder / "metrics.csv")]
+        last = read_metrics(run.folder / "metrics.csv")[-1]
     agent = ppo.Agent(recipe, recipe.make_env(1, seed))
     parameters = sum(parameter.numel() for parameter in agent.parameters())
-    return (BATCHES - 1) * STEPS / (times[-1] - times[0]), parameters, times[0] - start
+    return Outcome(laps, laps[0][0] - start, last["return_mean"], parameters)
 
 
-@contextmanager
-def timed(*parts: tuple[str, Any, str]) -> Iterator[dict[str, float]]:
-    """Adds up the seconds that pass in functions: (name of the part, owner, function)."""
-    seconds: dict[str, float] = defaultdict(float)
-    originals = [(owner, function, getattr(owner, function)) for _, owner, function in parts]
+class Timers:
+    """Adds up the seconds that pass in functions."""
 
-    def wrap(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
-        def timing(*args: Any, **kwargs: Any) -> Any:
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+
+    def around(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
             start = time.perf_counter()
             try:
-                return original(*args, **kwargs)
+                return function(*args, **kwargs)
             finally:
-                key = name
-                if name == "backbone":  # acting has its own row
-                    key = "update: backbone" if torch.is_grad_enabled() else "collect: backbone"
-                seconds[key] += time.perf_counter() - start
+                # The backbone serves both; only the update has gradients.
+                key = part.format("update" if torch.is_grad_enabled() else "collect")
+                self.seconds[key] += time.perf_counter() - start
 
-        return timing
-
-    for (name, owner, function), (_, _, original) in zip(parts, originals, strict=True):
-        setattr(owner, function, wrap(name, original))
-    try:
-        yield seconds
-    finally:
-        for owner, function, original in originals:
-            setattr(owner, function, original)
+        return timed
 
 
-def profile() -> dict[str, float]:
-    """Seconds of each part of our run."""
-    with timed(
-        ("collect: all", Collector, "rollout"),
-        ("collect: environments", GymVectorEnv, "step_and_maybe_reset"),
-        ("backbone", Backbone, "forward"),
-        ("advantages", ppo, "add_advantages"),
-        ("update: heads and loss", ClipPPOLoss, "forward"),
-        ("update: backward", torch.Tensor, "backward"),
-        ("update: gradient norm", nn.utils, "clip_grad_norm_"),
-        ("update: optimizer", torch.optim.Adam, "step"),
-    ) as seconds:
-        start = time.perf_counter()
-        run_ours(0)
-        seconds["all"] = time.perf_counter() - start
-    return dict(seconds)
+def profile(compile: Compile) -> dict[str, float]:
+    """Where our time goes: the share of each part, without the first batch."""
+    timers = Timers()
+    make_objective = ppo.make_objective
+    parts: list[tuple[Any, str, str]] = [
+        (Collector, "rollout", "collect"),
+        (GymVectorEnv, "step_and_maybe_reset", "collect: environments"),
+        (ppo, "add_advantages", "advantages"),
+        (Tensor, "backward", "update: backward"),
+        (nn.utils, "clip_grad_norm_", "update: gradient norm"),
+        (torch.optim.Adam, "step", "update: optimizer"),
+    ]
+    if compile == "off":  # inside what is compiled there is nothing to time
+        parts.append((Backbone, "forward", "{}: backbone"))
+    with ExitStack() as stack:
+        for owner, name, part in parts:
+            function = timers.around(getattr(owner, name), part)
+            stack.enter_context(patch.object(owner, name, function))
+        stack.enter_context(
+            patch.object(
+                ppo,
+                "make_objective",
+                lambda *args: timers.around(make_objective(*args), "update: forward"),
+            )
+        )
+        laps = run_ours(0, compile, timers).laps
+    seconds = dict(timers.seconds)
+    acting = seconds.get("collect: backbone", 0)
+    encoding = seconds.get("update: backbone", 0)
+    seconds["collect: the rest"] = (
+        seconds.pop("collect") - seconds["collect: environments"] - acting
+    )
+    seconds["update: heads and loss"] = seconds.pop("update: forward") - encoding
+    whole = laps[-1][0] - laps[0][0]
+    seconds["minibatches, checks, metrics, checkpoints"] = whole - sum(seconds.values())
+    return {part: passed / whole for part, passed in sorted(seconds.items())}
 
 
 def main(out: Path | None) -> None:
-    """Measures on one thread."""
+    """Measures on one thread, with an empty cache of compiled code."""
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as cache:  # what was compiled before must not help
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache
+    with (
+        tempfile.TemporaryDirectory() as cache,
+        patch.dict(os.environ, TORCHINDUCTOR_CACHE_DIR=cache),
+    ):
         measure(out)
 
 
 def measure(out: Path | None) -> None:
     """Measures, alternating, and reports."""
-    sb3, ours, compiled, compile_seconds = [], [], [], []
+    runs: dict[str, list[Outcome]] = defaultdict(list)
     for repeat in range(REPEATS):
-        speed, sb3_parameters = run_sb3(repeat)
-        sb3.append(speed)
-        speed, our_parameters, _ = run_ours(repeat)
-        ours.append(speed)
-        speed, _, first_batch = run_ours(repeat, "on")
-        compiled.append(speed)
-        compile_seconds.append(first_batch - STEPS / speed)
-    assert sb3_parameters == our_parameters, (sb3_parameters, our_parameters)
-    ratios = [a / b for a, b in zip(ours, sb3, strict=True)]
-    compiled_ratios = [a / b for a, b in zip(compiled, sb3, strict=True)]
-    seconds = profile()
-    whole = seconds["all"]
+        runs["sb3"].append(run_sb3(repeat))
+        runs["ours"].append(run_ours(repeat, "off"))
+        runs["compiled"].append(run_ours(repeat, "on"))
+    (parameters,) = {outcome.parameters for outcomes in runs.values() for outcome in outcomes}
+    shares = {"ours": profile("off"), "compiled": profile("on")}
     markdown = (
         "# PPO on CartPole-v1, end to end\n\n"
-        f"Enhanced_TIT (K 1, width 32, 2 blocks, 1 head, features 64; {our_parameters} parameters "
-        f"with the heads), {ENVS} environments, {STEPS} steps a batch, minibatches of 64, 10 "
-        f"epochs, one thread. {REPEATS} rounds of runs, alternating, of {BATCHES - 1} batches.\n\n"
+        "Enhanced_TIT (K 1, width 32, 2 blocks, 1 head, features 64; "
+        f"{parameters} parameters with the heads), {ENVS} environments,\n{STEPS} steps a batch, "
+        f"minibatches of 64, 10 epochs, one thread. {REPEATS} rounds of runs, alternating, of "
+        f"{BATCHES}\nbatches each, of which the first is left out. Medians and ranges; ratios are "
+        "taken round by round.\n\n"
         + table(
-            ["", "environment steps a second: median (range)", "ratio, pair by pair"],
+            ["", "steps a second", "ratio", "ratio of processor time", "return after training"],
             [
-                ["Stable-Baselines3, straightforward network", spread(sb3), ""],
-                ["this library", spread(ours), spread(ratios, 2)],
-                ["this library, `--compile on`", spread(compiled), spread(compiled_ratios, 2)],
+                row("Stable-Baselines3, straightforward network", runs["sb3"], runs["sb3"]),
+                row("this library, compiled", runs["compiled"], runs["sb3"]),
+                row("this library, `--compile off`", runs["ours"], runs["sb3"]),
             ],
         )
-        + f"\nCompiling took {compile_seconds[0]:.0f} seconds the first time, in the batch that is "
-        "left out, with nothing\ncached on the disk. It is on by default in runs of 10,000 "
-        "gradient steps or more (this recipe's 100k\nsteps have 15,680), where there is a C++ "
-        "compiler.\n"
-        "\nWhere our time goes (a run of its own, with the timers in it):\n\n"
+        + "\nThe return is that of the episodes that ended in the last batch, after "
+        f"{(BATCHES - 1) * STEPS} steps of\ntraining: the same algorithm learns the same. "
+        f"Compiling took {runs['compiled'][0].first_batch:.0f} seconds the first time, with "
+        "nothing\ncached on the disk, in the batch that is left out. It is on by default in runs "
+        "of 10,000 gradient\nsteps or more (100k steps have 15,680), where there is a C++ "
+        "compiler.\n\nWhere our time goes (runs of their own, with the timers in them):\n\n"
         + table(
-            ["part", "share"],
-            [[name, f"{100 * seconds[name] / whole:.0f} %"] for name in sorted(seconds)],
+            ["part", "compiled", "`--compile off`"],
+            [
+                [
+                    part,
+                    *(f"{100 * share[part]:.0f} %" if part in share else "" for share in columns),
+                ]
+                for columns in [(shares["compiled"], shares["ours"])]
+                for part in shares["ours"]
+            ],
         )
+        + "\nWhere it is compiled, the backbone is part of *the rest* and of *heads and loss*.\n"
     )
-    numbers = {
-        "sb3_steps_per_second": sb3,
-        "our_steps_per_second": ours,
-        "ratios": ratios,
-        "median_ratio": statistics.median(ratios),
-        "our_compiled_steps_per_second": compiled,
-        "compiled_ratios": compiled_ratios,
-        "compile_seconds": compile_seconds,
-        "median_compiled_ratio": statistics.median(compiled_ratios),
-        "seconds_of_parts": seconds,
+    numbers: dict[str, Any] = {
+        name: {
+            "steps_per_second": [outcome.speed() for outcome in outcomes],
+            "steps_per_second_of_processor_time": [outcome.speed(1) for outcome in outcomes],
+            "training_return": [outcome.training_return for outcome in outcomes],
+            "first_batch_seconds": [outcome.first_batch for outcome in outcomes],
+        }
+        for name, outcomes in runs.items()
     }
-    publish("ppo_cartpole", markdown, numbers, out)
+    publish("ppo_cartpole", markdown, {**numbers, "shares": shares}, out)
+
+
+def row(name: str, runs: list[Outcome], peers: list[Outcome]) -> list[str]:
+    """A row of the table: speed, its ratios to a peer's, and what was learnt."""
+    ratios = (
+        [run.speed(clock) / peer.speed(clock) for run, peer in zip(runs, peers, strict=True)]
+        for clock in (0, 1)
+    )
+    return [
+        name,
+        spread([run.speed() for run in runs]),
+        *("" if runs is peers else spread(ratio, 2) for ratio in ratios),
+        spread([run.training_return for run in runs]),
+    ]
