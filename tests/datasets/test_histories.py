@@ -181,3 +181,18 @@ def test_nothing_to_draw(arrays: Transitions) -> None:
     one["timeouts"][:] = True
     with pytest.raises(DatasetError, match="nothing can be drawn from its 1 episodes"):
         HistoryStorage(episodes_from_arrays(**one), time_limits="drop")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+def test_windows_cut_on_a_gpu(rolled: Transitions) -> None:
+    episodes = episodes_from_arrays(**rolled)
+    here = HistoryStorage(episodes, 4, terminal_observations="zero")
+    there = HistoryStorage(episodes.to("cuda"), 4, terminal_observations="zero")
+    buffer = make_replay_buffer(there, 16)
+
+    assert (there[:].cpu() == here[:]).all()
+    state = buffer.state_dict()
+    sample = buffer.sample()
+    buffer.load_state_dict(state)
+    assert sample["history"].device.type == "cuda"
+    assert (buffer.sample() == sample).all()
