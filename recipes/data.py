@@ -34,6 +34,12 @@ def add_data_commands(parser: argparse.ArgumentParser) -> None:
         command.add_argument(
             "--max-episode-steps", type=int, help="time limit of a file that does not mark it"
         )
+        command.add_argument(
+            "--gaps",
+            choices=["error", "cut"],
+            default="error",
+            help="where an episode goes on with another observation than the file says",
+        )
         command.add_argument("--directory", type=Path, help="folder with room for the data")
     convert.add_argument("target", help="HDF5 file, Minari folder (/PATH-v0 or ./PATH-v0) or name")
 
@@ -54,6 +60,7 @@ def run_data_command(options: argparse.Namespace) -> str:
     reading = {
         "task": options.env,
         "max_episode_steps": options.max_episode_steps,
+        "gaps": options.gaps,
         "directory": options.directory,
     }
     if options.command == "info":

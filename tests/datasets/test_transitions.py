@@ -91,3 +91,17 @@ def test_other_byte_orders_are_read(arrays: Transitions) -> None:
     expected = episodes_from_arrays(**arrays).rows
     swapped = {n: a.astype(a.dtype.newbyteorder(">")) for n, a in arrays.items()}
     assert (episodes_from_arrays(**swapped).rows == expected).all()
+
+
+def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:
+    start, stop = max(spans(arrays), key=lambda span: span[1] - span[0])
+    row = (start + stop) // 2
+    arrays["next_observations"][row, 4] += 1
+
+    with pytest.raises(DatasetError, match=f"'next_observations', row {row}: .* gaps=\"cut\""):
+        episodes_from_arrays(**arrays)
+    episodes = episodes_from_arrays(**arrays, gaps="cut")
+
+    arrays["timeouts"][row] = True
+    assert (episodes.rows == episodes_from_arrays(**arrays).rows).all()
+    assert (row + 1 - start) in episodes.lengths

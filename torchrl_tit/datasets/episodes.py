@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_tit.datasets.errors import DatasetError
 
-CHUNK_BYTES = 16 * 2**20  # what is read, checked and converted at a time
+CHUNK_BYTES = 4 * 2**20  # what is read, checked and converted at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ class Episodes:
         """
         count = self.lengths[self.finished].sum()
         mean = sum(chunk.double().sum(0) for chunk in self._observations()) / count
-        squares = sum((chunk.double() - mean).square().sum(0) for chunk in self._observations())
+        squares = sum(chunk.double().sub_(mean).square_().sum(0) for chunk in self._observations())
         return mean.float(), (squares / count).sqrt().float() + 1e-6
 
     def _observations(self) -> Iterator[Tensor]:
@@ -175,6 +175,6 @@ def rows_per_chunk(bytes_per_row: int) -> int:
 
     Example:
         >>> rows_per_chunk(1024)
-        16384
+        4096
     """
     return max(1, CHUNK_BYTES // max(1, bytes_per_row))

@@ -13,6 +13,7 @@ from torchrl_tit.datasets.d4rl import download_d4rl
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.hdf5 import read_hdf5
 from torchrl_tit.datasets.minari import is_minari_name, read_minari
+from torchrl_tit.datasets.transitions import Gaps
 
 HDF5_SUFFIXES = (".hdf5", ".h5")
 
@@ -22,6 +23,7 @@ def load_episodes(
     *,
     task: str | TaskSpaces | None = None,
     max_episode_steps: int | None = None,
+    gaps: Gaps = "error",
     dtype: torch.dtype | None = torch.float32,
     directory: str | os.PathLike[str] | None = None,
     cache_dir: str | os.PathLike[str] | None = None,
@@ -36,6 +38,8 @@ def load_episodes(
             registered, such as "Hopper-v5", or its spaces. Not checked where None.
         max_episode_steps: The time limit of an HDF5 file that does not say where it struck: see
             :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
+        gaps: What to do where an HDF5 file's episode goes on with another observation than its
+            "next_observations" says: see there too.
         dtype: What floats are turned into; each field keeps its own where None. Integers stay.
         directory: A folder on a disk with room for the rows, which leave nothing there; the
             system's for temporary files where None.
@@ -66,6 +70,7 @@ def load_episodes(
             path,
             task=spaces,
             max_episode_steps=max_episode_steps,
+            gaps=gaps,
             dtype=dtype,
             directory=directory,
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.memory import memory_mapped_rows
 from torchrl_tit.datasets.transition_reader import FIELDS, TransitionReader
+
+Gaps = Literal["error", "cut"]
 
 
 def episodes_from_arrays(
@@ -67,6 +69,7 @@ def episodes_from_transitions(
     source: str = "the data",
     task: TaskSpaces | None = None,
     max_episode_steps: int | None = None,
+    gaps: Gaps = "error",
     dtype: torch.dtype | None = torch.float32,
     directory: str | os.PathLike[str] | None = None,
     attributes: Mapping[str, Any] | None = None,
@@ -86,6 +89,9 @@ def episodes_from_transitions(
         source: What the data came from, for messages.
         task: The task whose sizes and action bounds the data must have; not checked where None.
         max_episode_steps: The time limit of data that do not say where it struck.
+        gaps: What to do where an episode goes on with another observation than
+            ``next_observations`` says: ``"error"`` refuses the data, ``"cut"`` ends the episode
+            there, as cut off.
         dtype: What floats are turned into; each field keeps its own where None. Integers stay.
         directory: Where the memory-mapped rows go on the disk; see
             :func:`~torchrl_tit.datasets.memory.memory_mapped_rows`.
@@ -108,7 +114,7 @@ def episodes_from_transitions(
     """
     reader = TransitionReader(fields, source, task, dtype)
     terminated = reader.flags("terminals")
-    truncated, ends = _ends(reader, terminated, max_episode_steps)
+    truncated, ends = _ends(reader, terminated, max_episode_steps, gaps)
     last_steps = np.flatnonzero(ends)
     if last_steps.size == 0:
         hint = "" if "timeouts" in fields else "; give max_episode_steps if there is a time limit"
@@ -144,27 +150,31 @@ _ROW_NAMES = {"observations": "observation", "actions": "action", "rewards": "re
 
 
 def _ends(
-    reader: TransitionReader, terminated: NDArray, max_episode_steps: int | None
+    reader: TransitionReader, terminated: NDArray, max_episode_steps: int | None, gaps: Gaps
 ) -> tuple[NDArray, NDArray]:
     """Where episodes were cut off, and where they end at all; bool [N] each."""
-    if "timeouts" in reader.fields:
-        truncated = reader.flags("timeouts")
-        return truncated, terminated | truncated
-    truncated = np.zeros_like(terminated)
-    if "next_observations" in reader.fields:
-        for start, following in reader.chunks("next_observations"):
-            # The last row has no row after it to compare with.
-            after = reader.read("observations", start + 1, start + 1 + len(following))
-            differs = (following[: len(after)] != after).flatten(1).any(1).numpy()
-            truncated[start : start + len(after)] = differs
-        truncated &= ~terminated
+    marked = "timeouts" in reader.fields
+    truncated = reader.flags("timeouts") if marked else np.zeros_like(terminated)
+    if "next_observations" in reader.fields and (gaps == "cut" or not marked):
+        truncated |= _gaps(reader) & ~terminated
     ends = terminated | truncated
-    if max_episode_steps is not None:
+    if max_episode_steps is not None and not marked:
         bounds = [-1, *np.flatnonzero(ends), len(ends) - 1]
         for before, last in pairwise(bounds):
             truncated[before + max_episode_steps : last + 1 : max_episode_steps] = True
         truncated &= ~terminated
     return truncated, terminated | truncated
+
+
+def _gaps(reader: TransitionReader) -> NDArray:
+    """Where the next observation is not the observation of the row after; bool [N]."""
+    gaps = np.zeros(reader.num_rows, dtype=bool)
+    for start, following in reader.chunks("next_observations"):
+        # The last row has no row after it to compare with.
+        after = reader.read("observations", start + 1, start + 1 + len(following))
+        differs = (following[: len(after)] != after).flatten(1).any(1)
+        gaps[start : start + len(after)] = differs.numpy()
+    return gaps
 
 
 def _place_next_observations(
@@ -182,8 +192,8 @@ def _place_next_observations(
         if differs.any():
             raise DatasetError(
                 reader.source,
-                "is not the observation of the row after, but the episode goes on there; mark its "
-                "end in 'timeouts', or leave 'timeouts' out to end it where they differ.",
+                "is not the observation of the row after, but the episode goes on there; "
+                'gaps="cut" ends it there.',
                 "next_observations",
                 start + int(differs.int().argmax()),
             )
