@@ -1,4 +1,4 @@
-"""The command line: list, show, train, evaluate, sweep, compare, data."""
+"""The command line: list, show, train, evaluate, render, sweep, compare, data."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ usage: {program} COMMAND ...
                               `train NAME --help` explains every field
   train --resume RUN          go on with a run that was stopped or killed
   evaluate RUN                evaluate a run's newest checkpoint
+  render RUN --out FILE       film a run's agent: a GIF or MP4
   sweep NAME [NAME ...]       train many recipes and seeds side by side; names can be patterns
   compare RUN [RUN ...]       learning curves of several runs, seeds of a recipe as one band
   data info SOURCE            what is in a data set: an HDF5 file, D4RL's or Minari's name
@@ -50,6 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
         "show": _show,
         "train": _train,
         "evaluate": _evaluate,
+        "render": _render,
         "sweep": _sweep,
         "compare": _compare,
         "data": _data,
@@ -193,6 +195,15 @@ def _evaluate(words: list[str]) -> None:
     evaluation = recipe.evaluate(run)
     path = run.save_evaluation(evaluation, options.out)
     print(f"{_summary(recipe, evaluation)}\nwritten to {path}")
+
+
+def _render(words: list[str]) -> None:
+    # Not at the top: only pictures need what it imports.
+    from .render import add_render_options, run_render
+
+    parser = _Parser(f"{_program()} render")
+    add_render_options(parser)
+    run_render(parser.parse_args(words))
 
 
 def _sweep(words: list[str]) -> None:

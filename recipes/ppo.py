@@ -18,7 +18,7 @@ from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from torchrl_tit.envs import make_env
-from torchrl_tit.evaluation import evaluate
+from torchrl_tit.evaluation import evaluate, finished_returns
 
 from .compilation import STATIC_SHAPES, Compile, should_compile
 from .interrupt import Interrupt
@@ -137,8 +137,8 @@ class PPO(Recipe):
         batches = self.final_step // self.steps_per_batch
         return batches * self.epochs * math.ceil(self.steps_per_batch / self.minibatch_size)
 
-    def make_env(self, num_envs: int, seed: int) -> EnvBase:
-        """Builds the environment, with the history as part of it."""
+    def make_env(self, num_envs: int, seed: int, **kwargs: Any) -> EnvBase:
+        """Builds the environment, with the history as part of it; settings go to the task."""
         device = self.torch_device()
         return make_env(
             self.env,
@@ -147,6 +147,7 @@ class PPO(Recipe):
             history=self.history,
             padding=self.padding,
             device=None if device.type == "cpu" else device,
+            **kwargs,
         )
 
     def check(self) -> None:
@@ -180,14 +181,7 @@ class PPO(Recipe):
         Raises:
             FileNotFoundError: if there is no checkpoint.
         """
-        loaded = run.load()
-        if loaded is None:
-            raise FileNotFoundError(f"{run.checkpoints} holds no checkpoint: train the run first")
-        step, state = loaded
-        torch.set_num_threads(self.threads)
-        agent = Agent(self, self.make_env(1, self.evaluation_seed))
-        with run.restoring(step):
-            agent.load_state_dict(state["agent"])
+        step, agent = self.load_agent(run)
         returns = evaluate(
             lambda num_envs: self.make_env(num_envs, self.evaluation_seed),
             agent.policy,
@@ -203,6 +197,28 @@ class PPO(Recipe):
             "steps": step,
             "returns": returns.tolist(),
         }
+
+    def load_agent(self, run: Run) -> tuple[int, Agent]:
+        """Loads the agent of a run's newest checkpoint.
+
+        Args:
+            run: a run folder with a checkpoint.
+
+        Returns:
+            The steps that it was trained for, and the agent.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+        """
+        loaded = run.load()
+        if loaded is None:
+            raise FileNotFoundError(f"{run.checkpoints} holds no checkpoint: train the run first")
+        step, state = loaded
+        torch.set_num_threads(self.threads)
+        agent = Agent(self, self.make_env(1, self.evaluation_seed))
+        with run.restoring(step):
+            agent.load_state_dict(state["agent"])
+        return step, agent
 
 
 def train(recipe: PPO, run: Run) -> None:
@@ -287,7 +303,7 @@ def train(recipe: PPO, run: Run) -> None:
             check_agent(agent, minibatch, step, saved_step)  # before it is saved
             means = dict(zip(LOSSES, torch.stack(losses).mean(0).tolist(), strict=True))
 
-            finished = batch["next", "episode_reward"][batch["next", "done"]]
+            finished = finished_returns(batch)
             mean_return = finished.mean().item()  # NaN where no episode ended
             metrics.log(
                 step,

@@ -71,6 +71,7 @@ class TrainingState:
         That happens at each checkpoint, whether or not the run is stopped there, and with a seed
         that follows from the run's and the step: so both go on alike.
         """
-        if not can_save_env(self.collector.env):
+        # After its last batch a collector has closed the environment.
+        if not can_save_env(self.collector.env) and not self.collector.env.is_closed:
             seed = np.random.SeedSequence([self.seed, step]).generate_state(1).item()
             self.collector.reset(seed=seed)

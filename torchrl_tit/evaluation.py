@@ -25,9 +25,10 @@ def evaluate(
     Episode i starts from the seed ``seed + i``, in an environment of its own, so the same policy
     gets the same returns whatever the number of environments. As many episodes as there are
     environments run side by side, until the last of them ends: which episodes count does not depend
-    on how long they take. Training goes on afterwards as if nothing had been evaluated: the policy
-    gets its training mode back, and the global random generators of PyTorch, NumPy and Python their
-    states.
+    on how long they take. In Atari (:class:`~torchrl_tit.envs.AtariEnv`) an episode is a whole
+    game with all of its points, however many lives it takes. Training goes on afterwards as if
+    nothing had been evaluated: the policy gets its training mode back, and the global random
+    generators of PyTorch, NumPy and Python their states.
 
     Args:
         env: An environment of any batch size, whose `reset` takes a seed as those of
@@ -94,10 +95,39 @@ def _play(
     playing = torch.ones_like(returns, dtype=torch.bool)
     while playing.any():
         step, tensordict = env.step_and_maybe_reset(policy(tensordict))
+        outcome = step["next"]
         # An environment whose episode has ended plays on, but nothing of that counts.
-        returns += step["next", reward_key].flatten() * playing
-        playing &= ~step["next", "done"].flatten()
+        game_over = outcome.get("game_over", None)
+        if game_over is None:
+            returns += outcome[reward_key].flatten() * playing
+            playing &= ~outcome["done"].flatten()
+        else:
+            returns = outcome["game_return"].flatten().double().where(playing, returns)
+            playing &= ~game_over.flatten()
     return returns
+
+
+def finished_returns(batch: TensorDictBase) -> Tensor:
+    """Picks the returns of the episodes, or of the whole Atari games, that ended in a batch.
+
+    Args:
+        batch: Steps of :func:`~torchrl_tit.envs.make_env`'s environments, as a collector hands them
+            over; any shape.
+
+    Returns:
+        The undiscounted return of each, in the task's own rewards; [episodes].
+
+    Example:
+        >>> from torchrl_tit.envs import make_env
+        >>> env = make_env("CartPole-v1", seed=0)
+        >>> finished_returns(env.rollout(100, break_when_any_done=False)).sum() <= 100
+        tensor(True)
+    """
+    outcome = batch["next"]
+    game_over = outcome.get("game_over", None)
+    if game_over is None:
+        return outcome["episode_reward"][outcome["done"]]
+    return outcome["game_return"][game_over]
 
 
 @contextmanager

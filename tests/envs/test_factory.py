@@ -81,3 +81,21 @@ def test_unknown_names(name, words):
 def test_no_copies():
     with pytest.raises(ValueError, match="num_envs must be at least 1, but is 0"):
         make_env("CartPole-v1", 0)
+
+
+def test_processes():
+    env = make_env("Pendulum-v1", 2, seed=0, history=3, vectorization_mode="async")
+    expected = make_env("Pendulum-v1", 2, seed=0, history=3)
+    assert torch.equal(env.reset()["history"], expected.reset()["history"])
+    env.close()
+
+
+def test_settings_that_are_wrong_or_of_no_use():
+    with pytest.raises(ValueError, match="must be 'sync' or 'async', but is 'p'"):
+        make_env("CartPole-v1", vectorization_mode="p")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="not known which observations of 'Ant-v5' are velocities"):
+        make_env("Ant-v5", hide_velocities=True)
+
+
+def test_older_versions_by_name():
+    assert make_env("Ant-v4").observation_spec["observation"].shape == (1, 27)

@@ -1,6 +1,8 @@
-"""Gymnasium tasks as TorchRL environments."""
+"""Gymnasium tasks and Atari games as TorchRL environments."""
 
+from torchrl_tit.envs.atari import AtariEnv
+from torchrl_tit.envs.atari_games import AtariGames
 from torchrl_tit.envs.factory import make_env
 from torchrl_tit.envs.vector import GymVectorEnv
 
-__all__ = ["GymVectorEnv", "make_env"]
+__all__ = ["AtariEnv", "AtariGames", "GymVectorEnv", "make_env"]

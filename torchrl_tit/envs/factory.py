@@ -1,15 +1,23 @@
-"""Gymnasium tasks by name."""
+"""Gymnasium tasks and Atari games by name."""
 
 import difflib
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_args
 
 import gymnasium
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from torchrl.envs import EnvBase, TransformedEnv
 
+from torchrl_tit.envs.atari import AtariEnv
+from torchrl_tit.envs.atari_games import AtariGames
 from torchrl_tit.envs.vector import GymVectorEnv
+from torchrl_tit.transforms.hide_velocities import HideVelocities
 from torchrl_tit.transforms.history import Padding
+
+VectorizationMode = Literal["sync", "async"]
+
+_ATARI = "ALE/"
 
 
 def make_env(
@@ -20,27 +28,39 @@ def make_env(
     history: int = 1,
     padding: Padding = "same",
     clip_actions: bool = True,
+    hide_velocities: bool = False,
+    vectorization_mode: VectorizationMode = "sync",
     device: torch.device | str | None = None,
     **kwargs: Any,
-) -> GymVectorEnv:
-    """Makes copies of a Gymnasium task, stepped one after the other in this process.
+) -> EnvBase:
+    """Makes copies of a Gymnasium task or an Atari game.
 
     Args:
-        name: A name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5".
+        name: A name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". Names that
+            begin with "ALE/", such as "ALE/Pong-v5", are Atari games under the protocol that stands
+            in :class:`~torchrl_tit.envs.AtariGames`; they need ale-py, the extra "atari".
         num_envs: N, the number of copies; the batch size is [N], for N = 1 too.
         seed: Copy i is seeded with ``seed + i``; without one, each differs from run to run.
         history: K, the number of observations in a history.
         padding: How histories begin: see :class:`~torchrl_tit.envs.GymVectorEnv`.
         clip_actions: Whether continuous actions are clipped on their way to the task: see there.
+        hide_velocities: Whether observation and history are left without the velocities: see
+            :class:`~torchrl_tit.transforms.HideVelocities`.
+        vectorization_mode: ``"sync"`` steps the copies one after the other in this process,
+            ``"async"`` side by side in a process each, with the same numbers; this pays for slow
+            tasks. Atari games always run side by side, in threads.
         device: Where the tensors go; by default they stay on the CPU without a stated device.
-        **kwargs: Passed to `gymnasium.make`, as ``max_episode_steps=200``.
+        **kwargs: Passed to `gymnasium.make`, as ``max_episode_steps=200``, or to
+            :class:`~torchrl_tit.envs.AtariGames`.
 
     Returns:
-        The environment, whose keys and shapes stand in :class:`~torchrl_tit.envs.GymVectorEnv`.
+        The environment, whose keys and shapes stand in :class:`~torchrl_tit.envs.GymVectorEnv` and,
+        for Atari games, :class:`~torchrl_tit.envs.AtariEnv`.
 
     Raises:
         ValueError: If the name is unknown or a package that the task needs is missing,
-            ``num_envs`` is less than 1, or history or padding are wrong.
+            ``num_envs`` is less than 1, history or padding are wrong, the mode is unknown or of no
+            use, or it is not known which observations are velocities.
         TypeError: If the task's observations or actions are of a kind that is not supported.
 
     Example:
@@ -52,28 +72,66 @@ def make_env(
         ...
         ValueError: Unknown task 'CartPole-v2'; did you mean one of 'CartPole-v1', 'CartPole-v0'...
     """
-    _check_name(name)
     if num_envs < 1:
         raise ValueError(f"num_envs must be at least 1, but is {num_envs}.")
-    # The specs are checked once, in tests; Gymnasium's checker would cost time at every step. What
-    # the vector environment returns is copied at once, so it need not make copies of its own.
-    make = partial(gymnasium.make, name, disable_env_checker=True, **kwargs)
-    try:
-        tasks = SyncVectorEnv([make] * num_envs, copy=False, autoreset_mode=AutoresetMode.DISABLED)
-    except (gymnasium.error.Error, ImportError) as error:  # a package is missing, say
-        raise ValueError(f"Task {name!r} cannot be made: {error}") from error
-    env = GymVectorEnv(
-        tasks, history=history, padding=padding, clip_actions=clip_actions, device=device
-    )
+    if vectorization_mode not in get_args(VectorizationMode):
+        raise ValueError(
+            f"vectorization_mode must be 'sync' or 'async', but is {vectorization_mode!r}."
+        )
+    env: EnvBase
+    if name.startswith(_ATARI):
+        if vectorization_mode == "async":
+            raise ValueError(
+                f"{name} runs in threads, side by side; leave vectorization_mode at 'sync'."
+            )
+        games = AtariGames(_rom(name), num_envs, **kwargs)
+        env = AtariEnv(games, history=history, padding=padding, device=device)
+    else:
+        env = GymVectorEnv(
+            _tasks(name, num_envs, vectorization_mode, **kwargs),
+            history=history,
+            padding=padding,
+            clip_actions=clip_actions,
+            device=device,
+        )
     if seed is not None:
         env.set_seed(seed)
+    if hide_velocities:
+        env = TransformedEnv(env, HideVelocities(name, in_keys=["observation", "history"]))
     return env
 
 
-def _check_name(name: str) -> None:
+def _tasks(
+    name: str, num_envs: int, mode: VectorizationMode, **kwargs: Any
+) -> gymnasium.vector.VectorEnv:
     # "module:name" makes Gymnasium import the module, which registers the name.
-    if name in gymnasium.registry or ":" in name:
-        return
+    if name not in gymnasium.registry and ":" not in name:
+        raise _unknown(name)
+    # The specs are checked once, in tests; Gymnasium's checker would cost time at every step. What
+    # the vector environment returns is copied at once, so it need not make copies of its own.
+    make = partial(gymnasium.make, name, disable_env_checker=True, **kwargs)
+    vectorize = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
+    try:
+        return vectorize([make] * num_envs, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+    except (gymnasium.error.Error, ImportError) as error:  # a package is missing, say
+        raise ValueError(f"Task {name!r} cannot be made: {error}") from error
+
+
+def _rom(name: str) -> str:
+    """The name of an Atari game's ROM file."""
+    try:
+        import ale_py
+    except ImportError as error:
+        raise ValueError(
+            f"Task {name!r} needs ale-py: pip install 'torchrl-tit[atari]'."
+        ) from error
+    gymnasium.register_envs(ale_py)
+    if name not in gymnasium.registry:
+        raise _unknown(name)
+    return gymnasium.registry[name].kwargs["game"]
+
+
+def _unknown(name: str) -> ValueError:
     known = {key.lower(): key for key in gymnasium.registry}
     nearest = [known[key] for key in difflib.get_close_matches(name.lower(), known, n=3)]
     hint = (
@@ -81,6 +139,6 @@ def _check_name(name: str) -> None:
         if nearest
         else "is its package imported"
     )
-    raise ValueError(
+    return ValueError(
         f"Unknown task {name!r}; {hint}? `gymnasium.pprint_registry()` lists all names."
     )

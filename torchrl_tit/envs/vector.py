@@ -1,5 +1,7 @@
 """A Gymnasium vector environment as a TorchRL environment that adds little time to a step."""
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 import torch
@@ -140,7 +142,7 @@ class GymVectorEnv(EnvBase):
         action = tensordict.get("action").numpy(force=True)
         if self._bounds is not None:
             action = action.clip(*self._bounds)
-        observations, rewards, terminated, truncated, _ = self._env.step(action)
+        observations, rewards, terminated, truncated, info = self._env.step(action)
         observation = self._tensor(np.array(observations, self._observation_dtype))
         reward = self._tensor(rewards.astype(np.float32)).unsqueeze(-1)
         self._return.add_(reward)
@@ -152,6 +154,7 @@ class GymVectorEnv(EnvBase):
             terminated=self._tensor(terminated).unsqueeze(-1),
             truncated=self._tensor(truncated).unsqueeze(-1),
             done=self._tensor(terminated | truncated).unsqueeze(-1),
+            **self._further(info),
         )
 
     def _reset(
@@ -163,7 +166,7 @@ class GymVectorEnv(EnvBase):
     def _restart(self, mask: Tensor | None = None, seed: int | None = None) -> TensorDictBase:
         """Begins new episodes where the mask [N] is set, or all; the others' entries are kept."""
         options = None if mask is None else {"reset_mask": mask.numpy(force=True)}
-        observations, _ = self._env.reset(seed=seed, options=options)
+        observations, info = self._env.reset(seed=seed, options=options)
         observation = self._tensor(np.array(observations, self._observation_dtype))
         where = slice(None) if mask is None else mask
         first = observation[where].unsqueeze(1)  # [M, 1, *obs]
@@ -178,7 +181,31 @@ class GymVectorEnv(EnvBase):
             terminated=flag,
             truncated=flag.clone(),
             done=flag.clone(),
+            **self._further(info),
         )
+
+    def _further(self, info: dict[str, Any]) -> dict[str, Tensor]:
+        """What else a subclass writes, from what the vector environment tells beside."""
+        return {}
+
+    @property
+    def render_fps(self) -> int:
+        """Pictures a second at which the task looks natural."""
+        return int(self._env.metadata.get("render_fps", 30))
+
+    def render(self) -> np.ndarray:
+        """Takes pictures of the tasks, which must be made with ``render_mode="rgb_array"``.
+
+        Returns:
+            One picture of each task; uint8 [N, height, width, 3].
+
+        Raises:
+            ValueError: If the tasks have no pictures.
+        """
+        pictures = self._env.render() or (None,)
+        if pictures[0] is None:
+            raise ValueError('The tasks have no pictures; make them with render_mode="rgb_array".')
+        return np.stack(pictures)
 
     def _set_seed(self, seed: int | None) -> None:
         # As in GymWrapper: a reset seeds environment i with seed + i, and it draws on from there.

@@ -1,5 +1,6 @@
-"""TorchRL transforms that hand a network the last K observations."""
+"""TorchRL transforms: the last K observations for a network, and observations with gaps."""
 
+from torchrl_tit.transforms.hide_velocities import VELOCITIES, HideEntries, HideVelocities
 from torchrl_tit.transforms.history import History
 
-__all__ = ["History"]
+__all__ = ["VELOCITIES", "HideEntries", "HideVelocities", "History"]
