@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule
-from torch import nn
+from torch import Tensor, nn
+
+from torchrl_tit.modules.frame_cache import Encode, FrameCache
+from torchrl_tit.networks import HistoryNetwork
 
 
 class Backbone(TensorDictModule):
@@ -14,6 +20,9 @@ class Backbone(TensorDictModule):
 
     Put it in front of the heads, once: heads read the features, so the network runs once a step
     while collecting and once a minibatch in the update, however many heads and losses there are.
+
+    While acting, each step's history holds K - 1 frames of the step before. Within :meth:`acting`
+    only the newest is encoded, where the network has a frame encoder; the features are the same.
 
     Args:
         network: maps a history [..., K, *observation_shape] to features [..., F], or to as many
@@ -27,7 +36,6 @@ class Backbone(TensorDictModule):
         KeyError: in ``forward``, if there is no history under the key.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl_tit import Backbone, EnhancedTIT
         >>> tit = EnhancedTIT(observation_shape=(4,), history=8, features_dim=32)
@@ -48,6 +56,9 @@ class Backbone(TensorDictModule):
                 f"in_keys={list(in_keys)} and out_keys={list(out_keys)}"
             )
         super().__init__(network, in_keys=list(in_keys), out_keys=list(out_keys))
+        self._cache: FrameCache | None = None  # while acting
+        # What runs while acting in place of frame encoder and history encoder, if compiled.
+        self._compiled: tuple[Encode, Encode] | None = None
 
     def forward(
         self, tensordict: TensorDictBase, *args: object, **kwargs: object
@@ -60,3 +71,80 @@ class Backbone(TensorDictModule):
                 ": add torchrl_tit.History to the environment, or name the key in in_keys"
             )
         return super().forward(tensordict, *args, **kwargs)
+
+    @contextmanager
+    def acting(self) -> Iterator[None]:
+        """Keeps the tokens of the frames just seen, to encode only the newest of each step.
+
+        For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses.
+        Whatever it is given, the features are those of the network (see
+        :class:`~torchrl_tit.modules.FrameCache`): another batch, a reset or changed weights cost
+        time only. Does nothing for networks that have no frame encoder or see one frame.
+
+        What is kept (copies of one batch of histories, of its tokens, and of the frame encoder's
+        weights) goes at the end, and when a state dict is taken: a run then goes on as one that is
+        resumed from there does. Within another ``acting``, it starts with nothing, and the outer
+        one goes on with what it kept. A copy made within, a collector's in another process say,
+        acts for good, and starts with nothing.
+
+        Example:
+            >>> from tensordict import TensorDict
+            >>> from torchrl_tit import EnhancedTIT
+            >>> backbone = Backbone(EnhancedTIT(observation_shape=(4,), history=8))
+            >>> frames = torch.randn(5, 20, 4)
+            >>> with backbone.acting(), torch.no_grad():
+            ...     for step in range(12):
+            ...         td = backbone(TensorDict({"history": frames[:, step : step + 8]}, [5]))
+        """
+        outer, self._cache = self._cache, self._make_cache()
+        try:
+            yield
+        finally:
+            self._cache = outer
+
+    def compile_parts(self, **options: Any) -> None:
+        """Compiles what runs while acting: encoding the newest frames, and all that follows it.
+
+        What is kept and compared is decided between the two, so compile no policy around them: a
+        compiled one keeps nothing. Copies of the backbone are not compiled.
+
+        Args:
+            **options: of ``torch.compile``.
+        """
+        network = self.module
+        if self._make_cache() is not None:
+            self._compiled = (
+                torch.compile(network.frame_encoder, **options),
+                torch.compile(network.encode_history, **options),
+            )
+
+    def clear_cache(self) -> None:
+        """Forgets what was kept while acting."""
+        if self._cache is not None:
+            self._cache.clear()
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """As of any module. Forgets what was kept while acting, which is no part of it."""
+        self.clear_cache()
+        return super().state_dict(*args, **kwargs)
+
+    def _make_cache(self) -> FrameCache | None:
+        network = self.module
+        if not isinstance(network, HistoryNetwork) or network.frame_encoder is None:
+            return None
+        if network.history == 1:
+            return None
+        encode_newest = self._compiled[0] if self._compiled else None
+        return FrameCache(network.frame_encoder, len(network.observation_shape), encode_newest)
+
+    def _call_module(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
+        """Where TensorDictModule calls the network."""
+        if torch.compiler.is_compiling() or self._cache is None:
+            return super()._call_module(tensors, **kwargs)
+        (history,) = tensors
+        self.module.check(history)
+        encode_history = self._compiled[1] if self._compiled else self.module.encode_history
+        return encode_history(self._cache(history))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_compiled": None}  # they are the original's

@@ -81,6 +81,10 @@ class HistoryNetwork(nn.Module):
         """
         self.check(history)
         tokens = history if self.frame_encoder is None else self.frame_encoder(history)
+        return self.encode_history(tokens)
+
+    def encode_history(self, tokens: Tensor) -> Tensor:
+        """Maps the tokens of K observations to features, float [..., K, L, D] -> [..., F]."""
         return self.head(self.history_encoder(tokens))
 
     def attention_maps(self, history: Tensor) -> AttentionMaps:
@@ -138,7 +142,9 @@ def check_history(
             f"[..., {', '.join(map(str, expected))}], which is {steps} observations of "
             f"shape {observation_shape}, oldest first (torchrl_tit.History stacks them)"
         )
-    autocast = torch.is_autocast_enabled(history.device.type)
+    device = history.device.type
+    # "meta", say, has no autocast to ask about.
+    autocast = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
     # Autocast converts every float type but double.
     fits = history.dtype == dtype or (
         autocast and history.is_floating_point() and history.dtype != torch.float64

@@ -1,0 +1,262 @@
+"""Where the frame cache steps aside: gradients, dropout, vmap, tracing; and compiled parts."""
+
+import copy
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torch.autograd import forward_ad
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from tests.modules.frames import CountedFrames, assert_exact, features, make
+from torchrl_tit import Backbone, EnhancedTIT
+
+
+def act(backbone, stream, steps=2):
+    """Fills the cache, and returns the next history, of which it knows all but one frame."""
+    with torch.no_grad():
+        for start in range(steps):
+            features(backbone, stream[:, start : start + 4])
+    return stream[:, steps : steps + 4]
+
+
+def test_gradients_are_whole_while_acting():
+    backbone, network, shape = make()
+    frames = CountedFrames(network)
+    with backbone.acting():
+        history = act(backbone, torch.randn(5, 8, *shape)).clone().requires_grad_()
+        frames.take()
+        features(backbone, history).square().sum().backward()
+        assert frames.take() == 20
+        acted = [history.grad, *(p.grad for p in network.parameters())]
+        history.grad = None
+        network.zero_grad()
+        network(history).square().sum().backward()
+        full = [history.grad, *(p.grad for p in network.parameters())]
+        torch.testing.assert_close(acted, full, rtol=0, atol=0)
+        assert history.grad[:, 0].any()
+        # What was kept before is still good.
+        frames.take()
+        with torch.no_grad():
+            features(backbone, history.detach())
+        assert frames.take() == 5
+
+
+def test_gradients_of_the_history_alone():
+    backbone, network, shape = make()
+    network.requires_grad_(False)
+    with backbone.acting():
+        history = act(backbone, torch.randn(5, 8, *shape)).clone().requires_grad_()
+        features(backbone, history).sum().backward()
+        assert history.grad[:, 0].any()
+
+
+def test_a_frozen_frame_encoder_keeps_tokens_and_the_rest_gets_gradients():
+    backbone, network, shape = make()
+    network.frame_encoder.requires_grad_(False)
+    frames = CountedFrames(network)
+    stream = torch.randn(5, 8, *shape)
+    with backbone.acting():
+        with torch.inference_mode():
+            features(backbone, stream[:, :4])
+        features(backbone, stream[:, 1:5]).sum().backward()  # tokens of inference mode would fail
+        frames.take()
+        features(backbone, stream[:, 2:6]).sum().backward()
+        assert frames.take() == 5
+    assert all(p.grad is not None for p in network.history_encoder.parameters())
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_without_gradients_only_the_newest_frame_is_encoded(mode):
+    backbone, network, shape = make()
+    frames = CountedFrames(network)
+    stream = torch.randn(5, 8, *shape)
+    with backbone.acting(), mode():
+        features(backbone, stream[:, :4])
+        frames.take()
+        features(backbone, stream[:, 1:5])
+        assert frames.take() == 5
+
+
+@torch.no_grad()
+def test_active_dropout_draws_for_every_frame():
+    network = EnhancedTIT((3,), 4, embed_dim=16, ffn_dropout_inner=0.5, attention_dropout_outer=0.5)
+    backbone = Backbone(network)
+    frames = CountedFrames(network)
+    with backbone.acting():
+        network.train()
+        history = act(backbone, torch.randn(5, 8, 3))
+        frames.take()
+        torch.manual_seed(1)
+        acted = features(backbone, history)
+        assert frames.take() == 20
+        torch.manual_seed(1)
+        assert torch.equal(acted, network(history))
+        frames.take()
+
+        network.eval()
+        assert_exact(backbone, history)
+        frames.take()
+        assert network.frame_encoder is not None
+        inner = network.frame_encoder.modules()
+        (dropout, *_) = (m for m in inner if isinstance(m, nn.Dropout) and m.p > 0)
+        dropout.train()
+        features(backbone, torch.cat([history[:, 1:], history[:, :1]], 1))
+        assert frames.take() == 20
+
+
+@torch.no_grad()
+def test_training_mode_without_dropout_keeps():
+    backbone, network, shape = make()
+    network.train()
+    frames = CountedFrames(network)
+    with backbone.acting():
+        history = act(backbone, torch.randn(5, 8, *shape))
+        frames.take()
+        features(backbone, history)
+        assert frames.take() == 5
+
+
+@torch.no_grad()
+def test_vmap_over_histories_and_over_weights():
+    backbone, network, shape = make()
+    with backbone.acting():
+        history = act(backbone, torch.randn(5, 8, *shape))
+
+        def of(history):
+            return backbone(TensorDict({"history": history}))["features"]
+
+        torch.testing.assert_close(torch.vmap(of)(history), network(history), rtol=0, atol=1e-5)
+
+        weights = TensorDict.from_module(backbone).data
+        stacked = TensorDict.stack([weights, weights.apply(lambda x: x + 0.1)])
+
+        def with_weights(weights):
+            with weights.to_module(backbone):
+                return of_batch(history)
+
+        def of_batch(history):
+            return backbone(TensorDict({"history": history}, [5]))["features"]
+
+        both = torch.vmap(with_weights)(stacked)
+        torch.testing.assert_close(both[0], network(history), rtol=0, atol=1e-5)
+        stacked[1].to_module(network_holder := copy.deepcopy(backbone))
+        torch.testing.assert_close(both[1], network_holder.module(history), rtol=0, atol=1e-5)
+        assert_exact(backbone, history)
+
+
+@torch.no_grad()
+def test_forward_mode_derivatives():
+    backbone, network, shape = make()
+    with backbone.acting():
+        history = act(backbone, torch.randn(5, 8, *shape))
+        tangent = torch.randn_like(history)
+        with sdpa_kernel(SDPBackend.MATH):  # the fused kernel has no forward derivative
+            full = torch.func.jvp(network, (history,), (tangent,))[1]
+            with forward_ad.dual_level():
+                dual = forward_ad.make_dual(history, tangent)
+                _, acted = forward_ad.unpack_dual(features(backbone, dual))
+        torch.testing.assert_close(acted, full, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("strict", [False, True])
+@torch.no_grad()
+def test_export_holds_the_whole_network(strict):
+    backbone, network, shape = make()
+
+    class Features(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.backbone = backbone
+
+        def forward(self, history):
+            return self.backbone._call_module([history])
+
+    with backbone.acting():
+        history = act(backbone, torch.randn(5, 8, *shape))
+        exported = torch.export.export(Features(), (history,), strict=strict).module()
+    other = torch.randn(5, 4, *shape)
+    torch.testing.assert_close(exported(other), network(other), rtol=0, atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_compiled_backbone_is_the_whole_network():
+    backbone, network, shape = make()
+    compiled = torch.compile(backbone, backend="aot_eager", fullgraph=True)
+    stream = torch.randn(5, 8, *shape)
+    with backbone.acting():
+        for start in range(3):
+            history = stream[:, start : start + 4]
+            td = compiled(TensorDict({"history": history}, [5]))
+            torch.testing.assert_close(td["features"], network(history), rtol=0, atol=1e-5)
+            assert backbone._cache._kept is None
+
+
+@torch.no_grad()
+def test_traced_by_jit_and_shaped_without_values():
+    backbone, network, shape = make()
+    network.requires_grad_(False)
+    with backbone.acting():
+        history = act(backbone, torch.randn(5, 8, *shape))
+        traced = torch.jit.trace(
+            lambda history: backbone._call_module([history]), (history,), check_trace=False
+        )
+        other = torch.randn(5, 4, *shape)
+        torch.testing.assert_close(traced(other), network(other), rtol=0, atol=1e-5)
+        network.to("meta")
+        assert features(backbone, history.to("meta")).shape == (5, 8)
+
+
+@torch.no_grad()
+def test_autocast_and_float32_do_not_share_tokens():
+    backbone, network, shape = make()
+    stream = torch.randn(5, 9, *shape)
+    with backbone.acting():
+        for start, enabled in enumerate([False, True, True, False, False]):
+            with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+                history = stream[:, start : start + 4]
+                acted, full = features(backbone, history), network(history)
+                assert acted.dtype == full.dtype
+                tolerance = 0.05 if enabled else 1e-5
+                torch.testing.assert_close(acted, full, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", ["enhanced", "Catformer"])
+@torch.no_grad()
+def test_compiled_parts(name):
+    backbone, network, shape = make(name)
+    graphs = []
+
+    def backend(graph, inputs):
+        graphs.append([x.shape for x in inputs if isinstance(x, torch.Tensor)])
+        return torch._dynamo.lookup_backend("aot_eager")(graph, inputs)
+
+    backbone.compile_parts(backend=backend, dynamic=False, fullgraph=True)
+    stream = torch.randn(5, 20, *shape)
+    with backbone.acting():
+        for start in range(6):
+            if start == 3:
+                network.frame_encoder.requires_grad_()
+                next(network.frame_encoder.parameters()).mul_(1.1)
+            if start == 4:
+                stream[2, :] = torch.randn_like(stream[2])
+            assert_exact(backbone, stream[:, start : start + 4])
+    assert len(graphs) == 2  # encode the newest, attend over the kept
+    assert_exact(backbone, stream[:, :4])
+    for twin in (copy.deepcopy(backbone), pickle.loads(pickle.dumps(backbone))):
+        next(twin.module.frame_encoder.parameters()).mul_(1.1)
+        with twin.acting():
+            assert_exact(twin, stream[:, :4])
+    assert len(graphs) == 2
+
+
+def test_wrong_histories_are_refused_as_ever():
+    backbone, _, shape = make()
+    with backbone.acting(), torch.no_grad():
+        act(backbone, torch.randn(5, 8, *shape))
+        with pytest.raises(ValueError, match="does not fit this network"):
+            features(backbone, torch.randn(5, 3, *shape))
+        with pytest.raises(TypeError, match="float64"):
+            features(backbone, torch.randn(5, 4, *shape, dtype=torch.float64))

@@ -1,0 +1,217 @@
+"""Tokens of the frames that were just seen, so that acting encodes only the newest one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.nn.modules.dropout import _DropoutNd
+
+from torchrl_tit.modules.frames import as_words, same_frames
+
+Encode = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """What is kept of a window, and what must not have changed for it to be of use."""
+
+    modules: list[nn.Module]  # all that the encoder is made of
+    slots: list[tuple[nn.Module, str]]  # where its weights stand
+    weights: list[Tensor]  # copies of those that made the tokens
+    circumstances: tuple[object, ...]
+    words: Tensor  # of the last K - 1 frames, int [N, K - 1, words]
+    tokens: Tensor  # of the same, float [N, K - 1, *token_shape]
+
+
+class FrameCache:
+    """Encodes the frames of a window of K steps, those it saw a step ago from memory.
+
+    A frame's tokens depend on that frame alone. While acting, the window of a step is that of the
+    step before, moved by one: K - 1 of its frames were encoded then.
+
+    What comes out is what the encoder would put out, within rounding (a frame encoded alone and
+    within a batch differ in the last bits), because nothing is taken on trust:
+
+    - A frame's tokens are reused if the frame has the same bytes as the one that they were made of,
+      which stood one step later in the window and in the same place of the batch. Bytes are
+      compared, not numbers: the same bytes give the same tokens whatever they mean, NaN and
+      negative zeros too.
+    - All weights and buffers of the encoder are compared with copies of those that made the tokens,
+      at each call. Nothing less sees every change: fused and compiled optimizers, writes through
+      ``.data`` or into shared memory do not count as versions of a parameter, and losses put other
+      tensors in its place.
+
+    All else is encoded, a frame that repeats within its window once: so the first window of an
+    episode, which starts with copies of one observation or of zeros, costs a frame or two.
+
+    Nothing is kept or reused where gradients are asked for, dropout or batch normalisation is
+    active in the encoder, under ``vmap`` and the other transforms of ``torch.func``, and while
+    ``torch.compile``, ``torch.export`` or a CUDA graph record. Copies and pickles are empty.
+
+    Args:
+        encoder: maps observations [..., *observation_shape] to tokens [..., *token_shape], each by
+            itself; what it draws at random, it draws in ``nn.Dropout``.
+        observation_ndim: number of axes of an observation.
+        encode_newest: encodes the newest frame of each window: the encoder itself where not given,
+            or the encoder compiled.
+
+    Example:
+        >>> from torchrl_tit import EnhancedTIT
+        >>> tit = EnhancedTIT(observation_shape=(4,), history=8)
+        >>> cache = FrameCache(tit.frame_encoder, observation_ndim=1)
+        >>> frames = torch.randn(16, 9, 4)
+        >>> with torch.no_grad():
+        ...     first = cache(frames[:, :8])  # 8 frames of each of 16 environments
+        ...     second = cache(frames[:, 1:])  # 1 frame
+        >>> first.shape, torch.equal(second[:, :-1], first[:, 1:])
+        (torch.Size([16, 8, 2, 32]), True)
+    """
+
+    def __init__(
+        self, encoder: nn.Module, observation_ndim: int, encode_newest: Encode | None = None
+    ) -> None:
+        self._encoder = encoder
+        self._observation_ndim = observation_ndim
+        self._encode_newest = encoder if encode_newest is None else encode_newest
+        self._kept: _Kept | None = None
+
+    def clear(self) -> None:
+        """Forgets everything, so that the next window is encoded as a first one is."""
+        self._kept = None
+
+    def __call__(self, window: Tensor) -> Tensor:
+        """Encodes windows.
+
+        Args:
+            window: [..., K, *observation_shape], oldest first.
+
+        Returns:
+            float [..., K, *token_shape].
+        """
+        kept = self._kept
+        modules = _modules(self._encoder)
+        slots = kept.slots if kept and kept.modules == modules else _slots(modules)
+        weights = _weights(slots)
+        if _must_bypass(window, modules, weights):
+            return self._encoder(window)
+        device = window.device.type
+        circumstances = (
+            window.shape,
+            window.dtype,
+            window.device,
+            # Tokens that were made under these are of another kind.
+            torch.is_inference_mode_enabled(),
+            torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device),
+        )
+        if kept and not (circumstances == kept.circumstances and _same(weights, kept.weights)):
+            kept = None
+
+        leading = window.shape[: window.ndim - self._observation_ndim - 1]
+        frames = window.reshape(math.prod(leading), *window.shape[len(leading) :])  # [N, K, *obs]
+        words = as_words(frames.flatten(2))  # [N, K, words]
+        # Copied before the encoder runs: if another process writes meanwhile, it is noticed next.
+        weights = kept.weights if kept else [weight.detach().clone() for weight in weights]
+        newest = self._encode_newest(frames[:, -1]).unsqueeze(1)  # [N, 1, *token_shape]
+        if kept and torch.equal(words[:, :-1], kept.words):
+            tokens = torch.cat([kept.tokens, newest], dim=1)
+        else:
+            tokens = self._encode_unknown(frames, words, newest, kept)
+        # Copies: windows and tokens belong to the caller, who may write into them.
+        self._kept = _Kept(
+            modules, slots, weights, circumstances, words[:, 1:].clone(), tokens[:, 1:].clone()
+        )
+        return tokens.reshape(*leading, *tokens.shape[1:])
+
+    def _encode_unknown(
+        self, frames: Tensor, words: Tensor, newest: Tensor, kept: _Kept | None
+    ) -> Tensor:
+        """Tokens [N, K, *token_shape] of frames of which only the newest are encoded."""
+        repeated = same_frames(words[:, :-1], words[:, 1:])  # by the next step, [N, K - 1]
+        if kept is None:
+            known = torch.zeros_like(repeated)
+            older = newest.expand(-1, repeated.shape[1], *newest.shape[2:])
+        else:
+            known = same_frames(words[:, :-1], kept.words)
+            older = kept.tokens
+        tokens = torch.cat([older, newest], dim=1)
+        unknown = ~known & ~repeated
+        if unknown.any():
+            tokens[:, :-1][unknown] = self._encoder(frames[:, :-1][unknown])
+        # A frame that repeats takes its tokens from the first later step that has some.
+        steps = torch.arange(frames.shape[1], device=frames.device)
+        last = steps[-1]
+        source = torch.where(repeated & ~known, last, steps[:-1])  # [N, K - 1]
+        source = source.flip(1).cummin(1).values.flip(1)
+        rows = torch.arange(len(frames), device=frames.device).unsqueeze(1)
+        return torch.cat([tokens[rows, source], newest], dim=1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"encoder": self._encoder, "observation_ndim": self._observation_ndim}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
+
+
+def _must_bypass(window: Tensor, modules: Sequence[nn.Module], weights: Sequence[Tensor]) -> bool:
+    """Whether kept tokens would lack gradients, randomness, or values to compare."""
+    return (
+        torch.compiler.is_compiling()
+        or torch.jit.is_tracing()
+        or type(window) is not Tensor  # a stand-in for one, while something is traced
+        or window.is_meta
+        or (torch.is_grad_enabled() and any(x.requires_grad for x in (window, *weights)))
+        or forward_ad._current_level >= 0
+        or torch._C._functorch.peek_interpreter_stack() is not None  # vmap, jvp, ...
+        or any(map(_depends_on_mode, modules))
+        or (window.is_cuda and torch.cuda.is_current_stream_capturing())
+    )
+
+
+def _depends_on_mode(module: nn.Module) -> bool:
+    """Whether a module is one that puts out other values in training mode, and is in it."""
+    if not module.training:
+        return False
+    return isinstance(module, _BatchNorm) or (isinstance(module, _DropoutNd) and module.p > 0)
+
+
+def _modules(module: nn.Module) -> list[nn.Module]:
+    """All modules within one: what ``modules()`` gives, at a quarter of the time."""
+    modules = [module]
+    for child in module._modules.values():
+        if child is not None:
+            modules += _modules(child)
+    return modules
+
+
+def _slots(modules: Sequence[nn.Module]) -> list[tuple[nn.Module, str]]:
+    """Where parameters and buffers stand; plain tensors too, which losses put in their places."""
+    return [
+        (module, name)
+        for module in modules
+        for name in (
+            *module._parameters,
+            *module._buffers,
+            *(name for name, value in vars(module).items() if isinstance(value, Tensor)),
+        )
+    ]
+
+
+def _weights(slots: Sequence[tuple[nn.Module, str]]) -> list[Tensor]:
+    """What stands there now."""
+    values = (getattr(module, name, None) for module, name in slots)
+    return [value for value in values if isinstance(value, Tensor)]
+
+
+def _same(weights: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
+    """Whether tensors have the same types and values."""
+    return len(weights) == len(others) and all(
+        a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
+        for a, b in zip(weights, others, strict=True)
+    )
