@@ -79,6 +79,10 @@ class PPO(Recipe):
     """Weight of the entropy bonus."""
     critic_coeff: float = 0.5
     """Weight of the mean squared value error."""
+    reward_scale: float = 1.0
+    """Rewards are multiplied by this for training. Where policy and value share a backbone, values
+    in the tens or hundreds drive its features to be the same in all states
+    (docs/results/classic_control.md); returns are always those of the task."""
     gamma: float = 0.99
     """Discount factor."""
     gae_lambda: float = 0.95
@@ -113,6 +117,7 @@ class PPO(Recipe):
             adam_eps=0,
             max_grad_norm=0,
             clip_epsilon=0,
+            reward_scale=0,
             gamma=0,
             gae_lambda=0,
             evaluation_episodes=1,
@@ -283,6 +288,7 @@ def train(recipe: PPO, run: Run) -> None:
             if recipe.decay_clip_epsilon:
                 loss.clip_epsilon.fill_(recipe.clip_epsilon * remaining)
 
+            batch["next", "reward"] = batch["next", "reward"] * recipe.reward_scale
             with torch.no_grad():
                 add_advantages(batch, agent, gae, recipe.bootstrap_time_limit)
             agent.train()

@@ -2,12 +2,14 @@
 
 import math
 from copy import deepcopy
+from dataclasses import replace
 
 import pytest
 import torch
 from tensordict import TensorDict
 
 from recipes import ppo
+from recipes.metrics import read_metrics
 from recipes.ppo import PPO
 from recipes.ppo_agent import Agent
 from recipes.run import Run
@@ -129,3 +131,16 @@ def test_two_updates_equal_those_by_hand(env, batches, tmp_path):
         torch.testing.assert_close(weight, expected[name], atol=5e-5, rtol=0, msg=name)
     moved = max((expected[name] - start[name]).abs().max() for name in start)
     assert moved > 1e-2  # a tolerance of 5e-5 is a small part of it
+
+
+def test_rewards_are_scaled_for_training_and_returns_are_not(batches, tmp_path):
+    """With gamma 0 the value's target is the reward: 1 at each step of CartPole."""
+    recipe = replace(RECIPE, gamma=0.0, reward_scale=0.25)
+    with Run.create(tmp_path / "run", recipe) as run:
+        recipe.train(run)
+        rows = read_metrics(run.folder / "metrics.csv")
+    for _, minibatches in batches:
+        for minibatch in minibatches:
+            target = minibatch["value_target"]
+            torch.testing.assert_close(target, torch.full_like(target, 0.25))
+    assert rows[-1]["return_mean"] > 5
