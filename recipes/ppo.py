@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate, finished_returns
+from torchrl_tit.modules import while_acting
 
 from .compilation import STATIC_SHAPES, Compile, should_compile
 from .interrupt import Interrupt
@@ -256,6 +257,10 @@ def train(recipe: PPO, run: Run) -> None:
     )
     compiled = should_compile(recipe.compile, recipe.gradient_steps)
     objective = make_objective(agent, loss, compiled)
+    # What is kept of the frames just seen is decided between two pieces, compiled by themselves.
+    keeps_frames = agent.backbone.keeps_frames
+    if compiled and keeps_frames:
+        agent.backbone.compile_parts(**STATIC_SHAPES)
     gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
     parameters = list(agent.parameters())
     optimizer = torch.optim.Adam(
@@ -268,7 +273,7 @@ def train(recipe: PPO, run: Run) -> None:
         total_frames=recipe.final_step,
         device=recipe.torch_device(),
         trust_policy=True,  # ours is on the right device already
-        compile_policy=STATIC_SHAPES if compiled else None,
+        compile_policy=STATIC_SHAPES if compiled and not keeps_frames else None,
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )
@@ -280,7 +285,7 @@ def train(recipe: PPO, run: Run) -> None:
         total=recipe.final_step, initial=step, unit=" steps", desc=recipe.name, smoothing=0.05
     )
     with Interrupt() as interrupt, progress, closing(metrics):
-        for batch in collector:
+        for batch in while_acting(agent.policy, collector):
             step += batch.numel()
             remaining = 1 - (step - batch.numel()) / recipe.final_step
             if recipe.decay_learning_rate:

@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_tit.modules import acting
+
 
 def evaluate(
     env: EnvBase | Callable[[int], EnvBase],
@@ -19,6 +21,7 @@ def evaluate(
     *,
     seed: int = 0,
     reward_key: NestedKey = "reward",
+    shrink: bool = False,
 ) -> Tensor:
     """Plays whole episodes with a deterministic policy.
 
@@ -41,6 +44,9 @@ def evaluate(
         episodes: Number of episodes.
         seed: Seed of the first episode.
         reward_key: Where the reward stands in "next".
+        shrink: Whether the policy is asked only about the environments whose episode still counts,
+            which saves time where episodes differ in length. It must take batches of any size, and
+            keep no state of its own from step to step.
 
     Returns:
         The undiscounted return of each episode; float64 [episodes], on the environment's device.
@@ -63,10 +69,10 @@ def evaluate(
         raise ValueError(f"episodes must be at least 1, but is {episodes}.")
     with _acting(policy, seed):
         if isinstance(env, EnvBase):
-            return _play_all(env, policy, episodes, seed, reward_key)
+            return _play_all(env, policy, episodes, seed, reward_key, shrink)
         made = env(episodes)
         try:
-            return _play_all(made, policy, episodes, seed, reward_key)
+            return _play_all(made, policy, episodes, seed, reward_key, shrink)
         finally:
             made.close()
 
@@ -77,10 +83,12 @@ def _play_all(
     episodes: int,
     seed: int,
     reward_key: NestedKey,
+    shrink: bool,
 ) -> Tensor:
     """The return of each episode; as many run at once as there are environments; [episodes]."""
     starts = range(seed, seed + episodes, env.batch_size.numel())
-    return torch.cat([_play(env, policy, start, reward_key) for start in starts])[:episodes]
+    returns = [_play(env, policy, start, reward_key, shrink) for start in starts]
+    return torch.cat(returns)[:episodes]
 
 
 def _play(
@@ -88,13 +96,15 @@ def _play(
     policy: Callable[[TensorDictBase], TensorDictBase],
     seed: int,
     reward_key: NestedKey,
+    shrink: bool,
 ) -> Tensor:
     """The return of one episode in each of the environments; float64 [N]."""
     tensordict = env.reset(seed=seed)
     returns = torch.zeros(env.batch_size.numel(), dtype=torch.float64, device=env.device)
     playing = torch.ones_like(returns, dtype=torch.bool)
     while playing.any():
-        step, tensordict = env.step_and_maybe_reset(policy(tensordict))
+        acted = _act(policy, tensordict, playing) if shrink else policy(tensordict)
+        step, tensordict = env.step_and_maybe_reset(acted)
         outcome = step["next"]
         # An environment whose episode has ended plays on, but nothing of that counts.
         game_over = outcome.get("game_over", None)
@@ -105,6 +115,19 @@ def _play(
             returns = outcome["game_return"].flatten().double().where(playing, returns)
             playing &= ~game_over.flatten()
     return returns
+
+
+def _act(
+    policy: Callable[[TensorDictBase], TensorDictBase], tensordict: TensorDictBase, playing: Tensor
+) -> TensorDictBase:
+    """Asks the policy about some environments; the others go on as copies of one of these."""
+    if playing.all():
+        return policy(tensordict)
+    rows = playing.nonzero().squeeze(-1)
+    source = torch.zeros_like(playing, dtype=torch.int64)
+    source[rows] = torch.arange(len(rows), device=rows.device)
+    acted = policy(tensordict.reshape(-1)[rows])
+    return acted[source].reshape(tensordict.shape)
 
 
 def finished_returns(batch: TensorDictBase) -> Tensor:
@@ -142,6 +165,7 @@ def _acting(policy: Callable[[TensorDictBase], TensorDictBase], seed: int) -> It
             torch.random.fork_rng(devices),
             torch.no_grad(),
             set_exploration_type(ExplorationType.DETERMINISTIC),
+            acting(policy),  # encodes the newest frames only
         ):
             # A policy that draws numbers all the same draws the same ones each time.
             torch.manual_seed(seed)

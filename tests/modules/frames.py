@@ -27,11 +27,14 @@ class CountedFrames:
 
     def __init__(self, network):
         self.count = 0
+        self.only_without_gradients = False
         self.ndim = len(network.observation_shape)
         network.frame_encoder.register_forward_pre_hook(self)
 
     def __call__(self, encoder, inputs):
         (x,) = inputs
+        if self.only_without_gradients and torch.is_grad_enabled():
+            return
         self.count += x.shape[: x.ndim - self.ndim].numel()
 
     def take(self):

@@ -112,7 +112,7 @@ class Backbone(TensorDictModule):
             **options: of ``torch.compile``.
         """
         network = self.module
-        if self._make_cache() is not None:
+        if self.keeps_frames:
             self._compiled = (
                 torch.compile(network.frame_encoder, **options),
                 torch.compile(network.encode_history, **options),
@@ -128,11 +128,19 @@ class Backbone(TensorDictModule):
         self.clear_cache()
         return super().state_dict(*args, **kwargs)
 
+    @property
+    def keeps_frames(self) -> bool:
+        """Whether acting mode spares anything: there are a frame encoder and earlier frames."""
+        network = self.module
+        return (
+            isinstance(network, HistoryNetwork)
+            and network.frame_encoder is not None
+            and network.history > 1
+        )
+
     def _make_cache(self) -> FrameCache | None:
         network = self.module
-        if not isinstance(network, HistoryNetwork) or network.frame_encoder is None:
-            return None
-        if network.history == 1:
+        if not self.keeps_frames:
             return None
         encode_newest = self._compiled[0] if self._compiled else None
         return FrameCache(network.frame_encoder, len(network.observation_shape), encode_newest)
