@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
-from torchrl_tit.envs import make_env
+from torchrl_tit.envs import VectorizationMode, make_env
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.modules import while_acting
 
@@ -54,8 +54,12 @@ class PPO(Recipe):
     """Number K of observations that the network sees."""
     padding: Literal["same", "constant"] = "same"
     """What stands before an episode's first observation: that observation, or zeros."""
+    hide_velocities: bool = False
+    """Whether the velocities are left out of the observations, so that one says too little."""
     num_envs: int = 1
     """Environments that are stepped side by side; they share the steps of a batch."""
+    vectorization_mode: VectorizationMode = "sync"
+    """Whether training steps them in this process or in one each, which pays for slow tasks."""
     total_steps: int = 100_000
     """Environment steps to train for, rounded up to whole batches."""
     steps_per_batch: int = 2048
@@ -152,6 +156,7 @@ class PPO(Recipe):
             seed=seed,
             history=self.history,
             padding=self.padding,
+            hide_velocities=self.hide_velocities,
             device=None if device.type == "cpu" else device,
             **kwargs,
         )
@@ -242,7 +247,9 @@ def train(recipe: PPO, run: Run) -> None:
     np.random.seed(recipe.seed)
     torch.manual_seed(recipe.seed)
 
-    env = recipe.make_env(recipe.num_envs, recipe.seed)
+    env = recipe.make_env(
+        recipe.num_envs, recipe.seed, vectorization_mode=recipe.vectorization_mode
+    )
     agent = Agent(recipe, env).eval()  # no dropout while acting
     loss = ClipPPOLoss(
         agent.actor,

@@ -15,6 +15,7 @@ from torchrl_tit.networks import (
 from .networks import NetworkConfig
 from .ppo import PPO
 from .recipe import Recipe, nearest
+from .no_velocity import NO_VELOCITY_RECIPES
 
 # Task name: environment and steps (arXiv 2212.14538, appendix). The paper ran MuJoCo's v3.
 _TASKS = {
@@ -60,7 +61,7 @@ def _named() -> dict[str, Recipe]:
                 # policy's (docs/results/cartpole.md). And environments side by side, for speed.
                 name += "-tuned"
                 recipes[name] = replace(recipe, name=name, critic_coeff=0.02, num_envs=8)
-    return recipes
+    return recipes | NO_VELOCITY_RECIPES
 
 
 RECIPES: dict[str, Recipe] = _named()
