@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NoReturn
 
 from torchrl_tit.networks import (
     D2RL,
@@ -12,6 +13,7 @@ from torchrl_tit.networks import (
     CoBERL,
     CoBERLConfig,
     D2RLConfig,
+    DecisionTransformerConfig,
     EnhancedTIT,
     EnhancedTITConfig,
     HistoryNetwork,
@@ -37,10 +39,18 @@ NetworkConfig = (
     | MLPConfig
     | OFENetConfig
     | D2RLConfig
+    | DecisionTransformerConfig
 )
 """Settings of a network: a recipe's field ``backbone``."""
 
 Network = HistoryNetwork | TwoTrunkNetwork
+
+
+def _reads_more(*_arguments: object) -> NoReturn:
+    raise ValueError(
+        "a decision-transformer reads returns and actions beside a history: use a dt or odt recipe"
+    )
+
 
 NETWORKS: dict[str, tuple[type[NetworkConfig], Callable[..., Network]]] = {
     "enhanced-tit": (EnhancedTITConfig, EnhancedTIT),
@@ -52,6 +62,7 @@ NETWORKS: dict[str, tuple[type[NetworkConfig], Callable[..., Network]]] = {
     "mlp": (MLPConfig, MLP),
     "ofenet": (OFENetConfig, OFENet),
     "d2rl": (D2RLConfig, D2RL),
+    "decision-transformer": (DecisionTransformerConfig, _reads_more),
 }
 """Settings and network by the name that recipes use."""
 

@@ -12,10 +12,11 @@ from torchrl_tit.networks import (
     VanillaTITConfig,
 )
 
+from .dt_named import DT_RECIPES
 from .networks import NetworkConfig
+from .no_velocity import NO_VELOCITY_RECIPES
 from .ppo import PPO
 from .recipe import Recipe, nearest
-from .no_velocity import NO_VELOCITY_RECIPES
 
 # Task name: environment and steps (arXiv 2212.14538, appendix). The paper ran MuJoCo's v3.
 _TASKS = {
@@ -61,7 +62,7 @@ def _named() -> dict[str, Recipe]:
                 # policy's (docs/results/cartpole.md). And environments side by side, for speed.
                 name += "-tuned"
                 recipes[name] = replace(recipe, name=name, critic_coeff=0.02, num_envs=8)
-    return recipes | NO_VELOCITY_RECIPES
+    return recipes | NO_VELOCITY_RECIPES | DT_RECIPES
 
 
 RECIPES: dict[str, Recipe] = _named()

@@ -2,16 +2,21 @@
 
 from torchrl_tit.modules.acting import acting, while_acting
 from torchrl_tit.modules.backbone import Backbone
+from torchrl_tit.modules.decision_transformer import make_dt_actor, make_dt_predictor
 from torchrl_tit.modules.frame_cache import FrameCache
 from torchrl_tit.modules.heads import make_actor, make_value
 from torchrl_tit.modules.rollout_features import add_rollout_features
+from torchrl_tit.modules.sequence_backbone import SequenceBackbone
 
 __all__ = [
     "Backbone",
     "FrameCache",
+    "SequenceBackbone",
     "acting",
     "add_rollout_features",
     "make_actor",
+    "make_dt_actor",
+    "make_dt_predictor",
     "make_value",
     "while_acting",
 ]

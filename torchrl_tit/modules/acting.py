@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from torch import nn
 
 from torchrl_tit.modules.backbone import Backbone
+from torchrl_tit.modules.sequence_backbone import SequenceBackbone
 
 T = TypeVar("T")
 
@@ -33,7 +34,7 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
     """
     with ExitStack() as stack:
         for module in policy.modules() if isinstance(policy, nn.Module) else ():
-            if isinstance(module, Backbone):
+            if isinstance(module, Backbone | SequenceBackbone):
                 stack.enter_context(module.acting())
         yield
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchrl_tit.networks.config import override_config
 from torchrl_tit.networks.decision_transformer_config import DecisionTransformerConfig
+from torchrl_tit.networks.dropout import Dropout
 from torchrl_tit.networks.history_network import check_history, check_observation
 
 _STATES = slice(1, None, 3)
@@ -75,7 +76,7 @@ class DecisionTransformer(nn.Module):
             nn.Embedding(config.max_ep_len, width) if config.timestep_embedding else None
         )
         self.embedding_norm = nn.LayerNorm(width)
-        self.dropout = nn.Dropout(config.dropout)
+        self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(config.make_block() for _ in range(config.num_blocks))
         self.norm = nn.LayerNorm(width)
         self.action_head = nn.Sequential(
@@ -119,10 +120,14 @@ class DecisionTransformer(nn.Module):
         Returns:
             float [..., K, D].
         """
+        self.check_states(states)
+        return self.state_encoder(states).squeeze(-2)
+
+    def check_states(self, states: Tensor) -> None:
+        """Raises ValueError or TypeError where states do not fit this network."""
         ndim = len(self.observation_shape)
         steps = states.shape[-ndim - 1] if states.ndim > ndim else 1
         check_history(states, steps, self.observation_shape, self.norm.weight.dtype)
-        return self.state_encoder(states).squeeze(-2)
 
     def encode(
         self,

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 
 from torchrl_tit.networks.activations import Activation, make_activation
 from torchrl_tit.networks.attention import SelfAttention
+from torchrl_tit.networks.dropout import Dropout
 
 
 class GPT2Block(nn.Module):
@@ -41,13 +42,13 @@ class GPT2Block(nn.Module):
         super().__init__()
         self.norm1 = nn.LayerNorm(embed_dim)
         self.attention = SelfAttention(embed_dim, num_heads, dropout=dropout)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
         self.norm2 = nn.LayerNorm(embed_dim)
         self.ffn = nn.Sequential(
             nn.Linear(embed_dim, ffn_dim),
             make_activation(activation),
             nn.Linear(ffn_dim, embed_dim),
-            nn.Dropout(dropout),
+            Dropout(dropout),
         )
         self.reset_parameters()
 

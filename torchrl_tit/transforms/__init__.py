@@ -2,5 +2,6 @@
 
 from torchrl_tit.transforms.hide_velocities import VELOCITIES, HideEntries, HideVelocities
 from torchrl_tit.transforms.history import History
+from torchrl_tit.transforms.sequence_history import SequenceHistory
 
-__all__ = ["VELOCITIES", "HideEntries", "HideVelocities", "History"]
+__all__ = ["VELOCITIES", "HideEntries", "HideVelocities", "History", "SequenceHistory"]

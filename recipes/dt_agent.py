@@ -1,0 +1,124 @@
+"""Network, normalisation and environment of Decision Transformer's recipes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import torch
+from torch import Tensor, nn
+from torchrl.data import Bounded, Categorical
+from torchrl.envs import Compose, EnvBase, ObservationNorm, TargetReturn, TransformedEnv
+
+from torchrl_tit.datasets import Episodes
+from torchrl_tit.envs import make_env
+from torchrl_tit.evaluation import evaluate
+from torchrl_tit.modules import acting, make_dt_actor
+from torchrl_tit.networks import DecisionTransformer, DecisionTransformerConfig
+from torchrl_tit.transforms import SequenceHistory
+
+
+class DTAgent(nn.Module):
+    """Decision Transformer with the statistics that normalise its observations.
+
+    Args:
+        env: name of the task.
+        config: the network's settings.
+        return_scale: returns-to-go are divided by it.
+
+    Raises:
+        ValueError: if the task does not fit the network.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, env: str, config: DecisionTransformerConfig, return_scale: float) -> None:
+        super().__init__()
+        self.env = env
+        self.return_scale = return_scale
+        task = make_env(env, clip_actions=False)
+        spec = task.observation_spec["observation"]
+        shape = spec.shape[1:]
+        self.normalizes = spec.dtype.is_floating_point
+        action_dim = _check_task(env, task.action_spec_unbatched, config)
+        task.close()
+        self.network = DecisionTransformer(shape, action_dim, config)
+        self.actor = make_dt_actor(self.network)
+        self.register_buffer("mean", torch.zeros(shape))
+        self.register_buffer("std", torch.ones(shape))
+
+    def fit_statistics(self, episodes: Episodes) -> None:
+        """Takes the statistics of a data set; uint8 images, which networks divide by 255, stay."""
+        if self.normalizes:
+            for buffer, value in zip(
+                (self.mean, self.std), episodes.observation_statistics(), strict=True
+            ):
+                buffer.copy_(value)
+
+    def make_env(
+        self, num_envs: int, target_return: float, seed: int | None = None, **settings: Any
+    ) -> EnvBase:
+        """Builds the task with all that the policy reads; actions go to it as they are.
+
+        Args:
+            num_envs: environments that are stepped side by side.
+            target_return: the return that is to be reached.
+            seed: of the first environment.
+            **settings: of the task.
+        """
+        device = self.mean.device
+        env = make_env(
+            self.env,
+            num_envs,
+            seed=seed,
+            clip_actions=False,
+            device=None if device.type == "cpu" else device,
+            **settings,
+        )
+        transforms = [
+            TargetReturn(target_return),
+            SequenceHistory(self.network.config.context, return_scale=self.return_scale),
+        ]
+        if self.normalizes:
+            normalize = ObservationNorm(
+                self.mean, self.std, in_keys=["observation"], standard_normal=True
+            )
+            transforms.insert(0, normalize)
+        return TransformedEnv(env, Compose(*transforms))
+
+    def play(self, target_return: float, episodes: int, seed: int) -> Tensor:
+        """Plays episodes side by side and returns what each returned; float64 [episodes]."""
+        with acting(self.actor):
+            return evaluate(
+                lambda num_envs: self.make_env(num_envs, target_return),
+                self.actor,
+                episodes,
+                seed=seed,
+                shrink=True,
+            )
+
+
+def _check_task(env: str, action_spec: Any, config: DecisionTransformerConfig) -> int:
+    """Entries of a continuous action, or the number of discrete ones, if the network can act."""
+    spec = gymnasium.spec(env)
+    if config.timestep_embedding and (spec.max_episode_steps or 0) > config.max_ep_len:
+        raise ValueError(
+            f"episodes of {env} have up to {spec.max_episode_steps} steps, but max_ep_len is "
+            f"{config.max_ep_len}: raise backbone.max_ep_len to {spec.max_episode_steps} or more"
+        )
+    discrete = isinstance(action_spec, Categorical)
+    if discrete != (config.action_space == "discrete"):
+        kind = "discrete" if discrete else "continuous"
+        raise ValueError(
+            f"{env} has {kind} actions, but the head's are {config.action_space}: set "
+            f"backbone.action_space to {kind!r}, or take another task"
+        )
+    if isinstance(action_spec, Bounded):
+        low, high = action_spec.low.min().item(), action_spec.high.max().item()
+        if (low, high) != (-1, 1):
+            raise ValueError(
+                f"actions of {env} reach from {low:g} to {high:g}, but the head's from -1 to 1: "
+                "take a task whose actions are scaled to that"
+            )
+    return action_spec.space.n if discrete else action_spec.shape[0]

@@ -1,0 +1,61 @@
+"""The data of Decision Transformer's recipes, and whether they fit them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
+
+from torchrl_tit.datasets import Episodes, load_episodes
+from torchrl_tit.networks import DecisionTransformerConfig
+
+
+def load_data(dataset: str, env: str, config: DecisionTransformerConfig) -> Episodes:
+    """Loads episodes and checks that a network can be trained on them.
+
+    Args:
+        dataset: a name or a path: see :func:`~torchrl_tit.datasets.load_episodes`.
+        env: name of the task that they are from.
+        config: the network's settings.
+
+    Raises:
+        ValueError: if its actions are of the other kind, or episodes are longer than it allows.
+        FileNotFoundError: if there are no such data.
+    """
+    episodes = load_episodes(dataset, task=env)
+    continuous = episodes.rows["action"].is_floating_point()
+    if continuous == (config.action_space == "discrete"):
+        kind = "continuous" if continuous else "discrete"
+        raise ValueError(
+            f"the actions in {dataset} are {kind}, but the head's are {config.action_space}: set "
+            f"backbone.action_space to {kind!r}, or take other data"
+        )
+    longest = int(episodes.lengths.max())
+    if config.timestep_embedding and longest > config.max_ep_len:
+        raise ValueError(
+            f"episodes in {dataset} have up to {longest} steps, but max_ep_len is "
+            f"{config.max_ep_len}: raise backbone.max_ep_len to {longest} or more"
+        )
+    return episodes
+
+
+def check_source(dataset: str, env: str, config: DecisionTransformerConfig) -> None:
+    """Checks what can be checked without a download: local data wholly, else the name alone."""
+    if dataset not in D4RL_DATASETS or Path(dataset).exists():
+        load_data(dataset, env, config)
+
+
+def warn_of_targets(target_returns: Sequence[float], episodes: Episodes) -> None:
+    """Warns of returns that are asked for, but that no episode of the data comes near."""
+    returns = episodes.returns[episodes.finished.cpu()]
+    low, high = returns.min().item(), returns.max().item()
+    outside = [target for target in target_returns if not low <= target <= high]
+    if outside:
+        warnings.warn(
+            f"target_returns {', '.join(f'{target:g}' for target in outside)}: no episode in "
+            f"{episodes.source} has such a return; they reach from {low:.1f} to {high:.1f}, with a "
+            f"mean of {returns.mean().item():.1f}",
+            stacklevel=3,
+        )

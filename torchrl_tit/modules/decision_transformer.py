@@ -1,0 +1,88 @@
+"""Decision Transformer's policy, and what its losses train."""
+
+from __future__ import annotations
+
+from tensordict import NestedKey
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import distributions
+from torchrl.modules import OneHotCategorical
+
+from torchrl_tit.modules.sequence_backbone import SequenceBackbone
+from torchrl_tit.networks import DecisionTransformer
+
+
+def make_dt_predictor(network: DecisionTransformer) -> TensorDictSequential:
+    """Builds what Decision Transformer's loss trains: the prediction of every step's action.
+
+    Args:
+        network: the network.
+
+    Returns:
+        A module that reads a batch of :class:`~torchrl_tit.datasets.SequenceStorage` and writes
+        over its "action" the predicted ones, float [..., K, A]: actions within -1..1, or logits of
+        discrete ones. TorchRL's `DTLoss` takes it, and
+        :class:`~torchrl_tit.objectives.MaskedDTLoss`.
+
+    Example:
+        >>> import torch
+        >>> from torchrl.objectives import DTLoss
+        >>> loss = DTLoss(make_dt_predictor(DecisionTransformer((11,), 3)))
+        >>> loss.loss_mask_key = "mask"  # or padding counts
+    """
+    return TensorDictSequential(
+        SequenceBackbone(network), TensorDictModule(network.action_head, ["features"], ["action"])
+    )
+
+
+def make_dt_actor(
+    network: DecisionTransformer,
+    *,
+    group: NestedKey | None = "sequence",
+    action_key: NestedKey = "action",
+    one_hot: bool = False,
+) -> TensorDictSequential:
+    """Builds Decision Transformer's policy: histories in, the newest step's action out.
+
+    Args:
+        network: the network, as it is trained: weights are shared, not copied.
+        group: the key under which :class:`~torchrl_tit.transforms.SequenceHistory` writes.
+        action_key: where the action goes.
+        one_hot: whether discrete actions are one-hot, as the environment's spec says.
+
+    Returns:
+        A policy for any TorchRL collector. It writes continuous actions, float [..., A], as they
+        are predicted; discrete ones, int64 [...] or one-hot [..., A], are the most likely ones, or
+        drawn, as TorchRL's exploration type says.
+
+    Example:
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl.envs import Compose, TargetReturn, TransformedEnv
+        >>> from torchrl_tit.envs import make_env
+        >>> from torchrl_tit.transforms import SequenceHistory
+        >>> network = DecisionTransformer((4,), 2, action_space="discrete", context=5)
+        >>> transforms = Compose(TargetReturn(500.0), SequenceHistory(context=5))
+        >>> env = TransformedEnv(make_env("CartPole-v1", 8), transforms)
+        >>> policy = make_dt_actor(network)
+        >>> collector = Collector(env, policy, frames_per_batch=80, total_frames=80)
+        >>> [batch["action"].shape for batch in collector]
+        [torch.Size([8, 10])]
+        >>> collector.shutdown()
+    """
+    backbone = SequenceBackbone(network, group=group, newest=True)
+    if network.config.action_space == "continuous":
+        return TensorDictSequential(
+            backbone, TensorDictModule(network.action_head, ["features"], [action_key])
+        )
+    return TensorDictSequential(
+        backbone,
+        TensorDictModule(network.action_head, ["features"], ["logits"]),
+        ProbabilisticTensorDictModule(
+            in_keys=["logits"],
+            out_keys=[action_key],
+            distribution_class=OneHotCategorical if one_hot else distributions.Categorical,
+        ),
+    )

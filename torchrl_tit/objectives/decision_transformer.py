@@ -1,0 +1,77 @@
+"""Decision Transformer's loss, which does not count padding and knows discrete actions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torch.nn import functional as F
+from torchrl.objectives import DTLoss
+
+
+class MaskedDTLoss(DTLoss):
+    """TorchRL's `DTLoss` over the steps that are no padding.
+
+    `DTLoss` counts padding until its ``loss_mask_key`` is set, which is done here, and has no loss
+    for discrete actions; with ``loss_function="cross_entropy"`` this one has. The mean is taken
+    over all entries of all unmasked actions.
+
+    Args:
+        actor_network: Reads a batch and writes the predicted action of every step over "action":
+            see :func:`~torchrl_tit.modules.make_dt_predictor`.
+        loss_function: "l2", "l1" or "smooth_l1" between continuous actions [..., K, A], or
+            "cross_entropy" between logits and discrete ones, integers [..., K] or one-hot.
+        mask_key: Where the mask stands, bool [..., K], False at padding.
+        **settings: Of `DTLoss`: ``reduction``.
+
+    Returns:
+        In ``forward``, a tensordict with "loss", float [].
+
+    Source: "Decision Transformer" (arXiv 2106.01345), section 3.
+
+    Example:
+        >>> from torchrl_tit.modules import make_dt_predictor
+        >>> from torchrl_tit.networks import DecisionTransformer
+        >>> loss = MaskedDTLoss(make_dt_predictor(DecisionTransformer((11,), 3)))
+        >>> batch = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(8, 20, 11),
+        ...         "action": torch.randn(8, 20, 3),
+        ...         "return_to_go": torch.ones(8, 20, 1),
+        ...         "timestep": torch.arange(20).expand(8, 20),
+        ...         "mask": torch.arange(20).expand(8, 20) > 4,
+        ...     },
+        ...     [8],
+        ... )
+        >>> loss(batch)["loss"].shape
+        torch.Size([])
+    """
+
+    def __init__(
+        self,
+        actor_network: TensorDictModule,
+        *,
+        loss_function: str = "l2",
+        mask_key: NestedKey = "mask",
+        **settings: Any,
+    ) -> None:
+        super().__init__(actor_network, loss_function=loss_function, **settings)
+        self.loss_mask_key = mask_key
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes the loss of a batch [...], which is left as it is."""
+        if self.loss_function != "cross_entropy":
+            return super().forward(tensordict)
+        tensordict = tensordict.copy()
+        target = tensordict.get(self.tensor_keys.action_target)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            logits = self.actor_network(tensordict).get(self.tensor_keys.action_pred)
+        if target.ndim == logits.ndim:  # one-hot
+            target = target.to(torch.int8).argmax(-1)
+        # Padding is no class; what stands for it here is masked below.
+        classes = target.long().clamp(min=0)
+        loss = F.cross_entropy(logits.flatten(0, -2), classes.flatten(), reduction="none")
+        loss = self._reduce_loss(loss.view_as(classes), tensordict=tensordict)
+        return TensorDict({"loss": loss})

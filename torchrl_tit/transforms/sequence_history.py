@@ -1,0 +1,162 @@
+"""The last K returns-to-go, observations and actions, as Decision Transformer reads them."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import Transform
+
+
+class SequenceHistory(Transform):
+    """Writes the last K steps of the episode as Decision Transformer reads them.
+
+    Under one key stands what an item of :class:`~torchrl_tit.datasets.SequenceStorage` holds:
+    "observation" [..., K, *obs], "action" [..., K, *action], "return_to_go" [..., K, 1], "timestep"
+    int64 [..., K] and "mask" bool [..., K]. The newest step stands last, with zeros for its action;
+    before an episode's first step stands padding, zeros that are masked. All of it is in the
+    tensordict: nothing is stored here, so any reset is right.
+
+    Put TorchRL's `TargetReturn` before it, which writes the return that is still to be reached.
+
+    Args:
+        context: K, the number of steps, at least 1.
+        return_scale: Returns-to-go are divided by it.
+        observation_key: Where the observation [..., *obs] stands.
+        action_key: Where the policy writes the action [..., *action].
+        target_return_key: Where the return that is to be reached [..., 1] stands.
+        out_key: Where the sequence goes.
+
+    Raises:
+        ValueError: If ``context`` is less than 1 or ``return_scale`` is not positive.
+        KeyError: If the environment has no such entry.
+
+    Source: "Decision Transformer" (arXiv 2106.01345), section 3.
+
+    Example:
+        >>> from torchrl.envs import Compose, TargetReturn, TransformedEnv
+        >>> from torchrl_tit.envs import make_env
+        >>> history = SequenceHistory(context=3, return_scale=100.0)
+        >>> env = make_env("CartPole-v1", seed=0)
+        >>> steps = TransformedEnv(env, Compose(TargetReturn(500.0), history)).rollout(3)
+        >>> steps["sequence", "return_to_go"][0, :, :, 0]
+        tensor([[0.0000, 0.0000, 5.0000],
+                [0.0000, 5.0000, 4.9900],
+                [5.0000, 4.9900, 4.9800]])
+        >>> steps["sequence", "mask"][0, 1]
+        tensor([False,  True,  True])
+    """
+
+    def __init__(
+        self,
+        context: int = 20,
+        *,
+        return_scale: float = 1000.0,
+        observation_key: NestedKey = "observation",
+        action_key: NestedKey = "action",
+        target_return_key: NestedKey = "target_return",
+        out_key: NestedKey = "sequence",
+    ) -> None:
+        if context < 1:
+            raise ValueError(f"context must be at least 1, but is {context}.")
+        if not return_scale > 0:
+            raise ValueError(f"return_scale must be positive, but is {return_scale}.")
+        super().__init__(in_keys=[observation_key, target_return_key], out_keys=[out_key])
+        self.context = context
+        self.return_scale = return_scale
+        self.action_key = action_key
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        (out_key,) = self.out_keys
+        sequence = self._first(tensordict_reset)
+        reset, before = tensordict.get("_reset", None), tensordict.get(out_key, None)
+        if reset is not None and before is not None:  # only some environments begin anew
+            sequence = sequence.where(reset.reshape(sequence.batch_size), before)
+        return tensordict_reset.set(out_key, sequence)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        (out_key,) = self.out_keys
+        before = tensordict.get(out_key)
+        axis = before.ndim
+        action = tensordict.get(self.action_key).unsqueeze(axis)
+        # The newest step gets the action that was taken there; then one more step follows.
+        taken = torch.cat([before["action"].narrow(axis, 0, self.context - 1), action], axis)
+        newest = {
+            **self._newest(next_tensordict, axis),
+            "timestep": before["timestep"].narrow(axis, -1, 1) + 1,
+            "action": torch.zeros_like(action),
+        }
+        sequence = TensorDict(
+            {
+                name: _push(taken if name == "action" else before[name], step, axis)
+                for name, step in newest.items()
+            },
+            before.batch_size,
+            device=before.device,
+        )
+        return next_tensordict.set(out_key, sequence)
+
+    def _newest(self, tensordict: TensorDictBase, axis: int) -> dict[str, Tensor]:
+        """What the environment tells about its newest step; [..., 1, ...] each."""
+        observation_key, target_return_key = self.in_keys
+        to_go = tensordict.get(target_return_key).unsqueeze(axis) / self.return_scale
+        return {
+            "observation": tensordict.get(observation_key).unsqueeze(axis),
+            "return_to_go": to_go,
+            "mask": torch.ones_like(to_go.squeeze(-1), dtype=torch.bool),
+        }
+
+    def _first(self, tensordict: TensorDictBase) -> TensorDict:
+        """The sequence of an episode's first step, behind padding."""
+        axis = tensordict.ndim
+        step = self._newest(tensordict, axis)
+        step["timestep"] = torch.zeros_like(step["mask"], dtype=torch.int64)
+        spec = self.parent.full_action_spec[self.action_key]
+        step["action"] = spec.zero().unsqueeze(axis)
+        padded = {}
+        for name, value in step.items():
+            shape = list(value.shape)
+            shape[axis] = self.context
+            padded[name] = _push(value.new_zeros(shape), value, axis)
+        return TensorDict(padded, tensordict.batch_size, device=tensordict.device)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds the sequence to what the environment is known to write."""
+        observation_key, target_return_key = self.in_keys
+        for key in self.in_keys:
+            if key not in observation_spec.keys(True, True):
+                raise KeyError(
+                    f"SequenceHistory found no {key!r} in the environment, which has "
+                    f"{sorted(map(str, observation_spec.keys(True, True)))}; put TorchRL's "
+                    "TargetReturn before it, or name other keys."
+                )
+        axis = observation_spec.ndim
+        specs = {
+            "observation": observation_spec[observation_key],
+            "action": self.parent.full_action_spec[self.action_key],
+            "return_to_go": observation_spec[target_return_key],
+        }
+        steps = {
+            name: Unbounded(
+                (*spec.shape[:axis], self.context, *spec.shape[axis:]),
+                dtype=spec.dtype,
+                device=spec.device,
+            )
+            for name, spec in specs.items()
+        }
+        leading = (*observation_spec.shape, self.context)
+        device = observation_spec.device
+        steps["timestep"] = Unbounded(leading, dtype=torch.int64, device=device)
+        steps["mask"] = Unbounded(leading, dtype=torch.bool, device=device)
+        observation_spec[self.out_keys[0]] = Composite(
+            steps, shape=observation_spec.shape, device=device
+        )
+        return observation_spec
+
+
+def _push(window: Tensor, step: Tensor, axis: int) -> Tensor:
+    """A window [..., K, ...] without its first step and with another [..., 1, ...] at its end."""
+    return torch.cat([window.narrow(axis, 1, window.shape[axis] - 1), step], axis)
