@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
+from torchrl_tit.modules import LSTMConfig
 from torchrl_tit.networks import (
     D2RL,
     MLP,
@@ -39,11 +40,16 @@ NetworkConfig = (
     | MLPConfig
     | OFENetConfig
     | D2RLConfig
+    | LSTMConfig
     | DecisionTransformerConfig
 )
 """Settings of a network: a recipe's field ``backbone``."""
 
 Network = HistoryNetwork | TwoTrunkNetwork
+
+
+def _remembers(*_arguments: object) -> NoReturn:
+    raise ValueError("an lstm carries its state from step to step: use a ppo recipe")
 
 
 def _reads_more(*_arguments: object) -> NoReturn:
@@ -62,6 +68,7 @@ NETWORKS: dict[str, tuple[type[NetworkConfig], Callable[..., Network]]] = {
     "mlp": (MLPConfig, MLP),
     "ofenet": (OFENetConfig, OFENet),
     "d2rl": (D2RLConfig, D2RL),
+    "lstm": (LSTMConfig, _remembers),
     "decision-transformer": (DecisionTransformerConfig, _reads_more),
 }
 """Settings and network by the name that recipes use."""

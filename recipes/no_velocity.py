@@ -6,6 +6,7 @@ All networks train with the same settings.
 
 from __future__ import annotations
 
+from torchrl_tit.modules import LSTMConfig
 from torchrl_tit.networks import EnhancedTITConfig, MLPConfig
 
 from .networks import NetworkConfig
@@ -19,6 +20,7 @@ _TASKS = {
 _NETWORKS: dict[str, tuple[int, NetworkConfig]] = {  # with the history K
     "mlp": (1, MLPConfig()),
     "mlp-stack-8": (8, MLPConfig()),
+    "lstm": (1, LSTMConfig()),
     "enhanced-tit-k1": (1, EnhancedTITConfig()),
     "enhanced-tit-k8": (8, EnhancedTITConfig()),
     "enhanced-tit-k8-positions": (8, EnhancedTITConfig(temporal_position_encoding=True)),

@@ -12,14 +12,14 @@ import numpy as np
 import torch
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
 from torchrl_tit.envs import VectorizationMode, make_env
 from torchrl_tit.evaluation import evaluate, finished_returns
-from torchrl_tit.modules import while_acting
+from torchrl_tit.modules import LSTMConfig, while_acting
 
 from .compilation import STATIC_SHAPES, Compile, should_compile
 from .interrupt import Interrupt
@@ -66,6 +66,9 @@ class PPO(Recipe):
     """Environment steps that are collected before each update; must be a multiple of num_envs."""
     minibatch_size: int = 64
     """Steps in one gradient step."""
+    sequence_length: int = 16
+    """Consecutive steps that a recurrent network is trained on at a time; must divide the steps of
+    an environment in a batch, and minibatch_size. Other networks are trained on single steps."""
     epochs: int = 10
     """Passes over each batch."""
     learning_rate: float = 3e-4
@@ -107,7 +110,7 @@ class PPO(Recipe):
     compile: Compile = "auto"
     """Whether acting and the update run through torch.compile, which needs a C++ compiler and about
     a minute at the start: "auto" is on where it works and the run is long enough to earn that
-    back."""
+    back. Recurrent networks are never compiled."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,6 +119,7 @@ class PPO(Recipe):
             history=1,
             num_envs=1,
             total_steps=1,
+            sequence_length=1,
             minibatch_size=2,  # an advantage alone has no standard deviation
             epochs=1,
             learning_rate=0,
@@ -136,6 +140,21 @@ class PPO(Recipe):
                 "environments: it must be a multiple of num_envs"
             )
 
+        if self.is_recurrent:
+            for name, steps in (
+                ("minibatch_size", self.minibatch_size),
+                ("steps_per_batch / num_envs", self.steps_per_batch // self.num_envs),
+            ):
+                if steps % self.sequence_length:
+                    raise ValueError(
+                        f"sequence_length {self.sequence_length} does not divide {name} = {steps}"
+                    )
+
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether the network carries a state from step to step."""
+        return isinstance(self.backbone, LSTMConfig)
+
     @property
     def final_step(self) -> int:
         """``total_steps``, rounded up to whole batches."""
@@ -150,7 +169,7 @@ class PPO(Recipe):
     def make_env(self, num_envs: int, seed: int, **kwargs: Any) -> EnvBase:
         """Builds the environment, with the history as part of it; settings go to the task."""
         device = self.torch_device()
-        return make_env(
+        env = make_env(
             self.env,
             num_envs,
             seed=seed,
@@ -160,6 +179,9 @@ class PPO(Recipe):
             device=None if device.type == "cpu" else device,
             **kwargs,
         )
+        if isinstance(self.backbone, LSTMConfig):
+            env = TransformedEnv(env, self.backbone.make_transforms(), auto_unwrap=True)
+        return env
 
     def check(self) -> None:
         """Builds environment and agent once and lets it act.
@@ -262,7 +284,8 @@ def train(recipe: PPO, run: Run) -> None:
         log_explained_variance=False,
         functional=False,
     )
-    compiled = should_compile(recipe.compile, recipe.gradient_steps)
+    # How long a sequence is varies with where episodes begin.
+    compiled = not recipe.is_recurrent and should_compile(recipe.compile, recipe.gradient_steps)
     objective = make_objective(agent, loss, compiled)
     # What is kept of the frames just seen is decided between two pieces, compiled by themselves.
     keeps_frames = agent.backbone.keeps_frames

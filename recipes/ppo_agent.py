@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.envs import EnvBase
+from torchrl.modules import set_recurrent_mode
 
-from torchrl_tit.modules import Backbone, make_actor, make_value
+from torchrl_tit.modules import Backbone, LSTMBackbone, LSTMConfig, make_actor, make_value
 from torchrl_tit.networks import TwoTrunkNetwork, init_orthogonal_
 
 from .networks import make_network
@@ -28,15 +30,31 @@ class Agent(nn.Module):
     def __init__(self, recipe: PPO, env: EnvBase) -> None:
         super().__init__()
         shape = env.observation_spec["history"].shape[env.batch_dims + 1 :]
-        network = make_network(recipe.backbone, shape, recipe.history)
+        self.backbone: Backbone | LSTMBackbone
+        if isinstance(recipe.backbone, LSTMConfig):
+            self.backbone = LSTMBackbone(shape, recipe.history, recipe.backbone)
+            keys, features_dim = ["features"], self.backbone.features_dim
+        else:
+            network = make_network(recipe.backbone, shape, recipe.history)
+            separate = isinstance(network, TwoTrunkNetwork)  # trunks for policy and value
+            keys = ["policy_features", "value_features"] if separate else ["features"]
+            self.backbone, features_dim = Backbone(network, out_keys=keys), network.features_dim
         if recipe.initialization == "orthogonal":
-            init_orthogonal_(network)
-        separate = isinstance(network, TwoTrunkNetwork)  # trunks for policy and value
-        out_keys = ["policy_features", "value_features"] if separate else ["features"]
-        self.backbone = Backbone(network, out_keys=out_keys)
-        self.actor = make_actor(network.features_dim, env.action_spec_unbatched, in_key=out_keys[0])
-        self.critic = make_value(network.features_dim, in_key=out_keys[-1])
+            init_orthogonal_(self.backbone)
+        self.actor = make_actor(features_dim, env.action_spec_unbatched, in_key=keys[0])
+        self.critic = make_value(features_dim, in_key=keys[-1])
         self.to(recipe.torch_device())
+
+    def encode(self, samples: TensorDictBase) -> TensorDictBase:
+        """Writes the features of a minibatch: steps, or sequences where the network is recurrent.
+
+        Args:
+            samples: steps [N], or sequences [N, time].
+        """
+        if isinstance(self.backbone, LSTMBackbone):
+            with set_recurrent_mode(True):
+                return self.backbone(samples)
+        return self.backbone(samples)
 
     @property
     def policy(self) -> TensorDictModuleBase:

@@ -37,7 +37,7 @@ def make_objective(
     """
 
     def objective(minibatch: TensorDict) -> tuple[Tensor, Tensor]:
-        agent.backbone(minibatch)  # once; the heads read its features
+        agent.encode(minibatch)  # once; the heads read its features
         terms = loss(minibatch)
         total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
         return total, torch.stack([terms[name].detach() for name in TERMS])
@@ -63,7 +63,7 @@ def add_advantages(
     ends = batch["next", "done"].squeeze(-1).clone()
     ends[:, -1] = True
     next_value = value.roll(-1, dims=1)
-    last = batch["next"][ends].select("history")
+    last = batch["next"][ends].select(*agent.backbone.in_keys)
     next_value[ends] = agent.critic(agent.backbone(last))["state_value"]
     batch["next", "state_value"] = next_value
     if not bootstrap_time_limit:
@@ -72,12 +72,26 @@ def add_advantages(
 
 
 def minibatches(batch: TensorDictBase, recipe: PPO) -> Iterator[TensorDict]:
-    """Yields shuffled minibatches of a batch, ``recipe.epochs`` times over."""
+    """Yields shuffled minibatches of a batch, ``recipe.epochs`` times over.
+
+    Args:
+        batch: [envs, time].
+        recipe: the settings.
+
+    Yields:
+        Single steps [N]; for a recurrent network sequences of consecutive steps [N, time], each
+        with the state that the network had at its start.
+    """
     keys = ["history", "action", "action_log_prob", "advantage", "value_target"]
-    steps = batch.select(*keys).reshape(-1)
+    if recipe.is_recurrent:
+        length = recipe.sequence_length
+        keys += ["recurrent_state_h", "recurrent_state_c", "is_init"]
+        samples, size = batch.select(*keys).reshape(-1, length), recipe.minibatch_size // length
+    else:
+        samples, size = batch.select(*keys).reshape(-1), recipe.minibatch_size
     for _ in range(recipe.epochs):
-        for index in torch.randperm(len(steps), device=steps.device).split(recipe.minibatch_size):
-            yield steps[index]
+        for index in torch.randperm(len(samples), device=samples.device).split(size):
+            yield samples[index]
 
 
 def check_finite(terms: Sequence[str], values: Tensor, step: int, saved_step: int) -> None:
@@ -110,6 +124,6 @@ def check_agent(agent: Agent, minibatch: TensorDictBase, step: int, saved_step: 
         FloatingPointError: as :func:`check_finite`.
     """
     with torch.no_grad():
-        value = agent.critic(agent.backbone(minibatch))["state_value"].mean()
+        value = agent.critic(agent.encode(minibatch))["state_value"].mean()
         weights = nn.utils.get_total_norm(agent.parameters())
     check_finite(["weights", "value"], torch.stack([weights, value]), step, saved_step)

@@ -5,12 +5,15 @@ from torchrl_tit.modules.backbone import Backbone
 from torchrl_tit.modules.decision_transformer import make_dt_actor, make_dt_predictor
 from torchrl_tit.modules.frame_cache import FrameCache
 from torchrl_tit.modules.heads import make_actor, make_value
+from torchrl_tit.modules.lstm_backbone import LSTMBackbone, LSTMConfig
 from torchrl_tit.modules.rollout_features import add_rollout_features
 from torchrl_tit.modules.sequence_backbone import SequenceBackbone
 
 __all__ = [
     "Backbone",
     "FrameCache",
+    "LSTMBackbone",
+    "LSTMConfig",
     "SequenceBackbone",
     "acting",
     "add_rollout_features",
