@@ -126,7 +126,7 @@ def test_action_heads() -> None:
     assert continuous.max() < 1
     network, inputs = make("discrete"), make_inputs("discrete", 4)
     features = network.encode(network.encode_states(inputs[0]), *inputs[1:])
-    linear = network.action_head[0]
+    linear = network.action_head.get_submodule("0")
     torch.testing.assert_close(network(*inputs), linear(features))  # logits as they are
     torch.testing.assert_close(network(inputs[0], inputs[1].bool(), *inputs[2:]), network(*inputs))
 

@@ -15,6 +15,7 @@ from torchrl_tit.datasets.scores import (
     normalized_score,
     normalized_spread,
 )
+from torchrl_tit.datasets.selection import join_episodes, select_episodes
 from torchrl_tit.datasets.sequences import SequenceStorage
 from torchrl_tit.datasets.sources import load_episodes
 from torchrl_tit.datasets.storage import EpisodeStorage
@@ -31,12 +32,14 @@ __all__ = [
     "download_d4rl",
     "episodes_from_arrays",
     "has_reference",
+    "join_episodes",
     "load_episodes",
     "make_replay_buffer",
     "normalized_score",
     "normalized_spread",
     "read_hdf5",
     "read_minari",
+    "select_episodes",
     "task_spaces",
     "write_hdf5",
     "write_minari",

@@ -5,11 +5,12 @@ from __future__ import annotations
 from tensordict import NestedKey
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
     TensorDictModule,
     TensorDictSequential,
 )
 from torch import distributions
-from torchrl.modules import OneHotCategorical
+from torchrl.modules import OneHotCategorical, TanhNormal
 
 from torchrl_tit.modules.sequence_backbone import SequenceBackbone
 from torchrl_tit.networks import DecisionTransformer
@@ -44,6 +45,7 @@ def make_dt_actor(
     group: NestedKey | None = "sequence",
     action_key: NestedKey = "action",
     one_hot: bool = False,
+    newest: bool = True,
 ) -> TensorDictSequential:
     """Builds Decision Transformer's policy: histories in, the newest step's action out.
 
@@ -52,11 +54,14 @@ def make_dt_actor(
         group: the key under which :class:`~torchrl_tit.transforms.SequenceHistory` writes.
         action_key: where the action goes.
         one_hot: whether discrete actions are one-hot, as the environment's spec says.
+        newest: whether only the newest step's action is asked for; for losses on distributions,
+            such as TorchRL's `OnlineDTLoss`, that of every step is, with ``group=None``.
 
     Returns:
         A policy for any TorchRL collector. It writes continuous actions, float [..., A], as they
-        are predicted; discrete ones, int64 [...] or one-hot [..., A], are the most likely ones, or
-        drawn, as TorchRL's exploration type says.
+        are predicted; those of a network with ``action_space="gaussian"`` and discrete ones, int64
+        [...] or one-hot [..., A], are the most likely ones, or drawn, as TorchRL's exploration type
+        says. With ``newest=False``, all shapes are [..., K, A] or [..., K].
 
     Example:
         >>> from torchrl.collectors import Collector
@@ -72,17 +77,21 @@ def make_dt_actor(
         [torch.Size([8, 10])]
         >>> collector.shutdown()
     """
-    backbone = SequenceBackbone(network, group=group, newest=True)
+    backbone = SequenceBackbone(network, group=group, newest=newest)
     if network.config.action_space == "continuous":
         return TensorDictSequential(
             backbone, TensorDictModule(network.action_head, ["features"], [action_key])
         )
-    return TensorDictSequential(
+    distribution: type[distributions.Distribution]
+    if network.config.action_space == "gaussian":
+        parameters, distribution = ["loc", "scale"], TanhNormal
+    else:
+        parameters = ["logits"]
+        distribution = OneHotCategorical if one_hot else distributions.Categorical
+    return ProbabilisticTensorDictSequential(
         backbone,
-        TensorDictModule(network.action_head, ["features"], ["logits"]),
+        TensorDictModule(network.action_head, ["features"], parameters),
         ProbabilisticTensorDictModule(
-            in_keys=["logits"],
-            out_keys=[action_key],
-            distribution_class=OneHotCategorical if one_hot else distributions.Categorical,
+            in_keys=parameters, out_keys=[action_key], distribution_class=distribution
         ),
     )

@@ -149,11 +149,12 @@ def as_vectors(actions: Tensor, network: DecisionTransformer, steps_ndim: int) -
         >>> as_vectors(torch.tensor([-10, 0, 1]), network, steps_ndim=1).tolist()
         [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
     """
-    given = "continuous" if actions.is_floating_point() else "discrete"
-    if given != network.config.action_space:
+    discrete = not actions.is_floating_point()
+    if discrete != (network.config.action_space == "discrete"):
+        given = "discrete" if discrete else "continuous"
         raise TypeError(
             f"actions of {actions.dtype} are {given}, but this network's are "
-            f"{network.config.action_space}: set action_space='{given}', or take other data"
+            f"{network.config.action_space}: set action_space={given!r}, or take other data"
         )
     if actions.ndim == steps_ndim:
         classes = torch.arange(network.action_dim, device=actions.device)

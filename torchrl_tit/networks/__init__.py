@@ -8,7 +8,9 @@ from torchrl_tit.networks.coberl import CoBERL, CoBERLConfig, CoBERLEncoder
 from torchrl_tit.networks.d2rl import D2RL, D2RLConfig
 from torchrl_tit.networks.decision_transformer import DecisionTransformer
 from torchrl_tit.networks.decision_transformer_config import DecisionTransformerConfig
+from torchrl_tit.networks.dropout import Dropout
 from torchrl_tit.networks.gated_transformer import GatedTransformerBlock, GRUGate
+from torchrl_tit.networks.gaussian_head import GaussianHead
 from torchrl_tit.networks.gpt2_block import GPT2Block
 from torchrl_tit.networks.history_network import AttentionMaps, HistoryNetwork
 from torchrl_tit.networks.initialization import init_normal_, init_orthogonal_
@@ -39,11 +41,13 @@ __all__ = [
     "D2RLConfig",
     "DecisionTransformer",
     "DecisionTransformerConfig",
+    "Dropout",
     "EnhancedTIT",
     "EnhancedTITConfig",
     "GPT2Block",
     "GRUGate",
     "GatedTransformerBlock",
+    "GaussianHead",
     "HistoryNetwork",
     "ImagePatchEmbedding",
     "InnerTransformer",

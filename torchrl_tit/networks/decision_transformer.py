@@ -79,10 +79,7 @@ class DecisionTransformer(nn.Module):
         self.dropout = Dropout(config.dropout)
         self.blocks = nn.ModuleList(config.make_block() for _ in range(config.num_blocks))
         self.norm = nn.LayerNorm(width)
-        self.action_head = nn.Sequential(
-            nn.Linear(width, action_dim),
-            nn.Tanh() if config.action_space == "continuous" else nn.Identity(),
-        )
+        self.action_head = config.make_action_head(action_dim)
 
     def forward(
         self,
@@ -91,7 +88,7 @@ class DecisionTransformer(nn.Module):
         returns_to_go: Tensor,
         timesteps: Tensor,
         attention_mask: Tensor | None = None,
-    ) -> Tensor:
+    ) -> Tensor | tuple[Tensor, Tensor]:
         """Predicts the action of every step from what came before it.
 
         Args:
@@ -104,8 +101,9 @@ class DecisionTransformer(nn.Module):
                 other step sees; None where there is no padding.
 
         Returns:
-            float [..., K, A]: actions within -1..1, or logits of discrete ones. Meaningless, but
-            finite, at padding.
+            float [..., K, A]: actions within -1..1, or logits of discrete ones; with
+            ``action_space="gaussian"`` mean and standard deviation. Meaningless, but finite, at
+            padding.
         """
         tokens = self.encode_states(states)
         features = self.encode(tokens, actions, returns_to_go, timesteps, attention_mask)

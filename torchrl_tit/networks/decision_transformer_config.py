@@ -11,6 +11,7 @@ from torch import nn
 from torchrl_tit.networks.activations import Activation
 from torchrl_tit.networks.block import TransformerBlock
 from torchrl_tit.networks.config import check_positive, check_probability
+from torchrl_tit.networks.gaussian_head import GaussianHead
 from torchrl_tit.networks.gpt2_block import GPT2Block
 from torchrl_tit.networks.inner import InnerTransformer, LinearFrameEncoder
 
@@ -21,8 +22,9 @@ class DecisionTransformerConfig:
 
     state_encoder: Literal["linear", "inner_transformer"] = "linear"
     """What makes a token of a state: a linear layer (DT), or an inner transformer (DT_TIT)."""
-    action_space: Literal["continuous", "discrete"] = "continuous"
-    """Continuous actions are predicted within -1..1 by a tanh, discrete ones by logits."""
+    action_space: Literal["continuous", "gaussian", "discrete"] = "continuous"
+    """Continuous actions are predicted within -1..1 by a tanh, or by mean and standard deviation of
+    a Gaussian that a tanh squashes (Online DT); discrete ones by logits."""
     embed_dim: int = 128
     """Width D of a token."""
     num_blocks: int = 3
@@ -57,7 +59,7 @@ class DecisionTransformerConfig:
     def __post_init__(self) -> None:
         choices = {
             "state_encoder": ("linear", "inner_transformer"),
-            "action_space": ("continuous", "discrete"),
+            "action_space": ("continuous", "gaussian", "discrete"),
         }
         for name, known in choices.items():
             if getattr(self, name) not in known:
@@ -99,6 +101,13 @@ class DecisionTransformerConfig:
             every_block=False,
             position_encoding=self.position_encoding,
         )
+
+    def make_action_head(self, action_dim: int) -> nn.Module:
+        """Builds the head: [..., D] -> actions, logits, or mean and standard deviation [..., A]."""
+        if self.action_space == "gaussian":
+            return GaussianHead(self.embed_dim, action_dim)
+        squash = nn.Tanh() if self.action_space == "continuous" else nn.Identity()
+        return nn.Sequential(nn.Linear(self.embed_dim, action_dim), squash)
 
     def make_block(self) -> GPT2Block:
         """Builds a GPT-2 block."""

@@ -1,0 +1,44 @@
+"""The head of a stochastic policy."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+_LOG_STD_MIN, _LOG_STD_MAX = -5.0, 2.0
+
+
+class GaussianHead(nn.Module):
+    """Mean and standard deviation of each entry of an action, before a tanh squashes it.
+
+    Zheng et al., "Online Decision Transformer", arXiv 2202.05607, and its authors' code: two linear
+    layers, orthogonal at the start; a tanh keeps the logarithm of the standard deviation within -5
+    and 2.
+
+    Args:
+        in_features: size F of the features.
+        action_dim: entries A of an action.
+
+    Example:
+        >>> import torch
+        >>> mean, std = GaussianHead(64, 3)(torch.randn(8, 20, 64))
+        >>> mean.shape, bool(((std > 0.006) & (std < 7.4)).all())
+        (torch.Size([8, 20, 3]), True)
+    """
+
+    def __init__(self, in_features: int, action_dim: int) -> None:
+        super().__init__()
+        self.mean = nn.Linear(in_features, action_dim)
+        self.log_std = nn.Linear(in_features, action_dim)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises orthogonally, with biases 0."""
+        for layer in (self.mean, self.log_std):
+            nn.init.orthogonal_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Float [..., F] -> mean and standard deviation, float [..., A] each."""
+        middle, half = (_LOG_STD_MAX + _LOG_STD_MIN) / 2, (_LOG_STD_MAX - _LOG_STD_MIN) / 2
+        log_std = middle + half * self.log_std(features).tanh()
+        return self.mean(features), log_std.exp()
