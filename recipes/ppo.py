@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, SignTransform, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
@@ -87,6 +87,8 @@ class PPO(Recipe):
     """Weight of the entropy bonus."""
     critic_coeff: float = 0.5
     """Weight of the mean squared value error."""
+    clip_rewards: bool = False
+    """Whether training sees the rewards' signs only; returns are always those of the task."""
     reward_scale: float = 1.0
     """Rewards are multiplied by this for training. Where policy and value share a backbone, values
     in the tens or hundreds drive its features to be the same in all states
@@ -191,11 +193,11 @@ class PPO(Recipe):
         """
         should_compile(self.compile, self.gradient_steps)
         try:
-            env = self.make_env(1, self.seed)
-            Agent(self, env).policy(env.reset())
+            env = self.make_env(1, self.seed, vectorization_mode=self.vectorization_mode)
+            with closing(env):
+                Agent(self, env).policy(env.reset())
         except TypeError as error:  # a kind of observation, say, that no network here reads
             raise ValueError(str(error)) from error
-        env.close()
 
     def train(self, run: Run) -> None:
         """Trains in a run folder; see :func:`train`."""
@@ -304,6 +306,7 @@ def train(recipe: PPO, run: Run) -> None:
         device=recipe.torch_device(),
         trust_policy=True,  # ours is on the right device already
         compile_policy=STATIC_SHAPES if compiled and not keeps_frames else None,
+        postproc=SignTransform([("next", "reward")]) if recipe.clip_rewards else None,
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )

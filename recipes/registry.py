@@ -12,6 +12,7 @@ from torchrl_tit.networks import (
     VanillaTITConfig,
 )
 
+from .atari import ATARI_RECIPES
 from .dt_named import DT_RECIPES
 from .networks import NetworkConfig
 from .no_velocity import NO_VELOCITY_RECIPES
@@ -62,7 +63,7 @@ def _named() -> dict[str, Recipe]:
                 # policy's (docs/results/cartpole.md). And environments side by side, for speed.
                 name += "-tuned"
                 recipes[name] = replace(recipe, name=name, critic_coeff=0.02, num_envs=8)
-    return recipes | NO_VELOCITY_RECIPES | DT_RECIPES
+    return recipes | NO_VELOCITY_RECIPES | ATARI_RECIPES | DT_RECIPES
 
 
 RECIPES: dict[str, Recipe] = _named()
