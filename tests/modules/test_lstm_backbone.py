@@ -11,7 +11,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl_tit.envs import make_env
 from torchrl_tit.modules import LSTMBackbone, LSTMConfig, make_actor
 
-CONFIG = LSTMConfig(embed_dim=8, features_dim=6)
+CONFIG = LSTMConfig(embed_dim=8, hidden_dim=6, features_dim=5)
 N, T = 3, 12
 
 
@@ -47,7 +47,7 @@ def by_hand(backbone, td):
         write, forget, new, read = gates.chunk(4, -1)
         cell = forget.sigmoid() * cell + write.sigmoid() * new.tanh()
         hidden = read.sigmoid() * cell.tanh()
-        features.append(hidden)
+        features.append(backbone[2].module(hidden))
     return torch.stack(features, 1)
 
 
@@ -71,7 +71,7 @@ def test_sequences_of_a_rollout_are_its_steps():
     """Over ends of episodes and of sequences: the state goes on, or begins at zero."""
     env = TransformedEnv(make_env("CartPole-v1", 4, seed=0), CONFIG.make_transforms())
     backbone = LSTMBackbone((4,), config=CONFIG)
-    policy = TensorDictSequential(backbone, make_actor(6, env.action_spec_unbatched))
+    policy = TensorDictSequential(backbone, make_actor(5, env.action_spec_unbatched))
     collector = Collector(
         env,
         policy,
@@ -81,11 +81,12 @@ def test_sequences_of_a_rollout_are_its_steps():
     )
     for batch in collector:
         features, states = batch["features"].clone(), batch["recurrent_state_h"].squeeze(-2)
+        memory = batch["memory"].clone()
         begins = batch["is_init"].squeeze(-1)
         assert begins[:, 1:].sum() > 4
         torch.testing.assert_close(begins[:, 1:], batch["next", "done"][:, :-1].squeeze(-1))
         assert not states[begins].any()
-        assert torch.equal(states[:, 1:][~begins[:, 1:]], features[:, :-1][~begins[:, 1:]])
+        assert torch.equal(states[:, 1:][~begins[:, 1:]], memory[:, :-1][~begins[:, 1:]])
         with set_recurrent_mode(True), torch.no_grad():
             again = backbone(batch.select(*backbone.in_keys).reshape(-1, 20))
         torch.testing.assert_close(again["features"].reshape(features.shape), features)

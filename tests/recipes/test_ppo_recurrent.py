@@ -20,7 +20,7 @@ from torchrl_tit.networks import MLPConfig
 RECIPE = PPO(
     env="CartPole-v1",
     hide_velocities=True,
-    backbone=LSTMConfig(embed_dim=8, features_dim=8),
+    backbone=LSTMConfig(embed_dim=8, hidden_dim=8, features_dim=8),
     num_envs=2,
     total_steps=256,
     steps_per_batch=64,

@@ -13,6 +13,7 @@ from torchrl.envs import Compose, InitTracker, TensorDictPrimer
 from torchrl.modules import LSTMModule
 
 from torchrl_tit.networks.config import check_positive, override_config
+from torchrl_tit.networks.history_network import make_head
 from torchrl_tit.networks.two_trunks import check_array
 
 _STATE = ["recurrent_state_h", "recurrent_state_c"]
@@ -24,11 +25,13 @@ class LSTMConfig:
 
     embed_dim: int = 64
     """Width of the tanh layer on an observation, before the LSTM."""
+    hidden_dim: int = 64
+    """Size of the LSTM's state."""
     features_dim: int = 64
-    """Size of the LSTM's state, which is the features that it puts out."""
+    """Size of the features that the network puts out."""
 
     def __post_init__(self) -> None:
-        check_positive(self, "embed_dim", "features_dim")
+        check_positive(self, "embed_dim", "hidden_dim", "features_dim")
 
     def make_transforms(self) -> Compose:
         """Builds what an environment needs for the state to go from step to step.
@@ -37,7 +40,7 @@ class LSTMConfig:
             TorchRL's `InitTracker`, which says where an episode begins, and `TensorDictPrimer`,
             which puts a state of zeros there.
         """
-        spec = Unbounded(shape=(1, self.features_dim))  # layers, state
+        spec = Unbounded(shape=(1, self.hidden_dim))  # layers, state
         primer = TensorDictPrimer({key: spec.clone() for key in _STATE}, expand_specs=True)
         return Compose(InitTracker(), primer)
 
@@ -45,7 +48,9 @@ class LSTMConfig:
 class LSTMBackbone(TensorDictSequential):
     """Reads the newest observation and the state before it; writes features and the new state.
 
-    A tanh layer and TorchRL's `LSTMModule`. The state stands in the tensordict, so environments,
+    A tanh layer, TorchRL's `LSTMModule`, and a head as TIT has it (LayerNorm, linear, tanh,
+    LayerNorm): small observations, of positions say, hardly move the state, and the head's
+    LayerNorm makes that readable. The state stands in the tensordict, so environments,
     collectors and checkpoints carry it like an observation: it begins at zero with an episode and
     goes on to its end. Step by step by default; within ``torchrl.modules.set_recurrent_mode(True)``
     the last batch dimension is time: then it runs over whole sequences, each from the state that
@@ -55,10 +60,10 @@ class LSTMBackbone(TensorDictSequential):
     key                                         shape               what it is
     ==========================================  ==================  ================================
     ``history``                                 [..., 1, D]         in: the newest observation
-    ``recurrent_state_h``, ``..._c``            [..., 1, F]         in: the state before it
+    ``recurrent_state_h``, ``..._c``            [..., 1, H]         in: the state before it
     ``is_init``                                 [..., 1]            in: bool, an episode begins
     ``features``                                [..., F]            out
-    ``("next", "recurrent_state_h")``, ...      [..., 1, F]         out: the state after it
+    ``("next", "recurrent_state_h")``, ...      [..., 1, H]         out: the state after it
     ==========================================  ==================  ================================
 
     Args:
@@ -75,12 +80,12 @@ class LSTMBackbone(TensorDictSequential):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from torchrl_tit.envs import make_env
-        >>> config = LSTMConfig(features_dim=32)
+        >>> config = LSTMConfig(hidden_dim=32)
         >>> env = TransformedEnv(make_env("CartPole-v1", num_envs=8), config.make_transforms())
         >>> backbone = LSTMBackbone(observation_shape=(4,), config=config)
         >>> td = backbone(env.reset())
         >>> td["features"].shape, td["next", "recurrent_state_h"].shape
-        (torch.Size([8, 32]), torch.Size([8, 1, 32]))
+        (torch.Size([8, 64]), torch.Size([8, 1, 32]))
     """
 
     keeps_frames = False
@@ -102,21 +107,23 @@ class LSTMBackbone(TensorDictSequential):
         )
         lstm = LSTMModule(
             config.embed_dim,
-            config.features_dim,
+            config.hidden_dim,
             in_keys=["embedding", *_STATE],
-            out_keys=["features", *(("next", key) for key in _STATE)],
+            out_keys=["memory", *(("next", key) for key in _STATE)],
         )
-        super().__init__(TensorDictModule(embedding, ["history"], ["embedding"]), lstm)
+        super().__init__(
+            TensorDictModule(embedding, ["history"], ["embedding"]),
+            lstm,
+            TensorDictModule(
+                make_head(config.hidden_dim, config.features_dim, "tanh"), ["memory"], ["features"]
+            ),
+        )
         self.config = config
         self.features_dim = config.features_dim
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises the LSTM: orthogonal weights, biases 0. The layer before it has its own.
-
-        PyTorch's small uniform weights forget the step before at once, and small observations, of
-        positions say, hardly move the state.
-        """
+        """Initialises the LSTM: orthogonal weights, biases 0; the other layers have their own."""
         for name, parameter in self[1].lstm.named_parameters():
             if name.startswith("weight"):
                 nn.init.orthogonal_(parameter)
