@@ -11,6 +11,8 @@ import torch
 
 Compile = Literal["auto", "on", "off"]
 
+Precision = Literal["auto", "float32", "bfloat16"]
+
 STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
 """How torch.compile is called: which kernels run must not depend on the sizes seen before, or a
 resumed run would differ in the last bit."""
@@ -43,6 +45,49 @@ def should_compile(setting: Compile, gradient_steps: int) -> bool:
     if setting == "auto":
         return gradient_steps >= _PAYS_FROM and _has_compiler() and _works()
     return setting == "on"
+
+
+def compile_options(cuda_graphs: Compile, device: torch.device) -> dict[str, Any]:
+    """Decides how ``torch.compile`` is called.
+
+    Args:
+        cuda_graphs: whether kernels are recorded and launched together; "auto" is on on a GPU,
+            where launching small kernels one by one takes longer than running them.
+        device: where the networks are.
+
+    Raises:
+        ValueError: if it is "on" and the networks are not on a GPU.
+
+    Example:
+        >>> compile_options("auto", torch.device("cpu"))
+        {'dynamic': False}
+    """
+    if cuda_graphs == "on" and device.type != "cuda":
+        raise ValueError(
+            f"cuda_graphs is on, but the networks are on {device}: set device to cuda, or "
+            "cuda_graphs to off"
+        )
+    if cuda_graphs == "off" or device.type != "cuda":
+        return STATIC_SHAPES
+    return {**STATIC_SHAPES, "mode": "reduce-overhead"}
+
+
+def autocast_type(precision: Precision, device: torch.device) -> torch.dtype | None:
+    """Decides what matrix products are computed in: None is the type of the weights.
+
+    Args:
+        precision: "auto" is bfloat16 on a GPU that has it, where it is several times as fast.
+            Processors gain from it only where they have instructions for it.
+        device: where the networks are.
+
+    Example:
+        >>> autocast_type("auto", torch.device("cpu")) is None
+        True
+    """
+    if precision == "auto":
+        fast = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+        return torch.bfloat16 if fast else None
+    return torch.bfloat16 if precision == "bfloat16" else None
 
 
 def _has_compiler() -> bool:

@@ -10,20 +10,20 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from torch import nn
-from torchrl.collectors import Collector
-from torchrl.envs import EnvBase, SignTransform, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 from tqdm import tqdm
 
+from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.envs import VectorizationMode, make_env
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.modules import LSTMConfig, while_acting
 
-from .compilation import STATIC_SHAPES, Compile, should_compile
+from .compilation import Compile, Precision, compile_options, should_compile
 from .interrupt import Interrupt
 from .ppo_agent import Agent
+from .ppo_collector import make_collector
 from .ppo_state import TrainingState
 from .ppo_update import (
     LOSSES,
@@ -31,7 +31,10 @@ from .ppo_update import (
     check_agent,
     check_finite,
     make_objective,
+    make_optimizer,
+    make_weight_update,
     minibatches,
+    set_learning_rate,
 )
 from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
@@ -109,10 +112,25 @@ class PPO(Recipe):
     """Seed of the first evaluation episode; the others follow one by one."""
     checkpoint_interval: int = 10_240
     """Environment steps between checkpoints."""
+    collectors: int = 1
+    """Processes that act side by side, each with its share of the environments; 1 acts in the
+    training process. They pay for slow environments. A run of several can be resumed, but then acts
+    with other random numbers than one that never stopped."""
+    async_collection: bool = False
+    """Whether several collectors go on acting during updates: a batch is then that of one of them,
+    and up to one update behind."""
     compile: Compile = "auto"
     """Whether acting and the update run through torch.compile, which needs a C++ compiler and about
     a minute at the start: "auto" is on where it works and the run is long enough to earn that
     back. Recurrent networks are never compiled."""
+    compile_optimizer: Compile = "auto"
+    """Whether the gradient's norm and Adam are compiled too: "auto" is on on a GPU, where the rest
+    is compiled. On a processor Adam's own kernel is faster."""
+    cuda_graphs: Compile = "auto"
+    """Whether a GPU launches what is compiled as CUDA graphs; "auto" is on."""
+    precision: Precision = "auto"
+    """What the backbone's matrix products are computed in: "auto" is bfloat16 on a GPU that has it
+    and float32 elsewhere. Weights, heads and losses are float32."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -120,6 +138,7 @@ class PPO(Recipe):
             self,
             history=1,
             num_envs=1,
+            collectors=1,
             total_steps=1,
             sequence_length=1,
             minibatch_size=2,  # an advantage alone has no standard deviation
@@ -151,6 +170,16 @@ class PPO(Recipe):
                     raise ValueError(
                         f"sequence_length {self.sequence_length} does not divide {name} = {steps}"
                     )
+
+        if self.num_envs % self.collectors:
+            raise ValueError(
+                f"num_envs {self.num_envs} cannot be shared by {self.collectors} collectors: it "
+                "must be a multiple of collectors"
+            )
+        if self.is_recurrent and self.precision == "bfloat16":
+            raise ValueError("precision is bfloat16, but a recurrent network computes in float32")
+        if self.async_collection and self.collectors == 1:
+            raise ValueError("async_collection is on, but there is one collector: set collectors")
 
     @property
     def is_recurrent(self) -> bool:
@@ -192,6 +221,8 @@ class PPO(Recipe):
             ValueError: if they cannot be built as the fields say, or do not fit each other.
         """
         should_compile(self.compile, self.gradient_steps)
+        should_compile(self.compile_optimizer, self.gradient_steps)
+        compile_options(self.cuda_graphs, self.torch_device())
         try:
             env = self.make_env(1, self.seed, vectorization_mode=self.vectorization_mode)
             with closing(env):
@@ -288,30 +319,24 @@ def train(recipe: PPO, run: Run) -> None:
     )
     # How long a sequence is varies with where episodes begin.
     compiled = not recipe.is_recurrent and should_compile(recipe.compile, recipe.gradient_steps)
-    objective = make_objective(agent, loss, compiled)
-    # What is kept of the frames just seen is decided between two pieces, compiled by themselves.
-    keeps_frames = agent.backbone.keeps_frames
-    if compiled and keeps_frames:
-        agent.backbone.compile_parts(**STATIC_SHAPES)
+    device = recipe.torch_device()
+    options = compile_options(recipe.cuda_graphs, device)
+    objective = make_objective(agent, loss, options if compiled else None)
+    if compiled and agent.backbone.keeps_frames:
+        agent.backbone.compile_parts(**options)
     gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
-    parameters = list(agent.parameters())
-    optimizer = torch.optim.Adam(
-        parameters, lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
+    # On a processor Adam's own fused kernel is faster than what is compiled.
+    compiled_update = recipe.compile_optimizer == "on" or (
+        recipe.compile_optimizer == "auto" and compiled and device.type == "cuda"
     )
-    collector = Collector(
-        env,
-        agent.policy,
-        frames_per_batch=recipe.steps_per_batch,
-        total_frames=recipe.final_step,
-        device=recipe.torch_device(),
-        trust_policy=True,  # ours is on the right device already
-        compile_policy=STATIC_SHAPES if compiled and not keeps_frames else None,
-        postproc=SignTransform([("next", "reward")]) if recipe.clip_rewards else None,
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
+    optimizer = make_optimizer(agent, recipe, compiled_update)
+    update_weights = make_weight_update(
+        optimizer, recipe.max_grad_norm, options if compiled_update else None
     )
+    step = max(checkpoint_steps(run.checkpoints), default=0)
+    collector = make_collector(recipe, env, agent, step, options if compiled else None)
     state = TrainingState(agent, optimizer, collector, recipe.seed)
-    step = state.load(run)
+    state.load(run)
     metrics = run.metrics(COLUMNS, last_step=step)
     saved_step = step
     progress = tqdm(
@@ -322,7 +347,7 @@ def train(recipe: PPO, run: Run) -> None:
             step += batch.numel()
             remaining = 1 - (step - batch.numel()) / recipe.final_step
             if recipe.decay_learning_rate:
-                optimizer.param_groups[0]["lr"] = recipe.learning_rate * remaining
+                set_learning_rate(optimizer, recipe.learning_rate * remaining)
             if recipe.decay_clip_epsilon:
                 loss.clip_epsilon.fill_(recipe.clip_epsilon * remaining)
 
@@ -339,11 +364,12 @@ def train(recipe: PPO, run: Run) -> None:
                     raise
                 optimizer.zero_grad()
                 total.backward()
-                norm = nn.utils.clip_grad_norm_(parameters, recipe.max_grad_norm)
+                norm = update_weights()
                 losses.append(torch.cat([terms, norm.unsqueeze(0)]))
                 check_finite(LOSSES, losses[-1], step, saved_step)
-                optimizer.step()
             agent.eval()
+            if recipe.collectors > 1:
+                collector.update_policy_weights_()
             check_agent(agent, minibatch, step, saved_step)  # before it is saved
             means = dict(zip(LOSSES, torch.stack(losses).mean(0).tolist(), strict=True))
 
@@ -353,7 +379,7 @@ def train(recipe: PPO, run: Run) -> None:
                 step,
                 return_mean=mean_return,
                 episodes=len(finished),
-                learning_rate=optimizer.param_groups[0]["lr"],
+                learning_rate=float(optimizer.param_groups[0]["lr"]),
                 **means,
             )
             progress.update(batch.numel())

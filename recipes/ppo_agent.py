@@ -13,6 +13,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl_tit.modules import Backbone, LSTMBackbone, LSTMConfig, make_actor, make_value
 from torchrl_tit.networks import TwoTrunkNetwork, init_orthogonal_
 
+from .compilation import autocast_type
 from .networks import make_network
 
 if TYPE_CHECKING:
@@ -38,7 +39,9 @@ class Agent(nn.Module):
             network = make_network(recipe.backbone, shape, recipe.history)
             separate = isinstance(network, TwoTrunkNetwork)  # trunks for policy and value
             keys = ["policy_features", "value_features"] if separate else ["features"]
-            self.backbone, features_dim = Backbone(network, out_keys=keys), network.features_dim
+            autocast = autocast_type(recipe.precision, recipe.torch_device())
+            self.backbone = Backbone(network, out_keys=keys, autocast=autocast)
+            features_dim = network.features_dim
         if recipe.initialization == "orthogonal":
             init_orthogonal_(self.backbone)
         self.actor = make_actor(features_dim, env.action_spec_unbatched, in_key=keys[0])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 
 from torchrl_tit.checkpoint import (
     can_save_env,
@@ -24,12 +24,13 @@ class TrainingState:
     Args:
         agent: the networks.
         optimizer: the optimizer of the agent.
-        collector: the collector, with its environment.
+        collector: the collector, with its environment. One with processes of its own starts anew
+            after a stop: what happens in those is not saved.
         seed: the recipe's seed.
     """
 
     def __init__(
-        self, agent: Agent, optimizer: torch.optim.Optimizer, collector: Collector, seed: int
+        self, agent: Agent, optimizer: torch.optim.Optimizer, collector: BaseCollector, seed: int
     ) -> None:
         self.agent = agent
         self.optimizer = optimizer
@@ -39,12 +40,13 @@ class TrainingState:
     def save(self, run: Run, step: int) -> None:
         """Saves a checkpoint."""
         self._reset_unsavable_env(step)
+        here = self.collector if isinstance(self.collector, Collector) else None
         run.save(
             step,
             {
                 "agent": self.agent.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
-                "collector": collector_state(self.collector),
+                "collector": collector_state(here) if here else None,
                 "rng": global_rng_state(),
             },
         )
@@ -60,7 +62,8 @@ class TrainingState:
         with run.restoring(step):
             self.agent.load_state_dict(state["agent"])
             self.optimizer.load_state_dict({**state["optimizer"], "param_groups": settings})
-            set_collector_state(self.collector, state["collector"])
+            if isinstance(self.collector, Collector) and state["collector"] is not None:
+                set_collector_state(self.collector, state["collector"])
         self._reset_unsavable_env(step)
         set_global_rng_state(state["rng"])
         return step
@@ -71,6 +74,8 @@ class TrainingState:
         That happens at each checkpoint, whether or not the run is stopped there, and with a seed
         that follows from the run's and the step: so both go on alike.
         """
+        if not isinstance(self.collector, Collector):
+            return
         # After its last batch a collector has closed the environment.
         if not can_save_env(self.collector.env) and not self.collector.env.is_closed:
             seed = np.random.SeedSequence([self.seed, step]).generate_state(1).item()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from .compilation import STATIC_SHAPES
 from .ppo_agent import Agent
 
 if TYPE_CHECKING:
@@ -23,14 +22,14 @@ LOSSES = [*TERMS, "gradient_norm"]
 
 
 def make_objective(
-    agent: Agent, loss: ClipPPOLoss, compiled: bool
+    agent: Agent, loss: ClipPPOLoss, options: Mapping[str, Any] | None
 ) -> Callable[[TensorDict], tuple[Tensor, Tensor]]:
     """Builds the function of a minibatch that is minimised.
 
     Args:
         agent: the agent whose backbone writes the features.
         loss: TorchRL's loss on the heads, which read them.
-        compiled: whether it runs through ``torch.compile``.
+        options: of ``torch.compile``; without any it is not compiled.
 
     Returns:
         A function of a minibatch [N]: the total, float [], and its ``TERMS``, float [terms].
@@ -42,7 +41,54 @@ def make_objective(
         total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
         return total, torch.stack([terms[name].detach() for name in TERMS])
 
-    return torch.compile(objective, **STATIC_SHAPES) if compiled else objective
+    return torch.compile(objective, **options) if options else objective
+
+
+def make_optimizer(agent: Agent, recipe: PPO, compiled: bool) -> torch.optim.Adam:
+    """Builds Adam, for an update that is compiled or not.
+
+    What is compiled would be compiled anew for each learning rate that is a number.
+    """
+    rate = recipe.learning_rate
+    return torch.optim.Adam(
+        agent.parameters(),
+        lr=torch.tensor(rate, device=recipe.torch_device()) if compiled else rate,
+        eps=recipe.adam_eps,
+        fused=not compiled,
+        capturable=compiled and recipe.torch_device().type == "cuda",
+    )
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
+    """Sets the learning rate of an optimizer of :func:`make_optimizer`."""
+    for group in optimizer.param_groups:
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
+
+
+def make_weight_update(
+    optimizer: torch.optim.Optimizer, max_grad_norm: float, options: Mapping[str, Any] | None
+) -> Callable[[], Tensor]:
+    """Builds what follows ``backward``: scaling the gradient down, and the optimizer's step.
+
+    Args:
+        optimizer: the optimizer.
+        max_grad_norm: the norm that the gradient may have.
+        options: of ``torch.compile``; without any it is not compiled.
+
+    Returns:
+        A function that returns the norm that the gradient had, float [].
+    """
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+
+    def update_weights() -> Tensor:
+        norm = nn.utils.clip_grad_norm_(parameters, max_grad_norm)
+        optimizer.step()
+        return norm
+
+    return torch.compile(update_weights, **options) if options else update_weights
 
 
 def add_advantages(

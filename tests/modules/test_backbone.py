@@ -1,5 +1,7 @@
 """The backbone as a TensorDictModule."""
 
+from contextlib import nullcontext
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -77,3 +79,31 @@ def test_gradients_of_a_loss_on_heads_reach_the_backbone():
     assert len(gradients) == len(list(network.parameters()))
     assert all(gradient.isfinite().all() for gradient in gradients)
     assert all(gradient.any() for gradient in gradients)
+
+
+@pytest.mark.parametrize("acts", [False, True])
+def test_autocast_computes_in_bfloat16_and_hands_over_float32(acts):
+    torch.manual_seed(0)
+    network = EnhancedTIT((4,), history=3)
+    backbone = Backbone(network, autocast=torch.bfloat16)
+    seen = []
+    network.get_submodule("head.1").register_forward_hook(
+        lambda module, args, out: seen.append(out.dtype)
+    )
+    history = torch.randn(32, 3, 4)
+    full = network(history)
+    assert seen.pop() == torch.float32
+    with backbone.acting() if acts else nullcontext(), torch.set_grad_enabled(not acts):
+        features = backbone(TensorDict({"history": history}, [32]))["features"]
+    assert seen.pop() == torch.bfloat16
+    assert features.dtype == torch.float32
+    assert 0 < (features - full).abs().max() < 0.2
+    if not acts:
+        features.square().sum().backward()
+        assert {p.grad.dtype for p in network.parameters() if p.grad is not None} == {torch.float32}
+
+
+def test_autocast_of_two_trunks():
+    backbone = Backbone(MLP((4,), history=1), out_keys=["a", "b"], autocast=torch.bfloat16)
+    td = backbone(TensorDict({"history": torch.randn(5, 1, 4)}, [5]))
+    assert td["a"].dtype == td["b"].dtype == torch.float32

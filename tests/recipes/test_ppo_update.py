@@ -9,9 +9,11 @@ import torch
 from tensordict import TensorDict
 
 from recipes import ppo
+from recipes.compilation import STATIC_SHAPES
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO
 from recipes.ppo_agent import Agent
+from recipes.ppo_update import make_optimizer, make_weight_update, set_learning_rate
 from recipes.run import Run
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.networks import EnhancedTITConfig
@@ -144,3 +146,22 @@ def test_rewards_are_scaled_for_training_and_returns_are_not(batches, tmp_path):
             target = minibatch["value_target"]
             torch.testing.assert_close(target, torch.full_like(target, 0.25))
     assert rows[-1]["return_mean"] > 5
+
+
+def test_a_compiled_optimizer_takes_the_same_steps():
+    """The gradient's norm, Adam, and learning rates that change without compiling anew."""
+    env = RECIPE.make_env(2, 0)
+    results = []
+    for options in (None, STATIC_SHAPES):
+        torch.manual_seed(0)
+        agent = Agent(RECIPE, env)
+        optimizer = make_optimizer(agent, RECIPE, compiled=options is not None)
+        update_weights = make_weight_update(optimizer, 0.5, options)
+        norms = []
+        for rate in (1e-2, 5e-3, 1e-3):
+            set_learning_rate(optimizer, rate)
+            for parameter in agent.parameters():
+                parameter.grad = torch.randn_like(parameter)
+            norms.append(update_weights())
+        results.append((norms, [p.detach().clone() for p in agent.parameters()]))
+    torch.testing.assert_close(results[0], results[1], rtol=1e-5, atol=1e-6)

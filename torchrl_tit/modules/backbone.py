@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -30,6 +30,8 @@ class Backbone(TensorDictModule):
         in_keys: one key, nested or not, under which the history stands (see
             :class:`~torchrl_tit.transforms.History`).
         out_keys: one key for each tensor that the network puts out.
+        autocast: the type that matrix products are computed in, such as ``torch.bfloat16``; weights
+            and features keep theirs. None computes all in the type of the weights.
 
     Raises:
         ValueError: if there is not exactly one ``in_key``, or no ``out_key``.
@@ -49,6 +51,7 @@ class Backbone(TensorDictModule):
         network: nn.Module,
         in_keys: Sequence[NestedKey] = ("history",),
         out_keys: Sequence[NestedKey] = ("features",),
+        autocast: torch.dtype | None = None,
     ) -> None:
         if len(in_keys) != 1 or not out_keys:
             raise ValueError(
@@ -56,6 +59,7 @@ class Backbone(TensorDictModule):
                 f"in_keys={list(in_keys)} and out_keys={list(out_keys)}"
             )
         super().__init__(network, in_keys=list(in_keys), out_keys=list(out_keys))
+        self.autocast = autocast
         self._cache: FrameCache | None = None  # while acting
         # What runs while acting in place of frame encoder and history encoder, if compiled.
         self._compiled: tuple[Encode, Encode] | None = None
@@ -147,6 +151,22 @@ class Backbone(TensorDictModule):
 
     def _call_module(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
         """Where TensorDictModule calls the network."""
+        if self.autocast is None:
+            return self._encode(tensors, **kwargs)
+        with self.computing(tensors[0].device):
+            features = self._encode(tensors, **kwargs)
+        # Heads and losses need all digits.
+        if isinstance(features, Tensor):
+            return features.float()
+        return tuple(feature.float() for feature in features)
+
+    def computing(self, device: torch.device) -> AbstractContextManager[object]:
+        """The context in which matrix products are computed in the type of ``autocast``."""
+        if self.autocast is None:
+            return nullcontext()
+        return torch.autocast(device.type, self.autocast)
+
+    def _encode(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
         if torch.compiler.is_compiling() or self._cache is None:
             return super()._call_module(tensors, **kwargs)
         (history,) = tensors

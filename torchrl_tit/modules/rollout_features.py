@@ -61,18 +61,22 @@ def add_rollout_features(
     ends[:, :-1] = ~same_frames(following_words[:, :-1], words[:, 1:]).all(-1)
     histories = [windows.flatten(0, 1), following[ends]]  # [N * T, K, *obs], [E, K, *obs]
 
-    if isinstance(network, HistoryNetwork) and network.frame_encoder is not None:
-        network.check(windows)
-        sources = _sources(words, following_words[ends], ends)  # [N * T + E, K]
-        tokens, index = _encode_each_once(network.frame_encoder, histories, sources, chunk_size)
-        results = [network.encode_history(tokens[chunk]) for chunk in index.split(chunk_size)]
-    else:
-        results = [network(chunk) for x in histories for chunk in x.split(chunk_size)]
+    with backbone.computing(windows.device):
+        if isinstance(network, HistoryNetwork) and network.frame_encoder is not None:
+            network.check(windows)
+            sources = _sources(words, following_words[ends], ends)  # [N * T + E, K]
+            tokens, index = _encode_each_once(network.frame_encoder, histories, sources, chunk_size)
+            results = [network.encode_history(tokens[chunk]) for chunk in index.split(chunk_size)]
+        else:
+            results = [network(chunk) for x in histories for chunk in x.split(chunk_size)]
     # Networks with separate trunks put out several features.
     outputs = [(result,) if isinstance(result, Tensor) else result for result in results]
 
     for out_key, parts in zip(backbone.out_keys, zip(*outputs, strict=True), strict=True):
-        features, of_ends = torch.cat(parts).split([len(x) for x in histories])
+        together = torch.cat(parts)
+        if backbone.autocast is not None:
+            together = together.float()
+        features, of_ends = together.split([len(x) for x in histories])
         features = features.view(*ends.shape, -1)  # [N, T, F]
         of_next = features.roll(-1, dims=1)
         of_next[ends] = of_ends
