@@ -136,7 +136,7 @@ def test_network_is_transformer_gate_and_lstm() -> None:
 
 
 def test_gate_bias_starts_near_the_identity_and_survives_initialisation() -> None:
-    network = CoBERL((20, 20), 4, **SMALL, gate_bias=9.0)
+    network = CoBERL((20, 20), 4, **SMALL, gate_bias=9)
     init_orthogonal_(network)
     gates = [module for module in network.modules() if isinstance(module, GRUGate)]
     assert len(gates) == 5  # two a block, one before the LSTM

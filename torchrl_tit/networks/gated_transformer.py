@@ -37,7 +37,7 @@ class GRUGate(nn.Module):
         self.candidate_y = nn.Linear(embed_dim, embed_dim, bias=False)
         self.candidate_x = nn.Linear(embed_dim, embed_dim, bias=False)
         # Not a linear layer's bias: initialisations that zero those must leave this one.
-        self.bias = nn.Parameter(torch.full((embed_dim,), bias))
+        self.bias = nn.Parameter(torch.full((embed_dim,), float(bias)))
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
         """Stream x and update y, float [..., D] each -> float [..., D]."""

@@ -1,5 +1,6 @@
 """Losses that TorchRL lacks or has otherwise."""
 
+from torchrl_tit.objectives.contrastive import contrastive_prediction_loss
 from torchrl_tit.objectives.decision_transformer import MaskedDTLoss
 
-__all__ = ["MaskedDTLoss"]
+__all__ = ["MaskedDTLoss", "contrastive_prediction_loss"]
