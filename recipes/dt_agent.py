@@ -24,6 +24,7 @@ class DTAgent(nn.Module):
     Args:
         env: name of the task.
         config: the network's settings.
+        context: steps that the network sees when it acts.
         return_scale: returns-to-go are divided by it.
 
     Raises:
@@ -33,9 +34,12 @@ class DTAgent(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, env: str, config: DecisionTransformerConfig, return_scale: float) -> None:
+    def __init__(
+        self, env: str, config: DecisionTransformerConfig, context: int, return_scale: float
+    ) -> None:
         super().__init__()
         self.env = env
+        self.context = context
         self.return_scale = return_scale
         task = make_env(env, clip_actions=False)
         spec = task.observation_spec["observation"]
@@ -76,16 +80,21 @@ class DTAgent(nn.Module):
             device=None if device.type == "cpu" else device,
             **settings,
         )
-        transforms = [
-            TargetReturn(target_return),
-            SequenceHistory(self.network.config.context, return_scale=self.return_scale),
-        ]
+        key = "observation"
+        transforms = [TargetReturn(target_return)]
         if self.normalizes:
-            normalize = ObservationNorm(
-                self.mean, self.std, in_keys=["observation"], standard_normal=True
+            key = "normalized_observation"  # beside the observation, which new data need as it is
+            transforms.append(
+                ObservationNorm(
+                    self.mean,
+                    self.std,
+                    in_keys=["observation"],
+                    out_keys=[key],
+                    standard_normal=True,
+                )
             )
-            transforms.insert(0, normalize)
-        return TransformedEnv(env, Compose(*transforms))
+        history = SequenceHistory(self.context, return_scale=self.return_scale, observation_key=key)
+        return TransformedEnv(env, Compose(*transforms, history))
 
     def play(self, target_return: float, episodes: int, seed: int) -> Tensor:
         """Plays episodes side by side and returns what each returned; float64 [episodes]."""

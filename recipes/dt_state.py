@@ -2,55 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
-from torchrl.data import ReplayBuffer
 
 from torchrl_tit.checkpoint import global_rng_state, set_global_rng_state
 
-from .dt_agent import DTAgent
 from .dt_outcomes import Outcome
 from .run import Run
+
+
+class Stateful(Protocol):
+    """What has a state that can be saved: modules, optimizers, replay buffers."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the state."""
+
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> Any:
+        """Takes a state over."""
 
 
 class TrainingState:
     """All that a run needs to go on as if it had never stopped.
 
     Args:
-        agent: the network.
-        optimizer: its optimizer.
-        buffer: what batches are drawn from, with its random generator.
+        parts: the network ("agent"), optimizers, and what batches are drawn from.
         evaluation_seed: seed of the first episode of the evaluations.
     """
 
-    def __init__(
-        self,
-        agent: DTAgent,
-        optimizer: torch.optim.Optimizer,
-        buffer: ReplayBuffer,
-        evaluation_seed: int,
-    ) -> None:
-        self.agent = agent
-        self.optimizer = optimizer
-        self.buffer = buffer
-        self.evaluation_seed = evaluation_seed
+    def __init__(self, parts: Mapping[str, Stateful], evaluation_seed: int) -> None:
         self.outcomes: list[Outcome] = []
         """Of all evaluations so far."""
         self.saved_step = 0
         """Step of the newest checkpoint."""
-        self._sums: list[float] = []  # of the losses since the last row of metrics
+        self._parts = parts
+        self._evaluation_seed = evaluation_seed
+        self._sums: list[float] = []  # of the terms since the last row of metrics
         self._count = 0
 
-    def add(self, losses: Tensor) -> None:
-        """Takes in the losses of one gradient step, float [terms]."""
-        values = losses.tolist()
+    def add(self, terms: Tensor) -> None:
+        """Takes in what one gradient step gave, float [terms]."""
+        values = terms.tolist()
         self._sums = [a + b for a, b in zip(self._sums or [0.0] * len(values), values, strict=True)]
         self._count += 1
 
     def take_means(self) -> list[float]:
-        """Returns the means of the losses since it was asked last."""
+        """Returns the means of the terms since it was asked last."""
         means = [total / self._count for total in self._sums]
         self._sums, self._count = [], 0
         return means
@@ -60,12 +60,10 @@ class TrainingState:
         run.save(
             step,
             {
-                "agent": self.agent.state_dict(),
-                "optimizer": self.optimizer.state_dict(),
-                "buffer": self.buffer.state_dict(),
+                **{name: part.state_dict() for name, part in self._parts.items()},
                 "rng": global_rng_state(),
                 "outcomes": [asdict(outcome) for outcome in self.outcomes],
-                "evaluation_seed": self.evaluation_seed,
+                "evaluation_seed": self._evaluation_seed,
                 "sums": self._sums,
                 "count": self._count,
             },
@@ -78,14 +76,20 @@ class TrainingState:
         if loaded is None:
             return 0
         step, state = loaded
-        # Its settings are the recipe's, also where those were changed since.
-        settings = self.optimizer.state_dict()["param_groups"]
         with run.restoring(step):
-            self.agent.load_state_dict(state["agent"])
-            self.optimizer.load_state_dict({**state["optimizer"], "param_groups": settings})
-            self.buffer.load_state_dict(state["buffer"])
+            for name, part in self._parts.items():
+                _load(part, state[name])
             self.outcomes = [Outcome(**outcome) for outcome in state["outcomes"]]
             self._sums, self._count = state["sums"], state["count"]
         set_global_rng_state(state["rng"])
         self.saved_step = step
         return step
+
+
+def _load(part: Stateful, state: dict[str, Any]) -> None:
+    if isinstance(part, torch.optim.Optimizer):
+        # Its settings are the recipe's, also where those were changed since; not so its counters.
+        groups = zip(state["param_groups"], part.state_dict()["param_groups"], strict=True)
+        kept = [{**own, **{k: saved[k] for k in saved if k == "step"}} for saved, own in groups]
+        state = {**state, "param_groups": kept}
+    part.load_state_dict(state)

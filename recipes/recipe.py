@@ -48,7 +48,8 @@ class Recipe:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        ALGORITHMS[cls.algorithm] = cls
+        if "algorithm" in vars(cls):  # not what several recipes share
+            ALGORITHMS[cls.algorithm] = cls
 
     def __post_init__(self) -> None:
         check_at_least(self, threads=1, seed=0)

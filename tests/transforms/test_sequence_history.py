@@ -17,7 +17,8 @@ def add_history(env, context, target=100.0, scale=10.0):
 
 def reference(steps, context, target, scale):
     """The sequences of one environment's steps [T], one step after the other."""
-    episode, sequences = [], []
+    episode: list[tuple] = []
+    sequences = []
     for step in steps.unbind(0):
         to_go = target - sum(reward for *_, reward in episode)
         actions = [action for _, action, _, _ in episode]
@@ -55,13 +56,8 @@ def test_equals_the_plain_reference(task, context):
         for t, expected in enumerate(reference(one, context, 100.0, 10.0)):
             for name, value in expected.items():
                 actual = one["sequence", name][t]
-                torch.testing.assert_close(
-                    actual.squeeze(-1) if name == "return_to_go" else actual,
-                    value,
-                    rtol=1e-5,
-                    atol=1e-5,
-                    msg=lambda text, name=name, t=t: f"{name} at {t}: {text}",
-                )
+                actual = actual.squeeze(-1) if name == "return_to_go" else actual
+                torch.testing.assert_close(actual, value, rtol=1e-5, atol=1e-5)
 
 
 def test_what_follows_a_step_holds_the_next_observation():

@@ -1,0 +1,129 @@
+"""Episodes that Online Decision Transformer trains on: first a data set, then its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import ReplayBuffer
+
+from torchrl_tit.datasets import (
+    Episodes,
+    SequenceStorage,
+    episodes_from_arrays,
+    join_episodes,
+    make_replay_buffer,
+    select_episodes,
+)
+
+_LIMIT = 1 - 1e-6
+"""The largest action that a squashed Gaussian gives a finite likelihood."""
+
+
+class OnlineData:
+    """Draws batches from a data set, and from the first rollout on from a first-in first-out store.
+
+    The store begins with the data's best episodes; each episode that is added takes the place of
+    the oldest, the data's worst first.
+
+    Args:
+        episodes: the data set.
+        make_storage: cuts sequences out of episodes.
+        batch_size: sequences in a batch.
+        capacity: episodes in the store.
+        seed: of what is drawn.
+    """
+
+    def __init__(
+        self,
+        episodes: Episodes,
+        make_storage: Callable[[Episodes], SequenceStorage],
+        *,
+        batch_size: int,
+        capacity: int,
+        seed: int,
+    ) -> None:
+        self.rounds = 0
+        """Times that episodes were added."""
+        self._episodes = episodes
+        self._make_storage = make_storage
+        self._batch_size = batch_size
+        self._capacity = capacity
+        self._seed = seed
+        self._buffer = self._make_buffer()
+
+    @property
+    def newest_return(self) -> float:
+        """Return of the episode that was added last; NaN before any was."""
+        return self._episodes.returns[-1].item() if self.rounds else math.nan
+
+    def sample(self) -> TensorDictBase:
+        """Draws a batch, its actions within what a squashed Gaussian can give."""
+        batch = self._buffer.sample()
+        batch["action"].clamp_(-_LIMIT, _LIMIT)
+        return batch
+
+    def add(self, episodes: Episodes) -> None:
+        """Adds episodes to the store."""
+        if self.rounds == 0:
+            finished = self._episodes.finished.nonzero().squeeze(-1)
+            order = self._episodes.returns[finished.cpu()].argsort(stable=True)
+            best = finished[order.to(finished.device)][-self._capacity :]
+            self._episodes = select_episodes(self._episodes, best)
+        joined = join_episodes([self._episodes, episodes])
+        oldest = max(0, len(joined.lengths) - self._capacity)
+        index = joined.lengths.new_tensor(range(oldest, len(joined.lengths)))
+        self._episodes = select_episodes(joined, index)
+        self.rounds += 1
+        self._buffer = self._make_buffer()
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the store holds, without the data set, and the state of what is drawn."""
+        state: dict[str, Any] = {"rounds": self.rounds, "buffer": self._buffer.state_dict()}
+        if self.rounds:
+            state["rows"] = dict(self._episodes.rows.items())
+            state["lengths"] = self._episodes.lengths
+            state["final_known"] = self._episodes.final_known
+        return state
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Takes a state over."""
+        self.rounds = state_dict["rounds"]
+        if self.rounds:
+            rows = TensorDict(state_dict["rows"])
+            rows.auto_batch_size_(1)
+            self._episodes = Episodes(
+                rows=rows,
+                lengths=state_dict["lengths"],
+                final_known=state_dict["final_known"],
+                source=self._episodes.source,
+            ).to(self._episodes.lengths.device)
+            self._buffer = self._make_buffer()
+        self._buffer.load_state_dict(state_dict["buffer"])
+
+    def _make_buffer(self) -> ReplayBuffer:
+        seed = np.random.SeedSequence([self._seed, self.rounds]).generate_state(1).item()
+        return make_replay_buffer(self._make_storage(self._episodes), self._batch_size, seed=seed)
+
+
+def as_episodes(rollout: TensorDictBase) -> Episodes:
+    """Makes an episode of a rollout [1, T] of one environment; its last step is taken for its end.
+
+    Args:
+        rollout: what :meth:`torchrl.envs.EnvBase.rollout` returned.
+    """
+    steps = rollout[0]
+    terminated = steps["next", "terminated"].flatten()
+    cut_off = ~terminated
+    cut_off[:-1] = False
+    return episodes_from_arrays(
+        steps["observation"].cpu(),
+        steps["action"].cpu(),
+        steps["next", "reward"].flatten().cpu(),
+        terminated.cpu(),
+        cut_off.cpu(),
+        steps["next", "observation"].cpu(),
+    )

@@ -1,0 +1,67 @@
+"""The loop around the gradient steps of Decision Transformer's recipes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import closing
+
+from torch import Tensor
+from tqdm import tqdm
+
+from .dt_agent import DTAgent
+from .dt_state import TrainingState
+from .interrupt import Interrupt
+from .run import Run
+from .sequence_recipe import SequenceRecipe
+
+
+def run_updates(
+    recipe: SequenceRecipe,
+    run: Run,
+    agent: DTAgent,
+    state: TrainingState,
+    terms: Sequence[str],
+    update: Callable[[int], Tensor],
+) -> None:
+    """Takes gradient steps to the end of a run, with evaluations, metrics and checkpoints.
+
+    Args:
+        recipe: the settings.
+        run: an open run folder, from whose newest checkpoint the state is loaded.
+        agent: what is trained.
+        state: all that belongs into a checkpoint.
+        terms: names of what a gradient step gives.
+        update: takes one, the first where it is given 0, and returns its terms, float [terms].
+    """
+    step = state.load(run)
+    targets = {target: f"return_{target:g}" for target in recipe.target_returns}
+    columns = ["return_mean", *targets.values(), *terms, "learning_rate"]
+    metrics = run.metrics(columns, last_step=step)
+    progress = tqdm(
+        total=recipe.final_step, initial=step, unit=" updates", desc=recipe.name, smoothing=0.05
+    )
+    with Interrupt() as interrupt, progress, closing(metrics):
+        while step < recipe.final_step:
+            agent.train()
+            state.add(update(step))
+            agent.eval()
+            step += 1
+            evaluation_due = recipe.evaluation_due(step)
+            if evaluation_due or step % recipe.log_interval == 0:
+                returns = dict.fromkeys(["return_mean", *targets.values()], math.nan)
+                if evaluation_due:
+                    outcomes = recipe.play(agent, step)
+                    state.outcomes += outcomes
+                    returns |= {targets[o.target_return]: o.mean for o in outcomes}
+                    returns["return_mean"] = max(outcome.mean for outcome in outcomes)
+                    progress.set_postfix_str(f"return {returns['return_mean']:.1f}")
+                means = dict(zip(terms, state.take_means(), strict=True))
+                learning_rate = recipe.learning_rate_at(step - 1)
+                metrics.log(step, **returns, **means, learning_rate=learning_rate)
+            progress.update()
+            checkpoint_due = evaluation_due or step % recipe.checkpoint_interval == 0
+            if checkpoint_due or interrupt.requested:
+                state.save(run, step)
+            if interrupt.requested:
+                raise KeyboardInterrupt
