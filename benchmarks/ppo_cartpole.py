@@ -190,7 +190,7 @@ def profile(compile: Compile) -> dict[str, float]:
             patch.object(
                 ppo,
                 "make_objective",
-                lambda *args: timers.around(make_objective(*args), "update: forward"),
+                lambda *args, **kw: timers.around(make_objective(*args, **kw), "update: forward"),
             )
         )
         laps = run_ours(0, compile, timers).laps

@@ -75,6 +75,15 @@ def _named(game: str) -> list[PPO]:
         checkpoint_interval=500_000,
     )
     recipes = {name: replace(base, backbone=network) for name, network in _BASELINES.items()}
+    # The skills of the baselines' own papers (for CoBERL arXiv 2107.05431); how long the warm-up is
+    # and which of their other skills "+tuned" had, arXiv 2212.14538 does not say.
+    tuned = replace(base, warmup_steps=200_000, initialization="own")
+    recipes |= {
+        "catformer-tuned": replace(
+            tuned, backbone=CatformerConfig(attention_expansion=2, ffn_expansion=4)
+        ),
+        "coberl-tuned": replace(tuned, backbone=CoBERLConfig(gate_bias=2.0), contrastive_coeff=1.0),
+    }
     tit = replace(base, minibatch_size=64)
     recipes |= {name: replace(tit, backbone=network) for name, network in _TIT.items()}
     return [replace(recipe, name=f"ppo/{game}/{name}") for name, recipe in recipes.items()]

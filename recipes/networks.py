@@ -75,6 +75,14 @@ NETWORKS: dict[str, tuple[type[NetworkConfig], Callable[..., Network]]] = {
 
 
 def make_network(config: NetworkConfig, observation_shape: Sequence[int], history: int) -> Network:
-    """Builds the network that settings describe, for observations of a shape and K of them."""
-    network = next(network for kind, network in NETWORKS.values() if kind is type(config))
+    """Builds the network that settings describe, for observations of a shape and K of them.
+
+    Raises:
+        ValueError: if the network cannot read them, or has no use for K = 1.
+    """
+    name, network = next((name, n) for name, (kind, n) in NETWORKS.items() if kind is type(config))
+    if history == 1 and isinstance(config, CatformerConfig | CoBERLConfig):
+        raise ValueError(f"a {name} is a transformer over time: set history to 2 or more, not 1")
+    if history == 1 and getattr(config, "temporal_position_encoding", False):
+        raise ValueError("there are no temporal positions in one observation: set history to more")
     return network(observation_shape, history, config)

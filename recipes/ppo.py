@@ -19,6 +19,7 @@ from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.envs import VectorizationMode, make_env
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.modules import LSTMConfig, while_acting
+from torchrl_tit.networks import CoBERLConfig
 
 from .compilation import Compile, Precision, compile_options, should_compile
 from .interrupt import Interrupt
@@ -26,7 +27,7 @@ from .ppo_agent import Agent
 from .ppo_collector import make_collector
 from .ppo_state import TrainingState
 from .ppo_update import (
-    LOSSES,
+    TERMS,
     add_advantages,
     check_agent,
     check_finite,
@@ -38,8 +39,6 @@ from .ppo_update import (
 )
 from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
-
-COLUMNS = ["return_mean", "episodes", "learning_rate", *LOSSES]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,9 +74,11 @@ class PPO(Recipe):
     epochs: int = 10
     """Passes over each batch."""
     learning_rate: float = 3e-4
-    """Learning rate of Adam, at the start where it decays."""
+    """Learning rate of Adam, before it is scaled by warm-up and decay."""
     decay_learning_rate: bool = False
     """Whether the learning rate falls linearly to 0 over the run."""
+    warmup_steps: int = 0
+    """Environment steps over which the learning rate rises linearly from 0."""
     adam_eps: float = 1e-5
     """Epsilon of Adam."""
     max_grad_norm: float = 0.5
@@ -90,6 +91,10 @@ class PPO(Recipe):
     """Weight of the entropy bonus."""
     critic_coeff: float = 0.5
     """Weight of the mean squared value error."""
+    contrastive_coeff: float = 0.0
+    """Weight of the contrastive loss of CoBERL (arXiv 2107.05431: 1); other networks have none."""
+    masked_fraction: float = 0.15
+    """Share of the steps that the contrastive loss hides."""
     clip_rewards: bool = False
     """Whether training sees the rewards' signs only; returns are always those of the task."""
     reward_scale: float = 1.0
@@ -144,6 +149,9 @@ class PPO(Recipe):
             minibatch_size=2,  # an advantage alone has no standard deviation
             epochs=1,
             learning_rate=0,
+            warmup_steps=0,
+            contrastive_coeff=0,
+            masked_fraction=0,
             adam_eps=0,
             max_grad_norm=0,
             clip_epsilon=0,
@@ -154,13 +162,20 @@ class PPO(Recipe):
             evaluation_seed=0,
             checkpoint_interval=1,
         )
-        check_at_most(self, clip_epsilon=1, gamma=1, gae_lambda=1, evaluation_seed=2**31)
+        check_at_most(
+            self, clip_epsilon=1, gamma=1, gae_lambda=1, masked_fraction=1, evaluation_seed=2**31
+        )
         if self.steps_per_batch < 2 or self.steps_per_batch % self.num_envs:
             raise ValueError(
                 f"steps_per_batch {self.steps_per_batch} cannot be shared by {self.num_envs} "
                 "environments: it must be a multiple of num_envs"
             )
 
+        if self.contrastive_coeff and not isinstance(self.backbone, CoBERLConfig):
+            raise ValueError(
+                "contrastive_coeff is the weight of a loss of coberl alone: set it to 0 for other "
+                "networks"
+            )
         if self.is_recurrent:
             for name, steps in (
                 ("minibatch_size", self.minibatch_size),
@@ -196,6 +211,13 @@ class PPO(Recipe):
         """Gradient steps of the whole run."""
         batches = self.final_step // self.steps_per_batch
         return batches * self.epochs * math.ceil(self.steps_per_batch / self.minibatch_size)
+
+    def learning_rate_at(self, step: int) -> float:
+        """The learning rate of the update that follows the batch up to a step."""
+        begun = step - self.steps_per_batch
+        rise = min(1, step / self.warmup_steps) if self.warmup_steps else 1
+        fall = 1 - begun / self.final_step if self.decay_learning_rate else 1
+        return self.learning_rate * rise * fall
 
     def make_env(self, num_envs: int, seed: int, **kwargs: Any) -> EnvBase:
         """Builds the environment, with the history as part of it; settings go to the task."""
@@ -321,7 +343,14 @@ def train(recipe: PPO, run: Run) -> None:
     compiled = not recipe.is_recurrent and should_compile(recipe.compile, recipe.gradient_steps)
     device = recipe.torch_device()
     options = compile_options(recipe.cuda_graphs, device)
-    objective = make_objective(agent, loss, options if compiled else None)
+    objective = make_objective(
+        agent,
+        loss,
+        options if compiled else None,
+        contrastive_coeff=recipe.contrastive_coeff,
+        masked_fraction=recipe.masked_fraction,
+    )
+    terms = [*TERMS, *(["loss_contrastive"] if recipe.contrastive_coeff else []), "gradient_norm"]
     if compiled and agent.backbone.keeps_frames:
         agent.backbone.compile_parts(**options)
     gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
@@ -337,7 +366,8 @@ def train(recipe: PPO, run: Run) -> None:
     collector = make_collector(recipe, env, agent, step, options if compiled else None)
     state = TrainingState(agent, optimizer, collector, recipe.seed)
     state.load(run)
-    metrics = run.metrics(COLUMNS, last_step=step)
+    columns = ["return_mean", "episodes", "learning_rate", *terms]
+    metrics = run.metrics(columns, last_step=step)
     saved_step = step
     progress = tqdm(
         total=recipe.final_step, initial=step, unit=" steps", desc=recipe.name, smoothing=0.05
@@ -346,8 +376,7 @@ def train(recipe: PPO, run: Run) -> None:
         for batch in while_acting(agent.policy, collector):
             step += batch.numel()
             remaining = 1 - (step - batch.numel()) / recipe.final_step
-            if recipe.decay_learning_rate:
-                set_learning_rate(optimizer, recipe.learning_rate * remaining)
+            set_learning_rate(optimizer, recipe.learning_rate_at(step))
             if recipe.decay_clip_epsilon:
                 loss.clip_epsilon.fill_(recipe.clip_epsilon * remaining)
 
@@ -358,20 +387,20 @@ def train(recipe: PPO, run: Run) -> None:
             losses = []
             for minibatch in minibatches(batch, recipe):
                 try:
-                    total, terms = objective(minibatch)
+                    total, values = objective(minibatch)
                 except RuntimeError:  # TorchRL draws samples where an entropy is not finite
                     check_agent(agent, minibatch, step, saved_step)
                     raise
                 optimizer.zero_grad()
                 total.backward()
                 norm = update_weights()
-                losses.append(torch.cat([terms, norm.unsqueeze(0)]))
-                check_finite(LOSSES, losses[-1], step, saved_step)
+                losses.append(torch.cat([values, norm.unsqueeze(0)]))
+                check_finite(terms, losses[-1], step, saved_step)
             agent.eval()
             if recipe.collectors > 1:
                 collector.update_policy_weights_()
             check_agent(agent, minibatch, step, saved_step)  # before it is saved
-            means = dict(zip(LOSSES, torch.stack(losses).mean(0).tolist(), strict=True))
+            means = dict(zip(terms, torch.stack(losses).mean(0).tolist(), strict=True))
 
             finished = finished_returns(batch)
             mean_return = finished.mean().item()  # NaN where no episode ended

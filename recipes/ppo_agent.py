@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 
 from torchrl_tit.modules import Backbone, LSTMBackbone, LSTMConfig, make_actor, make_value
-from torchrl_tit.networks import TwoTrunkNetwork, init_orthogonal_
+from torchrl_tit.networks import CoBERL, TwoTrunkNetwork, init_orthogonal_
+from torchrl_tit.objectives import contrastive_prediction_loss
 
 from .compilation import autocast_type
 from .networks import make_network
@@ -58,6 +60,21 @@ class Agent(nn.Module):
             with set_recurrent_mode(True):
                 return self.backbone(samples)
         return self.backbone(samples)
+
+    def contrastive_loss(self, history: Tensor, masked_fraction: float) -> Tensor:
+        """CoBERL's contrastive loss, in a pass of its own: its transformer looks both ways.
+
+        Args:
+            history: [N, K, *observation].
+            masked_fraction: share of the steps that are hidden.
+
+        Returns:
+            float [].
+        """
+        network = self.backbone.module
+        assert isinstance(network, CoBERL)
+        mask = torch.rand(history.shape[:2], device=history.device) < masked_fraction
+        return contrastive_prediction_loss(*network.predict_masked(history, mask), mask)
 
     @property
     def policy(self) -> TensorDictModuleBase:

@@ -18,11 +18,15 @@ if TYPE_CHECKING:
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
 """What TorchRL's loss gives, of which a row of metrics has the means."""
-LOSSES = [*TERMS, "gradient_norm"]
 
 
 def make_objective(
-    agent: Agent, loss: ClipPPOLoss, options: Mapping[str, Any] | None
+    agent: Agent,
+    loss: ClipPPOLoss,
+    options: Mapping[str, Any] | None,
+    *,
+    contrastive_coeff: float = 0.0,
+    masked_fraction: float = 0.15,
 ) -> Callable[[TensorDict], tuple[Tensor, Tensor]]:
     """Builds the function of a minibatch that is minimised.
 
@@ -30,16 +34,24 @@ def make_objective(
         agent: the agent whose backbone writes the features.
         loss: TorchRL's loss on the heads, which read them.
         options: of ``torch.compile``; without any it is not compiled.
+        contrastive_coeff: weight of the contrastive loss of CoBERL; 0 for other networks.
+        masked_fraction: share of the steps that it hides.
 
     Returns:
-        A function of a minibatch [N]: the total, float [], and its ``TERMS``, float [terms].
+        A function of a minibatch [N]: the total, float [], and its ``TERMS``, float [terms],
+        followed by the contrastive loss where there is one.
     """
 
     def objective(minibatch: TensorDict) -> tuple[Tensor, Tensor]:
         agent.encode(minibatch)  # once; the heads read its features
         terms = loss(minibatch)
         total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
-        return total, torch.stack([terms[name].detach() for name in TERMS])
+        values = [terms[name].detach() for name in TERMS]
+        if contrastive_coeff:
+            contrast = agent.contrastive_loss(minibatch["history"], masked_fraction)
+            total = total + contrastive_coeff * contrast
+            values.append(contrast.detach())
+        return total, torch.stack(values)
 
     return torch.compile(objective, **options) if options else objective
 
