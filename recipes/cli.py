@@ -1,4 +1,4 @@
-"""The command line: list, show, train, evaluate, render, sweep, compare, data."""
+"""The command line."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from typing import Annotated, Any, NoReturn
 
 import tyro
 
-from .plot import plot_comparison
+from torchrl_tit.files import write_text_atomic
+
+from .plot import plot_comparison, plot_table
 from .recipe import Recipe, recipe_from_json, recipe_to_json
 from .registry import RECIPES, get_recipe
 from .run import Run
 from .sweep import make_jobs, run_jobs
+from .table import make_table, to_csv, to_markdown
 
 _USAGE = """\
 usage: {program} COMMAND ...
@@ -32,6 +35,7 @@ usage: {program} COMMAND ...
   render RUN --out FILE       film a run's agent: a GIF or MP4
   sweep NAME [NAME ...]       train many recipes and seeds side by side; names can be patterns
   compare RUN [RUN ...]       learning curves of several runs, seeds of a recipe as one band
+  table FOLDER [FOLDER ...]   the paper's tables from all runs in folders
   data info SOURCE            what is in a data set: an HDF5 file, D4RL's or Minari's name
   data convert SOURCE TARGET  between HDF5 in D4RL's layout and Minari
 
@@ -54,6 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
         "render": _render,
         "sweep": _sweep,
         "compare": _compare,
+        "table": _table,
         "data": _data,
     }
     if not words or words[0] not in commands:
@@ -242,6 +247,24 @@ def _compare(words: list[str]) -> None:
         curves.setdefault(run.recipe.name or str(folder), []).append(folder / "metrics.csv")
     plot_comparison(curves, options.out, title=options.title)
     print(f"written to {options.out}")
+
+
+def _table(words: list[str]) -> None:
+    parser = _Parser(f"{_program()} table")
+    parser.add_argument("folders", type=Path, nargs="+", help="folders with run folders in them")
+    parser.add_argument("--format", choices=["md", "csv"], default="md", help="what is printed")
+    parser.add_argument("--out", type=Path, help="folder for table.md, table.csv and table.png")
+    options = parser.parse_args(words)
+    cells, notes = make_table(options.folders)
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+    print(to_csv(cells) if options.format == "csv" else to_markdown(cells), end="")
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(options.out / "table.md", to_markdown(cells))
+        write_text_atomic(options.out / "table.csv", to_csv(cells))
+        plot_table(cells, options.out / "table.png")
+        print(f"written to {options.out}")
 
 
 def _data(words: list[str]) -> None:

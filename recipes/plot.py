@@ -16,6 +16,8 @@ from .metrics import read_metrics
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from .table import Cell
+
 
 def plot_learning_curve(metrics: Path, picture: Path, *, title: str, window: int = 5) -> None:
     """Draws returns of training episodes over environment steps.
@@ -64,19 +66,71 @@ def plot_comparison(
     _write(figure, picture)
 
 
+def plot_table(cells: Sequence[Cell], picture: Path) -> None:
+    """Draws cells beside the paper's values, a panel a task.
+
+    Args:
+        cells: what :func:`~recipes.table.make_table` returns.
+        picture: the PNG file to write.
+    """
+    tasks: dict[str, list[Cell]] = {}
+    for cell in cells:
+        tasks.setdefault(cell.recipe.rpartition("/")[0], []).append(cell)
+    columns = min(3, len(tasks))
+    rows = -(-len(tasks) // columns)
+    height = 0.6 + 0.32 * max(map(len, tasks.values()))
+    figure = _blank((4.2 * columns, height * rows + 0.6))
+    panels = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axes, (task, group) in zip(panels, tasks.items(), strict=False):
+        places = np.arange(len(group))
+        # A single run has no interval.
+        below = [cell.iqm - cell.low if cell.runs > 1 else 0 for cell in group]
+        above = [cell.high - cell.iqm if cell.runs > 1 else 0 for cell in group]
+        axes.errorbar(
+            [cell.iqm for cell in group],
+            places,
+            xerr=[below, above],
+            fmt="o",
+            color="C0",
+            capsize=3,
+            label="interquartile mean, 95%",
+        )
+        axes.errorbar(
+            [cell.paper_mean for cell in group],
+            places + 0.22,
+            xerr=[cell.paper_std for cell in group],
+            fmt="s",
+            color="grey",
+            markersize=4,
+            label="paper",
+        )
+        axes.set_yticks(places, [cell.recipe.rpartition("/")[2] for cell in group])
+        axes.set(title=task, ylim=(len(group) - 0.4, -0.6))
+        axes.grid(alpha=0.3)
+    for axes in panels[len(tasks) :]:
+        axes.set_visible(False)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    _save(figure, picture)
+
+
 def _curve(metrics: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps and returns of the batches in which an episode ended."""
     rows = [row for row in read_metrics(metrics) if not np.isnan(row["return_mean"])]
     return np.array([row["step"] for row in rows]), np.array([row["return_mean"] for row in rows])
 
 
-def _figure(title: str) -> Figure:
+def _blank(size: tuple[float, float]) -> Figure:
     # Not at the top: Matplotlib takes a second that only drawing should cost.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 4), dpi=120, layout="constrained")
+    figure = Figure(figsize=size, dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
+    return figure
+
+
+def _figure(title: str) -> Figure:
+    figure = _blank((7, 4))
     axes = figure.add_subplot()
     axes.set(title=title, xlabel="environment steps", ylabel="return of training episodes")
     axes.grid(alpha=0.3)
@@ -86,6 +140,10 @@ def _figure(title: str) -> Figure:
 def _write(figure: Figure, picture: Path) -> None:
     (axes,) = figure.axes
     axes.legend(frameon=False)
+    _save(figure, picture)
+
+
+def _save(figure: Figure, picture: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     write_bytes_atomic(picture, buffer.getvalue())
