@@ -34,6 +34,7 @@ usage: {program} COMMAND ...
   evaluate RUN                evaluate a run's newest checkpoint
   render RUN --out FILE       film a run's agent: a GIF or MP4
   sweep NAME [NAME ...]       train many recipes and seeds side by side; names can be patterns
+  tune NAME --out FOLDER      search a recipe's fields for the best settings, with Optuna
   compare RUN [RUN ...]       learning curves of several runs, seeds of a recipe as one band
   table FOLDER [FOLDER ...]   the paper's tables from all runs in folders
   data info SOURCE            what is in a data set: an HDF5 file, D4RL's or Minari's name
@@ -57,6 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
         "evaluate": _evaluate,
         "render": _render,
         "sweep": _sweep,
+        "tune": _tune,
         "compare": _compare,
         "table": _table,
         "data": _data,
@@ -235,6 +237,49 @@ def _sweep(words: list[str]) -> None:
     print(f"{len(jobs)} runs are complete in {options.out}")
 
 
+def _tune(words: list[str]) -> None:
+    # Not at the top: Optuna is an extra.
+    from .search_space import load_space
+    from .tune import Search, Settings
+
+    parser = _Parser(f"{_program()} tune")
+    parser.add_argument("name", help="name of a recipe, or a JSON file")
+    parser.add_argument("--space", type=Path, help="JSON file with the search space")
+    parser.add_argument("--trials", type=int, default=50, help="trials of the whole search")
+    parser.add_argument("--workers", type=int, default=1, help="trials at a time, a process each")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each trial")
+    parser.add_argument(
+        "--startup-trials", type=int, default=5, help="trials before which none is pruned"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the search")
+    options = parser.parse_args(words)
+    for name in ("trials", "workers", "startup_trials"):
+        if getattr(options, name) < 1:
+            _fail(f"--{name.replace('_', '-')} must be at least 1, not {getattr(options, name)}")
+    recipe = _find(options.name)
+    recipe.check()
+    settings = Settings(
+        recipe,
+        load_space(options.space, recipe),
+        seeds=tuple(options.seeds),
+        startup_trials=options.startup_trials,
+    )
+    search = Search(options.out, settings)
+    try:
+        failed = search.run(options.trials, options.workers)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on", file=sys.stderr)
+        raise
+    best = search.best()
+    if failed:
+        print(f"note: trials {failed} failed: see trial-N/*.log in {options.out}", file=sys.stderr)
+    if best is None:
+        _fail(f"no trial of {options.out} was complete")
+    values = ", ".join(f"{field} {value}" for field, value in best.params.items())
+    print(f"best of {len(search.study.trials)} trials: {best.value:.1f} with {values}")
+    print(f"its recipe: {options.out / 'best.json'}")
+
+
 def _compare(words: list[str]) -> None:
     parser = _Parser(f"{_program()} compare")
     parser.add_argument("runs", type=Path, nargs="+", help="run folders")
@@ -245,7 +290,7 @@ def _compare(words: list[str]) -> None:
     for folder in options.runs:
         run = Run.open(folder)
         curves.setdefault(run.recipe.name or str(folder), []).append(folder / "metrics.csv")
-    plot_comparison(curves, options.out, title=options.title)
+    plot_comparison(curves, options.out, title=options.title, offline=run.recipe.offline)
     print(f"written to {options.out}")
 
 

@@ -24,6 +24,8 @@ class Job:
 
     recipe: Recipe
     folder: Path
+    source: str = ""
+    """A JSON file that holds the recipe; where this is empty, it is a named one."""
 
     @property
     def log(self) -> Path:
@@ -37,7 +39,7 @@ class Job:
             return [*train, "--resume", str(self.folder)]
         return [
             *train,
-            self.recipe.name,
+            self.source or self.recipe.name,
             "--seed",
             str(self.recipe.seed),
             "--out",
@@ -116,7 +118,7 @@ def run_jobs(jobs: list[Job], workers: int) -> list[Job]:
             while waiting or running:
                 while waiting and len(running) < workers:
                     job = waiting.pop(0)
-                    running[job] = _start(job)
+                    running[job] = start(job)
                     progress.set_postfix_str(f"{len(running)} at work")
                 time.sleep(0.2)
                 for job in [job for job, process in running.items() if process.poll() is not None]:
@@ -132,7 +134,8 @@ def run_jobs(jobs: list[Job], workers: int) -> list[Job]:
     return failed
 
 
-def _start(job: Job) -> subprocess.Popen[bytes]:
+def start(job: Job) -> subprocess.Popen[bytes]:
+    """Starts or resumes a run in a process of its own, which prints to the job's log."""
     job.log.parent.mkdir(parents=True, exist_ok=True)
     with job.log.open("ab") as log:
         # A session of its own: the terminal's Ctrl-C reaches this process, which passes it on.
