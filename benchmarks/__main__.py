@@ -6,7 +6,7 @@ import argparse
 import importlib
 from pathlib import Path
 
-BENCHMARKS = ["history_windows", "ppo_cartpole"]
+BENCHMARKS = ["decision_transformer", "history_windows", "ppo_cartpole"]
 
 
 def main() -> None:

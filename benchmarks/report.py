@@ -14,7 +14,7 @@ from typing import Any
 
 from torchrl_tit.files import write_text_atomic
 
-_PACKAGES = ["torch", "torchrl", "tensordict", "gymnasium", "stable-baselines3"]
+_PACKAGES = ["torch", "torchrl", "tensordict", "gymnasium", "stable-baselines3", "transformers"]
 
 
 def spread(values: Sequence[float], digits: int = 0) -> str:

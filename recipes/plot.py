@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from .table import Cell
 
 
-def plot_learning_curve(metrics: Path, picture: Path, *, title: str, window: int = 5) -> None:
+def plot_learning_curve(
+    metrics: Path, picture: Path, *, title: str, window: int = 5, offline: bool = False
+) -> None:
     """Draws returns of training episodes over environment steps.
 
     Args:
@@ -27,18 +29,25 @@ def plot_learning_curve(metrics: Path, picture: Path, *, title: str, window: int
         picture: the PNG file to write.
         title: title of the picture.
         window: batches over which the bold line is averaged.
+        offline: whether it is of evaluation episodes over gradient steps instead.
     """
     steps, returns = _curve(metrics)
     smooth = np.array([returns[max(0, i - window + 1) : i + 1].mean() for i in range(len(returns))])
-    figure = _figure(title)
+    figure = _figure(title, offline)
     (axes,) = figure.axes
-    axes.plot(steps, returns, color="C0", alpha=0.35, linewidth=1, label="mean of a batch")
-    axes.plot(steps, smooth, color="C0", linewidth=2, label=f"mean of {window} batches")
+    batch, batches = ("an evaluation", "evaluations") if offline else ("a batch", "batches")
+    axes.plot(steps, returns, color="C0", alpha=0.35, linewidth=1, label=f"mean of {batch}")
+    axes.plot(steps, smooth, color="C0", linewidth=2, label=f"mean of {window} {batches}")
     _write(figure, picture)
 
 
 def plot_comparison(
-    curves: Mapping[str, Sequence[Path]], picture: Path, *, title: str, points: int = 200
+    curves: Mapping[str, Sequence[Path]],
+    picture: Path,
+    *,
+    title: str,
+    points: int = 200,
+    offline: bool = False,
 ) -> None:
     """Draws learning curves of several groups of runs: mean over the runs, band of one deviation.
 
@@ -47,8 +56,9 @@ def plot_comparison(
         picture: the PNG file to write.
         title: title of the picture.
         points: steps at which the runs are compared; between batches, returns are interpolated.
+        offline: as for :func:`plot_learning_curve`.
     """
-    figure = _figure(title)
+    figure = _figure(title, offline)
     (axes,) = figure.axes
     for name, runs in curves.items():
         known = [(steps, returns) for steps, returns in map(_curve, runs) if len(steps)]
@@ -129,10 +139,11 @@ def _blank(size: tuple[float, float]) -> Figure:
     return figure
 
 
-def _figure(title: str) -> Figure:
+def _figure(title: str, offline: bool) -> Figure:
     figure = _blank((7, 4))
     axes = figure.add_subplot()
-    axes.set(title=title, xlabel="environment steps", ylabel="return of training episodes")
+    steps, episodes = ("gradient", "evaluation") if offline else ("environment", "training")
+    axes.set(title=title, xlabel=f"{steps} steps", ylabel=f"return of {episodes} episodes")
     axes.grid(alpha=0.3)
     return figure
 

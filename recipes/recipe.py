@@ -34,6 +34,8 @@ class Recipe:
     """Settings that every experiment has."""
 
     algorithm: ClassVar[str]
+    offline: ClassVar[bool] = False
+    """Whether steps are gradient steps, and returns those of evaluations."""
 
     name: Annotated[str, tyro.conf.Suppress] = ""
     """The recipe's name, such as ppo/cartpole/enhanced-tit."""

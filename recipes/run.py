@@ -138,7 +138,12 @@ class Run:
     def plot(self) -> Path:
         """Draws ``learning_curve.png`` from the metrics and returns its path."""
         path = self.folder / _CURVE
-        plot_learning_curve(self.folder / "metrics.csv", path, title=self.recipe.name)
+        plot_learning_curve(
+            self.folder / "metrics.csv",
+            path,
+            title=self.recipe.name,
+            offline=self.recipe.offline,
+        )
         return path
 
     def version_changes(self) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
@@ -20,6 +20,8 @@ from .run import Run
 @dataclass(frozen=True, kw_only=True)
 class SequenceRecipe(Recipe):
     """Settings of every recipe that trains a Decision Transformer on a data set."""
+
+    offline: ClassVar[bool] = True
 
     backbone: DecisionTransformerConfig = field(default_factory=DecisionTransformerConfig)
     """The network and its hyperparameters."""
