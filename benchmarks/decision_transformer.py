@@ -189,7 +189,7 @@ def main(out: Path | None) -> None:
         "## A training step\n\n"
         "Batch 64, 20 steps, width 128, 3 layers, 1 head, dropout 0.1, Hopper's sizes; forward, "
         "backward,\nclipping and fused AdamW, one thread, processor time. "
-        f"{ROUNDS} rounds\nof {STEPS} steps each, alternating: median (range), ratios round by "
+        f"{ROUNDS} rounds of {STEPS} steps each,\nalternating: median (range), ratios round by "
         f"round; {peer / ours:.2f} times by the medians.\n\n"
         + table(["", "ms a step", "times as fast as `DTActor`"], training)
         + "\nOurs computes an embedding of time steps and a mask of padding in addition, and of "

@@ -51,6 +51,22 @@ def test_the_number_of_environments_does_not_matter(num_envs):
     assert torch.equal(evaluate(env, lean, episodes=9, seed=7), expected)
 
 
+@pytest.mark.parametrize("num_envs", [1, 4, 9])
+def test_shrinking_asks_only_about_what_still_counts(num_envs):
+    expected = played_by_hand("CartPole-v1", lambda x: int(x[2] > 0), seed=7, episodes=9)
+    asked = []
+
+    def policy(tensordict):
+        asked.append(len(tensordict))
+        return lean(tensordict)
+
+    env = make_env("CartPole-v1", num_envs)
+    assert torch.equal(evaluate(env, policy, episodes=9, seed=7, shrink=True), expected)
+    playing = [sum(ret > step for ret in expected) for step in range(int(expected.max()))]
+    if num_envs == 9:
+        assert asked == playing
+
+
 def test_torchrls_own_environments():
     expected = played_by_hand("CartPole-v1", lambda x: int(x[2] > 0), seed=7, episodes=4)
     single = GymEnv("CartPole-v1", categorical_action_encoding=True)
