@@ -6,7 +6,14 @@ import argparse
 import importlib
 from pathlib import Path
 
-BENCHMARKS = ["decision_transformer", "history_windows", "ppo_cartpole"]
+BENCHMARKS = [
+    "acting",
+    "training_step",
+    "memory",
+    "decision_transformer",
+    "history_windows",
+    "ppo_cartpole",
+]
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Enhanced_TIT as one would write it first: nn.MultiheadAttention, everything computed.
+"""Both TITs as one would write them first: nn.MultiheadAttention, everything computed.
 
 Every block runs over every token of every frame of the window, for each query anew.
 """
@@ -30,7 +30,7 @@ class Block(nn.Module):
 
 
 class StraightforwardTIT(nn.Module):
-    """Enhanced_TIT on arrays [B, K, D] (patch 1) or images [B, K, H, W]."""
+    """TIT on arrays [B, K, D] (patch 1) or images [B, K, H, W]: Enhanced, or Vanilla."""
 
     def __init__(
         self,
@@ -43,8 +43,10 @@ class StraightforwardTIT(nn.Module):
         expansion: int = 4,
         features_dim: int = 64,
         head: type[nn.Module] = nn.Tanh,
+        enhanced: bool = True,
     ) -> None:
         super().__init__()
+        self.enhanced = enhanced
         convolution = nn.Conv1d if len(observation_shape) == 1 else nn.Conv2d
         self.patches = convolution(1, embed_dim, patch_size, patch_size, bias=False)
         num_patches = 1
@@ -58,9 +60,10 @@ class StraightforwardTIT(nn.Module):
         self.outer = nn.ModuleList(
             Block(embed_dim, num_heads, expansion, True) for _ in range(num_blocks)
         )
+        width = num_blocks * embed_dim if enhanced else embed_dim
         self.head = nn.Sequential(
-            nn.LayerNorm(num_blocks * embed_dim),
-            nn.Linear(num_blocks * embed_dim, features_dim),
+            nn.LayerNorm(width),
+            nn.Linear(width, features_dim),
             head(),
             nn.LayerNorm(features_dim),
         )
@@ -74,5 +77,11 @@ class StraightforwardTIT(nn.Module):
         outputs = []
         for inner, outer in zip(self.inner, self.outer, strict=True):
             x = inner(x)  # [B * K, 1 + patches, D]
-            outputs.append(outer(x[:, 0].unflatten(0, (batch, steps)))[:, -1])
+            if self.enhanced:
+                outputs.append(outer(x[:, 0].unflatten(0, (batch, steps)))[:, -1])
+        if not self.enhanced:
+            x = x[:, 0].unflatten(0, (batch, steps))
+            for outer in self.outer:
+                x = outer(x)  # [B, K, D]
+            outputs.append(x[:, -1])
         return self.head(torch.cat(outputs, dim=-1))

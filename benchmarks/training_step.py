@@ -1,0 +1,148 @@
+"""A training step: forward, backward, and Adam, against the straightforward network.
+
+Both train on the same minibatch with the same loss and the same fused Adam. Ours is measured as it
+is, and compiled; in bfloat16 the straightforward network runs under the same autocast.
+Milliseconds a step.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from .acting import synchronize
+from .cases import COLUMNS, Case
+from .report import publish, spread, table
+
+CASES = [
+    *(Case("Enhanced", "arrays", history, 64) for history in (1, 4, 16, 64)),
+    *(Case("Vanilla", "arrays", history, 64) for history in (1, 4, 16, 64)),
+    *(Case("Enhanced", "images", history, 64) for history in (1, 4, 16)),
+    *(Case("Vanilla", "images", history, 64) for history in (1, 4, 16)),
+]
+COMPILED = [  # each takes a minute to compile
+    Case("Enhanced", "arrays", 1, 64),
+    Case("Enhanced", "arrays", 16, 64),
+    Case("Enhanced", "images", 4, 64),
+]
+GPU_CASES = [Case("Enhanced", "images", 4, 1024)]
+REPEATS, SECONDS = 7, 0.5
+
+
+def make_step(
+    network: nn.Module, history: Tensor, autocast: torch.dtype | None, compiled: bool
+) -> Callable[[], None]:
+    """A function that takes one training step."""
+    optimizer = torch.optim.Adam(network.parameters(), fused=True)
+
+    def loss_of(history: Tensor) -> Tensor:
+        with torch.autocast(history.device.type, autocast) if autocast else nullcontext():
+            return network(history).float().square().mean()
+
+    loss = torch.compile(loss_of, dynamic=False) if compiled else loss_of
+
+    def step() -> None:
+        optimizer.zero_grad()
+        loss(history).backward()
+        optimizer.step()
+
+    return step
+
+
+def milliseconds(step: Callable[[], None], history: Tensor, seconds: float) -> float:
+    """Milliseconds a step, over about so many seconds."""
+    synchronize(history)
+    steps, start = 0, time.perf_counter()
+    while steps == 0 or time.perf_counter() - start < seconds:
+        step()
+        steps += 1
+        synchronize(history)
+    return 1000 * (time.perf_counter() - start) / steps
+
+
+def measure(
+    case: Case,
+    repeats: int,
+    seconds: float,
+    *,
+    compiled: bool,
+    bfloat16: bool = False,
+    device: str = "cpu",
+) -> dict[str, Any]:
+    """Measures ours, ours compiled, and the straightforward network, alternating."""
+    torch.manual_seed(0)
+    history = case.frames(case.history).to(device)
+    autocast = torch.bfloat16 if bfloat16 else None
+    steps = {
+        "ours": make_step(case.ours().to(device), history, autocast, compiled=False),
+        # On a GPU what is compared with is float32: that is how one would write it first.
+        "straightforward": make_step(
+            case.straightforward().to(device),
+            history,
+            autocast if device == "cpu" else None,
+            compiled=False,
+        ),
+    }
+    compile_seconds = float("nan")
+    if compiled:
+        steps["compiled"] = make_step(case.ours().to(device), history, autocast, compiled=True)
+        start = time.perf_counter()
+        steps["compiled"]()
+        synchronize(history)
+        compile_seconds = time.perf_counter() - start
+    for step in steps.values():
+        step()
+    times: dict[str, list[float]] = {name: [] for name in steps}
+    for _ in range(repeats):
+        for name, step in steps.items():
+            times[name].append(milliseconds(step, history, seconds))
+    row: dict[str, Any] = {**case.record(), "dtype": "bfloat16" if bfloat16 else "float32"}
+    for name, values in times.items():
+        row[f"{name}_ms"] = values
+        if name != "straightforward":
+            ratios = [b / a for a, b in zip(values, times["straightforward"], strict=True)]
+            row |= {f"{name}_ratios": ratios, f"{name}_median_ratio": statistics.median(ratios)}
+    return row | ({"compile_seconds": compile_seconds} if compiled else {})
+
+
+def cells(row: dict[str, Any]) -> list[str]:
+    """What a row of the table says of the times."""
+    compiled = "compiled_ms" in row
+    return [
+        row["dtype"],
+        spread(row["ours_ms"], 1),
+        spread(row["compiled_ms"], 1) if compiled else "",
+        spread(row["straightforward_ms"], 1),
+        spread(row["ours_ratios"], 2),
+        spread(row["compiled_ratios"], 2) if compiled else "",
+        f"{row['compile_seconds']:.0f} s" if compiled else "",
+    ]
+
+
+def main(out: Path | None) -> None:
+    """Measures on one thread, or on a GPU, and reports."""
+    torch.set_num_threads(1)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    cases = [(case, case in COMPILED, False) for case in CASES]
+    cases.append((Case("Enhanced", "images", 4, 64), True, True))
+    if device == "cuda":
+        cases += [(case, True, True) for case in GPU_CASES]
+    rows = [
+        measure(case, REPEATS, SECONDS, compiled=compiled, bfloat16=bfloat16, device=device)
+        for case, compiled, bfloat16 in cases
+    ]
+    lines = [[*case.columns(), *cells(row)] for (case, _, _), row in zip(cases, rows, strict=True)]
+    header = ["dtype", "ours", "ours, compiled", "straightforward", "ratio", "ratio, compiled"]
+    markdown = (
+        f"# Training step\n\nMilliseconds a step on {device}, dropout off. {REPEATS} rounds of "
+        f"{SECONDS} seconds each, alternating:\nmedian (range); ratios are taken round by round."
+        "\n\n" + table([*COLUMNS, *header, "compiling"], lines)
+    )
+    publish("training_step", markdown, {"rows": rows}, out)

@@ -1,0 +1,57 @@
+"""Every benchmark of the networks runs, at sizes that take seconds, and compares like with like."""
+
+import pytest
+import torch
+
+from benchmarks import acting, memory, training_step
+from benchmarks.cases import Case, same_number_of_weights
+from torchrl_tit.modules import Backbone
+
+CASES = [
+    Case("Enhanced", "arrays", 4, 3),
+    Case("Vanilla", "arrays", 4, 3),
+    Case("Enhanced", "images", 4, 2),
+    Case("Vanilla", "images", 1, 2),
+]
+
+
+@pytest.mark.parametrize("case", [*acting.CASES, *training_step.CASES])
+def test_both_networks_have_the_same_weights(case):
+    assert same_number_of_weights(case)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_acting(case):
+    row = acting.measure(case, steps=2, repeats=2)
+    assert row["ratios"] == [
+        b / a for a, b in zip(row["ours_ms"], row["straightforward_ms"], strict=True)
+    ]
+
+
+def test_windows_move_on_and_start_anew():
+    case = Case("Enhanced", "arrays", 4, 3)
+    windows = acting.make_windows(case, 14)
+    for before, after in zip(windows, windows[1:], strict=False):
+        assert torch.equal(before[1:, 1:], after[1:, :-1])
+    assert torch.equal(windows[10][0, :3], windows[10][0, 3:].expand(3, -1))  # a new episode
+    assert not torch.equal(windows[9][0, 1:], windows[10][0, :-1])
+    backbone = Backbone(case.ours()).eval()
+    with torch.no_grad(), backbone.acting():
+        for window in windows:
+            features = backbone._call_module([window])
+            torch.testing.assert_close(features, backbone.module(window), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("bfloat16", [False, True])
+@pytest.mark.parametrize("case", CASES[:3])
+def test_training_step(case, bfloat16):
+    row = training_step.measure(case, 2, 0.0, compiled=False, bfloat16=bfloat16)
+    assert len(row["ours_ratios"]) == 2
+    assert len(training_step.cells(row)) == 7
+
+
+def test_memory_counts_what_is_stored():
+    stream = memory.make_stream((84, 84), torch.uint8, 300)
+    frame = 84 * 84
+    assert memory.stacked_bytes(stream, 4) == pytest.approx(8 * frame, rel=0.01)
+    assert memory.our_bytes(stream, 4) == pytest.approx(frame, rel=0.02)
