@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose, EnvBase, ObservationNorm, TargetReturn, TransformedEnv
@@ -48,9 +49,15 @@ class DTAgent(nn.Module):
         action_dim = _check_task(env, task.action_spec_unbatched, config)
         task.close()
         self.network = DecisionTransformer(shape, action_dim, config)
-        self.actor = make_dt_actor(self.network)
+        # In a tuple it is no submodule: its weights are the network's, and saved once.
+        self._actor = (make_dt_actor(self.network),)
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("std", torch.ones(shape))
+
+    @property
+    def actor(self) -> TensorDictModuleBase:
+        """The policy, whose weights are the network's."""
+        return self._actor[0]
 
     def fit_statistics(self, episodes: Episodes) -> None:
         """Takes the statistics of a data set; uint8 images, which networks divide by 255, stay."""

@@ -252,6 +252,12 @@ def test_data_that_do_not_fit_the_network(tmp_path):
         load_data(str(path), "Hopper-v5", discrete)
 
 
+def test_other_algorithms_refuse_the_network():
+    recipe = replace(get_recipe("ppo/cartpole/mlp"), backbone=DecisionTransformerConfig())
+    with pytest.raises(ValueError, match="reads returns and actions beside a history"):
+        recipe.check()
+
+
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
     recipe = make_dt(tmp_path, max_grad_norm=0.25)
     with Run.create(tmp_path / "run", recipe) as run:
