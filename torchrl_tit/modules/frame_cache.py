@@ -13,7 +13,7 @@ from torch.autograd import forward_ad
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
 
-from torchrl_tit.modules.frames import as_words, same_frames
+from torchrl_tit.modules.frames import all_same, as_words, same_frames
 
 Encode = Callable[[Tensor], Tensor]
 
@@ -119,7 +119,7 @@ class FrameCache:
         # Copied before the encoder runs: if another process writes meanwhile, it is noticed next.
         weights = kept.weights if kept else [weight.detach().clone() for weight in weights]
         newest = self._encode_newest(frames[:, -1]).unsqueeze(1)  # [N, 1, *token_shape]
-        if kept and torch.equal(words[:, :-1], kept.words):
+        if kept and all_same(words[:, :-1], kept.words):
             tokens = torch.cat([kept.tokens, newest], dim=1)
         else:
             tokens = self._encode_unknown(frames, words, newest, kept)

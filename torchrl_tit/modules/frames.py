@@ -34,6 +34,24 @@ def as_words(frames: Tensor) -> Tensor:
     return frames.view(word)
 
 
+def all_same(tensor: Tensor, other: Tensor) -> bool:
+    """Tells whether two tensors of the same shape and type have the same values.
+
+    On a CPU it asks NumPy, which compares strided arrays several times as fast as ``torch.equal``.
+
+    Args:
+        tensor: of any shape and type that NumPy has.
+        other: of the same.
+
+    Example:
+        >>> all_same(torch.arange(3), torch.arange(3))
+        True
+    """
+    if tensor.is_cpu:
+        return bool((tensor.detach().numpy() == other.detach().numpy()).all())
+    return torch.equal(tensor, other)
+
+
 def same_frames(words: Tensor, others: Tensor) -> Tensor:
     """Tells which of two times as many frames have the same bytes: [..., words] -> bool [...]."""
     return (words == others).all(-1)
