@@ -366,7 +366,7 @@ def train(recipe: PPO, run: Run) -> None:
     collector = make_collector(recipe, env, agent, step, options if compiled else None)
     state = TrainingState(agent, optimizer, collector, recipe.seed)
     state.load(run)
-    columns = ["return_mean", "episodes", "learning_rate", *terms]
+    columns = ["return_mean", "episodes", "learning_rate", "feature_spread", *terms]
     metrics = run.metrics(columns, last_step=step)
     saved_step = step
     progress = tqdm(
@@ -402,12 +402,16 @@ def train(recipe: PPO, run: Run) -> None:
             check_agent(agent, minibatch, step, saved_step)  # before it is saved
             means = dict(zip(terms, torch.stack(losses).mean(0).tolist(), strict=True))
 
+            # Where this goes to 0, the features are the same in all states, and so is the policy.
+            features = batch[agent.backbone.out_keys[0]].flatten(0, -2)  # [steps, features]
+            feature_spread = features.std(0).mean().item()
             finished = finished_returns(batch)
             mean_return = finished.mean().item()  # NaN where no episode ended
             metrics.log(
                 step,
                 return_mean=mean_return,
                 episodes=len(finished),
+                feature_spread=feature_spread,
                 learning_rate=float(optimizer.param_groups[0]["lr"]),
                 **means,
             )

@@ -165,3 +165,20 @@ def test_a_compiled_optimizer_takes_the_same_steps():
             norms.append(update_weights())
         results.append((norms, [p.detach().clone() for p in agent.parameters()]))
     torch.testing.assert_close(results[0], results[1], rtol=1e-5, atol=1e-6)
+
+
+def test_metrics_tell_how_far_features_are_spread(tmp_path, monkeypatch):
+    batches = []
+    original = ppo.add_advantages
+
+    def recording(batch, *args):
+        original(batch, *args)
+        batches.append(batch.clone())
+
+    monkeypatch.setattr(ppo, "add_advantages", recording)
+    with Run.create(tmp_path / "run", RECIPE) as run:
+        RECIPE.train(run)
+        rows = read_metrics(run.folder / "metrics.csv")
+    for row, batch in zip(rows, batches, strict=True):
+        deviations = batch["features"].reshape(-1, 8).std(0)
+        assert row["feature_spread"] == pytest.approx(deviations.mean().item(), rel=1e-5)
