@@ -50,12 +50,13 @@ def _named() -> dict[str, Recipe]:
                 online_return=7200.0,
                 backbone=config,
             )
-            # What a CPU can do in minutes: a smaller network that learns faster, and is asked for
-            # returns that are in the data.
+            # What a CPU can do in minutes: a smaller network that learns faster, is asked for returns
+            # that are in the data, and sees as much when it acts as in training.
             small = replace(
                 full,
                 name=f"{full.name}-small",
                 backbone=replace(config, embed_dim=64, num_blocks=2, num_heads=2),
+                acting_context=None,
                 target_returns=(3000.0,),
                 online_return=3200.0,
                 batch_size=64,
