@@ -50,8 +50,8 @@ def _named() -> dict[str, Recipe]:
                 online_return=7200.0,
                 backbone=config,
             )
-            # What a CPU can do in minutes: a smaller network that learns faster, is asked for returns
-            # that are in the data, and sees as much when it acts as in training.
+            # What a CPU can do in minutes: a smaller network that learns faster, is asked for
+            # returns that are in the data, and sees as much when it acts as in training.
             small = replace(
                 full,
                 name=f"{full.name}-small",
