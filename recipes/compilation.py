@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import os
 import shutil
-from functools import cache
-from typing import Any, Literal
+import sys
+import time
+from collections.abc import Callable, Mapping
+from functools import cache, wraps
+from typing import Any, Literal, ParamSpec, TypeVar
 
 import torch
+from tqdm import tqdm
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 Compile = Literal["auto", "on", "off"]
 
@@ -70,6 +77,33 @@ def compile_options(cuda_graphs: Compile, device: torch.device) -> dict[str, Any
     if cuda_graphs == "off" or device.type != "cuda":
         return STATIC_SHAPES
     return {**STATIC_SHAPES, "mode": "reduce-overhead"}
+
+
+def compile_and_time(
+    function: Callable[P, T], options: Mapping[str, Any], name: str
+) -> Callable[P, T]:
+    """Compiles a function, and prints how long its first call took, which does the compiling.
+
+    Args:
+        function: what to compile.
+        options: of ``torch.compile``.
+        name: what it is, for the message.
+    """
+    fast = torch.compile(function, **options)
+    first = True
+
+    @wraps(function)
+    def timed(*args: P.args, **kwargs: P.kwargs) -> T:
+        nonlocal first
+        if not first:
+            return fast(*args, **kwargs)
+        first = False
+        start = time.perf_counter()
+        result = fast(*args, **kwargs)
+        tqdm.write(f"compiled {name} in {time.perf_counter() - start:.0f} s", file=sys.stderr)
+        return result
+
+    return timed
 
 
 def autocast_type(precision: Precision, device: torch.device) -> torch.dtype | None:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from .compilation import compile_and_time
 from .ppo_agent import Agent
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def make_objective(
             values.append(contrast.detach())
         return total, torch.stack(values)
 
-    return torch.compile(objective, **options) if options else objective
+    return compile_and_time(objective, options, "the loss") if options else objective
 
 
 def make_optimizer(agent: Agent, recipe: PPO, compiled: bool) -> torch.optim.Adam:
@@ -100,7 +101,7 @@ def make_weight_update(
         optimizer.step()
         return norm
 
-    return torch.compile(update_weights, **options) if options else update_weights
+    return compile_and_time(update_weights, options, "the optimizer") if options else update_weights
 
 
 def add_advantages(
