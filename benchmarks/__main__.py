@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 from pathlib import Path
+
+from torchrl_tit.files import write_text_atomic
 
 BENCHMARKS = [
     "acting",
@@ -17,15 +20,29 @@ BENCHMARKS = [
 
 
 def main() -> None:
-    """Runs the benchmarks, prints their Markdown, and writes it with the numbers as JSON."""
+    """Runs the benchmarks, prints their Markdown, and writes it with the numbers as JSON.
+
+    All of them together are gathered in benchmarks.md and benchmarks.json too.
+    """
     parser = argparse.ArgumentParser("python -m benchmarks")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(BENCHMARKS)}")
     parser.add_argument("--out", type=Path, help="folder for NAME.md and NAME.json")
     options = parser.parse_args()
     if unknown := set(options.names) - set(BENCHMARKS):
         parser.error(f"unknown benchmark {sorted(unknown)}: choose from {', '.join(BENCHMARKS)}")
-    for name in options.names or BENCHMARKS:
+    names = options.names or BENCHMARKS
+    for name in names:
         importlib.import_module(f"benchmarks.{name}").main(options.out)
+    if options.out is not None and not options.names:
+        gather(options.out)
+
+
+def gather(out: Path) -> None:
+    """Puts what the benchmarks in a folder have written together: benchmarks.md and .json."""
+    texts = [(out / f"{name}.md").read_text(encoding="utf-8") for name in BENCHMARKS]
+    numbers = {name: json.loads((out / f"{name}.json").read_bytes()) for name in BENCHMARKS}
+    write_text_atomic(out / "benchmarks.md", "\n".join(texts))
+    write_text_atomic(out / "benchmarks.json", json.dumps(numbers, indent=2) + "\n")
 
 
 if __name__ == "__main__":

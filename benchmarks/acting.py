@@ -113,6 +113,7 @@ def cells(row: dict[str, Any]) -> list[str]:
     """What a row of the table says of the times."""
     compiled = "compiled_ms" in row
     return [
+        row["dtype"],
         spread(row["ours_ms"], 2),
         spread(row["compiled_ms"], 2) if compiled else "",
         spread(row["straightforward_ms"], 2),
@@ -137,7 +138,7 @@ def main(out: Path | None) -> None:
         f"{variant}, images, compiled": growth(rows, variant, "images", "compiled")
         for variant in ("Enhanced", "Vanilla")
     }
-    header = ["ours", "ours, compiled", "straightforward", "ratio", "ratio, compiled"]
+    header = ["dtype", "ours", "ours, compiled", "straightforward", "ratio", "ratio, compiled"]
     markdown = (
         f"# Acting\n\nMilliseconds a step of all environments together, float32, on {device}. "
         f"{REPEATS} rounds of\n{STEPS} steps, alternating: median (range); ratios are taken round "

@@ -1,9 +1,12 @@
 """Every benchmark of the networks runs, at sizes that take seconds, and compares like with like."""
 
+import json
+
 import pytest
 import torch
 
 from benchmarks import acting, memory, training_step
+from benchmarks.__main__ import BENCHMARKS, gather
 from benchmarks.cases import Case, same_number_of_weights
 from torchrl_tit.modules import Backbone
 
@@ -23,7 +26,7 @@ def test_both_networks_have_the_same_weights(case):
 @pytest.mark.parametrize("case", CASES)
 def test_acting(case):
     row = acting.measure(case, steps=2, repeats=2)
-    assert len(acting.cells(row)) == 5
+    assert len(acting.cells(row)) == 6
     assert row["ours_ratios"] == [
         b / a for a, b in zip(row["ours_ms"], row["straightforward_ms"], strict=True)
     ]
@@ -56,3 +59,13 @@ def test_memory_counts_what_is_stored():
     frame = 84 * 84
     assert memory.stacked_bytes(stream, 4) == pytest.approx(8 * frame, rel=0.01)
     assert memory.our_bytes(stream, 4) == pytest.approx(frame, rel=0.02)
+
+
+def test_results_are_gathered(tmp_path):
+    for name in BENCHMARKS:
+        (tmp_path / f"{name}.md").write_text(f"# {name}\n")
+        (tmp_path / f"{name}.json").write_text('{"a": 1}')
+    gather(tmp_path)
+    text = (tmp_path / "benchmarks.md").read_text()
+    assert all(f"# {name}\n" in text for name in BENCHMARKS)
+    assert set(json.loads((tmp_path / "benchmarks.json").read_text())) == set(BENCHMARKS)

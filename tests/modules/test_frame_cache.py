@@ -62,7 +62,7 @@ def test_a_wrong_token_would_show():
     with backbone.acting():
         features(backbone, streams.windows)
         history = streams.step(torch.zeros(5, dtype=torch.bool))
-        backbone._cache._kept.tokens[0, 1] *= -1
+        backbone._cache._kept.tokens.entries[0, 1] *= -1
         assert not torch.allclose(features(backbone, history), network(history), rtol=0, atol=1e-4)
 
 
@@ -231,9 +231,10 @@ def test_only_one_batch_is_kept_and_it_goes_at_the_end():
         for n in (7, 3):
             features(backbone, torch.randn(n, 4, *shape))
         kept = backbone._cache._kept
-        assert kept.tokens.shape == (3, 3, 2, 16)
-        assert kept.words.untyped_storage().nbytes() == 3 * 3 * 3 * 4
-        assert kept.tokens.untyped_storage().nbytes() == 3 * 3 * 2 * 16 * 4
+        words, tokens = kept.words.entries, kept.tokens.entries
+        assert tokens.shape == (3, 3, 2, 16)
+        assert words.untyped_storage().nbytes() == 2 * (3 * 3 * 3 * 4)  # with room for as many
+        assert tokens.untyped_storage().nbytes() == 2 * (3 * 3 * 2 * 16 * 4)
     assert backbone._cache is None
 
 

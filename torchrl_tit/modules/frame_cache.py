@@ -14,11 +14,12 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torch.nn.modules.dropout import _DropoutNd
 
 from torchrl_tit.modules.frames import all_same, as_words, same_frames
+from torchrl_tit.modules.shelf import Shelf
 
 Encode = Callable[[Tensor], Tensor]
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Kept:
     """What is kept of a window, and what must not have changed for it to be of use."""
 
@@ -26,8 +27,8 @@ class _Kept:
     slots: list[tuple[nn.Module, str]]  # where its weights stand
     weights: list[Tensor]  # copies of those that made the tokens
     circumstances: tuple[object, ...]
-    words: Tensor  # of the last K - 1 frames, int [N, K - 1, words]
-    tokens: Tensor  # of the same, float [N, K - 1, *token_shape]
+    words: Shelf  # of the last K - 1 frames, int [N, K - 1, words]
+    tokens: Shelf  # of the same, float [N, K - 1, *token_shape]
 
 
 class FrameCache:
@@ -116,16 +117,20 @@ class FrameCache:
         leading = window.shape[: window.ndim - self._observation_ndim - 1]
         frames = window.reshape(math.prod(leading), *window.shape[len(leading) :])  # [N, K, *obs]
         words = as_words(frames.flatten(2))  # [N, K, words]
+        if kept and all_same(words[:, :-1], kept.words.entries):
+            newest = self._encode_newest(frames[:, -1])  # [N, *token_shape]
+            tokens = torch.cat([kept.tokens.entries, newest.unsqueeze(1)], dim=1)
+            kept.words.append(words[:, -1])
+            kept.tokens.append(newest)
+            self._kept = kept
+            return tokens.reshape(*leading, *tokens.shape[1:])
+
         # Copied before the encoder runs: if another process writes meanwhile, it is noticed next.
         weights = kept.weights if kept else [weight.detach().clone() for weight in weights]
-        newest = self._encode_newest(frames[:, -1]).unsqueeze(1)  # [N, 1, *token_shape]
-        if kept and all_same(words[:, :-1], kept.words):
-            tokens = torch.cat([kept.tokens, newest], dim=1)
-        else:
-            tokens = self._encode_unknown(frames, words, newest, kept)
-        # Copies: windows and tokens belong to the caller, who may write into them.
+        newest = self._encode_newest(frames[:, -1]).unsqueeze(1)
+        tokens = self._encode_unknown(frames, words, newest, kept)
         self._kept = _Kept(
-            modules, slots, weights, circumstances, words[:, 1:].clone(), tokens[:, 1:].clone()
+            modules, slots, weights, circumstances, Shelf(words[:, 1:]), Shelf(tokens[:, 1:])
         )
         return tokens.reshape(*leading, *tokens.shape[1:])
 
@@ -138,8 +143,8 @@ class FrameCache:
             known = torch.zeros_like(repeated)
             older = newest.expand(-1, repeated.shape[1], *newest.shape[2:])
         else:
-            known = same_frames(words[:, :-1], kept.words)
-            older = kept.tokens
+            known = same_frames(words[:, :-1], kept.words.entries)
+            older = kept.tokens.entries
         tokens = torch.cat([older, newest], dim=1)
         unknown = ~known & ~repeated
         if unknown.any():
