@@ -72,7 +72,13 @@ def make_dt_actor(
         >>> transforms = Compose(TargetReturn(500.0), SequenceHistory(context=5))
         >>> env = TransformedEnv(make_env("CartPole-v1", 8), transforms)
         >>> policy = make_dt_actor(network)
-        >>> collector = Collector(env, policy, frames_per_batch=80, total_frames=80)
+        >>> collector = Collector(
+        ...     env,
+        ...     policy,
+        ...     frames_per_batch=80,
+        ...     total_frames=80,
+        ...     auto_register_policy_transforms=False,
+        ... )
         >>> [batch["action"].shape for batch in collector]
         [torch.Size([8, 10])]
         >>> collector.shutdown()
