@@ -1,6 +1,7 @@
 """Every benchmark of the networks runs, at sizes that take seconds, and compares like with like."""
 
 import json
+from itertools import pairwise
 
 import pytest
 import torch
@@ -35,7 +36,7 @@ def test_acting(case):
 def test_windows_move_on_and_start_anew():
     case = Case("Enhanced", "arrays", 4, 3)
     windows = acting.make_windows(case, 14)
-    for before, after in zip(windows, windows[1:], strict=False):
+    for before, after in pairwise(windows):
         assert torch.equal(before[1:, 1:], after[1:, :-1])
     assert torch.equal(windows[10][0, :3], windows[10][0, 3:].expand(3, -1))  # a new episode
     assert not torch.equal(windows[9][0, 1:], windows[10][0, :-1])
