@@ -23,7 +23,11 @@ class Block(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         steps = x.shape[1]
-        mask = torch.full((steps, steps), float("-inf")).triu(1) if self.causal else None
+        mask = (
+            torch.full((steps, steps), float("-inf"), device=x.device).triu(1)
+            if self.causal
+            else None
+        )
         y = self.norm1(x)
         x = x + self.attention(y, y, y, attn_mask=mask, need_weights=False)[0]
         return x + self.ffn(self.norm2(x))
