@@ -7,18 +7,22 @@ Milliseconds a step.
 
 from __future__ import annotations
 
+import os
 import statistics
+import tempfile
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
 
 from .acting import synchronize
 from .cases import COLUMNS, Case
+from .matrix_peak import count_flops, peak_flops
 from .report import publish, spread, table
 
 CASES = [
@@ -109,6 +113,14 @@ def measure(
         if name != "straightforward":
             ratios = [b / a for a, b in zip(values, times["straightforward"], strict=True)]
             row |= {f"{name}_ratios": ratios, f"{name}_median_ratio": statistics.median(ratios)}
+    if device == "cuda":
+        flops = count_flops(steps["ours"])
+        peak = peak_flops(device, autocast or torch.float32)
+        row["peak_shares"] = {
+            name: 1000 * flops / statistics.median(times[name]) / peak
+            for name in times
+            if name != "straightforward"
+        }
     return row | ({"compile_seconds": compile_seconds} if compiled else {})
 
 
@@ -127,6 +139,15 @@ def cells(row: dict[str, Any]) -> list[str]:
 
 
 def main(out: Path | None) -> None:
+    """Measures with an empty cache of compiled code, so that compiling is timed too."""
+    with (
+        tempfile.TemporaryDirectory() as cache,
+        patch.dict(os.environ, TORCHINDUCTOR_CACHE_DIR=cache),
+    ):
+        report(out)
+
+
+def report(out: Path | None) -> None:
     """Measures on one thread, or on a GPU, and reports."""
     torch.set_num_threads(1)
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -145,4 +166,9 @@ def main(out: Path | None) -> None:
         f"{SECONDS} seconds each, alternating:\nmedian (range); ratios are taken round by round."
         "\n\n" + table([*COLUMNS, *header, "compiling"], lines)
     )
+    if device == "cuda":
+        last = rows[-1]["peak_shares"]
+        markdown += "\nOf the rate of one large matrix product, the last row's step reaches: " + (
+            ", ".join(f"{name} {100 * share:.1f} %" for name, share in last.items()) + ".\n"
+        )
     publish("training_step", markdown, {"rows": rows}, out)

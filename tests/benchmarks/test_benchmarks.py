@@ -9,6 +9,7 @@ import torch
 from benchmarks import acting, memory, training_step
 from benchmarks.__main__ import BENCHMARKS, gather
 from benchmarks.cases import Case, same_number_of_weights
+from benchmarks.matrix_peak import count_flops, peak_flops
 from torchrl_tit.modules import Backbone
 
 CASES = [
@@ -53,6 +54,14 @@ def test_training_step(case, bfloat16):
     row = training_step.measure(case, 2, 0.0, compiled=False, bfloat16=bfloat16)
     assert len(row["ours_ratios"]) == 2
     assert len(training_step.cells(row)) == 7
+
+
+def test_operations_of_matrix_products_are_counted():
+    a = torch.randn(3, 5, requires_grad=True)
+    b = torch.randn(5, 7, requires_grad=True)
+    # The product, and one more for the gradient of each factor.
+    assert count_flops(lambda: (a @ b).sum().backward()) == 3 * 2 * 3 * 5 * 7
+    assert peak_flops("cpu", torch.float32, size=16, repeats=2) > 0
 
 
 def test_memory_counts_what_is_stored():
