@@ -28,8 +28,8 @@ from .report import publish, spread, table
 CASES = [
     *(Case("Enhanced", "arrays", history, 64) for history in (1, 4, 16, 64)),
     *(Case("Vanilla", "arrays", history, 64) for history in (1, 4, 16, 64)),
-    *(Case("Enhanced", "images", history, 64) for history in (1, 4, 16)),
-    *(Case("Vanilla", "images", history, 64) for history in (1, 4, 16)),
+    *(Case("Enhanced", "images", history, 64) for history in (1, 4, 16, 64)),
+    *(Case("Vanilla", "images", history, 64) for history in (1, 4, 16, 64)),
 ]
 COMPILED = [  # each takes a minute to compile
     Case("Enhanced", "arrays", 1, 64),

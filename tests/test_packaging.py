@@ -48,7 +48,11 @@ def test_wheel_holds_every_module_once_and_nothing_beside_the_library(wheel: Pat
     with ZipFile(wheel) as archive:
         names = {n for n in archive.namelist() if ".dist-info/" not in n}
     library = {p.relative_to(ROOT).as_posix() for p in (ROOT / "torchrl_tit").rglob("*.py")}
-    recipes = {p.relative_to(ROOT).as_posix() for p in (ROOT / "recipes").rglob("*.py")}
+    recipes = {
+        p.relative_to(ROOT).as_posix()
+        for p in (ROOT / "recipes").rglob("*")
+        if p.suffix in (".py", ".csv", ".json")  # with the paper's results and search spaces
+    }
 
     assert names == library | {f"torchrl_tit/{n}" for n in recipes} | {"torchrl_tit/py.typed"}
 
