@@ -51,16 +51,19 @@ _MOUNTAINCAR_NETWORKS: dict[str, NetworkConfig] = {
 
 # What makes TIT learn where the settings above do not: docs/results/classic_control.md says why.
 # Environments side by side are for speed.
+_FOR_SPARSE_GOALS: dict[str, Any] = {
+    "num_envs": 16,
+    "steps_per_batch": 1024,
+    "learning_rate": 2e-4,
+    "gae_lambda": 0.98,
+    "entropy_coeff": 0.01,
+    "reward_scale": 0.1,
+    "backbone": {"patch_size": 2, "activation_head": "relu"},
+}
 _TUNED_TIT: dict[str, dict[str, Any]] = {
-    "acrobot": {"num_envs": 8, "reward_scale": 0.01, "patch_size": 2},
+    "acrobot": _FOR_SPARSE_GOALS,
     "cartpole": {"num_envs": 8, "critic_coeff": 0.02},
-    "mountaincar": {
-        "num_envs": 16,
-        "steps_per_batch": 256,
-        "epochs": 4,
-        "gae_lambda": 0.98,
-        "reward_scale": 0.01,
-    },
+    "mountaincar": _FOR_SPARSE_GOALS,
     "ant": {"num_envs": 8, "reward_scale": 0.01},
     "halfcheetah": {"num_envs": 8, "reward_scale": 0.01},
     "hopper": {"num_envs": 8, "reward_scale": 0.01},
@@ -79,8 +82,7 @@ def _named() -> dict[str, Recipe]:
             if isinstance(backbone, EnhancedTITConfig | VanillaTITConfig):
                 name += "-tuned"
                 tuned = dict(_TUNED_TIT[task])
-                patch_size = tuned.pop("patch_size", backbone.patch_size)
-                other = replace(backbone, patch_size=patch_size)
+                other = replace(backbone, **tuned.pop("backbone", {}))
                 recipes[name] = replace(recipe, name=name, backbone=other, **tuned)
     return recipes | NO_VELOCITY_RECIPES | ATARI_RECIPES | DT_RECIPES
 
