@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 
@@ -35,6 +37,25 @@ class Interrupt:
             raise KeyboardInterrupt
         self.requested = True
         print("\nsaving a checkpoint after this batch; again to stop at once", file=sys.stderr)
+
+
+@contextmanager
+def raise_on_signals() -> Iterator[None]:
+    """Within it SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that workers are stopped too.
+
+    So does SIGINT where a shell that started the process in the background had it ignored.
+
+    Example:
+        >>> with raise_on_signals():
+        ...     signal.getsignal(signal.SIGTERM) is signal.default_int_handler
+        True
+    """
+    previous = {s: signal.signal(s, signal.default_int_handler) for s in _SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

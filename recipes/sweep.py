@@ -13,6 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from .interrupt import raise_on_signals
 from .recipe import Recipe, nearest
 from .registry import RECIPES
 from .run import Run
@@ -98,7 +99,7 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
 def run_jobs(jobs: list[Job], workers: int) -> list[Job]:
     """Runs what is not complete yet, some at a time; a run that was killed goes on where it was.
 
-    Ctrl-C is passed on: every worker saves a checkpoint and stops.
+    Ctrl-C (or SIGTERM) is passed on: every worker saves a checkpoint and stops.
 
     Args:
         jobs: the runs.
@@ -113,7 +114,8 @@ def run_jobs(jobs: list[Job], workers: int) -> list[Job]:
     waiting = [job for job in jobs if not job.is_complete()]
     running: dict[Job, subprocess.Popen[bytes]] = {}
     failed = []
-    with tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit=" runs") as progress:
+    done = len(jobs) - len(waiting)
+    with raise_on_signals(), tqdm(total=len(jobs), initial=done, unit=" runs") as progress:
         try:
             while waiting or running:
                 while waiting and len(running) < workers:

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from torchrl_tit.files import write_text_atomic
 
+from .interrupt import raise_on_signals
 from .metrics import read_metrics
 from .recipe import Recipe, recipe_to_json
 from .search_space import SearchSpace, with_values
@@ -112,7 +113,8 @@ class Search:
             if trial.state == TrialState.RUNNING
         ]
         failed = [t.number for t in ended if t.state == TrialState.FAIL]
-        with tqdm(total=trials, initial=len(ended), unit=" trials") as progress:
+        progress = tqdm(total=trials, initial=len(ended), unit=" trials")
+        with raise_on_signals(), progress:
             try:
                 while progress.n < trials:
                     while len(running) < min(workers, trials - progress.n):

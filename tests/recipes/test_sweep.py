@@ -89,7 +89,8 @@ def test_unknown_names_are_refused(tmp_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_stops_every_worker(tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_stops_every_worker(tmp_path, number):
     out = tmp_path / "sweep"
     job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], out)[0]
     process = subprocess.Popen(
@@ -103,7 +104,7 @@ def test_ctrl_c_stops_every_worker(tmp_path):
     while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
         assert process.poll() is None
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=90)
     assert process.returncode == 130
     assert "the same command goes on" in errors
