@@ -8,6 +8,7 @@ from torchrl_tit.datasets.hdf5 import read_hdf5, write_hdf5
 from torchrl_tit.datasets.histories import HistoryStorage
 from torchrl_tit.datasets.minari import read_minari
 from torchrl_tit.datasets.minari_writer import write_minari
+from torchrl_tit.datasets.parts import TransitionParts
 from torchrl_tit.datasets.replay_buffer import make_replay_buffer
 from torchrl_tit.datasets.scores import (
     REFERENCE_RETURNS,
@@ -29,6 +30,7 @@ __all__ = [
     "HistoryStorage",
     "SequenceStorage",
     "TaskSpaces",
+    "TransitionParts",
     "download_d4rl",
     "episodes_from_arrays",
     "has_reference",

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.envs import is_atari, make_games
 
 FLAGS = ("terminals", "timeouts", "terminated", "truncated")
 _REWARDS = ("rewards", "reward")
@@ -39,7 +40,9 @@ def task_spaces(env_name: str) -> TaskSpaces:
     """Asks a Gymnasium task for its spaces.
 
     Args:
-        env_name: A name that Gymnasium has registered, such as "Hopper-v5".
+        env_name: A name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
+            "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one picture
+            of 84 x 84 grey levels.
 
     Returns:
         Its spaces.
@@ -51,6 +54,10 @@ def task_spaces(env_name: str) -> TaskSpaces:
         >>> task_spaces("Pendulum-v1").action.shape
         (1,)
     """
+    if is_atari(env_name):
+        games = make_games(env_name)
+        games.close()
+        return TaskSpaces(games.single_observation_space, games.single_action_space, env_name)
     try:
         env = gymnasium.make(env_name, disable_env_checker=True)
     except (gymnasium.error.Error, ImportError) as error:

@@ -10,6 +10,7 @@ import gymnasium
 import minari
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Discrete
 from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
@@ -18,6 +19,7 @@ from minari.storage.datasets_root_dir import get_dataset_path
 from torchrl_tit.datasets.checks import task_spaces
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
 from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, is_minari_name
+from torchrl_tit.envs import is_atari
 from torchrl_tit.files import whole_or_not_at_all
 
 
@@ -27,13 +29,16 @@ def write_minari(
     """Writes episodes as a Minari data set, one at a time.
 
     Every field has the dtype it has in memory. It is written from Minari's episode buffers, since
-    Minari's collector needs packages that a conversion does not.
+    Minari's collector needs packages that a conversion does not. The data's attributes "algorithm"
+    and "description" are also what Minari lists under these names.
 
     Args:
         episodes: The data.
         name: The folder to make, an absolute path or one that begins with a dot, whose last part
             ends in a version such as "-v0"; or else a data set's name for Minari's own folder.
-        env_name: The Gymnasium task that the data are from, for Minari to recover.
+        env_name: The Gymnasium task that the data are from, for Minari to recover. For Atari games
+            it only says which actions there are: what Minari would recover shows other pictures
+            than :func:`~torchrl_tit.envs.make_env`.
 
     Raises:
         FileExistsError: If there is such a data set already.
@@ -60,7 +65,7 @@ def write_minari(
             hidden / "data",
             observation_space=_box(episodes.rows["observation"]),
             action_space=action_space,
-            env_spec=None if env_name is None else gymnasium.spec(env_name),
+            env_spec=_env_spec(env_name),
             jpeg_encoding=False,  # images as they are
         )
         storage.update_metadata(
@@ -68,6 +73,7 @@ def write_minari(
                 "dataset_id": dataset_id,
                 "minari_version": minari.__version__,
                 ATTRIBUTES: dict(episodes.attributes),
+                **_listed(episodes),
             }
         )
         storage.update_episodes(_buffers(episodes))
@@ -86,6 +92,17 @@ def _target(name: str | os.PathLike[str]) -> tuple[Path, str]:
             f"'medium-v0' does."
         )
     return folder, dataset_id
+
+
+def _env_spec(env_name: str | None) -> EnvSpec | None:
+    return None if env_name is None or is_atari(env_name) else gymnasium.spec(env_name)
+
+
+def _listed(episodes: Episodes) -> dict[str, str]:
+    """Those of the data's attributes that Minari has a place for."""
+    names = {"algorithm": "algorithm_name", "description": "description"}
+    known = {place: episodes.attributes.get(name) for name, place in names.items()}
+    return {place: value for place, value in known.items() if isinstance(value, str)}
 
 
 def _action_space(episodes: Episodes) -> gymnasium.Space:

@@ -2,7 +2,15 @@
 
 from torchrl_tit.envs.atari import AtariEnv
 from torchrl_tit.envs.atari_games import AtariGames
-from torchrl_tit.envs.factory import VectorizationMode, make_env
+from torchrl_tit.envs.factory import VectorizationMode, is_atari, make_env, make_games
 from torchrl_tit.envs.vector import GymVectorEnv
 
-__all__ = ["AtariEnv", "AtariGames", "GymVectorEnv", "VectorizationMode", "make_env"]
+__all__ = [
+    "AtariEnv",
+    "AtariGames",
+    "GymVectorEnv",
+    "VectorizationMode",
+    "is_atari",
+    "make_env",
+    "make_games",
+]

@@ -17,8 +17,6 @@ from torchrl_tit.transforms.history import Padding
 
 VectorizationMode = Literal["sync", "async"]
 
-_ATARI = "ALE/"
-
 
 def make_env(
     name: str,
@@ -79,12 +77,12 @@ def make_env(
             f"vectorization_mode must be 'sync' or 'async', but is {vectorization_mode!r}."
         )
     env: EnvBase
-    if name.startswith(_ATARI):
+    if is_atari(name):
         if vectorization_mode == "async":
             raise ValueError(
                 f"{name} runs in threads, side by side; leave vectorization_mode at 'sync'."
             )
-        games = AtariGames(_rom(name), num_envs, **kwargs)
+        games = make_games(name, num_envs, **kwargs)
         env = AtariEnv(games, history=history, padding=padding, device=device)
     else:
         env = GymVectorEnv(
@@ -99,6 +97,43 @@ def make_env(
     if hide_velocities:
         env = TransformedEnv(env, HideVelocities(name, in_keys=["observation", "history"]))
     return env
+
+
+def is_atari(name: str) -> bool:
+    """Says whether a name is that of an Atari game: all of these begin with "ALE/".
+
+    Args:
+        name: A name that Gymnasium may have registered.
+
+    Returns:
+        Whether it is.
+
+    Example:
+        >>> is_atari("ALE/Pong-v5"), is_atari("Hopper-v5")
+        (True, False)
+    """
+    return name.startswith("ALE/")
+
+
+def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
+    """Makes copies of an Atari game as :func:`make_env` plays it, by Gymnasium's name.
+
+    Args:
+        name: A name such as "ALE/Pong-v5".
+        num_envs: The number of copies.
+        **kwargs: Passed to :class:`~torchrl_tit.envs.AtariGames`.
+
+    Returns:
+        The games.
+
+    Raises:
+        ValueError: If the name is unknown, or ale-py is missing.
+
+    Example:
+        >>> make_games("ALE/Pong-v5").single_observation_space
+        Box(0, 255, (84, 84), uint8)
+    """
+    return AtariGames(_rom(name), num_envs, **kwargs)
 
 
 def _tasks(

@@ -1,0 +1,156 @@
+"""Transitions in parts, and the episodes that come out of them."""
+
+from pathlib import Path
+
+import minari
+import numpy as np
+import pytest
+import torch
+
+from tests.datasets.rollouts import Transitions, spans
+from torchrl_tit.datasets import (
+    DatasetError,
+    TransitionParts,
+    episodes_from_arrays,
+    load_episodes,
+    task_spaces,
+    write_minari,
+)
+
+
+def split(arrays: Transitions, streams: int, steps: list[int]) -> list[Transitions]:
+    """The first rows as streams [S, T], cut into parts of so many steps."""
+    total = sum(steps)
+    side_by_side = {
+        name: array[: streams * total].reshape(streams, total, *array.shape[1:])
+        for name, array in arrays.items()
+    }
+    bounds = np.cumsum([0, *steps])
+    return [
+        {name: array[:, a:b] for name, array in side_by_side.items()}
+        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+    ]
+
+
+def write_all(folder: Path, pieces: list[Transitions]) -> TransitionParts:
+    parts = TransitionParts(folder)
+    for number, piece in enumerate(pieces):
+        parts.write(number * 10, piece)
+    return parts
+
+
+def test_streams_go_on_from_part_to_part(arrays: Transitions, tmp_path: Path) -> None:
+    parts = write_all(tmp_path / "parts", split(arrays, 3, [40, 7, 53]))
+
+    episodes = parts.episodes()
+
+    # Where a stream ends in the middle of an episode, that is cut off there.
+    expected = {name: array[:300] for name, array in arrays.items()}
+    for last in (99, 199, 299):
+        expected["timeouts"][last] |= not expected["terminals"][last]
+    assert (episodes.rows == episodes_from_arrays(**expected).rows).all()
+    assert episodes.final_known.all()
+    assert episodes.finished.all()
+    assert episodes.lengths.tolist() == [stop - start for start, stop in spans(expected)]
+    assert episodes.rows["observation"].dtype == torch.float32
+    assert episodes.left_out == ()
+
+
+def test_a_restart_between_two_parts_cuts_an_episode_off(
+    arrays: Transitions, tmp_path: Path
+) -> None:
+    first, lost, later = split(arrays, 1, [4, 3, 30])
+    assert not (first["terminals"] | first["timeouts"]).any()
+
+    episodes = write_all(tmp_path, [first, later]).episodes()
+
+    assert lost["rewards"].shape == (1, 3)
+    assert episodes.lengths[0] == 4
+    assert episodes.truncated[0]
+    np.testing.assert_array_equal(
+        episodes.rows["observation"][4], first["next_observations"][0, -1]
+    )
+    np.testing.assert_array_equal(episodes.rows["observation"][5], later["observations"][0, 0])
+
+
+def test_up_to_a_part(arrays: Transitions, tmp_path: Path) -> None:
+    pieces = split(arrays, 2, [10, 20, 30])
+    parts = write_all(tmp_path, pieces)
+    (tmp_path / ".000000000030.hdf5.1a2b.tmp").write_bytes(b"half")
+
+    assert parts.numbers() == [0, 10, 20]
+    assert parts.numbers(last=19) == [0, 10]
+    assert parts.num_rows() == 120
+    assert parts.num_rows(last=10) == parts.episodes(last=10).num_transitions == 60
+    for name, array in pieces[1].items():
+        np.testing.assert_array_equal(parts.read(10)[name], array)
+
+    parts.drop_after(10)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "000000000000.hdf5",
+        "000000000010.hdf5",
+    ]
+    assert TransitionParts(tmp_path).num_rows() == 60
+
+
+def test_pictures_and_discrete_actions_keep_their_dtypes(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    frames = generator.integers(0, 256, (1, 7, 84, 84), dtype=np.uint8)
+    ends = np.array([[False, False, True] * 2])
+    parts = TransitionParts(tmp_path)
+    parts.write(
+        1,
+        {
+            "observations": frames[:, :-1],
+            "actions": np.arange(6)[None],
+            "rewards": np.ones((1, 6), np.float32),
+            "terminals": ends,
+            "timeouts": ~ends & ends,
+            "next_observations": frames[:, 1:],
+        },
+    )
+
+    rows = parts.episodes(task=task_spaces("ALE/Pong-v5")).rows
+
+    assert rows["observation"].dtype == torch.uint8
+    assert rows["action"].tolist() == [0, 1, 2, 0, 3, 4, 5, 0]
+    with pytest.raises(DatasetError, match="one row has the shape"):
+        parts.episodes(task=task_spaces("CartPole-v1"))
+
+
+def test_a_game_of_minaris(tmp_path: Path) -> None:
+    """All of the game's actions, and its pictures as they are; not what Minari would recover."""
+    frames = np.zeros((2, 84, 84), np.uint8)
+    episodes = episodes_from_arrays(
+        frames,
+        [0, 1],
+        [0.0, 1.0],
+        [False, True],
+        attributes={"algorithm": "PPO", "description": "two pictures"},
+    )
+    write_minari(episodes, tmp_path / "pong-v0", "ALE/Pong-v5")
+
+    read = load_episodes(tmp_path / "pong-v0", task="ALE/Pong-v5")
+    assert (read.rows == episodes.rows).all()
+    dataset = minari.MinariDataset(tmp_path / "pong-v0" / "data")
+    assert dataset.action_space.n == 6
+    assert dataset.observation_space.dtype == np.uint8
+    assert dataset.env_spec is None
+    assert dataset.storage.metadata["algorithm_name"] == "PPO"
+    assert dataset.storage.metadata["description"] == "two pictures"
+
+
+def test_what_cannot_be_put_together(arrays: Transitions, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="holds no transitions"):
+        TransitionParts(tmp_path / "none").episodes()
+
+    parts = write_all(tmp_path / "parts", [*split(arrays, 2, [10]), *split(arrays, 3, [10])])
+    with pytest.raises(DatasetError, match=r"000000000010.hdf5: .* does not go on with"):
+        parts.episodes()
+    with pytest.raises(FileExistsError, match="exists already"):
+        parts.write(10, split(arrays, 2, [10])[0])
+
+    path = tmp_path / "parts" / "000000000010.hdf5"
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DatasetError, match=r"000000000010.hdf5: is not a whole HDF5 file"):
+        parts.episodes()
