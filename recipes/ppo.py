@@ -39,6 +39,7 @@ from .ppo_update import (
 )
 from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
+from .watcher import Watcher
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -309,12 +310,13 @@ class PPO(Recipe):
         return step, agent
 
 
-def train(recipe: PPO, run: Run) -> None:
+def train(recipe: PPO, run: Run, watcher: Watcher | None = None) -> None:
     """Trains an agent, from the newest checkpoint of the run where there is one.
 
     Args:
         recipe: the settings.
         run: an open run folder.
+        watcher: is shown every batch and every update, and may stop the run at a checkpoint.
 
     Raises:
         FloatingPointError: if a loss or the gradient is not finite.
@@ -380,7 +382,11 @@ def train(recipe: PPO, run: Run) -> None:
             if recipe.decay_clip_epsilon:
                 loss.clip_epsilon.fill_(recipe.clip_epsilon * remaining)
 
-            batch["next", "reward"] = batch["next", "reward"] * recipe.reward_scale
+            if watcher is not None:
+                watcher.collected(step, batch)
+            reward = batch["next", "reward"]
+            reward = reward.sign() if recipe.clip_rewards else reward
+            batch["next", "reward"] = reward * recipe.reward_scale
             with torch.no_grad():
                 add_advantages(batch, agent, gae, recipe.bootstrap_time_limit)
             agent.train()
@@ -422,9 +428,12 @@ def train(recipe: PPO, run: Run) -> None:
             due = step // recipe.checkpoint_interval > (step - batch.numel()) // (
                 recipe.checkpoint_interval
             )
-            if due or interrupt.requested or step >= recipe.final_step:
+            enough = watcher is not None and watcher.updated(step, agent.policy)
+            if due or enough or interrupt.requested or step >= recipe.final_step:
                 state.save(run, step)
                 saved_step = step
             if interrupt.requested:
                 raise KeyboardInterrupt
+            if enough:
+                break
     collector.shutdown()

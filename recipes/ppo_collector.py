@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
-from torchrl.envs import EnvBase, SignTransform
+from torchrl.envs import EnvBase
 
 from torchrl_tit.modules import acting
 
@@ -41,7 +41,6 @@ def make_collector(
         "frames_per_batch": recipe.steps_per_batch,
         "device": recipe.torch_device(),
         "trust_policy": True,  # ours is on the right device already
-        "postproc": SignTransform([("next", "reward")]) if recipe.clip_rewards else None,
         "auto_register_policy_transforms": False,
     }
     if recipe.collectors == 1:

@@ -39,7 +39,7 @@ class TrainingState:
 
     def save(self, run: Run, step: int) -> None:
         """Saves a checkpoint."""
-        self._reset_unsavable_env(step)
+        reset_unsavable_env(self.collector, self.seed, step)
         here = self.collector if isinstance(self.collector, Collector) else None
         run.save(
             step,
@@ -64,19 +64,24 @@ class TrainingState:
             self.optimizer.load_state_dict({**state["optimizer"], "param_groups": settings})
             if isinstance(self.collector, Collector) and state["collector"] is not None:
                 set_collector_state(self.collector, state["collector"])
-        self._reset_unsavable_env(step)
+        reset_unsavable_env(self.collector, self.seed, step)
         set_global_rng_state(state["rng"])
         return step
 
-    def _reset_unsavable_env(self, step: int) -> None:
-        """Starts new episodes where an environment cannot be saved.
 
-        That happens at each checkpoint, whether or not the run is stopped there, and with a seed
-        that follows from the run's and the step: so both go on alike.
-        """
-        if not isinstance(self.collector, Collector):
-            return
-        # After its last batch a collector has closed the environment.
-        if not can_save_env(self.collector.env) and not self.collector.env.is_closed:
-            seed = np.random.SeedSequence([self.seed, step]).generate_state(1).item()
-            self.collector.reset(seed=seed)
+def reset_unsavable_env(collector: BaseCollector, seed: int, step: int) -> None:
+    """Starts new episodes where an environment cannot be saved.
+
+    That happens at each checkpoint, whether or not the run is stopped there, and with a seed that
+    follows from the run's and the step: so both go on alike.
+
+    Args:
+        collector: the run's collector.
+        seed: the run's seed.
+        step: of the checkpoint.
+    """
+    if not isinstance(collector, Collector):
+        return
+    # After its last batch a collector has closed the environment.
+    if not can_save_env(collector.env) and not collector.env.is_closed:
+        collector.reset(seed=np.random.SeedSequence([seed, step]).generate_state(1).item())

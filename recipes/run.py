@@ -59,7 +59,7 @@ class Run:
                 "another folder with --out"
             )
         folder.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(folder / "versions.json", json.dumps(_versions(), indent=2) + "\n")
+        write_text_atomic(folder / "versions.json", json.dumps(package_versions(), indent=2) + "\n")
         write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
         return cls(folder, recipe)
 
@@ -153,11 +153,12 @@ class Run:
             before = json.loads(path.read_text(encoding="utf-8"))
         except (OSError, ValueError):  # lost or damaged: nothing to compare with
             return []
-        now = _versions()
+        now = package_versions()
         return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
+    """Returns the versions of Python and of the packages that results depend on, by name."""
     versions = {
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
