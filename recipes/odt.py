@@ -19,13 +19,13 @@ from torchrl_tit.networks import DecisionTransformerConfig
 
 from .dt_agent import DTAgent
 from .dt_data import load_data, warn_of_targets
-from .dt_state import TrainingState
 from .odt_data import OnlineData, as_episodes
+from .offline_state import TrainingState
+from .offline_training import run_updates
 from .ppo_update import check_finite
 from .recipe import check_at_least
 from .run import Run
 from .sequence_recipe import SequenceRecipe
-from .sequence_training import run_updates
 
 LOSSES = ["loss_log_likelihood", "loss_entropy", "entropy", "alpha", "gradient_norm"]
 TERMS = [*LOSSES, "online_return"]

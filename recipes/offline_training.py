@@ -1,25 +1,27 @@
-"""The loop around the gradient steps of Decision Transformer's recipes."""
+"""The loop around the gradient steps of recipes that train on data sets."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
+from typing import TypeVar
 
 from torch import Tensor
 from tqdm import tqdm
 
-from .dt_agent import DTAgent
-from .dt_state import TrainingState
 from .interrupt import Interrupt
+from .offline_recipe import OfflineAgent, OfflineRecipe
+from .offline_state import TrainingState
 from .run import Run
-from .sequence_recipe import SequenceRecipe
+
+AgentT = TypeVar("AgentT", bound=OfflineAgent)
 
 
 def run_updates(
-    recipe: SequenceRecipe,
+    recipe: OfflineRecipe[AgentT],
     run: Run,
-    agent: DTAgent,
+    agent: AgentT,
     state: TrainingState,
     terms: Sequence[str],
     update: Callable[[int], Tensor],
@@ -35,8 +37,8 @@ def run_updates(
         update: takes one, the first where it is given 0, and returns its terms, float [terms].
     """
     step = state.load(run)
-    targets = {target: f"return_{target:g}" for target in recipe.target_returns}
-    columns = ["return_mean", *targets.values(), *terms, "learning_rate"]
+    returns_of = recipe.outcome_columns()
+    columns = ["return_mean", *returns_of.values(), *terms, *recipe.schedule(0)]
     metrics = run.metrics(columns, last_step=step)
     progress = tqdm(
         total=recipe.final_step, initial=step, unit=" updates", desc=recipe.name, smoothing=0.05
@@ -49,16 +51,19 @@ def run_updates(
             step += 1
             evaluation_due = recipe.evaluation_due(step)
             if evaluation_due or step % recipe.log_interval == 0:
-                returns = dict.fromkeys(["return_mean", *targets.values()], math.nan)
+                returns = dict.fromkeys(["return_mean", *returns_of.values()], math.nan)
                 if evaluation_due:
                     outcomes = recipe.play(agent, step)
                     state.outcomes += outcomes
-                    returns |= {targets[o.target_return]: o.mean for o in outcomes}
+                    returns |= {
+                        returns_of[o.target_return]: o.mean
+                        for o in outcomes
+                        if o.target_return is not None
+                    }
                     returns["return_mean"] = max(outcome.mean for outcome in outcomes)
                     progress.set_postfix_str(f"return {returns['return_mean']:.1f}")
                 means = dict(zip(terms, state.take_means(), strict=True))
-                learning_rate = recipe.learning_rate_at(step - 1)
-                metrics.log(step, **returns, **means, learning_rate=learning_rate)
+                metrics.log(step, **returns, **means, **recipe.schedule(step - 1))
             progress.update()
             checkpoint_due = evaluation_due or step % recipe.checkpoint_interval == 0
             if checkpoint_due or interrupt.requested:

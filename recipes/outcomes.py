@@ -1,4 +1,4 @@
-"""What Decision Transformer's evaluations gave, as ``evaluation.json`` holds it."""
+"""What the evaluations of a run on a data set gave, as ``evaluation.json`` holds it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from torchrl_tit.datasets import has_reference, normalized_score, normalized_spr
 
 @dataclass(frozen=True)
 class Outcome:
-    """Returns of the episodes that were played for one target return at one step of training."""
+    """Returns of the episodes that were played at one step of training, for one target return."""
 
     step: int
-    target_return: float
     returns: list[float]
+    target_return: float | None = None
+    """The return that was asked for; None where the network is asked for none."""
 
     @property
     def mean(self) -> float:
@@ -38,31 +39,33 @@ def summarize(
 
     Returns:
         ``mean``, ``std`` (population), ``episodes`` and ``returns`` of the better target return,
-        which is ``target_return``; the same for each in ``targets``; and ``score``, normalised as
-        D4RL does: ``last``, of the better target, and ``best``, over all steps and targets (returns
-        as they are where there is no reference).
+        and ``score``, normalised as D4RL does: ``last``, of the better target, and ``best``, over
+        all steps and targets (returns as they are where there is no reference). Where returns are
+        asked for, ``target_return`` is the better one, and ``targets`` holds the same for each.
     """
     best = max(outcomes, key=lambda outcome: outcome.mean)
     highest = max(outcome.mean for outcome in [*outcomes, *earlier])
-    return {
+    summary = {
         "mean": best.mean,
         **_spread(best, env),
-        "target_return": best.target_return,
         "score": {"best": _score(highest, env), "last": _score(best.mean, env)},
         "env": env,
         "dataset": dataset,
         "steps": best.step,
         "returns": best.returns,
-        "targets": {
-            f"{outcome.target_return:g}": {
-                "mean": outcome.mean,
-                **_spread(outcome, env),
-                "score": _score(outcome.mean, env),
-                "returns": outcome.returns,
-            }
-            for outcome in outcomes
-        },
     }
+    if best.target_return is None:
+        return summary
+    targets = {
+        f"{outcome.target_return:g}": {
+            "mean": outcome.mean,
+            **_spread(outcome, env),
+            "score": _score(outcome.mean, env),
+            "returns": outcome.returns,
+        }
+        for outcome in outcomes
+    }
+    return {**summary, "target_return": best.target_return, "targets": targets}
 
 
 def _spread(outcome: Outcome, env: str) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What a Decision Transformer run needs to go on as if it had never stopped."""
+"""What a run on a data set needs to go on as if it had never stopped."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_tit.checkpoint import global_rng_state, set_global_rng_state
 
-from .dt_outcomes import Outcome
+from .outcomes import Outcome
 from .run import Run
 
 

@@ -1,0 +1,133 @@
+"""What every recipe that trains on a data set has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import torch
+
+from .outcomes import Outcome, summarize
+from .recipe import Recipe, check_at_least
+from .run import Run
+
+
+class OfflineAgent(Protocol):
+    """What is trained, and plays the evaluations."""
+
+    def train(self) -> Any:
+        """Switches to training mode."""
+
+    def eval(self) -> Any:
+        """Switches to evaluation mode."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the weights."""
+
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> Any:
+        """Takes weights over."""
+
+
+AgentT = TypeVar("AgentT", bound=OfflineAgent)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfflineRecipe(Recipe, Generic[AgentT]):
+    """Settings of every recipe that trains on a data set and is evaluated in an environment."""
+
+    offline: ClassVar[bool] = True
+
+    dataset: str
+    """A data set: a file in D4RL's layout, or D4RL's or Minari's name."""
+    env: str
+    """Name of the Gymnasium environment that the network is evaluated in."""
+    batch_size: int = 64
+    """Items of the data set in one gradient step."""
+    evaluation_episodes: int = 100
+    """Episodes of every evaluation."""
+    evaluation_seed: int = 1_000_000
+    """Seed of the first evaluation episode; the others follow one by one."""
+    log_interval: int = 100
+    """Gradient steps to a row of metrics."""
+    checkpoint_interval: int = 1000
+    """Gradient steps between checkpoints."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(
+            self,
+            batch_size=1,
+            evaluation_episodes=1,
+            evaluation_seed=0,
+            log_interval=1,
+            checkpoint_interval=1,
+        )
+
+    def make_agent(self) -> AgentT:
+        """Builds what is trained, untrained."""
+        raise NotImplementedError
+
+    def play(self, agent: AgentT, step: int) -> list[Outcome]:
+        """Plays the evaluation's episodes."""
+        raise NotImplementedError
+
+    def evaluation_due(self, step: int) -> bool:
+        """Whether the network is evaluated after so many gradient steps."""
+        raise NotImplementedError
+
+    def schedule(self, step: int) -> dict[str, float]:
+        """What follows a schedule, at the gradient step after so many others."""
+        return {}
+
+    def outcome_columns(self) -> dict[float, str]:
+        """Names of the metrics that hold the mean return for each target return, if there are."""
+        return {}
+
+    def evaluate(self, run: Run) -> dict[str, Any]:
+        """Evaluates a run's newest checkpoint; see :func:`~recipes.outcomes.summarize`.
+
+        Episodes that were played with these weights and seeds already are not played again.
+
+        Args:
+            run: a run folder with a checkpoint.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+        """
+        step, agent, state = self.load_agent(run)
+        outcomes = [Outcome(**outcome) for outcome in state["outcomes"]]
+        targets: list[float | None] = [*self.outcome_columns()] or [None]
+        now = [
+            outcome
+            for outcome in outcomes
+            if outcome.step == step
+            and state["evaluation_seed"] == self.evaluation_seed
+            and len(outcome.returns) == self.evaluation_episodes
+            and outcome.target_return in targets
+        ]
+        if len(now) < len(targets):
+            now = self.play(agent, step)
+        summary = summarize(now, outcomes, self.dataset, self.env)
+        return {**summary, "seed": self.evaluation_seed}
+
+    def load_agent(self, run: Run) -> tuple[int, AgentT, dict[str, Any]]:
+        """Loads the agent of a run's newest checkpoint.
+
+        Args:
+            run: a run folder with a checkpoint.
+
+        Returns:
+            Gradient steps that it was trained for, the agent, and all that the checkpoint holds.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+        """
+        loaded = run.load()
+        if loaded is None:
+            raise FileNotFoundError(f"{run.checkpoints} holds no checkpoint: train the run first")
+        step, state = loaded
+        torch.set_num_threads(self.threads)
+        agent = self.make_agent()
+        with run.restoring(step):
+            agent.load_state_dict(state["agent"])
+        return step, agent, state
