@@ -268,6 +268,6 @@ def test_only_what_is_read_is_computed(network: str) -> None:
             module(history)
         return counter.get_total_flops()
 
-    # Of two inner blocks the second needs keys and values of all 50 tokens, but a query, an
-    # output projection and an FFN of the class token only.
-    assert flops(ours) < 0.65 * flops(reference)
+    # Of two inner blocks the second needs a query, an output projection and an FFN of the class
+    # token only, and keys and values of nobody.
+    assert flops(ours) < 0.57 * flops(reference)

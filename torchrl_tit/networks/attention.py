@@ -93,8 +93,10 @@ class SelfAttention(nn.Module):
             # A softmax over one position is 1: only the value is left.
             return self.out_proj(self._project(x, 2, 3))
         positions = read if isinstance(read, slice) else READ_SLICES[read]
-        query, key, value = self._heads(x, positions)  # [N, heads, positions, D / heads] each
         masked = mask is None and self.causal and read != "last"  # the last sees everything
+        if read in ("first", "last") and mask is None and not masked and not dropping:
+            return self.out_proj(self._read_one(x, positions))
+        query, key, value = self._heads(x, positions)  # [N, heads, positions, D / heads] each
         fused = masked and read == "all" and not dropping
         if masked and not fused:
             mask = self._past(x)
@@ -127,6 +129,31 @@ class SelfAttention(nn.Module):
             query = self._project(x[:, positions], 0, 1)
             key, value = self._project(x, 1, 3).chunk(2, dim=-1)
         return self._split(query), self._split(key), self._split(value)
+
+    def _read_one(self, x: Tensor, position: slice) -> Tensor:
+        """What one position that sees all others takes from them, float [N, 1, D].
+
+        Nobody's key or value is computed, because projections are linear:
+
+            q . (W x_i + b) = (W^T q) . x_i + q . b,  and the softmax ignores what all i share,
+            sum_i a_i (W x_i + b) = W (sum_i a_i x_i) + b,  as the a_i sum to 1.
+
+        So keys' and values' weights are applied once to each head, not to each of the S tokens.
+        """
+        width = x.shape[-1]
+        query = self._project(x[:, position], 0, 1).unflatten(-1, (self.num_heads, -1))
+        weights = self.in_proj_weight[width:].unflatten(0, (2, self.num_heads, -1))
+        key_weight, value_weight = weights.unbind()  # [heads, D / heads, D] each
+        value_bias = self.in_proj_bias[2 * width :].unflatten(0, (self.num_heads, 1, -1))
+        # The heads stand where positions usually do: all read the same tokens.
+        query = query.permute(2, 0, 1, 3).squeeze(2)
+        scale = query.shape[-1] ** -0.5
+        query = (query @ key_weight).transpose(0, 1)  # [N, heads, D]
+        tokens = x.unsqueeze(1)
+        mixed = F.scaled_dot_product_attention(query.unsqueeze(1), tokens, tokens, scale=scale)
+        mixed = mixed.squeeze(1).transpose(0, 1)  # [heads, N, D]
+        value = torch.baddbmm(value_bias, mixed, value_weight.mT)  # [heads, N, D / heads]
+        return value.transpose(0, 1).flatten(1).unsqueeze(1)
 
     def _split(self, x: Tensor) -> Tensor:
         """[N, S, D] -> [N, heads, S, D / heads]."""
