@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
-
-from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from torchrl_tit.datasets import Episodes, load_episodes
 from torchrl_tit.networks import DecisionTransformerConfig
+
+from .offline_recipe import is_remote
 
 
 def load_data(dataset: str, env: str, config: DecisionTransformerConfig) -> Episodes:
@@ -43,7 +42,7 @@ def load_data(dataset: str, env: str, config: DecisionTransformerConfig) -> Epis
 
 def check_source(dataset: str, env: str, config: DecisionTransformerConfig) -> None:
     """Checks what can be checked without a download: local data wholly, else the name alone."""
-    if dataset not in D4RL_DATASETS or Path(dataset).exists():
+    if not is_remote(dataset):
         load_data(dataset, env, config)
 
 

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import torch
+from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from .outcomes import Outcome, summarize
 from .recipe import Recipe, check_at_least
 from .run import Run
+
+
+def is_remote(dataset: str) -> bool:
+    """Whether a data set is one that has to be downloaded, by D4RL's name."""
+    return dataset in D4RL_DATASETS and not Path(dataset).exists()
 
 
 class OfflineAgent(Protocol):

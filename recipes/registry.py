@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from torchrl_tit.networks import (
@@ -14,11 +15,13 @@ from torchrl_tit.networks import (
 )
 
 from .atari import ATARI_RECIPES
+from .cql_named import CQL_RECIPES
+from .discrete_cql import DiscreteCQL  # noqa: F401 - recipes in JSON name it
 from .dt_named import DT_RECIPES
 from .networks import NetworkConfig
 from .no_velocity import NO_VELOCITY_RECIPES
 from .ppo import PPO
-from .recipe import Recipe, nearest
+from .recipe import Recipe, nearest, recipe_from_json
 
 # Task name: environment and steps (arXiv 2212.14538, appendix). The paper ran MuJoCo's v3.
 _TASKS = {
@@ -84,7 +87,7 @@ def _named() -> dict[str, Recipe]:
                 tuned = dict(_TUNED_TIT[task])
                 other = replace(backbone, **tuned.pop("backbone", {}))
                 recipes[name] = replace(recipe, name=name, backbone=other, **tuned)
-    return recipes | NO_VELOCITY_RECIPES | ATARI_RECIPES | DT_RECIPES
+    return recipes | NO_VELOCITY_RECIPES | ATARI_RECIPES | CQL_RECIPES | DT_RECIPES
 
 
 RECIPES: dict[str, Recipe] = _named()
@@ -104,3 +107,20 @@ def get_recipe(name: str) -> Recipe:
     if name not in RECIPES:
         raise ValueError(f"unknown recipe {name!r}: {nearest(name, RECIPES)}")
     return RECIPES[name]
+
+
+def find_recipe(name: str) -> Recipe:
+    """Looks a recipe up by name, or reads it from a JSON file such as a run's ``recipe.json``.
+
+    Raises:
+        ValueError: if there is none of that name, or the file holds none.
+        FileNotFoundError: if there is no such file.
+
+    Example:
+        >>> find_recipe("ppo/pong/enhanced-tit").env
+        'ALE/Pong-v5'
+    """
+    path = Path(name)
+    if path.suffix == ".json":
+        return recipe_from_json(path.read_bytes(), path)
+    return get_recipe(name)

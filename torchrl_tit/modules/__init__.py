@@ -6,20 +6,24 @@ from torchrl_tit.modules.decision_transformer import make_dt_actor, make_dt_pred
 from torchrl_tit.modules.frame_cache import FrameCache
 from torchrl_tit.modules.heads import make_actor, make_value
 from torchrl_tit.modules.lstm_backbone import LSTMBackbone, LSTMConfig
+from torchrl_tit.modules.many_actions import ManyActions
 from torchrl_tit.modules.rollout_features import add_rollout_features
 from torchrl_tit.modules.sequence_backbone import SequenceBackbone
+from torchrl_tit.modules.squashed_actor import make_squashed_actor
 
 __all__ = [
     "Backbone",
     "FrameCache",
     "LSTMBackbone",
     "LSTMConfig",
+    "ManyActions",
     "SequenceBackbone",
     "acting",
     "add_rollout_features",
     "make_actor",
     "make_dt_actor",
     "make_dt_predictor",
+    "make_squashed_actor",
     "make_value",
     "while_acting",
 ]

@@ -10,7 +10,7 @@ from torchrl_tit.networks.decision_transformer import DecisionTransformer
 from torchrl_tit.networks.decision_transformer_config import DecisionTransformerConfig
 from torchrl_tit.networks.dropout import Dropout
 from torchrl_tit.networks.gated_transformer import GatedTransformerBlock, GRUGate
-from torchrl_tit.networks.gaussian_head import GaussianHead
+from torchrl_tit.networks.gaussian_head import ClampedGaussianHead, GaussianHead
 from torchrl_tit.networks.gpt2_block import GPT2Block
 from torchrl_tit.networks.history_network import AttentionMaps, HistoryNetwork
 from torchrl_tit.networks.initialization import init_normal_, init_orthogonal_
@@ -35,6 +35,7 @@ __all__ = [
     "Catformer",
     "CatformerConfig",
     "CatformerEncoder",
+    "ClampedGaussianHead",
     "CoBERL",
     "CoBERLConfig",
     "CoBERLEncoder",

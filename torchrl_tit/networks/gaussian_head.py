@@ -1,4 +1,4 @@
-"""The head of a stochastic policy."""
+"""The heads of stochastic policies."""
 
 from __future__ import annotations
 
@@ -42,3 +42,31 @@ class GaussianHead(nn.Module):
         middle, half = (_LOG_STD_MAX + _LOG_STD_MIN) / 2, (_LOG_STD_MAX - _LOG_STD_MIN) / 2
         log_std = middle + half * self.log_std(features).tanh()
         return self.mean(features), log_std.exp()
+
+
+class ClampedGaussianHead(nn.Module):
+    """Mean and standard deviation of each entry of an action, before a tanh squashes it.
+
+    Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905, and their
+    code: two linear layers, which start as PyTorch's do; the logarithm of the standard deviation is
+    cut off at -20 and 2.
+
+    Args:
+        in_features: size F of the features.
+        action_dim: entries A of an action.
+
+    Example:
+        >>> import torch
+        >>> mean, std = ClampedGaussianHead(64, 3)(torch.randn(8, 64))
+        >>> mean.shape, std.shape
+        (torch.Size([8, 3]), torch.Size([8, 3]))
+    """
+
+    def __init__(self, in_features: int, action_dim: int) -> None:
+        super().__init__()
+        self.mean = nn.Linear(in_features, action_dim)
+        self.log_std = nn.Linear(in_features, action_dim)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Float [..., F] -> mean and standard deviation, float [..., A] each."""
+        return self.mean(features), self.log_std(features).clamp(-20.0, 2.0).exp()

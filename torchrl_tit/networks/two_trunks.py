@@ -71,12 +71,46 @@ class TwoTrunkNetwork(nn.Module):
         Returns:
             Features for the policy and for the value, float [..., F] each.
         """
-        dtype = weights_dtype(self)
-        check_history(history, self.history, self.observation_shape, dtype)
-        if history.dtype == torch.uint8:
-            history = history.to(dtype) / 255
-        x = history.flatten(-2)  # [..., K * D]
+        x = _flatten(history, self)  # [..., K * D]
         return self.policy(x), self.value(x)
+
+    def only_policy(self) -> OneTrunkNetwork:
+        """The network without the value's trunk, for an actor whose critics are apart.
+
+        Example:
+            >>> from torchrl_tit.networks import MLP
+            >>> MLP((11,), history=4).only_policy()(torch.randn(8, 4, 11)).shape
+            torch.Size([8, 64])
+        """
+        return OneTrunkNetwork(self)
+
+
+class OneTrunkNetwork(nn.Module):
+    """Maps a history of arrays to features, float [..., F], by the policy's trunk of a network.
+
+    Args:
+        network: the network, whose weights it shares.
+    """
+
+    def __init__(self, network: TwoTrunkNetwork) -> None:
+        super().__init__()
+        self.observation_shape = network.observation_shape
+        self.history = network.history
+        self.features_dim = network.features_dim
+        self.policy = network.policy
+
+    def forward(self, history: Tensor) -> Tensor:
+        """Maps histories to features; see :class:`TwoTrunkNetwork`."""
+        return self.policy(_flatten(history, self))
+
+
+def _flatten(history: Tensor, network: TwoTrunkNetwork | OneTrunkNetwork) -> Tensor:
+    """Checks a history and makes floats of it, all entries of all K steps in a row."""
+    dtype = weights_dtype(network)
+    check_history(history, network.history, network.observation_shape, dtype)
+    if history.dtype == torch.uint8:
+        history = history.to(dtype) / 255
+    return history.flatten(-2)
 
 
 def check_array(observation_shape: Sequence[int], history: int, *, single: bool) -> None:

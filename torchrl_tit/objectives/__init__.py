@@ -1,6 +1,12 @@
 """Losses that TorchRL lacks or has otherwise."""
 
 from torchrl_tit.objectives.contrastive import contrastive_prediction_loss
+from torchrl_tit.objectives.cql import ContinuousCQLLoss, PolicySamples
 from torchrl_tit.objectives.decision_transformer import MaskedDTLoss
 
-__all__ = ["MaskedDTLoss", "contrastive_prediction_loss"]
+__all__ = [
+    "ContinuousCQLLoss",
+    "MaskedDTLoss",
+    "PolicySamples",
+    "contrastive_prediction_loss",
+]

@@ -1,0 +1,171 @@
+"""Networks and losses of the recipes of conservative Q-learning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from torch import Tensor, nn
+from torchrl.data import Categorical
+from torchrl.envs import EnvBase
+from torchrl.modules import MLP, QValueModule, ValueOperator
+from torchrl.objectives import DiscreteCQLLoss
+from torchrl.objectives.common import LossModule
+
+from torchrl_tit.envs import make_env
+from torchrl_tit.evaluation import evaluate
+from torchrl_tit.modules import Backbone, acting, make_squashed_actor
+from torchrl_tit.networks import TwoTrunkNetwork
+from torchrl_tit.objectives import ContinuousCQLLoss
+
+from .networks import make_network
+
+if TYPE_CHECKING:
+    from .cql import CQL
+    from .cql_recipe import CQLRecipe
+    from .discrete_cql import DiscreteCQL
+
+
+class QAgent:
+    """A loss with the weights of all networks, and the policy, whose weights are among them.
+
+    Args:
+        recipe: the settings.
+    """
+
+    policy: TensorDictModuleBase
+    loss: LossModule
+
+    def __init__(self, recipe: CQLRecipe[Any]) -> None:
+        self.recipe = recipe
+        self.device = recipe.torch_device()
+        task = self.make_env(1)
+        self.action_spec = task.action_spec_unbatched.cpu()
+        self.shape = task.observation_spec["history"].shape[2:]
+        task.close()
+
+    def make_env(self, num_envs: int) -> EnvBase:
+        """Builds the task, with the history as part of it."""
+        return make_env(
+            self.recipe.env,
+            num_envs,
+            history=self.recipe.history,
+            padding=self.recipe.padding,
+            clip_actions=False,  # the policy keeps within the bounds, which the losses need
+            device=None if self.device.type == "cpu" else self.device,
+        )
+
+    def make_backbone(self, features_key: str) -> tuple[Backbone, int]:
+        """Builds a backbone of the recipe's settings; returns it and the size of its features."""
+        recipe = self.recipe
+        network = make_network(recipe.backbone, self.shape, recipe.history)
+        one = network.only_policy() if isinstance(network, TwoTrunkNetwork) else network
+        return Backbone(one, out_keys=[features_key]), network.features_dim
+
+    def play(self, episodes: int, seed: int) -> Tensor:
+        """Plays episodes side by side and returns what each returned; float64 [episodes]."""
+        with acting(self.policy):
+            return evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=True)
+
+    def train(self) -> None:
+        """Switches dropout on."""
+        self.loss.train()
+
+    def eval(self) -> None:
+        """Switches dropout off."""
+        self.loss.eval()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the weights of all networks, and the temperature."""
+        return self.loss.state_dict()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Takes weights over."""
+        self.loss.load_state_dict(state_dict)
+
+
+class CQLAgent(QAgent):
+    """Actor on a backbone, and critics, for continuous actions.
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if the task's actions are not continuous and bounded.
+    """
+
+    loss: ContinuousCQLLoss
+
+    def __init__(self, recipe: CQL) -> None:
+        super().__init__(recipe)
+        backbone, features_dim = self.make_backbone("features")
+        head = make_squashed_actor(features_dim, self.action_spec)
+        self.policy = ProbabilisticTensorDictSequential(backbone, *head).to(self.device)
+        self.loss = ContinuousCQLLoss(
+            self.policy,
+            self._make_critic(recipe.critic, recipe.critic_hidden).to(self.device),
+            action_spec=self.action_spec.to(self.device),
+            min_q_weight=recipe.conservative_weight,
+            num_random=recipe.action_samples,
+            over_critics=recipe.over_critics,
+            alpha_init=recipe.temperature_init,
+        )
+        self.loss.make_value_estimator(gamma=recipe.gamma)
+
+    def _make_critic(self, kind: str, hidden: Sequence[int]) -> TensorDictModuleBase:
+        """Q(s, a): an MLP on observation and action, or on a backbone's features and action."""
+        first: list[TensorDictModuleBase] = []
+        key, size = "observation", self.shape.numel()
+        if kind == "backbone":
+            key = "critic_features"
+            backbone, size = self.make_backbone(key)
+            first.append(backbone)
+        elif len(self.shape) != 1:
+            raise ValueError(
+                f"an MLP cannot value images {tuple(self.shape)}: set critic to 'backbone'"
+            )
+        mlp = MLP(
+            size + self.action_spec.shape[0], 1, num_cells=list(hidden), activation_class=nn.ReLU
+        )
+        value = ValueOperator(mlp, in_keys=[key, "action"], out_keys=["state_action_value"])
+        return TensorDictSequential(*first, value)
+
+
+class DiscreteCQLAgent(QAgent):
+    """A value for each action, on a backbone.
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if the task's actions are not discrete.
+    """
+
+    loss: DiscreteCQLLoss
+
+    def __init__(self, recipe: DiscreteCQL) -> None:
+        super().__init__(recipe)
+        if not isinstance(self.action_spec, Categorical):
+            raise ValueError(
+                f"{recipe.env} has continuous actions, but discrete-cql has a value for each of a "
+                "few: use a cql recipe"
+            )
+        backbone, features_dim = self.make_backbone("features")
+        actions = self.action_spec.space.n
+        head = TensorDictModule(nn.Linear(features_dim, actions), ["features"], ["action_value"])
+        self.policy = TensorDictSequential(backbone, head, QValueModule(spec=self.action_spec)).to(
+            self.device
+        )
+        self.loss = DiscreteCQLLoss(self.policy, action_space="categorical")
+        self.loss.make_value_estimator(gamma=recipe.gamma)
+
+
+def parameters_of(params: Any) -> list[nn.Parameter]:
+    """Lists the parameters of one of a loss's networks, for an optimizer."""
+    return [p for p in params.values(True, True) if isinstance(p, nn.Parameter)]

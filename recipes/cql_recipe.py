@@ -1,0 +1,120 @@
+"""What the recipes of conservative Q-learning share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import torch
+from torchrl.data import ReplayBuffer
+
+from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buffer
+from torchrl_tit.datasets.histories import TerminalObservations, TimeLimits, Unfinished
+from torchrl_tit.transforms.history import Padding
+
+from .compilation import Compile, should_compile
+from .cql_agent import QAgent
+from .offline_recipe import OfflineRecipe, is_remote
+from .outcomes import Outcome
+from .recipe import check_at_least, check_at_most
+
+AgentT = TypeVar("AgentT", bound=QAgent)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CQLRecipe(OfflineRecipe[AgentT]):
+    """Settings of every recipe that learns Q values from a data set."""
+
+    history: int = 1
+    """Number K of observations that the backbone sees."""
+    padding: Padding = "same"
+    """What stands before an episode's first observation: that observation, or zeros."""
+    total_updates: int = 500_000
+    """Gradient steps to train for."""
+    batch_size: int = 256
+    """Transitions in one gradient step, drawn with replacement."""
+    gamma: float = 0.99
+    """Discount factor."""
+    tau: float = 0.005
+    """Share of the weights that the target networks take over at each gradient step."""
+    conservative_weight: float = 5.0
+    """Weight of the conservative term."""
+    adam_eps: float = 1e-8
+    """Epsilon of Adam."""
+    time_limits: TimeLimits = "drop"
+    """Whether the last transition of an episode that a time limit cut off is kept. d3rlpy 1.1.1,
+    which the paper used, dropped it."""
+    terminal_observations: TerminalObservations = "zero"
+    """Whether a terminal observation is kept or zeroed, as in d3rlpy 1.1.1; nothing reads it."""
+    unfinished: Unfinished = "drop"
+    """Whether an episode without an end, with which the data break off, is kept."""
+    evaluation_interval: int = 1000
+    """Gradient steps between evaluations."""
+    evaluation_episodes: int = 10
+    """Episodes of every evaluation, side by side."""
+    compile: Compile = "auto"
+    """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
+    at the start: "auto" is on where it works and the run is long enough to earn that back."""
+    cuda_graphs: Compile = "auto"
+    """Whether a GPU launches what is compiled as CUDA graphs; "auto" is on."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(
+            self,
+            history=1,
+            total_updates=1,
+            gamma=0,
+            tau=0,
+            conservative_weight=0,
+            adam_eps=0,
+            evaluation_interval=1,
+        )
+        check_at_most(self, gamma=1, tau=1)
+
+    @property
+    def final_step(self) -> int:
+        """Gradient steps of the whole run."""
+        return self.total_updates
+
+    def evaluation_due(self, step: int) -> bool:
+        """Whether the agent is evaluated after so many gradient steps."""
+        return step % self.evaluation_interval == 0 or step == self.total_updates
+
+    def play(self, agent: AgentT, step: int) -> list[Outcome]:
+        """Plays the evaluation's episodes."""
+        returns = agent.play(self.evaluation_episodes, self.evaluation_seed)
+        return [Outcome(step, returns.tolist())]
+
+    def check(self) -> None:
+        """Builds the agent, lets it act once, and reads the data where they are here already.
+
+        Raises:
+            ValueError: if they cannot be built as the fields say, or do not fit each other.
+        """
+        should_compile(self.compile, self.total_updates)
+        agent = self.make_agent()
+        env = agent.make_env(1)
+        with torch.no_grad():
+            agent.policy(env.reset())
+        env.close()
+        if not is_remote(self.dataset):
+            self.make_buffer()
+
+    def make_buffer(self) -> ReplayBuffer:
+        """Loads the data set and makes a replay buffer of its transitions with histories.
+
+        Raises:
+            FileNotFoundError: if there are no such data.
+            DatasetError: if they cannot be used, or are not of the task.
+        """
+        episodes = load_episodes(self.dataset, task=self.env).to(self.torch_device())
+        storage = HistoryStorage(
+            episodes,
+            self.history,
+            padding=self.padding,
+            time_limits=self.time_limits,
+            terminal_observations=self.terminal_observations,
+            unfinished=self.unfinished,
+        )
+        return make_replay_buffer(storage, self.batch_size, seed=self.seed)

@@ -1,0 +1,97 @@
+"""One gradient step of conservative Q-learning with continuous actions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import SoftUpdate
+
+from torchrl_tit.objectives import ContinuousCQLLoss
+
+from .compilation import compile_and_time
+from .ppo_update import check_finite
+
+
+class CQLUpdate:
+    """Steps temperature, critics, actor and targets, in this order, on one batch.
+
+    The actor runs once for all of them; the actor's loss sees critics and temperature after their
+    steps, as in d3rlpy.
+
+    Args:
+        loss: the losses, with all weights.
+        temperature_optimizer: of the temperature.
+        critic_optimizer: of the critics.
+        actor_optimizer: of the actor.
+        target: moves the target critics.
+        options: of ``torch.compile``; without any nothing is compiled.
+    """
+
+    TERMS: ClassVar = ["loss_actor", "loss_qvalue", "loss_cql", "loss_alpha", "alpha", "entropy"]
+    """What a gradient step gives."""
+
+    def __init__(
+        self,
+        loss: ContinuousCQLLoss,
+        temperature_optimizer: torch.optim.Optimizer,
+        critic_optimizer: torch.optim.Optimizer,
+        actor_optimizer: torch.optim.Optimizer,
+        target: SoftUpdate,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.loss = loss
+        self.temperature_optimizer = temperature_optimizer
+        self.critic_optimizer = critic_optimizer
+        self.actor_optimizer = actor_optimizer
+        self.target = target
+        self.sample_policy, self.critic_losses = loss.sample_policy, loss.critic_losses
+        self.actor_loss = loss.actor_loss
+        if options is not None:
+            self.sample_policy = compile_and_time(loss.sample_policy, options, "the policy")
+            self.critic_losses = compile_and_time(loss.critic_losses, options, "the critics' loss")
+            self.actor_loss = compile_and_time(loss.actor_loss, options, "the actor's loss")
+
+    def __call__(self, batch: TensorDictBase, step: int, saved_step: int) -> Tensor:
+        """Takes a step.
+
+        Args:
+            batch: transitions [B].
+            step: gradient steps before this one, for messages.
+            saved_step: step of the newest checkpoint, for messages.
+
+        Returns:
+            ``TERMS``, float [terms].
+
+        Raises:
+            FloatingPointError: if a term is not finite.
+        """
+        samples = self.sample_policy(batch)
+        loss_alpha = self.loss.alpha_loss(samples)
+        _descend(loss_alpha, self.temperature_optimizer)
+        loss_qvalue, loss_cql = self.critic_losses(batch, samples)
+        _descend(loss_qvalue + loss_cql, self.critic_optimizer)
+        loss_actor, _ = self.actor_loss(batch, samples)
+        _descend(loss_actor, self.actor_optimizer)
+        self.target.step()
+        terms = torch.stack(
+            [
+                loss_actor.detach(),
+                loss_qvalue.detach(),
+                loss_cql.detach(),
+                loss_alpha.detach(),
+                self.loss.log_alpha.detach().exp(),
+                -samples.log_prob.detach().mean(),
+            ]
+        )
+        check_finite(self.TERMS, terms, step, saved_step)
+        return terms
+
+
+def _descend(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:
+    optimizer.zero_grad()
+    loss.backward()
+    optimizer.step()

@@ -1,0 +1,293 @@
+"""The loss of continuous CQL against its formulas, on fixed numbers, by loops in NumPy."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
+from torch import nn
+from torchrl.data import Bounded, Categorical, Unbounded
+from torchrl.modules import MLP, ValueOperator
+from torchrl.objectives import SoftUpdate
+
+from torchrl_tit import Backbone, EnhancedTIT
+from torchrl_tit.modules import make_squashed_actor
+from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples
+
+BATCH, SAMPLES, OBSERVATION, ACTION = 5, 3, 4, 2
+GAMMA, WEIGHT = 0.9, 7.0
+SPEC = Bounded(-torch.tensor([1.0, 2.0]), torch.tensor([1.0, 0.5]), shape=(ACTION,))
+WIDTHS = (2.0, 2.5)
+
+
+class Quadratic(nn.Module):
+    """w . s + a' M a + s_0 v . a: a value that NumPy can compute as well."""
+
+    def __init__(self):
+        super().__init__()
+        self.w = nn.Parameter(torch.randn(OBSERVATION, dtype=torch.float64))
+        self.m = nn.Parameter(torch.randn(ACTION, ACTION, dtype=torch.float64))
+        self.v = nn.Parameter(torch.randn(ACTION, dtype=torch.float64))
+
+    def forward(self, s, a):
+        square = torch.einsum("...i,ij,...j->...", a, self.m, a)
+        return (s @ self.w + square + s[..., 0] * (a @ self.v)).unsqueeze(-1)
+
+
+def value(params, critic, s, a):
+    w, m, v = (params[name][critic].detach().numpy() for name in ("w", "m", "v"))
+    return s @ w + a @ m @ a + s[0] * (v @ a)
+
+
+def make_batch(seed=1):
+    generator = np.random.default_rng(seed)
+    low, high = SPEC.space.low.numpy(), SPEC.space.high.numpy()
+
+    def states():
+        return torch.from_numpy(generator.normal(size=(BATCH, OBSERVATION)))
+
+    terminated = torch.tensor([[False], [True], [False], [False], [True]])
+    return TensorDict(
+        {
+            "state": states(),
+            "observation": states(),
+            "action": torch.from_numpy(generator.uniform(low, high, (BATCH, ACTION))),
+            "next": {
+                "state": states(),
+                "observation": states(),
+                "reward": torch.from_numpy(generator.normal(size=(BATCH, 1))),
+                "terminated": terminated,
+                "done": terminated | torch.tensor([[True], [False], [False], [False], [False]]),
+            },
+        },
+        [BATCH],
+    )
+
+
+def make_samples(seed=2):
+    generator = np.random.default_rng(seed)
+
+    def numbers(*shape):
+        return torch.from_numpy(generator.normal(size=shape))
+
+    return PolicySamples(
+        action=numbers(BATCH, ACTION).requires_grad_(),
+        log_prob=numbers(BATCH).requires_grad_(),
+        actions=numbers(BATCH, 2 * SAMPLES, ACTION),
+        log_probs=numbers(BATCH, 2 * SAMPLES),
+        next_action=numbers(BATCH, ACTION),
+    )
+
+
+def make_loss(**settings):
+    """The actor reads "observation", the critics "state": their own key."""
+    actor = make_squashed_actor(OBSERVATION, SPEC, in_key="observation").double()
+    critic = ValueOperator(Quadratic(), in_keys=["state", "action"])
+    options = {"min_q_weight": WEIGHT, "num_random": SAMPLES, "alpha_init": 0.3, **settings}
+    loss = ContinuousCQLLoss(actor, critic, action_spec=SPEC, **options)
+    loss.make_value_estimator(gamma=GAMMA)
+    for name, weight in loss.target_qvalue_network_params.items(True, True):
+        weight.data.normal_()
+        assert not torch.equal(weight, loss.qvalue_network_params[name])
+    return loss
+
+
+def weights(params):
+    return {key[-1]: weight for key, weight in params.items(True, True)}
+
+
+def uniform_actions(monkeypatch):
+    """Fixes the uniform draws; returns the actions that follow from them, [B, n, A]."""
+    drawn = torch.from_numpy(np.random.default_rng(3).uniform(size=(BATCH, SAMPLES, ACTION)))
+    monkeypatch.setattr(torch, "rand", lambda *shape, **_: drawn.reshape(shape))
+    low = SPEC.space.low.numpy()
+    return low + np.array(WIDTHS) * drawn.numpy()
+
+
+@pytest.mark.parametrize("over_critics", ["mean", "sum"])
+def test_critics(monkeypatch, over_critics):
+    loss, batch, samples = make_loss(over_critics=over_critics), make_batch(), make_samples()
+    uniform = uniform_actions(monkeypatch)
+    params = weights(loss.qvalue_network_params)
+    targets = weights(loss.target_qvalue_network_params)
+    errors, gaps = np.zeros(2), np.zeros(2)
+    for b in range(BATCH):
+        s, a = batch["state"][b].numpy(), batch["action"][b].numpy()
+        s_next, a_next = batch["next", "state"][b].numpy(), samples.next_action[b].numpy()
+        best = min(value(targets, c, s_next, a_next) for c in range(2))
+        # Time limits go on; only what is terminated has no future. No entropy in it.
+        future = 0.0 if batch["next", "terminated"][b] else GAMMA * best
+        target = batch["next", "reward"][b].item() + future
+        for c in range(2):
+            exponents = [
+                value(params, c, s, u) + math.log(WIDTHS[0] * WIDTHS[1]) for u in uniform[b]
+            ]
+            for j in range(2 * SAMPLES):  # those of s' as well: all at s
+                drawn = samples.actions[b, j].numpy()
+                exponents.append(value(params, c, s, drawn) - samples.log_probs[b, j].item())
+            q = value(params, c, s, a)
+            gaps[c] += (math.log(sum(map(math.exp, exponents))) - q) / BATCH
+            errors[c] += (q - target) ** 2 / BATCH
+    loss_qvalue, loss_cql = loss.critic_losses(batch, samples)
+    gap = gaps.mean() if over_critics == "mean" else gaps.sum()
+    assert loss_qvalue.item() == pytest.approx(errors.sum(), rel=1e-6)  # gamma is a float32
+    assert loss_cql.item() == pytest.approx(WEIGHT * gap, rel=1e-6)
+    assert loss.q_loss(batch, samples)[0].item() == pytest.approx(loss_qvalue.item())
+    assert loss.cql_loss(batch, samples)[0].item() == pytest.approx(loss_cql.item())
+
+
+def test_actor():
+    loss, batch, samples = make_loss(), make_batch(), make_samples()
+    params = weights(loss.qvalue_network_params)
+    expected = 0.0
+    for b in range(BATCH):
+        s, a = batch["state"][b].numpy(), samples.action[b].detach().numpy()
+        worst = min(value(params, c, s, a) for c in range(2))
+        expected += (0.3 * samples.log_prob[b].item() - worst) / BATCH
+    loss_actor, _ = loss.actor_loss(batch, samples)
+    assert loss_actor.item() == pytest.approx(expected, rel=1e-6)  # alpha is a float32
+    loss_actor.backward()
+    assert samples.action.grad is not None
+    torch.testing.assert_close(samples.log_prob.grad, torch.full((BATCH,), 0.3 / BATCH).double())
+    assert all(w.grad is None for w in params.values())
+    assert loss.log_alpha.grad is None
+
+
+def test_temperature():
+    loss, samples = make_loss(), make_samples()
+    surprise = samples.log_prob.detach().mean().item() - ACTION  # target entropy: -2
+    loss_alpha = loss.alpha_loss(samples)
+    assert loss_alpha.item() == pytest.approx(-0.3 * surprise, rel=1e-6)
+    loss_alpha.backward()  # with respect to the logarithm: exp(log alpha) again
+    assert loss.log_alpha.grad.item() == pytest.approx(-0.3 * surprise, rel=1e-6)
+    assert samples.log_prob.grad is None
+
+
+def test_the_policy_is_sampled_where_it_should_be():
+    """At s with a gradient, at s' without, densities with the exact Jacobian of tanh and bounds."""
+    loss, batch = make_loss(), make_batch()
+    torch.manual_seed(5)
+    samples = loss.sample_policy(batch)
+    assert samples.actions.shape == (BATCH, 2 * SAMPLES, ACTION)
+    assert not samples.actions.requires_grad
+    assert not samples.log_probs.requires_grad
+    assert samples.action.requires_grad
+    assert samples.log_prob.requires_grad
+    middle = (SPEC.space.high + SPEC.space.low).numpy() / 2
+    half = np.array(WIDTHS) / 2
+    head = loss.actor_network_params
+    weight = {key[-2:]: w.detach().numpy() for key, w in head.items(True, True)}
+
+    def check(state, action, log_prob):
+        mean, log_std = (
+            state @ weight[name, "weight"].T + weight[name, "bias"] for name in ("mean", "log_std")
+        )
+        squashed = (action - middle) / half
+        density = norm.logpdf(np.arctanh(squashed), mean, np.exp(log_std))
+        density -= np.log(1 - squashed**2) + np.log(half)
+        assert log_prob == pytest.approx(density.sum(), rel=1e-5)
+        return middle + half * np.tanh(mean)
+
+    for b in range(BATCH):
+        here, there = (d["observation"][b].numpy() for d in (batch, batch["next"]))
+        check(here, samples.action[b].detach().numpy(), samples.log_prob[b].item())
+        for j in range(2 * SAMPLES):
+            state = here if j < SAMPLES else there
+            check(state, samples.actions[b, j].numpy(), samples.log_probs[b, j].item())
+        best = check(there, samples.actions[b, -1].numpy(), samples.log_probs[b, -1].item())
+        np.testing.assert_allclose(samples.next_action[b].numpy(), best, rtol=1e-6)
+
+
+def test_forward_gives_the_same_and_leaves_the_batch(monkeypatch):
+    loss, batch, samples = make_loss(), make_batch(), make_samples()
+    uniform_actions(monkeypatch)
+    monkeypatch.setattr(loss, "sample_policy", lambda _: samples)
+    before = batch.clone()
+    terms = loss(batch)
+    assert (batch == before).all()
+    assert batch.keys() == before.keys()
+    loss_qvalue, loss_cql = loss.critic_losses(batch, samples)
+    torch.testing.assert_close(terms["loss_qvalue"], loss_qvalue)
+    torch.testing.assert_close(terms["loss_cql"], loss_cql)
+    torch.testing.assert_close(terms["loss_actor"], loss.actor_loss(batch, samples)[0])
+    torch.testing.assert_close(terms["loss_alpha"], loss.alpha_loss(samples))
+    torch.testing.assert_close(terms["entropy"], -samples.log_prob.detach().mean())
+    assert set(terms.keys()) == set(loss.out_keys)
+
+
+class Counting(EnhancedTIT):
+    calls: list[int]
+
+    def forward(self, history):
+        self.calls.append(history.shape[0])
+        return super().forward(history)
+
+
+def test_backbones_run_once_a_state_and_all_of_it_trains():
+    """The actor's at s and at s'; the critics' at s, at s', and under the actor's action."""
+    calls = {"actor": [], "critic": []}
+
+    def backbone(name, key):
+        network = Counting((OBSERVATION,), 2, embed_dim=16, ffn_dropout_inner=0.1)
+        network.calls = calls[name]
+        return Backbone(network, out_keys=[key]), network.features_dim
+
+    first, size = backbone("actor", "features")
+    actor = ProbabilisticTensorDictSequential(first, *make_squashed_actor(size, SPEC))
+    second, size = backbone("critic", "critic_features")
+    critic = TensorDictSequential(
+        second,
+        ValueOperator(
+            MLP(size + ACTION, 1, num_cells=[8]),
+            in_keys=["critic_features", "action"],
+            out_keys=["state_action_value"],
+        ),
+    )
+    loss = ContinuousCQLLoss(actor, critic, action_spec=SPEC, deactivate_vmap=True)
+    loss.make_value_estimator(gamma=GAMMA)
+    batch = make_batch().apply(lambda x: x.float() if x.is_floating_point() else x)
+    for part in (batch, batch["next"]):
+        part["history"] = torch.randn(BATCH, 2, OBSERVATION)
+    for names in calls.values():
+        names.clear()
+    terms = loss(batch)
+    assert calls == {"actor": [BATCH] * 2, "critic": [BATCH] * 6}
+    sum(terms[name] for name in ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha")).backward()
+    for params in (loss.actor_network_params, loss.qvalue_network_params):
+        assert all(w.grad is not None for w in params.values(True, True) if w.requires_grad)
+    target = SoftUpdate(loss, tau=0.5)
+    before = loss.target_qvalue_network_params.clone()
+    with torch.no_grad():
+        loss.qvalue_network_params.data.add_(1.0)
+    target.step()
+    moved = loss.target_qvalue_network_params.data - before.data
+    assert all(torch.allclose(w, torch.tensor(0.5)) for w in moved.values(True, True))
+
+
+@pytest.mark.parametrize("spec", [Categorical(3), Unbounded((2,)), Bounded(-1, 1, shape=(4, 2))])
+def test_actions_without_bounds_are_refused(spec):
+    actor = make_squashed_actor(OBSERVATION, SPEC, in_key="observation")
+    critic = ValueOperator(Quadratic(), in_keys=["state", "action"])
+    with pytest.raises(ValueError, match="action_spec must be a Bounded spec of one dimension"):
+        ContinuousCQLLoss(actor, critic, action_spec=spec)
+    with pytest.raises(ValueError, match="no squashed policy for the action space"):
+        make_squashed_actor(OBSERVATION, spec)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"num_random": 0}, "num_random must be"), ({"over_critics": "max"}, "over_critics must be")],
+)
+def test_impossible_settings_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        make_loss(**settings)
+
+
+def test_critics_that_do_not_read_the_action_are_refused():
+    actor = make_squashed_actor(OBSERVATION, SPEC, in_key="observation")
+    blind = ValueOperator(nn.Linear(OBSERVATION, 1), in_keys=["observation"])
+    with pytest.raises(ValueError, match=r"must read the action under 'action'.*\['observation'\]"):
+        ContinuousCQLLoss(actor, blind, action_spec=SPEC)

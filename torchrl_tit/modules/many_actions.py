@@ -1,0 +1,65 @@
+"""Values of several actions in one state."""
+
+from __future__ import annotations
+
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+
+
+class ManyActions(TensorDictModuleBase):
+    """Lets a Q network value several actions in every state.
+
+    Of a sequence of modules, those before the first that reads the action (a backbone, say) run
+    once a state; what they wrote is then repeated for each action, without a copy.
+
+    Args:
+        qvalue_network: Reads state entries [*batch, ...] and an action [*batch, A], and writes
+            a value [*batch, 1].
+        action_key: Where the action stands.
+
+    Raises:
+        ValueError: If the network does not read the action.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.modules import MLP, ValueOperator
+        >>> q = ManyActions(ValueOperator(MLP(11 + 3, 1), in_keys=["observation", "action"]))
+        >>> states, actions = torch.randn(8, 11), torch.rand(8, 30, 3)
+        >>> td = q(TensorDict({"observation": states, "action": actions}, [8]))
+        >>> td["state_action_value"].shape
+        torch.Size([8, 30, 1])
+    """
+
+    def __init__(
+        self, qvalue_network: TensorDictModuleBase, action_key: NestedKey = "action"
+    ) -> None:
+        super().__init__()
+        if action_key not in qvalue_network.in_keys:
+            raise ValueError(
+                f"a Q network must read the action under {action_key!r}, but this one reads "
+                f"{list(qvalue_network.in_keys)}"
+            )
+        self.qvalue_network = qvalue_network
+        self.action_key = action_key
+        self.in_keys = list(qvalue_network.in_keys)
+        self.out_keys = list(qvalue_network.out_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the values; [*batch, A] -> [*batch, 1], or [*batch, m, A] -> [*batch, m, 1]."""
+        action = tensordict.get(self.action_key)
+        network = self.qvalue_network
+        if action.ndim == tensordict.ndim + 1:
+            return network(tensordict)
+        modules = list(network.module) if isinstance(network, TensorDictSequential) else [network]
+        states = tensordict.exclude(self.action_key)
+        first = next(i for i, m in enumerate(modules) if self.action_key in m.in_keys)
+        for module in modules[:first]:
+            states = module(states)
+        each = states.unsqueeze(-1).expand(*tensordict.shape, action.shape[-2]).copy()
+        each.set(self.action_key, action)
+        for module in modules[first:]:
+            each = module(each)
+        for key in self.out_keys:
+            tensordict.set(key, each.get(key))
+        return tensordict

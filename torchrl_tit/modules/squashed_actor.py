@@ -1,0 +1,61 @@
+"""The policy head of offline RL and SAC: a Gaussian squashed into the bounds of the actions."""
+
+from __future__ import annotations
+
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded, TensorSpec
+from torchrl.modules import ProbabilisticActor, TanhNormal
+
+from torchrl_tit.networks import ClampedGaussianHead
+
+
+def make_squashed_actor(
+    features_dim: int,
+    action_spec: TensorSpec,
+    *,
+    in_key: NestedKey = "features",
+    action_key: NestedKey = "action",
+) -> ProbabilisticActor:
+    """Builds a tanh-squashed Gaussian policy head on features.
+
+    Two linear layers give the mean and the logarithm of the standard deviation, clamped to -20..2;
+    tanh and the bounds squash what is drawn (Haarnoja et al., "Soft Actor-Critic", arXiv
+    1801.01290, appendix C). The deterministic action is the squashed mean.
+
+    Args:
+        features_dim: size of the features.
+        action_spec: a ``Bounded`` spec of one action, without batch dimensions.
+        in_key: where the features [..., F] stand.
+        action_key: where to write the action, float [..., A].
+
+    Returns:
+        A :class:`~torchrl.modules.ProbabilisticActor` that follows TorchRL's exploration type.
+
+    Raises:
+        ValueError: if the actions are not continuous and bounded.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> actor = make_squashed_actor(64, Bounded(-1, 1, shape=(3,)))
+        >>> actor(TensorDict({"features": torch.randn(5, 64)}, [5]))["action"].abs().max() <= 1
+        tensor(True)
+    """
+    if not isinstance(action_spec, Bounded) or action_spec.ndim != 1:
+        raise ValueError(
+            f"no squashed policy for the action space {action_spec}: expected a Bounded spec of "
+            "one dimension, without batch dimensions"
+        )
+    head = ClampedGaussianHead(features_dim, action_spec.shape[0])
+    return ProbabilisticActor(
+        TensorDictModule(head, in_keys=[in_key], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        out_keys=[action_key],
+        distribution_class=TanhNormal,
+        distribution_kwargs={
+            "low": action_spec.space.low,
+            "high": action_spec.space.high,
+            "event_dims": 1,
+        },
+    )

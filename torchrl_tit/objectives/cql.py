@@ -1,0 +1,271 @@
+"""Conservative Q-learning with continuous actions, as the paper's agents were trained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Bounded
+from torchrl.modules.distributions.utils import rsample_and_log_prob
+from torchrl.objectives import CQLLoss, distance_loss
+
+from torchrl_tit.modules.many_actions import ManyActions
+
+OverCritics = Literal["mean", "sum"]
+
+
+@dataclass(frozen=True)
+class PolicySamples:
+    """What one pass of the actor over a batch, at s and at s', gives to all terms of the loss.
+
+    B states, n samples of each distribution, A entries of an action.
+    """
+
+    action: Tensor
+    """Drawn at s, with a gradient to the actor; float [B, A]."""
+    log_prob: Tensor
+    """Its log density, with a gradient too; float [B]."""
+    actions: Tensor
+    """n drawn at s and n at s', without gradient; float [B, 2n, A]."""
+    log_probs: Tensor
+    """Their log densities; float [B, 2n]."""
+    next_action: Tensor
+    """The deterministic action at s' (tanh of the mean), without gradient; float [B, A]."""
+
+
+class ContinuousCQLLoss(CQLLoss):
+    """TorchRL's `CQLLoss` with the formulas of the paper's agents.
+
+    Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning", arXiv 2006.04779,
+    equation 4 (CQL(H)) and appendix F, as in d3rlpy 1.1.1, which arXiv 2212.14538 trained with.
+    With m samples of each kind (uniform, policy at s, policy at s'), 3m in all, the loss of one
+    critic has two terms::
+
+        loss_qvalue  mean over s of (Q(s, a) - r - gamma min_i Q_i'(s', tanh(mean(s'))))^2
+        loss_cql     w * mean over s of [logsumexp_j (Q(s, a_j) - log p(a_j)) - Q(s, a)]
+
+    the squared errors summed over the critics, the conservative terms averaged (or summed:
+    ``over_critics``); the actor's is the mean of ``alpha log p(a) - min_i Q_i(s, a)``, and the
+    temperature's ``-alpha (log p(a) - target_entropy)`` with ``alpha = exp(log_alpha)``.
+
+    `CQLLoss` of TorchRL 0.14 takes a logsumexp over 3 values m times, evaluates the policy's
+    actions at s' there instead of at s, samples the action in the target, hands the critics the
+    actor's entries, and runs the actor on m copies of each state. Here each distribution is
+    computed once and sampled m times, and whatever of a critic does not read the action runs once
+    a state.
+
+    The terms are meant to be stepped one after the other, in this order, on the samples of one
+    pass: :meth:`alpha_loss`, :meth:`critic_losses`, :meth:`actor_loss`; each then sees what the
+    steps before it changed. ``forward`` gives them all at once.
+
+    Args:
+        actor_network: Policy with a distribution that has a ``deterministic_sample``, such as that
+            of :func:`~torchrl_tit.modules.make_squashed_actor`.
+        qvalue_network: Reads what keys it likes (of "next", in the target) and the action, and
+            writes "state_action_value", float [..., 1]. Two copies are made of one module.
+        action_spec: The bounds of an action, a ``Bounded`` spec of shape [A].
+        min_q_weight: Weight w of the conservative term.
+        num_random: Samples m of each kind.
+        over_critics: Whether the conservative term is the mean over the critics, as in d3rlpy
+            1.1.1, or their sum, as from its version 2.5 on.
+        alpha_init: Temperature at the start.
+        target_entropy: What the temperature aims at; minus the entries of an action where "auto".
+        loss_function: Distance to the target; "l2" is the square.
+        deactivate_vmap: Whether critics run one after the other; needed where they cannot be
+            stacked.
+
+    Raises:
+        ValueError: If the actions have no bounds, or a setting is not possible.
+
+    Example:
+        >>> from torchrl_tit.modules import make_squashed_actor
+        >>> from torchrl.modules import MLP, ValueOperator
+        >>> spec = Bounded(-1, 1, shape=(3,))
+        >>> q = ValueOperator(MLP(11 + 3, 1), in_keys=["observation", "action"])
+        >>> actor = make_squashed_actor(11, spec, in_key="observation")
+        >>> loss = ContinuousCQLLoss(actor, q, action_spec=spec, min_q_weight=5.0)
+        >>> loss.make_value_estimator(gamma=0.99)
+        >>> batch = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(8, 11),
+        ...         "action": torch.rand(8, 3),
+        ...         "next": {
+        ...             "observation": torch.randn(8, 11),
+        ...             "reward": torch.ones(8, 1),
+        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
+        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     [8],
+        ... )
+        >>> sorted(loss(batch).keys())
+        ['alpha', 'entropy', 'loss_actor', 'loss_alpha', 'loss_cql', 'loss_qvalue']
+    """
+
+    out_keys = ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha", "alpha", "entropy")
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        qvalue_network: TensorDictModuleBase,
+        *,
+        action_spec: Bounded,
+        min_q_weight: float = 5.0,
+        num_random: int = 10,
+        over_critics: OverCritics = "mean",
+        alpha_init: float = 1.0,
+        target_entropy: float | Literal["auto"] = "auto",
+        loss_function: str = "l2",
+        deactivate_vmap: bool = False,
+    ) -> None:
+        if not isinstance(action_spec, Bounded) or action_spec.ndim != 1:
+            raise ValueError(
+                f"action_spec must be a Bounded spec of one dimension, not {action_spec}: samples "
+                "are drawn uniformly between the bounds"
+            )
+        if num_random < 1:
+            raise ValueError(f"num_random must be at least 1, not {num_random}")
+        if over_critics not in ("mean", "sum"):
+            raise ValueError(f"over_critics must be 'mean' or 'sum', not {over_critics!r}")
+        super().__init__(
+            actor_network,
+            ManyActions(qvalue_network),
+            loss_function=loss_function,
+            alpha_init=alpha_init,
+            action_spec=action_spec,
+            target_entropy=target_entropy,
+            min_q_weight=min_q_weight,
+            num_random=num_random,
+            deactivate_vmap=deactivate_vmap,
+        )
+        self.over_critics = over_critics
+        self.register_buffer("_low", action_spec.space.low.clone())
+        self.register_buffer("_high", action_spec.space.high.clone())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes all terms of a batch [B], which is left as it is.
+
+        Returns:
+            "loss_actor", "loss_qvalue", "loss_cql" (weighted), "loss_alpha", "alpha" (the
+            temperature) and "entropy" (of the policy, estimated), float [] each.
+        """
+        samples = self.sample_policy(tensordict)
+        loss_qvalue, loss_cql = self.critic_losses(tensordict, samples)
+        return TensorDict(
+            {
+                "loss_actor": self.actor_loss(tensordict, samples)[0],
+                "loss_qvalue": loss_qvalue,
+                "loss_cql": loss_cql,
+                "loss_alpha": self.alpha_loss(samples),
+                "alpha": self._alpha,
+                "entropy": -samples.log_prob.detach().mean(),
+            }
+        )
+
+    def sample_policy(self, tensordict: TensorDictBase) -> PolicySamples:
+        """Runs the actor once at s and once at s', and draws what the terms need.
+
+        Args:
+            tensordict: a batch [B].
+        """
+        keys = self.actor_network.in_keys
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            dist = self.actor_network.get_dist(tensordict.select(*keys))
+            with torch.no_grad():
+                next_dist = self.actor_network.get_dist(tensordict["next"].select(*keys))
+        action, log_prob = rsample_and_log_prob(dist)
+        with torch.no_grad():
+            shape = torch.Size([self.num_random])
+            drawn = [rsample_and_log_prob(d, shape) for d in (dist, next_dist)]
+            actions = torch.cat([a for a, _ in drawn]).movedim(0, 1)  # [B, 2n, A]
+            log_probs = torch.cat([p for _, p in drawn]).movedim(0, 1)  # [B, 2n]
+            next_action = next_dist.deterministic_sample
+        return PolicySamples(action, log_prob, actions, log_probs, next_action)
+
+    def alpha_loss(self, samples: PolicySamples) -> Tensor:
+        """The temperature's loss, float []."""
+        surprise = samples.log_prob.detach() + self.target_entropy
+        return -(self.log_alpha.exp() * surprise).mean()
+
+    def critic_losses(
+        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The critics' squared error and weighted conservative term, float [] each.
+
+        Args:
+            tensordict: a batch [B].
+            samples: of :meth:`sample_policy`; drawn anew where not given.
+        """
+        samples = samples or self.sample_policy(tensordict)
+        target = self._target(tensordict, samples.next_action)  # [B]
+        action = tensordict.get(self.tensor_keys.action)
+        batch, size = action.shape
+        width = self._high - self._low
+        uniform = self._low + width * torch.rand(
+            batch, self.num_random, size, dtype=action.dtype, device=action.device
+        )
+        log_uniform = -width.log().sum().expand(batch, self.num_random)
+        values = self._values(
+            tensordict,
+            torch.cat([uniform, samples.actions, action.unsqueeze(1)], dim=1),
+            self.qvalue_network_params,
+        )  # [critics, B, 3n + 1], all of them at s
+        value = values[..., -1]
+        log_density = torch.cat([log_uniform, samples.log_probs], dim=1)
+        optimism = torch.logsumexp(values[..., :-1] - log_density, dim=-1)  # [critics, B]
+        gaps = (optimism - value).mean(dim=-1)  # [critics]
+        gap = gaps.mean() if self.over_critics == "mean" else gaps.sum()
+        errors = distance_loss(value, target.expand_as(value), self.loss_function)
+        return errors.mean(dim=-1).sum(), self.min_q_weight * gap
+
+    def q_loss(
+        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """The critics' squared error alone; use :meth:`critic_losses` where both are needed."""
+        return self.critic_losses(tensordict, samples)[0], {}
+
+    def cql_loss(
+        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """The weighted conservative term alone; see :meth:`critic_losses`."""
+        return self.critic_losses(tensordict, samples)[1], {}
+
+    def actor_loss(
+        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
+    ) -> tuple[Tensor, dict[str, Any]]:
+        """The actor's loss, float [], through critics that get no gradient.
+
+        Args:
+            tensordict: a batch [B].
+            samples: of :meth:`sample_policy`; drawn anew where not given.
+        """
+        samples = samples or self.sample_policy(tensordict)
+        values = self._values(
+            tensordict, samples.action.unsqueeze(1), self._cached_detach_qvalue_params
+        )
+        value = values.squeeze(-1).amin(0)  # [B]
+        return (self._alpha * samples.log_prob - value).mean(), {}
+
+    def _target(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
+        """What the critics aim at, without gradient; float [B]."""
+        with torch.no_grad():
+            values = self._values(
+                tensordict["next"], next_action.unsqueeze(1), self.target_qvalue_network_params
+            )
+            outcome = tensordict["next"].select(
+                self.tensor_keys.reward, self.tensor_keys.terminated, self.tensor_keys.done
+            )
+            outcome.set(self.value_estimator.tensor_keys.value, values.amin(0))
+            batch = TensorDict({"next": outcome}, tensordict.batch_size)
+            return self.value_estimator.value_estimate(batch).squeeze(-1)
+
+    def _values(self, tensordict: TensorDictBase, actions: Tensor, params: TensorDict) -> Tensor:
+        """Values of several actions in each state; [B, m, A] -> [critics, B, m]."""
+        keys = [key for key in self.qvalue_network.in_keys if key != self.tensor_keys.action]
+        states = tensordict.select(*keys).set(self.tensor_keys.action, actions)
+        values = self._vmap_qvalue_networkN0(states, params)
+        return values.get(self.tensor_keys.state_action_value).squeeze(-1)
