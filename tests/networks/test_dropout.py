@@ -13,7 +13,10 @@ def test_drops_with_its_probability_and_keeps_the_mean() -> None:
         y = Dropout(p)(x)
         kept = y != 0
         assert abs(kept.float().mean().item() - (1 - p)) < 5 * (p * (1 - p) / x.numel()) ** 0.5
-        torch.testing.assert_close(y[kept], torch.full_like(y[kept], 3 / (1 - p)))
+        # Shares are multiples of 1/65536.
+        expected = torch.full_like(y[kept], 3 / (1 - p))
+        torch.testing.assert_close(y[kept], expected, rtol=1e-4, atol=0)
+        assert abs(y.mean().item() / 3 - 1) < 5 * (p / (1 - p) / x.numel()) ** 0.5
         rows = kept.float().mean(1)  # entries are independent of their place
         assert abs(rows.var().item() / (p * (1 - p) / 1000) - 1) < 0.4
 
@@ -33,6 +36,16 @@ def test_does_nothing_in_evaluation_or_without_probability() -> None:
     assert torch.equal(Dropout(0.0)(x), x)
     assert torch.equal(torch.get_rng_state(), before)  # and draws nothing
     assert isinstance(Dropout(0.5), nn.Dropout)  # TorchRL's losses look for that
+
+
+def test_any_size_type_and_probability() -> None:
+    for size in (0, 1, 3, 5):
+        assert Dropout(0.5)(torch.ones(size)).shape == (size,)
+    y = Dropout(0.5)(torch.ones(1000, dtype=torch.bfloat16))
+    assert y.dtype == torch.bfloat16
+    assert set(y.unique().tolist()) == {0.0, 2.0}
+    assert not Dropout(1.0)(torch.ones(100)).any()
+    assert Dropout(1 - 1e-9)(torch.ones(100)).isfinite().all()
 
 
 def test_vmap_and_compile_take_it() -> None:

@@ -67,6 +67,21 @@ class TransformerBlock(nn.Module):
         x = x[:, READ_SLICES[read]] + self.attention(self.norm1(x), read)
         return x + self.ffn(self.norm2(x))
 
+    def read_first(self, first: Tensor, rest: Tensor) -> Tensor:
+        """Reads the first token where it is the same in all sequences, as before the first block.
+
+        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")``.
+
+        Args:
+            first: float [1, 1, D].
+            rest: tokens after it, float [N, S - 1, D].
+
+        Returns:
+            float [N, 1, D].
+        """
+        x = first + self.attention.read_first(self.norm1(first), self.norm1(rest))
+        return x + self.ffn(self.norm2(x))
+
     def attention_weights(self, x: Tensor) -> Tensor:
         """Returns the weights with which this block attends, float [N, heads, S, S]."""
         return self.attention.weights(self.norm1(x))

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
+
+_INT64 = torch.iinfo(torch.int64)
+_LEVELS = 2**16
+"""Numbers that 16 random bits can be, and the shares of entries that can be dropped."""
 
 
 class Dropout(nn.Dropout):
     """Dropout (Srivastava et al. 2014), with the distribution of :class:`torch.nn.Dropout`.
 
-    On a CPU, ``nn.Dropout`` draws Bernoulli numbers, which took a sixth of a training step of
-    Decision Transformer; comparing uniform numbers takes little more than half as long. Elsewhere
-    this is ``nn.Dropout``, whose kernels are fused.
+    On a CPU, ``nn.Dropout`` draws a number for each entry, one after another, which took a sixth of
+    a training step of Decision Transformer. This draws one of 64 bits for each four entries, in a
+    fifth of that time. Elsewhere this is ``nn.Dropout``, whose kernels are fused.
 
     Args:
-        p: probability of a zero.
+        p: probability of a zero; on a CPU to the nearest 1/65536, by which the rest is scaled too.
 
     Example:
         >>> dropout = Dropout(0.25)
@@ -29,7 +35,11 @@ class Dropout(nn.Dropout):
 
     def forward(self, input: Tensor) -> Tensor:
         """Zeroes entries with probability p while training and scales the others by 1 / (1 - p)."""
-        if not self.training or self.p == 0 or input.device.type != "cpu":
+        if not self.training or self.p in (0, 1) or input.device.type != "cpu":
             return super().forward(input)
-        scale = torch.rand_like(input).ge_(self.p).mul_(1 / (1 - self.p))  # 0 or 1 / (1 - p)
-        return input * scale
+        dropped = min(round(self.p * _LEVELS), _LEVELS - 1)
+        draws = torch.randint(_INT64.min, _INT64.max, (math.ceil(input.numel() / 4),))
+        bits = draws.view(torch.int16)[: input.numel()].view(input.shape)  # from -2^15 on
+        # Floats throughout: comparing integers, and turning booleans into numbers, takes longer.
+        scale = bits.float().ge_(dropped - _LEVELS // 2).mul_(_LEVELS / (_LEVELS - dropped))
+        return input * scale.to(input.dtype)  # 0 or 1 / (1 - p)

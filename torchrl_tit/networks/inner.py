@@ -85,7 +85,11 @@ class InnerTransformer(nn.Module):
         Returns:
             Class tokens, float [..., L, D], or [..., 1, D] of the last block only.
         """
-        x, leading = self._tokens(observation)  # [N, 1 + patches, D]
+        class_token, patches, leading = self._tokens(observation)
+        if self.num_blocks == 1:  # before it, the class token is the same for all observations
+            x = self._block(0).read_first(class_token, patches)  # [N, 1, D]
+            return x.reshape(*leading, 1, x.shape[-1])
+        x = _join(class_token, patches)
         class_tokens = []
         for index in range(self.num_blocks):
             last = index == self.num_blocks - 1
@@ -99,7 +103,8 @@ class InnerTransformer(nn.Module):
 
         S = 1 + patches; position 0 is the class token, the patches follow row by row.
         """
-        x, leading = self._tokens(observation)
+        class_token, patches, leading = self._tokens(observation)
+        x = _join(class_token, patches)
         maps = []
         for index in range(self.num_blocks):
             block = self._block(index)
@@ -113,8 +118,8 @@ class InnerTransformer(nn.Module):
         assert isinstance(block, TransformerBlock)
         return block
 
-    def _tokens(self, observation: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-        """[..., *observation] -> class and patch tokens [N, 1 + patches, D], leading shape."""
+    def _tokens(self, observation: Tensor) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+        """[..., *observation] -> class token [1, 1, D], patches [N, patches, D], leading shape."""
         frame_ndim = self.observation_ndim + (self.frames is not None)
         leading = observation.shape[: observation.ndim - frame_ndim]
         shape = observation.shape[observation.ndim - frame_ndim :]
@@ -123,8 +128,15 @@ class InnerTransformer(nn.Module):
         channels = math.prod(shape[:-space])
         x = observation.reshape(math.prod(leading), channels, *shape[-space:])
         patches = self.patch_embedding(x)
-        x = torch.cat([self.class_token.expand(patches.shape[0], -1, -1), patches], dim=1)
-        return x if self.positions is None else x + self.positions, tuple(leading)
+        if self.positions is None:
+            return self.class_token, patches, tuple(leading)
+        class_token = self.class_token + self.positions[:, :1]
+        return class_token, patches + self.positions[:, 1:], tuple(leading)
+
+
+def _join(class_token: Tensor, patches: Tensor) -> Tensor:
+    """[1, 1, D] and [N, patches, D] -> [N, 1 + patches, D]."""
+    return torch.cat([class_token.expand(patches.shape[0], -1, -1), patches], dim=1)
 
 
 class LinearFrameEncoder(nn.Module):
