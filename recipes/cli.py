@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import shlex
 import sys
 import time
 from contextlib import redirect_stderr
@@ -17,8 +18,8 @@ import tyro
 from torchrl_tit.files import write_text_atomic
 
 from .plot import plot_comparison, plot_table
-from .recipe import Recipe, recipe_from_json, recipe_to_json
-from .registry import RECIPES, get_recipe
+from .recipe import Recipe, recipe_to_json
+from .registry import RECIPES, find_recipe
 from .run import Run
 from .sweep import make_jobs, run_jobs
 from .table import make_table, to_csv, to_markdown
@@ -39,6 +40,7 @@ usage: {program} COMMAND ...
   table FOLDER [FOLDER ...]   the paper's tables from all runs in folders
   data info SOURCE            what is in a data set: an HDF5 file, D4RL's or Minari's name
   data convert SOURCE TARGET  between HDF5 in D4RL's layout and Minari
+  data collect TASK           medium, mixed, expert and random sets of a task, as D4RL made them
 
 Everywhere: --seed, --out, --device, --threads where they apply; COMMAND --help tells.
 """
@@ -92,7 +94,7 @@ def _list(words: list[str]) -> None:
 def _show(words: list[str]) -> None:
     parser = _Parser(f"{_program()} show")
     parser.add_argument("name", help="name of a recipe, or a JSON file")
-    print(recipe_to_json(_find(parser.parse_args(words).name)), end="")
+    print(recipe_to_json(find_recipe(parser.parse_args(words).name)), end="")
 
 
 def _train(words: list[str]) -> None:
@@ -120,7 +122,7 @@ def _start(words: list[str]) -> Run:
         sys.exit(0)
     if not words or words[0].startswith("-"):
         _fail("train needs a recipe's name first, or --resume RUN")
-    recipe, out = _parse(_find(words[0]), words[1:])
+    recipe, out = _parse(find_recipe(words[0]), words[1:])
     recipe.check()
     return Run.create(out or _default_folder(recipe), recipe)
 
@@ -147,27 +149,36 @@ def _summary(recipe: Recipe, evaluation: dict[str, Any]) -> str:
 def _parse(recipe: Recipe, words: list[str]) -> tuple[Recipe, Path | None]:
     """Overrides a recipe's fields, its network's included, and reads --out."""
     out = tyro.conf.arg(help="Run folder to make; runs/NAME/seed-SEED-DATE where missing.")
-    settings = make_dataclass(
-        "settings",
+    parsed = _parse_fields(
         [
             ("recipe", Annotated[type(recipe), tyro.conf.arg(name="")], recipe),
             ("out", Annotated[Path | None, out], None),
         ],
+        words,
+        f"train {recipe.name}",
+        type(recipe).__doc__,
     )
+    return parsed.recipe, parsed.out
+
+
+def _parse_fields(
+    fields: list[Any], words: list[str], command: str, description: str | None
+) -> Any:
+    """Reads dataclasses from the command line: fields as `make_dataclass` takes them."""
+    settings = make_dataclass("settings", fields)
     errors = io.StringIO()
     try:
         with redirect_stderr(errors):
-            parsed: Any = tyro.cli(
+            return tyro.cli(
                 tyro.conf.AvoidSubcommands[settings],  # type: ignore[misc, valid-type]
                 args=words,
-                prog=f"{_program()} train {recipe.name}",
-                description=type(recipe).__doc__,
+                prog=f"{_program()} {command}",
+                description=description,
             )
     except SystemExit as stop:
         if stop.code:
             _fail(_unboxed(errors.getvalue()))
         raise
-    return parsed.recipe, parsed.out
 
 
 def _unboxed(message: str) -> str:
@@ -256,7 +267,7 @@ def _tune(words: list[str]) -> None:
     for name in ("trials", "workers", "startup_trials"):
         if getattr(options, name) < 1:
             _fail(f"--{name.replace('_', '-')} must be at least 1, not {getattr(options, name)}")
-    recipe = _find(options.name)
+    recipe = find_recipe(options.name)
     recipe.check()
     settings = Settings(
         recipe,
@@ -312,7 +323,31 @@ def _table(words: list[str]) -> None:
         print(f"written to {options.out}")
 
 
+def _collect(words: list[str]) -> None:
+    from .collect import Collection, collect  # takes a second that others save
+
+    out = tyro.conf.arg(help="Folder of the data, which the same command goes on with.")
+    parsed = _parse_fields(
+        [
+            ("collection", Annotated[Collection, tyro.conf.arg(name="")]),
+            ("out", Annotated[Path, out]),
+        ],
+        words,
+        "data collect",
+        Collection.__doc__,
+    )
+    command = shlex.join([*_program().split(), "data", "collect", *words])
+    try:
+        lines = collect(parsed.collection, parsed.out, command)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on", file=sys.stderr)
+        raise
+    print("\n".join(lines))
+
+
 def _data(words: list[str]) -> None:
+    if words[:1] == ["collect"]:
+        return _collect(words[1:])
     from .data import add_data_commands, run_data_command  # takes a second that others save
 
     parser = _Parser(f"{_program()} data")
@@ -327,14 +362,6 @@ def _add_machine_options(parser: argparse.ArgumentParser) -> None:
 
 def _override(recipe: Recipe, **fields: Any) -> Recipe:
     return replace(recipe, **{key: value for key, value in fields.items() if value is not None})
-
-
-def _find(name: str) -> Recipe:
-    """A recipe by name, or from a JSON file such as a run's recipe.json."""
-    path = Path(name)
-    if path.suffix == ".json":
-        return recipe_from_json(path.read_bytes(), path)
-    return get_recipe(name)
 
 
 def _default_folder(recipe: Recipe) -> Path:

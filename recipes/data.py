@@ -25,9 +25,13 @@ def add_data_commands(parser: argparse.ArgumentParser) -> None:
     Args:
         parser: What reads the words after `data`; its options then go to :func:`run_data_command`.
     """
-    commands = parser.add_subparsers(dest="command", required=True, metavar="info | convert")
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="info | convert | collect"
+    )
     info = commands.add_parser("info", help="what is in a data set")
     convert = commands.add_parser("convert", help="between HDF5 in D4RL's layout and Minari")
+    # Its options are the fields of a dataclass, which recipes/cli.py reads.
+    commands.add_parser("collect", add_help=False, help="make data sets of a task, as D4RL did")
     for command in (info, convert):
         command.add_argument("source", help="HDF5 file, Minari folder, D4RL's or Minari's name")
         command.add_argument("--env", help="Gymnasium task that the data must fit, as Hopper-v5")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 from tensordict import TensorDictBase
@@ -28,4 +29,18 @@ class Watcher(Protocol):
 
         Returns:
             Whether that is enough: the loop then saves a checkpoint and ends.
+        """
+
+
+class RecallingWatcher(Watcher, Protocol):
+    """One that also keeps what it was shown, for algorithms that train on all of it."""
+
+    def recall(self, step: int) -> Iterator[TensorDictBase]:
+        """Gives back what was collected.
+
+        Args:
+            step: environment steps up to which it is wanted.
+
+        Yields:
+            The batches one after the other, each [envs, time].
         """

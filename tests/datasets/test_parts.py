@@ -1,5 +1,6 @@
 """Transitions in parts, and the episodes that come out of them."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import minari
@@ -28,7 +29,7 @@ def split(arrays: Transitions, streams: int, steps: list[int]) -> list[Transitio
     bounds = np.cumsum([0, *steps])
     return [
         {name: array[:, a:b] for name, array in side_by_side.items()}
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+        for a, b in pairwise(bounds)
     ]
 
 
