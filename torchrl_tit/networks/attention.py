@@ -154,19 +154,18 @@ class SelfAttention(nn.Module):
 
         So keys' and values' weights are applied once to each head, not to each of the S tokens.
         """
-        width = x.shape[-1]
-        query = self._project(x[:, position], 0, 1).unflatten(-1, (self.num_heads, -1))
-        weights = self.in_proj_weight[width:].unflatten(0, (2, self.num_heads, -1))
-        key_weight, value_weight = weights.unbind()  # [heads, D / heads, D] each
-        value_bias = self.in_proj_bias[2 * width :].unflatten(0, (self.num_heads, 1, -1))
-        # The heads stand where positions usually do: all read the same tokens.
-        query = query.permute(2, 0, 1, 3).squeeze(2)
+        weights = self.in_proj_weight.unflatten(0, (3, self.num_heads, -1))
+        query_weight, key_weight, value_weight = weights.unbind()  # [heads, D / heads, D] each
+        biases = self.in_proj_bias.unflatten(0, (3, self.num_heads, 1, -1))
+        query_bias, _, value_bias = biases.unbind()  # [heads, 1, D / heads] each
+        one = x[:, position].transpose(0, 1).expand(self.num_heads, -1, -1)  # [heads, N, D]
+        query = torch.baddbmm(query_bias, one, query_weight.mT)  # [heads, N, D / heads]
         scale = query.shape[-1] ** -0.5
-        query = (query @ key_weight).transpose(0, 1)  # [N, heads, D]
+        # The heads stand where positions usually do: all read the same tokens.
+        query = torch.bmm(query, key_weight).transpose(0, 1).unsqueeze(1)  # [N, 1, heads, D]
         tokens = x.unsqueeze(1)
-        mixed = F.scaled_dot_product_attention(query.unsqueeze(1), tokens, tokens, scale=scale)
-        mixed = mixed.squeeze(1).transpose(0, 1)  # [heads, N, D]
-        value = torch.baddbmm(value_bias, mixed, value_weight.mT)  # [heads, N, D / heads]
+        mixed = F.scaled_dot_product_attention(query, tokens, tokens, scale=scale).squeeze(1)
+        value = torch.baddbmm(value_bias, mixed.transpose(0, 1), value_weight.mT)
         return value.transpose(0, 1).flatten(1).unsqueeze(1)
 
     def _split(self, x: Tensor) -> Tensor:
