@@ -89,9 +89,12 @@ class SelfAttention(nn.Module):
             float [N, positions read, D].
         """
         dropping = self.training and self.dropout.p > 0
-        if x.shape[1] == 1 and not dropping:
-            # A softmax over one position is 1: only the value is left.
-            return self.out_proj(self._project(x, 2, 3))
+        if x.shape[1] == 1:  # a softmax over one position is 1: only the value is left
+            value = self._project(x, 2, 3)
+            if dropping:
+                ones = x.new_ones(x.shape[0], 1, self.num_heads, 1)
+                value = (self.dropout(ones) * value.unflatten(-1, (self.num_heads, -1))).flatten(2)
+            return self.out_proj(value)
         positions = read if isinstance(read, slice) else READ_SLICES[read]
         masked = mask is None and self.causal and read != "last"  # the last sees everything
         if read in ("first", "last") and mask is None and not masked and not dropping:
