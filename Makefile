@@ -38,6 +38,7 @@ unit: $(VENV)/installed-test  ## Run the tests and the examples in docstrings (A
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
 
 bench: $(VENV)/installed-bench  ## Measure speed against other libraries
+	$(BIN)/python -m pip install --no-deps -r benchmarks/d3rlpy.txt
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(ARGS)
 
 format: $(VENV)/installed-test  ## Rewrite the code in the project's style

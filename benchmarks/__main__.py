@@ -13,6 +13,7 @@ BENCHMARKS = [
     "acting",
     "training_step",
     "memory",
+    "cql",
     "decision_transformer",
     "history_windows",
     "ppo_cartpole",

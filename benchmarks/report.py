@@ -9,12 +9,14 @@ import os
 import platform
 import statistics
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from torchrl_tit.files import write_text_atomic
 
 _PACKAGES = ["torch", "torchrl", "tensordict", "gymnasium", "stable-baselines3", "transformers"]
+_BESIDE = ["d3rlpy"]
 
 
 def spread(values: Sequence[float], digits: int = 0) -> str:
@@ -36,6 +38,11 @@ def conditions() -> dict[str, Any]:
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
         **{package: importlib.metadata.version(package) for package in _PACKAGES},
+        **{
+            package: importlib.metadata.version(package)
+            for package in _BESIDE
+            if find_spec(package)
+        },
     }
 
 

@@ -12,7 +12,6 @@ from torchrl.objectives import SoftUpdate
 
 from torchrl_tit.objectives.cql import OverCritics
 
-from .compilation import compile_options, should_compile
 from .cql_agent import CQLAgent, parameters_of
 from .cql_recipe import CQLRecipe
 from .cql_update import CQLUpdate
@@ -89,34 +88,36 @@ def train(recipe: CQL, run: Run) -> None:
     torch.manual_seed(recipe.seed)
     buffer = recipe.make_buffer()
     agent = recipe.make_agent()
-    loss = agent.loss
-    adam = partial(torch.optim.Adam, eps=recipe.adam_eps, fused=True)
-    temperature_optimizer = adam([loss.log_alpha], lr=recipe.temperature_learning_rate)
-    critic_optimizer = adam(
-        parameters_of(loss.qvalue_network_params), lr=recipe.critic_learning_rate
-    )
-    actor_optimizer = adam(parameters_of(loss.actor_network_params), lr=recipe.actor_learning_rate)
-    state = TrainingState(
-        {
-            "agent": agent,
-            "temperature_optimizer": temperature_optimizer,
-            "critic_optimizer": critic_optimizer,
-            "actor_optimizer": actor_optimizer,
-            "buffer": buffer,
-        },
-        recipe.evaluation_seed,
-    )
-    compiled = should_compile(recipe.compile, recipe.total_updates)
-    update = CQLUpdate(
-        loss,
-        temperature_optimizer,
-        critic_optimizer,
-        actor_optimizer,
-        SoftUpdate(loss, tau=recipe.tau),
-        compile_options(recipe.cuda_graphs, recipe.torch_device()) if compiled else None,
-    )
+    update, optimizers = make_update(recipe, agent)
+    state = TrainingState({"agent": agent, **optimizers, "buffer": buffer}, recipe.evaluation_seed)
 
     def step(number: int) -> Tensor:
         return update(buffer.sample(), number, state.saved_step)
 
     run_updates(recipe, run, agent, state, CQLUpdate.TERMS, step)
+
+
+def make_update(recipe: CQL, agent: CQLAgent) -> tuple[CQLUpdate, dict[str, torch.optim.Optimizer]]:
+    """Builds the gradient step of an agent.
+
+    Args:
+        recipe: the settings.
+        agent: what is trained.
+
+    Returns:
+        The step, and its optimizers by name.
+    """
+    loss = agent.loss
+    adam = partial(torch.optim.Adam, eps=recipe.adam_eps, fused=True)
+    optimizers: dict[str, torch.optim.Optimizer] = {
+        "temperature_optimizer": adam([loss.log_alpha], lr=recipe.temperature_learning_rate),
+        "critic_optimizer": adam(
+            parameters_of(loss.qvalue_network_params), lr=recipe.critic_learning_rate
+        ),
+        "actor_optimizer": adam(
+            parameters_of(loss.actor_network_params), lr=recipe.actor_learning_rate
+        ),
+    }
+    options = recipe.compile_options()
+    update = CQLUpdate(loss, **optimizers, target=SoftUpdate(loss, tau=recipe.tau), options=options)
+    return update, optimizers

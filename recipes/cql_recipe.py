@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torchrl.data import ReplayBuffer
@@ -12,7 +12,7 @@ from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buff
 from torchrl_tit.datasets.histories import TerminalObservations, TimeLimits, Unfinished
 from torchrl_tit.transforms.history import Padding
 
-from .compilation import Compile, should_compile
+from .compilation import Compile, compile_options, should_compile
 from .cql_agent import QAgent
 from .offline_recipe import OfflineRecipe, is_remote
 from .outcomes import Outcome
@@ -54,7 +54,8 @@ class CQLRecipe(OfflineRecipe[AgentT]):
     """Episodes of every evaluation, side by side."""
     compile: Compile = "auto"
     """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
-    at the start: "auto" is on where it works and the run is long enough to earn that back."""
+    at the start: "auto" is on on a GPU, for runs long enough to earn that back. On a CPU the time
+    goes into the critics' matrix products, which compiling does not make faster."""
     cuda_graphs: Compile = "auto"
     """Whether a GPU launches what is compiled as CUDA graphs; "auto" is on."""
 
@@ -81,6 +82,17 @@ class CQLRecipe(OfflineRecipe[AgentT]):
         """Whether the agent is evaluated after so many gradient steps."""
         return step % self.evaluation_interval == 0 or step == self.total_updates
 
+    def compile_options(self) -> dict[str, Any] | None:
+        """How torch.compile is called; None where it is not.
+
+        Raises:
+            ValueError: if it is asked for where it cannot be.
+        """
+        device = self.torch_device()
+        options = compile_options(self.cuda_graphs, device)
+        pays = self.compile == "on" or device.type == "cuda"
+        return options if pays and should_compile(self.compile, self.total_updates) else None
+
     def play(self, agent: AgentT, step: int) -> list[Outcome]:
         """Plays the evaluation's episodes."""
         returns = agent.play(self.evaluation_episodes, self.evaluation_seed)
@@ -92,7 +104,7 @@ class CQLRecipe(OfflineRecipe[AgentT]):
         Raises:
             ValueError: if they cannot be built as the fields say, or do not fit each other.
         """
-        should_compile(self.compile, self.total_updates)
+        self.compile_options()
         agent = self.make_agent()
         env = agent.make_env(1)
         with torch.no_grad():

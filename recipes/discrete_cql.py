@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from .compilation import compile_and_time, compile_options, should_compile
+from .compilation import compile_and_time
 from .cql_agent import DiscreteCQLAgent, parameters_of
 from .cql_recipe import CQLRecipe
 from .offline_state import TrainingState
@@ -73,8 +73,8 @@ def train(recipe: DiscreteCQL, run: Run) -> None:
         {"agent": agent, "optimizer": optimizer, "buffer": buffer}, recipe.evaluation_seed
     )
     objective = agent.loss.forward
-    if should_compile(recipe.compile, recipe.total_updates):
-        options = compile_options(recipe.cuda_graphs, recipe.torch_device())
+    options = recipe.compile_options()
+    if options is not None:
         objective = compile_and_time(objective, options, "the loss")
 
     def update(step: int) -> Tensor:

@@ -228,7 +228,7 @@ class Counting(EnhancedTIT):
 
 def test_backbones_run_once_a_state_and_all_of_it_trains():
     """The actor's at s and at s'; the critics' at s, at s', and under the actor's action."""
-    calls = {"actor": [], "critic": []}
+    calls: dict[str, list[int]] = {"actor": [], "critic": []}
 
     def backbone(name, key):
         network = Counting((OBSERVATION,), 2, embed_dim=16, ffn_dropout_inner=0.1)

@@ -1,0 +1,212 @@
+"""One update of CQL_TIT: ours against d3rlpy's with the same networks, on the same batches.
+
+The networks are those of the paper's hopper-medium-replay: batch 256, two critics of three layers
+of 256, 30 actions in each state, an Enhanced_TIT of width 128 as actor, K = 1. Both update all of
+it once: temperature, critics, actor, targets. The floor is what the critics' matrix products take
+alone, each as one product in PyTorch.
+
+d3rlpy wants another version of Gymnasium than this project, for environments that are not needed
+here. Install it beside: ``pip install --no-deps -r benchmarks/d3rlpy.txt``.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from d3rlpy.algos import CQLConfig
+from d3rlpy.models.encoders import EncoderFactory, VectorEncoderFactory
+from d3rlpy.torch_utility import TorchMiniBatch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from recipes.cql import CQL, make_update
+from recipes.cql_agent import CQLAgent
+from recipes.registry import RECIPES
+from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig
+
+from .report import publish, spread, table
+
+ROUNDS, STEPS = 10, 3
+OBSERVATION, ACTION = 11, 3
+
+
+@dataclass()
+class TITEncoderFactory(EncoderFactory):
+    """Gives d3rlpy's policy the actor's network."""
+
+    def create(self, observation_shape: Any) -> nn.Module:
+        """Builds the network."""
+        return _Newest(EnhancedTIT((OBSERVATION,), 1, tit_config()))
+
+    @staticmethod
+    def get_type() -> str:
+        """A name that d3rlpy's configuration needs."""
+        return "tit"
+
+
+class _Newest(nn.Module):
+    """A network of K = 1 on observations without a time axis."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.network(x.unsqueeze(-2))
+
+
+def get_recipe() -> CQL:
+    """The paper's recipe."""
+    recipe = RECIPES["cql/hopper-medium-replay-v0/enhanced-tit"]
+    assert isinstance(recipe, CQL)
+    return recipe
+
+
+def tit_config() -> EnhancedTITConfig:
+    """The actor's settings."""
+    config = get_recipe().backbone
+    assert isinstance(config, EnhancedTITConfig)
+    return config
+
+
+def make_batch() -> TensorDictBase:
+    """Random transitions."""
+
+    def states() -> dict[str, Tensor]:
+        observation = torch.randn(256, OBSERVATION)
+        return {"observation": observation, "history": observation.unsqueeze(1)}
+
+    ends = torch.rand(256, 1) < 0.01
+    return TensorDict(
+        {
+            **states(),
+            "action": torch.rand(256, ACTION) * 2 - 1,
+            "next": {
+                **states(),
+                "reward": torch.rand(256, 1),
+                "terminated": ends,
+                "done": ends,
+            },
+        },
+        [256],
+    )
+
+
+def make_ours() -> Callable[[TensorDictBase], Any]:
+    """Our update."""
+    recipe = get_recipe()
+    update, _ = make_update(recipe, CQLAgent(recipe))
+    return lambda batch: update(batch, 0, 0)
+
+
+def make_theirs() -> Callable[[TensorDictBase], Any]:
+    """d3rlpy's, which takes its weight of the conservative term for each critic."""
+    recipe = get_recipe()
+    algorithm = CQLConfig(
+        actor_learning_rate=recipe.actor_learning_rate,
+        critic_learning_rate=recipe.critic_learning_rate,
+        temp_learning_rate=recipe.temperature_learning_rate,
+        alpha_learning_rate=0.0,
+        initial_alpha=1.0,
+        batch_size=recipe.batch_size,
+        conservative_weight=recipe.conservative_weight / 2,
+        n_action_samples=recipe.action_samples,
+        actor_encoder_factory=TITEncoderFactory(),
+        critic_encoder_factory=VectorEncoderFactory(list(recipe.critic_hidden)),
+    ).create(device="cpu:0")
+    algorithm.create_impl((OBSERVATION,), ACTION)
+    assert algorithm.impl is not None
+
+    def update(batch: TensorDictBase) -> Any:
+        step = batch["next"]
+        converted = TorchMiniBatch(
+            observations=batch["observation"],
+            actions=batch["action"],
+            rewards=step["reward"],
+            next_observations=step["observation"],
+            next_actions=batch["action"],  # not read
+            returns_to_go=step["reward"],  # not read
+            terminals=step["terminated"].float(),
+            intervals=torch.ones(len(batch), 1),
+            device="cpu:0",
+        )
+        return algorithm.impl.update(converted, 0)
+
+    return update
+
+
+def make_floor() -> Callable[[TensorDictBase], Any]:
+    """The critics' matrix products: 31 actions in each state, the target, and the actor's loss."""
+    recipe = get_recipe()
+    widths = [OBSERVATION + ACTION, *recipe.critic_hidden, 1]
+    layers = [
+        (torch.randn(a, b), torch.randn(256 * (3 * recipe.action_samples + 1), max(a, b)))
+        for a, b in pairwise(widths)
+    ]
+
+    def products(batch: TensorDictBase) -> None:
+        with torch.no_grad():
+            for _ in range(2):  # critics
+                for index, (weight, rows) in enumerate(layers):
+                    a, b = weight.shape
+                    x, y = rows[:, :a].contiguous(), rows[:, :b].contiguous()
+                    x @ weight
+                    x.T @ y
+                    if index:  # nothing asks for the gradient of states and actions
+                        y @ weight.T
+                    x[:256] @ weight  # target
+                    x[:256] @ weight  # the actor's loss, and back to its action
+                    y[:256] @ weight.T
+
+    return products
+
+
+def main(out: Path | None) -> None:
+    """Measures on one thread, alternating, and reports."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    updates = {"d3rlpy": make_theirs(), "ours": make_ours(), "floor": make_floor()}
+    batches = [make_batch() for _ in range(STEPS)]
+    times: dict[str, list[float]] = {name: [] for name in updates}
+    for update in updates.values():
+        update(batches[0])
+    for _ in range(ROUNDS):
+        for name, update in updates.items():
+            start = time.process_time()  # what runs beside on the machine does not count
+            for batch in batches:
+                update(batch)
+            times[name].append((time.process_time() - start) / STEPS)
+    whole = [a / b for a, b in zip(times["d3rlpy"], times["ours"], strict=True)]
+    rest = [
+        (theirs - floor) / (ours - floor)
+        for theirs, ours, floor in zip(times["d3rlpy"], times["ours"], times["floor"], strict=True)
+    ]
+    labels = {
+        "d3rlpy": "d3rlpy",
+        "ours": "this library",
+        "floor": "the critics' matrix products alone",
+    }
+    rows = [[label, spread([1000 * t for t in times[name]])] for name, label in labels.items()]
+    markdown = (
+        "# Conservative Q-learning\n\n"
+        "One update of CQL_TIT with the networks of the paper's hopper-medium-replay, batch 256, "
+        "one thread,\nprocessor time; not compiled, which takes longer on a CPU. "
+        f"{ROUNDS} rounds of {STEPS} updates each, alternating: median (range).\n\n"
+        + table(["", "ms an update"], rows)
+        + f"\nTimes as fast as d3rlpy, round by round: {spread(whole, 2)}; everything but the "
+        f"critics' matrix\nproducts: {spread(rest, 2)}.\n"
+    )
+    numbers = {
+        "seconds": times,
+        "ratios": whole,
+        "median_ratio": statistics.median(whole),
+        "ratios_beside_the_floor": rest,
+    }
+    publish("cql", markdown, numbers, out)
