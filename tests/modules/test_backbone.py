@@ -5,6 +5,7 @@ from contextlib import nullcontext
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import set_skip_existing
 from torchrl.data import Categorical
 from torchrl.objectives import ClipPPOLoss
 
@@ -31,6 +32,30 @@ def test_nested_keys():
     )
     td = backbone(TensorDict({"agent": {"history": torch.randn(5, 2, 4)}}, [5]))
     assert td["agent", "features"].shape == (5, 64)
+
+
+@pytest.mark.parametrize("acts", [False, True])
+@torch.no_grad()
+def test_is_called_as_any_tensordict_module(acts):
+    network = EnhancedTIT((4,), history=2)
+    backbone = Backbone(network)
+    history = torch.randn(5, 2, 4)
+    expected = network(history)
+    with backbone.acting() if acts else nullcontext():
+        td = TensorDict({"history": history}, [5])
+        assert backbone(td) is td
+        torch.testing.assert_close(td["features"], expected)
+        other = TensorDict({}, [5])
+        assert backbone(td, tensordict_out=other) is other
+        torch.testing.assert_close(other["features"], expected)
+        torch.testing.assert_close(backbone(history), expected)
+        td["features"] = torch.zeros(5)
+        with set_skip_existing(True):
+            assert not backbone(td)["features"].any()
+        assert backbone(td)["features"].any()
+        locked = TensorDict({"history": history, "features": torch.zeros(5, 64)}, [5]).lock_()
+        with pytest.raises(RuntimeError, match="lock"):
+            backbone(locked)
 
 
 def test_two_trunks_write_two_keys():

@@ -47,6 +47,11 @@ def set_data(network):
     token.data = token.data + 1
 
 
+def transpose_in_place(network):
+    weight = network.frame_encoder.blocks[0].attention.out_proj.weight
+    weight.data = weight.data.t()  # the same memory, read in another order
+
+
 def copy_into(network):
     with torch.no_grad():
         network.frame_encoder.class_token.copy_(torch.ones(16))
@@ -107,6 +112,7 @@ CHANGES = {
     ".data": write_into_data,
     ".data, one bit": write_one_bit_into_data,
     ".data =": set_data,
+    ".data = .data.t()": transpose_in_place,
     "NumPy": write_into_a_numpy_view,
     "copy_": copy_into,
     "load_state_dict": load_state_dict,
@@ -187,6 +193,40 @@ def test_buffers_are_weights_too():
 
     network.frame_encoder = Normed(network.frame_encoder)
     assert_noticed(write_into_buffer, network, backbone, shape)
+
+
+@pytest.mark.parametrize("part", ["history_encoder", "head"])
+def test_what_follows_the_frame_encoder_is_not_kept(part):
+    backbone, network, shape = make()
+    frames = CountedFrames(network)
+    stream = torch.randn(5, 8, *shape)
+    optimizer = torch.optim.Adam(network.get_submodule(part).parameters(), lr=0.1, fused=True)
+    with backbone.acting():
+        for start in range(4):
+            frames.take()
+            acted = features_without_gradient(backbone, stream[:, start : start + 4])
+            assert frames.take() == (5 if start else 20)
+            full = network(stream[:, start : start + 4])
+            torch.testing.assert_close(acted, full, rtol=0, atol=1e-5)
+            full.square().sum().backward()
+            optimizer.step()
+
+
+@torch.no_grad()
+def test_weights_in_bfloat16():
+    backbone, network, shape = make()
+    network.bfloat16()
+    frames = CountedFrames(network)
+    stream = torch.randn(5, 8, *shape, dtype=torch.bfloat16)
+    with backbone.acting():
+        for start in range(4):
+            if start == 2:
+                network.frame_encoder.class_token += 0.1
+            frames.take()
+            acted = features(backbone, stream[:, start : start + 4])
+            assert frames.take() == (20 if start in (0, 2) else 5)
+            full = network(stream[:, start : start + 4])
+            torch.testing.assert_close(acted, full, rtol=0, atol=0.1)
 
 
 @torch.no_grad()

@@ -15,6 +15,7 @@ from torch.nn.modules.dropout import _DropoutNd
 
 from torchrl_tit.modules.frames import all_same, as_words, same_frames
 from torchrl_tit.modules.shelf import Shelf
+from torchrl_tit.modules.weights import WeightCopies, modules_within, weights_within
 
 Encode = Callable[[Tensor], Tensor]
 
@@ -23,9 +24,7 @@ Encode = Callable[[Tensor], Tensor]
 class _Kept:
     """What is kept of a window, and what must not have changed for it to be of use."""
 
-    modules: list[nn.Module]  # all that the encoder is made of
-    slots: list[tuple[nn.Module, str]]  # where its weights stand
-    weights: list[Tensor]  # copies of those that made the tokens
+    weights: WeightCopies  # of the encoder that made the tokens
     circumstances: tuple[object, ...]
     words: Shelf  # of the last K - 1 frames, int [N, K - 1, words]
     tokens: Shelf  # of the same, float [N, K - 1, *token_shape]
@@ -45,9 +44,7 @@ class FrameCache:
       compared, not numbers: the same bytes give the same tokens whatever they mean, NaN and
       negative zeros too.
     - All weights and buffers of the encoder are compared with copies of those that made the tokens,
-      at each call. Nothing less sees every change: fused and compiled optimizers, writes through
-      ``.data`` or into shared memory do not count as versions of a parameter, and losses put other
-      tensors in its place.
+      at each call.
 
     All else is encoded, a frame that repeats within its window once: so the first window of an
     episode, which starts with copies of one observation or of zeros, costs a frame or two.
@@ -97,10 +94,8 @@ class FrameCache:
             float [..., K, *token_shape].
         """
         kept = self._kept
-        modules = _modules(self._encoder)
-        slots = kept.slots if kept and kept.modules == modules else _slots(modules)
-        weights = _weights(slots)
-        if _must_bypass(window, modules, weights):
+        modules = modules_within(self._encoder)
+        if _must_bypass(window, modules):
             return self._encoder(window)
         device = window.device.type
         circumstances = (
@@ -111,7 +106,7 @@ class FrameCache:
             torch.is_inference_mode_enabled(),
             torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device),
         )
-        if kept and not (circumstances == kept.circumstances and _same(weights, kept.weights)):
+        if kept and not (circumstances == kept.circumstances and kept.weights.hold(modules)):
             kept = None
 
         leading = window.shape[: window.ndim - self._observation_ndim - 1]
@@ -126,12 +121,10 @@ class FrameCache:
             return tokens.reshape(*leading, *tokens.shape[1:])
 
         # Copied before the encoder runs: if another process writes meanwhile, it is noticed next.
-        weights = kept.weights if kept else [weight.detach().clone() for weight in weights]
+        weights = kept.weights if kept else WeightCopies(modules)
         newest = self._encode_newest(frames[:, -1]).unsqueeze(1)
         tokens = self._encode_unknown(frames, words, newest, kept)
-        self._kept = _Kept(
-            modules, slots, weights, circumstances, Shelf(words[:, 1:]), Shelf(tokens[:, 1:])
-        )
+        self._kept = _Kept(weights, circumstances, Shelf(words[:, 1:]), Shelf(tokens[:, 1:]))
         return tokens.reshape(*leading, *tokens.shape[1:])
 
     def _encode_unknown(
@@ -164,14 +157,17 @@ class FrameCache:
         self.__init__(**state)  # type: ignore[misc]
 
 
-def _must_bypass(window: Tensor, modules: Sequence[nn.Module], weights: Sequence[Tensor]) -> bool:
+def _must_bypass(window: Tensor, modules: Sequence[nn.Module]) -> bool:
     """Whether kept tokens would lack gradients, randomness, or values to compare."""
     return (
         torch.compiler.is_compiling()
         or torch.jit.is_tracing()
         or type(window) is not Tensor  # a stand-in for one, while something is traced
         or window.is_meta
-        or (torch.is_grad_enabled() and any(x.requires_grad for x in (window, *weights)))
+        or (
+            torch.is_grad_enabled()
+            and any(x.requires_grad for x in (window, *weights_within(modules)))
+        )
         or forward_ad._current_level >= 0
         or torch._C._functorch.peek_interpreter_stack() is not None  # vmap, jvp, ...
         or any(map(_depends_on_mode, modules))
@@ -184,39 +180,3 @@ def _depends_on_mode(module: nn.Module) -> bool:
     if not module.training:
         return False
     return isinstance(module, _BatchNorm) or (isinstance(module, _DropoutNd) and module.p > 0)
-
-
-def _modules(module: nn.Module) -> list[nn.Module]:
-    """All modules within one: what ``modules()`` gives, at a quarter of the time."""
-    modules = [module]
-    for child in module._modules.values():
-        if child is not None:
-            modules += _modules(child)
-    return modules
-
-
-def _slots(modules: Sequence[nn.Module]) -> list[tuple[nn.Module, str]]:
-    """Where parameters and buffers stand; plain tensors too, which losses put in their places."""
-    return [
-        (module, name)
-        for module in modules
-        for name in (
-            *module._parameters,
-            *module._buffers,
-            *(name for name, value in vars(module).items() if isinstance(value, Tensor)),
-        )
-    ]
-
-
-def _weights(slots: Sequence[tuple[nn.Module, str]]) -> list[Tensor]:
-    """What stands there now."""
-    values = (getattr(module, name, None) for module, name in slots)
-    return [value for value in values if isinstance(value, Tensor)]
-
-
-def _same(weights: Sequence[Tensor], others: Sequence[Tensor]) -> bool:
-    """Whether tensors have the same types and values."""
-    return len(weights) == len(others) and all(
-        a.dtype == b.dtype and a.device == b.device and torch.equal(a, b)
-        for a, b in zip(weights, others, strict=True)
-    )
