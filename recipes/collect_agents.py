@@ -132,7 +132,7 @@ class FinishedRun:
 
     def __init__(self, settings: Collection) -> None:
         self._folder = Path(settings.agent)
-        self._episodes = settings.evaluation_episodes
+        self._settings = settings
         run = Run.open(self._folder)
         self.recipe = replace(_check(run.recipe, settings.env), threads=settings.threads)
         self._step, self._agent = self.recipe.load_agent(run)
@@ -150,8 +150,9 @@ class FinishedRun:
         returns = evaluate(
             lambda num_envs: self.make_env(num_envs, EVALUATION_SEED),
             self._agent.policy,
-            self._episodes,
+            self._settings.evaluation_episodes,
             seed=EVALUATION_SEED,
+            deterministic=self._settings.deterministic,
         )
         score = Score(self._step, returns.mean().item(), returns.std(correction=0).item())
         if mark is not None and score.mean < mark:

@@ -66,6 +66,7 @@ class SetMaker:
                 marks=[mark for mark in marks if mark is not None],
                 evaluation_interval=settings.evaluation_interval,
                 evaluation_episodes=settings.evaluation_episodes,
+                deterministic=settings.deterministic,
             )
 
     def make(self, kind: Kind) -> str:

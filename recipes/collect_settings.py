@@ -48,7 +48,8 @@ class Collection:
     evaluation_episodes: int = 10
     """Episodes in each."""
     deterministic: bool = False
-    """Whether medium and expert take their most likely actions, instead of drawn ones."""
+    """Whether medium and expert take their most likely actions, in the data and in the evaluations,
+    instead of drawn ones."""
     num_envs: int = 8
     """Environments side by side that medium, expert and random sets are played in."""
     checkpoint_interval: int = 10_000

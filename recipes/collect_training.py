@@ -51,7 +51,7 @@ class Score:
     step: int
     """Environment steps that it was trained for."""
     mean: float
-    """Mean return of evaluation episodes, with the most likely actions."""
+    """Mean return of evaluation episodes, with such actions as the data are to have."""
     std: float
     """Standard deviation of their returns (population)."""
 
@@ -74,6 +74,7 @@ class Training:
         marks: mean returns at which the agent is kept, beside that of the end.
         evaluation_interval: environment steps between evaluations.
         evaluation_episodes: episodes in each.
+        deterministic: whether the most likely actions are taken in them.
     """
 
     def __init__(
@@ -85,6 +86,7 @@ class Training:
         marks: list[float],
         evaluation_interval: int,
         evaluation_episodes: int,
+        deterministic: bool,
     ) -> None:
         self._learner = learner
         self.parts = TransitionParts(folder / "seen")
@@ -93,6 +95,7 @@ class Training:
         self._marks = marks
         self._interval = evaluation_interval
         self._episodes = evaluation_episodes
+        self._deterministic = deterministic
         self._step = 0
         self._scores: list[Score] = []
         self._load()
@@ -155,6 +158,7 @@ class Training:
             policy,
             self._episodes,
             seed=EVALUATION_SEED,
+            deterministic=self._deterministic,
         )
         score = Score(step, returns.mean().item(), returns.std(correction=0).item())
         self._scores.append(score)

@@ -51,6 +51,25 @@ def test_the_number_of_environments_does_not_matter(num_envs):
     assert torch.equal(evaluate(env, lean, episodes=9, seed=7), expected)
 
 
+def test_actions_can_be_drawn():
+    head = ProbabilisticTensorDictModule(
+        ["logits"], ["action"], distribution_class=torch.distributions.Categorical
+    )
+    logits = Module(
+        lambda x: torch.tensor([0.0, 2.0]).expand(*x.shape[:-1], 2), ["observation"], ["logits"]
+    )
+    policy = ProbabilisticTensorDictSequential(logits, head)
+
+    def returns(**settings):
+        return evaluate(lambda n: make_env("CartPole-v1", n), policy, 30, **settings)
+
+    drawn = returns(deterministic=False)
+    assert torch.equal(drawn, returns(deterministic=False))  # from the seed
+    assert not torch.equal(drawn, returns(deterministic=False, seed=1))
+    # Now and then the other side holds the pole up for longer than always the same one.
+    assert drawn.mean() > returns().mean() + 1
+
+
 @pytest.mark.parametrize("num_envs", [1, 4, 9])
 def test_shrinking_asks_only_about_what_still_counts(num_envs):
     expected = played_by_hand("CartPole-v1", lambda x: int(x[2] > 0), seed=7, episodes=9)

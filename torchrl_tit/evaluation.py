@@ -22,8 +22,9 @@ def evaluate(
     seed: int = 0,
     reward_key: NestedKey = "reward",
     shrink: bool = False,
+    deterministic: bool = True,
 ) -> Tensor:
-    """Plays whole episodes with a deterministic policy.
+    """Plays whole episodes with a policy that learns nothing from them.
 
     Episode i starts from the seed ``seed + i``, in an environment of its own, so the same policy
     gets the same returns whatever the number of environments. As many episodes as there are
@@ -39,14 +40,15 @@ def evaluate(
             task's own rewards, not clipped ones. Its episodes are cut off by a reset. Or a function
             that makes one from the number of environments; it is called with ``episodes``, and what
             it made is closed at the end.
-        policy: Writes the action into the tensordict it is given. It acts in evaluation mode and
-            takes the distribution's deterministic action (argmax, or the mean).
+        policy: Writes the action into the tensordict it is given. It acts in evaluation mode.
         episodes: Number of episodes.
         seed: Seed of the first episode.
         reward_key: Where the reward stands in "next".
         shrink: Whether the policy is asked only about the environments whose episode still counts,
             which saves time where episodes differ in length. It must take batches of any size, and
             keep no state of its own from step to step.
+        deterministic: Whether the distribution's deterministic action is taken (argmax, or the
+            mean), instead of one that is drawn.
 
     Returns:
         The undiscounted return of each episode; float64 [episodes], on the environment's device.
@@ -67,7 +69,7 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, but is {episodes}.")
-    with _acting(policy, seed):
+    with _acting(policy, seed, deterministic):
         if isinstance(env, EnvBase):
             return _play_all(env, policy, episodes, seed, reward_key, shrink)
         made = env(episodes)
@@ -154,8 +156,11 @@ def finished_returns(batch: TensorDictBase) -> Tensor:
 
 
 @contextmanager
-def _acting(policy: Callable[[TensorDictBase], TensorDictBase], seed: int) -> Iterator[None]:
-    """Deterministic actions without gradients, and everything as it was before at the end."""
+def _acting(
+    policy: Callable[[TensorDictBase], TensorDictBase], seed: int, deterministic: bool
+) -> Iterator[None]:
+    """Actions without gradients, and everything as it was before at the end."""
+    exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     modules = list(policy.modules()) if isinstance(policy, nn.Module) else []
     modes = [module.training for module in modules]
     python_state, numpy_state = random.getstate(), np.random.get_state()
@@ -164,10 +169,10 @@ def _acting(policy: Callable[[TensorDictBase], TensorDictBase], seed: int) -> It
         with (
             torch.random.fork_rng(devices),
             torch.no_grad(),
-            set_exploration_type(ExplorationType.DETERMINISTIC),
+            set_exploration_type(exploration),
             acting(policy),  # encodes the newest frames only
         ):
-            # A policy that draws numbers all the same draws the same ones each time.
+            # A policy that draws numbers draws the same ones each time.
             torch.manual_seed(seed)
             if isinstance(policy, nn.Module):
                 policy.eval()
