@@ -6,6 +6,7 @@ from pathlib import Path
 
 import filelock
 import torch
+from gymnasium.spaces import Box, Discrete
 
 from torchrl_tit.datasets import task_spaces
 
@@ -50,6 +51,11 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
     """
     torch.set_num_threads(settings.threads)
     task = task_spaces(settings.env)
+    if not (isinstance(task.observation, Box) and isinstance(task.action, Box | Discrete)):
+        raise ValueError(
+            f"{settings.env} has observations {task.observation} and actions {task.action}, but "
+            "data can be collected of one array (Box) and of an array or one choice (Discrete)"
+        )
     agent = find_agent(settings)
     folder.mkdir(parents=True, exist_ok=True)
     try:

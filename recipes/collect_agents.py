@@ -10,12 +10,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs import make_env
-from torchrl_tit.evaluation import evaluate
 from torchrl_tit.files import write_text_atomic
 
 from . import ppo, sac
 from .collect_settings import Collection
-from .collect_training import EVALUATION_SEED, Score
+from .collect_training import Score, score_policy
 from .ppo_agent import Agent
 from .recipe import Recipe, recipe_to_json
 from .registry import find_recipe
@@ -147,14 +146,13 @@ class FinishedRun:
         Raises:
             ValueError: if it is below the mark.
         """
-        returns = evaluate(
-            lambda num_envs: self.make_env(num_envs, EVALUATION_SEED),
+        score = score_policy(
             self._agent.policy,
+            self._step,
+            self.make_env,
             self._settings.evaluation_episodes,
-            seed=EVALUATION_SEED,
             deterministic=self._settings.deterministic,
         )
-        score = Score(self._step, returns.mean().item(), returns.std(correction=0).item())
         if mark is not None and score.mean < mark:
             raise ValueError(
                 f"{name} {mark:g} is not reached by the run in {self._folder}: its agent has a "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -23,7 +23,7 @@ from .collect_rollout import as_fields
 from .watcher import RecallingWatcher
 
 # Far from the seeds of training and of what is rolled out.
-EVALUATION_SEED = 1_000_000
+_EVALUATION_SEED = 1_000_000
 
 
 class Learner(Protocol):
@@ -54,6 +54,33 @@ class Score:
     """Mean return of evaluation episodes, with such actions as the data are to have."""
     std: float
     """Standard deviation of their returns (population)."""
+
+
+def score_policy(
+    policy: TensorDictModuleBase,
+    step: int,
+    make_env: Callable[[int, int], EnvBase],
+    episodes: int,
+    *,
+    deterministic: bool,
+) -> Score:
+    """Evaluates a policy.
+
+    Args:
+        policy: the policy.
+        step: environment steps that it was trained for.
+        make_env: makes environments from their number and the seed of the first.
+        episodes: how many it plays.
+        deterministic: whether it takes its most likely actions instead of drawn ones.
+    """
+    returns = evaluate(
+        lambda num_envs: make_env(num_envs, _EVALUATION_SEED),
+        policy,
+        episodes,
+        seed=_EVALUATION_SEED,
+        deterministic=deterministic,
+    )
+    return Score(step, returns.mean().item(), returns.std(correction=0).item())
 
 
 class Training:
@@ -124,6 +151,11 @@ class Training:
         """
         while (score := self._first(mark)) is None:
             if self._step >= self._learner.final_step:
+                if mark is None or not self._scores:
+                    raise ValueError(
+                        f"{self._folder / 'evaluations.json'} has lost the evaluations: delete "
+                        f"{self._folder} to train anew"
+                    )
                 best = max(score.mean for score in self._scores)
                 raise ValueError(
                     f"{name} {mark:g} was never reached in {self._step} steps: the best of "
@@ -153,14 +185,9 @@ class Training:
         ends = step >= self._learner.final_step
         if not ends and (not self._marks or step // self._interval == before // self._interval):
             return False
-        returns = evaluate(
-            lambda num_envs: self._learner.make_env(num_envs, EVALUATION_SEED),
-            policy,
-            self._episodes,
-            seed=EVALUATION_SEED,
-            deterministic=self._deterministic,
+        score = score_policy(
+            policy, step, self.make_env, self._episodes, deterministic=self._deterministic
         )
-        score = Score(step, returns.mean().item(), returns.std(correction=0).item())
         self._scores.append(score)
         scores = json.dumps([asdict(score) for score in self._scores], indent=2) + "\n"
         write_text_atomic(self._folder / "evaluations.json", scores)
