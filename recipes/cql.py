@@ -29,6 +29,7 @@ class CQL(CQLRecipe[CQLAgent]):
     """
 
     algorithm: ClassVar[str] = "cql"
+    continuous: ClassVar[bool] = True
 
     actor_learning_rate: float = 1e-4
     """Learning rate of Adam for the actor."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import torch
+from tensordict import TensorDict
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -12,17 +14,16 @@ from tensordict.nn import (
     TensorDictSequential,
 )
 from torch import Tensor, nn
-from torchrl.data import Categorical
+from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, QValueModule, ValueOperator
-from torchrl.objectives import DiscreteCQLLoss
 from torchrl.objectives.common import LossModule
 
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.modules import Backbone, acting, make_squashed_actor
+from torchrl_tit.modules import Backbone, ManyActions, acting, make_squashed_actor
 from torchrl_tit.networks import TwoTrunkNetwork
-from torchrl_tit.objectives import ContinuousCQLLoss
+from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
 
 from .networks import make_network
 
@@ -73,13 +74,19 @@ class QAgent:
         with acting(self.policy):
             return evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=True)
 
+    def networks(self) -> list[nn.Module]:
+        """Everything that may hold dropout; the loss does not list its networks as modules."""
+        return [self.policy]
+
     def train(self) -> None:
         """Switches dropout on."""
-        self.loss.train()
+        for network in self.networks():
+            network.train()
 
     def eval(self) -> None:
         """Switches dropout off."""
-        self.loss.eval()
+        for network in self.networks():
+            network.eval()
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the weights of all networks, and the temperature."""
@@ -97,19 +104,26 @@ class CQLAgent(QAgent):
         recipe: the settings.
 
     Raises:
-        ValueError: if the task's actions are not continuous and bounded.
+        ValueError: if the task's actions are not continuous and bounded, or the critics cannot read
+            its observations.
     """
 
     loss: ContinuousCQLLoss
 
     def __init__(self, recipe: CQL) -> None:
         super().__init__(recipe)
+        if not isinstance(self.action_spec, Bounded) or self.action_spec.ndim != 1:
+            raise ValueError(
+                f"cql needs continuous actions within bounds, but those of {recipe.env} are "
+                f"{_describe(self.action_spec)}: use a discrete-cql recipe where they are discrete"
+            )
         backbone, features_dim = self.make_backbone("features")
         head = make_squashed_actor(features_dim, self.action_spec)
         self.policy = ProbabilisticTensorDictSequential(backbone, *head).to(self.device)
+        critics = [self._make_critic(recipe.critic, recipe.critic_hidden) for _ in range(2)]
         self.loss = ContinuousCQLLoss(
             self.policy,
-            self._make_critic(recipe.critic, recipe.critic_hidden).to(self.device),
+            critics[0].to(self.device),
             action_spec=self.action_spec.to(self.device),
             min_q_weight=recipe.conservative_weight,
             num_random=recipe.action_samples,
@@ -119,6 +133,16 @@ class CQLAgent(QAgent):
             deactivate_vmap=self.device.type == "cpu",
         )
         self.loss.make_value_estimator(gamma=recipe.gamma)
+        # The loss has drawn the weights of both anew, each entry uniformly between the smallest and
+        # the largest of its tensor. Targets are made copies where they are first moved.
+        with torch.no_grad():
+            for index, critic in enumerate(critics):
+                built = TensorDict.from_module(ManyActions(critic)).data
+                self.loss.qvalue_network_params.data[index].update_(built)
+
+    def networks(self) -> list[nn.Module]:
+        """Actor and critics."""
+        return [self.policy, self.loss.qvalue_network]
 
     def _make_critic(self, kind: str, hidden: Sequence[int]) -> TensorDictModuleBase:
         """Q(s, a): an MLP on observation and action, or on a backbone's features and action."""
@@ -149,14 +173,14 @@ class DiscreteCQLAgent(QAgent):
         ValueError: if the task's actions are not discrete.
     """
 
-    loss: DiscreteCQLLoss
+    loss: DelayedDiscreteCQLLoss
 
     def __init__(self, recipe: DiscreteCQL) -> None:
         super().__init__(recipe)
         if not isinstance(self.action_spec, Categorical):
             raise ValueError(
-                f"{recipe.env} has continuous actions, but discrete-cql has a value for each of a "
-                "few: use a cql recipe"
+                f"discrete-cql needs a few discrete actions, but those of {recipe.env} are "
+                f"{_describe(self.action_spec)}: use a cql recipe where they are continuous"
             )
         backbone, features_dim = self.make_backbone("features")
         actions = self.action_spec.space.n
@@ -164,8 +188,13 @@ class DiscreteCQLAgent(QAgent):
         self.policy = TensorDictSequential(backbone, head, QValueModule(spec=self.action_spec)).to(
             self.device
         )
-        self.loss = DiscreteCQLLoss(self.policy, action_space="categorical")
+        self.loss = DelayedDiscreteCQLLoss(self.policy, action_space="categorical")
         self.loss.make_value_estimator(gamma=recipe.gamma)
+
+
+def _describe(spec: TensorSpec) -> str:
+    kind = "continuous" if spec.dtype.is_floating_point else "discrete"
+    return f"{kind} ({type(spec).__name__}, shape {list(spec.shape)})"
 
 
 def parameters_of(params: Any) -> list[nn.Parameter]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torchrl.data import ReplayBuffer
@@ -24,6 +24,9 @@ AgentT = TypeVar("AgentT", bound=QAgent)
 @dataclass(frozen=True, kw_only=True)
 class CQLRecipe(OfflineRecipe[AgentT]):
     """Settings of every recipe that learns Q values from a data set."""
+
+    continuous: ClassVar[bool]
+    """Whether actions are continuous."""
 
     history: int = 1
     """Number K of observations that the backbone sees."""
@@ -119,10 +122,17 @@ class CQLRecipe(OfflineRecipe[AgentT]):
         Raises:
             FileNotFoundError: if there are no such data.
             DatasetError: if they cannot be used, or are not of the task.
+            ValueError: if their actions are of the other kind.
         """
-        episodes = load_episodes(self.dataset, task=self.env).to(self.torch_device())
+        episodes = load_episodes(self.dataset, task=self.env)
+        if episodes.rows["action"].is_floating_point() != self.continuous:
+            found, expected = ("integers", "floats") if self.continuous else ("floats", "integers")
+            raise ValueError(
+                f"the actions in {self.dataset} are {found}, but those of {self.env} are "
+                f"{expected}: take other data"
+            )
         storage = HistoryStorage(
-            episodes,
+            episodes.to(self.torch_device()),
             self.history,
             padding=self.padding,
             time_limits=self.time_limits,

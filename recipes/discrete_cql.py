@@ -29,6 +29,7 @@ class DiscreteCQL(CQLRecipe[DiscreteCQLAgent]):
     """
 
     algorithm: ClassVar[str] = "discrete-cql"
+    continuous: ClassVar[bool] = False
 
     conservative_weight: float = 1.0
     """Weight of the conservative term."""

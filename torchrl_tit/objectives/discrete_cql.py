@@ -1,0 +1,72 @@
+"""Conservative Q-learning with discrete actions, aimed at what the target network says."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import DiscreteCQLLoss
+
+
+class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
+    """TorchRL's `DiscreteCQLLoss` with a target network that counts.
+
+    Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning", arXiv 2006.04779,
+    equation 4 (CQL(H)) over the values of all actions::
+
+        loss_qvalue  mean over s of (Q(s, a) - r - gamma max_b Q'(s', b))^2 / 2
+        loss_cql     mean over s of [logsumexp_b Q(s, b) - Q(s, a)]
+
+    `DiscreteCQLLoss` of TorchRL 0.14 keeps target parameters Q', but takes Q itself at s'. Beside
+    what it writes into the batch, the value at s' is written there.
+
+    Args:
+        value_network: Writes "action_value", float [..., n], and "chosen_action_value", float
+            [..., 1].
+        **settings: Of `DiscreteCQLLoss`: ``action_space``, ``loss_function``, ``reduction``.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch import nn
+        >>> from torchrl.modules import QValueActor
+        >>> actor = QValueActor(nn.Linear(4, 2), action_space="categorical")
+        >>> loss = DelayedDiscreteCQLLoss(actor, action_space="categorical")
+        >>> loss.make_value_estimator(gamma=0.99)
+        >>> batch = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(8, 4),
+        ...         "action": torch.randint(2, (8,)),
+        ...         "next": {
+        ...             "observation": torch.randn(8, 4),
+        ...             "reward": torch.ones(8, 1),
+        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
+        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     [8],
+        ... )
+        >>> losses = loss(batch)
+        >>> (losses["loss_qvalue"] + losses["loss_cql"]).backward()
+    """
+
+    def __init__(self, value_network: Any, **settings: Any) -> None:
+        super().__init__(value_network, delay_value=True, **settings)
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
+        """Chooses how targets are computed; see TorchRL's `LossModule.make_value_estimator`."""
+        super().make_value_estimator(value_type, **hyperparams)
+        self.value_estimator.value_network = None  # it would be asked with the trained weights
+
+    def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The squared error of a batch [B], float [], and means to look at."""
+        following = tensordict["next"].select(*self.value_network.in_keys)
+        params = self._cached_detached_target_value_params
+        with (
+            torch.no_grad(),
+            params.to_module(self.value_network, preserve_module_state=False),
+        ):
+            value = self.value_network(following).get(self.tensor_keys.value)
+        tensordict.set(("next", self.tensor_keys.value), value)
+        return super().value_loss(tensordict)
