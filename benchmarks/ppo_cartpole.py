@@ -30,9 +30,11 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
-from recipes import ppo
+from recipes import ppo_training
 from recipes.compilation import Compile
 from recipes.metrics import Metrics, read_metrics
+from recipes.ppo import PPO
+from recipes.ppo_agent import Agent
 from recipes.registry import get_recipe
 from recipes.run import Run
 from torchrl_tit.envs import GymVectorEnv
@@ -122,7 +124,7 @@ def run_sb3(seed: int) -> Outcome:
 def run_ours(seed: int, compile: Compile, timers: Timers | None = None) -> Outcome:
     """The recipe as the command line runs it, with its checkpoints and metrics."""
     named = get_recipe("ppo/cartpole/enhanced-tit")
-    assert isinstance(named, ppo.PPO)
+    assert isinstance(named, PPO)
     recipe = replace(
         named,
         num_envs=ENVS,
@@ -148,7 +150,7 @@ def run_ours(seed: int, compile: Compile, timers: Timers | None = None) -> Outco
         start, _ = lap()
         recipe.train(run)
         last = read_metrics(run.folder / "metrics.csv")[-1]
-    agent = ppo.Agent(recipe, recipe.make_env(1, seed))
+    agent = Agent(recipe, recipe.make_env(1, seed))
     parameters = sum(parameter.numel() for parameter in agent.parameters())
     return Outcome(laps, laps[0][0] - start, last["return_mean"], parameters)
 
@@ -175,11 +177,11 @@ class Timers:
 def profile(compile: Compile) -> dict[str, float]:
     """Where our time goes: the share of each part, without the first batch."""
     timers = Timers()
-    make_objective = ppo.make_objective
+    make_objective = ppo_training.make_objective
     parts: list[tuple[Any, str, str]] = [
         (Collector, "rollout", "collect"),
         (GymVectorEnv, "step_and_maybe_reset", "collect: environments"),
-        (ppo, "add_advantages", "advantages"),
+        (ppo_training, "add_advantages", "advantages"),
         (Tensor, "backward", "update: backward"),
         (nn.utils, "clip_grad_norm_", "update: gradient norm"),
         (torch.optim.Adam, "step", "update: optimizer"),
@@ -192,7 +194,7 @@ def profile(compile: Compile) -> dict[str, float]:
             stack.enter_context(patch.object(owner, name, function))
         stack.enter_context(
             patch.object(
-                ppo,
+                ppo_training,
                 "make_objective",
                 lambda *args, **kw: timers.around(make_objective(*args, **kw), "update: forward"),
             )

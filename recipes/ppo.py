@@ -1,45 +1,25 @@
-"""PPO with any backbone of the house: the settings, and the loop that they drive."""
+"""PPO with any backbone of the house: the settings. The loop is in ppo_training.py."""
 
 from __future__ import annotations
 
 import math
-import random
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 import torch
 from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
-from tqdm import tqdm
 
-from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.envs import VectorizationMode, make_env
-from torchrl_tit.evaluation import evaluate, finished_returns
-from torchrl_tit.modules import LSTMConfig, while_acting
+from torchrl_tit.evaluation import evaluate
+from torchrl_tit.modules import LSTMConfig
 from torchrl_tit.networks import CoBERLConfig
 
 from .compilation import Compile, Precision, compile_options, should_compile
-from .interrupt import Interrupt
 from .ppo_agent import Agent
-from .ppo_collector import make_collector
-from .ppo_state import TrainingState
-from .ppo_update import (
-    TERMS,
-    add_advantages,
-    check_agent,
-    check_finite,
-    make_objective,
-    make_optimizer,
-    make_weight_update,
-    minibatches,
-    set_learning_rate,
-)
+from .ppo_training import train
 from .recipe import Recipe, check_at_least, check_at_most
 from .run import Run
-from .watcher import Watcher
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,132 +288,3 @@ class PPO(Recipe):
         with run.restoring(step):
             agent.load_state_dict(state["agent"])
         return step, agent
-
-
-def train(recipe: PPO, run: Run, watcher: Watcher | None = None) -> None:
-    """Trains an agent, from the newest checkpoint of the run where there is one.
-
-    Args:
-        recipe: the settings.
-        run: an open run folder.
-        watcher: is shown every batch and every update, and may stop the run at a checkpoint.
-
-    Raises:
-        FloatingPointError: if a loss or the gradient is not finite.
-    """
-    torch.set_num_threads(recipe.threads)
-    random.seed(recipe.seed)
-    np.random.seed(recipe.seed)
-    torch.manual_seed(recipe.seed)
-
-    env = recipe.make_env(
-        recipe.num_envs, recipe.seed, vectorization_mode=recipe.vectorization_mode
-    )
-    agent = Agent(recipe, env).eval()  # no dropout while acting
-    loss = ClipPPOLoss(
-        agent.actor,
-        agent.critic,
-        clip_epsilon=recipe.clip_epsilon,
-        entropy_coeff=recipe.entropy_coeff,
-        critic_coeff=recipe.critic_coeff,
-        loss_critic_type="l2",
-        normalize_advantage=True,
-        log_explained_variance=False,
-        functional=False,
-    )
-    # How long a sequence is varies with where episodes begin.
-    compiled = not recipe.is_recurrent and should_compile(recipe.compile, recipe.gradient_steps)
-    device = recipe.torch_device()
-    options = compile_options(recipe.cuda_graphs, device)
-    objective = make_objective(
-        agent,
-        loss,
-        options if compiled else None,
-        contrastive_coeff=recipe.contrastive_coeff,
-        masked_fraction=recipe.masked_fraction,
-    )
-    terms = [*TERMS, *(["loss_contrastive"] if recipe.contrastive_coeff else []), "gradient_norm"]
-    if compiled and agent.backbone.keeps_frames:
-        agent.backbone.compile_parts(**options)
-    gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
-    # On a processor Adam's own fused kernel is faster than what is compiled.
-    compiled_update = recipe.compile_optimizer == "on" or (
-        recipe.compile_optimizer == "auto" and compiled and device.type == "cuda"
-    )
-    optimizer = make_optimizer(agent, recipe, compiled_update)
-    update_weights = make_weight_update(
-        optimizer, recipe.max_grad_norm, options if compiled_update else None
-    )
-    step = max(checkpoint_steps(run.checkpoints), default=0)
-    collector = make_collector(recipe, env, agent, step, options if compiled else None)
-    state = TrainingState(agent, optimizer, collector, recipe.seed)
-    state.load(run)
-    columns = ["return_mean", "episodes", "learning_rate", "feature_spread", *terms]
-    metrics = run.metrics(columns, last_step=step)
-    saved_step = step
-    progress = tqdm(
-        total=recipe.final_step, initial=step, unit=" steps", desc=recipe.name, smoothing=0.05
-    )
-    with Interrupt() as interrupt, progress, closing(metrics):
-        for batch in while_acting(agent.policy, collector):
-            step += batch.numel()
-            remaining = 1 - (step - batch.numel()) / recipe.final_step
-            set_learning_rate(optimizer, recipe.learning_rate_at(step))
-            if recipe.decay_clip_epsilon:
-                loss.clip_epsilon.fill_(recipe.clip_epsilon * remaining)
-
-            if watcher is not None:
-                watcher.collected(step, batch)
-            reward = batch["next", "reward"]
-            reward = reward.sign() if recipe.clip_rewards else reward
-            batch["next", "reward"] = reward * recipe.reward_scale
-            with torch.no_grad():
-                add_advantages(batch, agent, gae, recipe.bootstrap_time_limit)
-            agent.train()
-            losses = []
-            for minibatch in minibatches(batch, recipe):
-                try:
-                    total, values = objective(minibatch)
-                except RuntimeError:  # TorchRL draws samples where an entropy is not finite
-                    check_agent(agent, minibatch, step, saved_step)
-                    raise
-                optimizer.zero_grad()
-                total.backward()
-                norm = update_weights()
-                losses.append(torch.cat([values, norm.unsqueeze(0)]))
-                check_finite(terms, losses[-1], step, saved_step)
-            agent.eval()
-            if recipe.collectors > 1:
-                collector.update_policy_weights_()
-            check_agent(agent, minibatch, step, saved_step)  # before it is saved
-            means = dict(zip(terms, torch.stack(losses).mean(0).tolist(), strict=True))
-
-            # Where this goes to 0, the features are the same in all states, and so is the policy.
-            features = batch[agent.backbone.out_keys[0]].flatten(0, -2)  # [steps, features]
-            feature_spread = features.std(0).mean().item()
-            finished = finished_returns(batch)
-            mean_return = finished.mean().item()  # NaN where no episode ended
-            metrics.log(
-                step,
-                return_mean=mean_return,
-                episodes=len(finished),
-                feature_spread=feature_spread,
-                learning_rate=float(optimizer.param_groups[0]["lr"]),
-                **means,
-            )
-            progress.update(batch.numel())
-            if len(finished):
-                progress.set_postfix_str(f"return {mean_return:.1f}")
-            # Counted from the start, so that a run that was stopped saves at the same steps.
-            due = step // recipe.checkpoint_interval > (step - batch.numel()) // (
-                recipe.checkpoint_interval
-            )
-            enough = watcher is not None and watcher.updated(step, agent.policy)
-            if due or enough or interrupt.requested or step >= recipe.final_step:
-                state.save(run, step)
-                saved_step = step
-            if interrupt.requested:
-                raise KeyboardInterrupt
-            if enough:
-                break
-    collector.shutdown()

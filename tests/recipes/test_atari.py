@@ -69,7 +69,7 @@ def seen_rewards(monkeypatch):
         rewards.append(batch["next", "reward"].clone())
         add_advantages(batch, *args)
 
-    monkeypatch.setattr("recipes.ppo.add_advantages", recording)
+    monkeypatch.setattr("recipes.ppo_training.add_advantages", recording)
     return rewards
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from recipes import ppo
+from recipes import ppo_training
 from recipes.compilation import STATIC_SHAPES
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO
@@ -42,7 +42,7 @@ def batches(monkeypatch):
     """For each batch: a copy of the agent before the update, and the minibatches of the update."""
     recorded: list[tuple[Agent, list[TensorDict]]] = []
     agents: list[Agent] = []
-    original_init, original_minibatches = Agent.__init__, ppo.minibatches
+    original_init, original_minibatches = Agent.__init__, ppo_training.minibatches
 
     def init(agent, *args):
         original_init(agent, *args)
@@ -55,7 +55,7 @@ def batches(monkeypatch):
             yield minibatch
 
     monkeypatch.setattr(Agent, "__init__", init)
-    monkeypatch.setattr(ppo, "minibatches", recording)
+    monkeypatch.setattr(ppo_training, "minibatches", recording)
     return recorded
 
 
@@ -169,13 +169,13 @@ def test_a_compiled_optimizer_takes_the_same_steps():
 
 def test_metrics_tell_how_far_features_are_spread(tmp_path, monkeypatch):
     batches = []
-    original = ppo.add_advantages
+    original = ppo_training.add_advantages
 
     def recording(batch, *args):
         original(batch, *args)
         batches.append(batch.clone())
 
-    monkeypatch.setattr(ppo, "add_advantages", recording)
+    monkeypatch.setattr(ppo_training, "add_advantages", recording)
     with Run.create(tmp_path / "run", RECIPE) as run:
         RECIPE.train(run)
         rows = read_metrics(run.folder / "metrics.csv")
