@@ -30,10 +30,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
-from recipes import ppo_training
+from recipes import ppo, ppo_training
 from recipes.compilation import Compile
 from recipes.metrics import Metrics, read_metrics
-from recipes.ppo import PPO
 from recipes.ppo_agent import Agent
 from recipes.registry import get_recipe
 from recipes.run import Run
@@ -124,7 +123,7 @@ def run_sb3(seed: int) -> Outcome:
 def run_ours(seed: int, compile: Compile, timers: Timers | None = None) -> Outcome:
     """The recipe as the command line runs it, with its checkpoints and metrics."""
     named = get_recipe("ppo/cartpole/enhanced-tit")
-    assert isinstance(named, PPO)
+    assert isinstance(named, ppo.PPO)
     recipe = replace(
         named,
         num_envs=ENVS,
