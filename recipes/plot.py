@@ -150,7 +150,12 @@ def _figure(title: str, offline: bool) -> Figure:
 
 def _write(figure: Figure, picture: Path) -> None:
     (axes,) = figure.axes
-    axes.legend(frameon=False)
+    handles, labels = axes.get_legend_handles_labels()
+    if len(handles) > 2:  # they would hide the curves
+        figure.set_figheight(4 + 0.15 * len(handles))
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    else:
+        axes.legend(frameon=False)
     _save(figure, picture)
 
 
