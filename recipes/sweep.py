@@ -1,4 +1,4 @@
-"""Many recipes and seeds, in worker processes on this machine."""
+"""Many recipes and seeds, in worker processes on this machine or others."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import islice
 from pathlib import Path
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
@@ -33,13 +35,12 @@ class Job:
         """What the worker prints."""
         return self.folder.with_name(self.folder.name + ".log")
 
-    def command(self) -> list[str]:
-        """The words that start or resume the run in a process of its own."""
-        train = [sys.executable, "-m", __package__, "train"]
+    def words(self) -> list[str]:
+        """The words of the command line that start or resume the run."""
         if self._exists():
-            return [*train, "--resume", str(self.folder)]
+            return ["train", "--resume", str(self.folder)]
         return [
-            *train,
+            "train",
             self.source or self.recipe.name,
             "--seed",
             str(self.recipe.seed),
@@ -50,6 +51,16 @@ class Job:
     def is_complete(self) -> bool:
         """Whether there is nothing left to do."""
         return self._exists() and Run.open(self.folder).is_complete()
+
+    def is_in_use(self) -> bool:
+        """Whether a process is at work there, such as one that a killed sweep left behind."""
+        if not self._exists():
+            return False
+        try:
+            with Run.open(self.folder):
+                return False
+        except RuntimeError:
+            return True
 
     def check(self) -> None:
         """Raises ValueError where the folder holds a run with other settings."""
@@ -96,44 +107,17 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
     return jobs
 
 
-def run_jobs(jobs: list[Job], workers: int) -> list[Job]:
-    """Runs what is not complete yet, some at a time; a run that was killed goes on where it was.
+class Worker(Protocol):
+    """A run in a process of its own, which may be on another machine."""
 
-    Ctrl-C (or SIGTERM) is passed on: every worker saves a checkpoint and stops.
+    def poll(self) -> int | None:
+        """Returns the exit code, which is 0 where the run is complete; None before the end."""
 
-    Args:
-        jobs: the runs.
-        workers: processes at a time.
+    def send_signal(self, number: int, /) -> None:
+        """Sends the process a signal; SIGINT lets it save a checkpoint and stop."""
 
-    Returns:
-        The runs that failed; what they printed is in their logs.
-
-    Raises:
-        KeyboardInterrupt: after Ctrl-C, once all workers have stopped.
-    """
-    waiting = [job for job in jobs if not job.is_complete()]
-    running: dict[Job, subprocess.Popen[bytes]] = {}
-    failed = []
-    done = len(jobs) - len(waiting)
-    with raise_on_signals(), tqdm(total=len(jobs), initial=done, unit=" runs") as progress:
-        try:
-            while waiting or running:
-                while waiting and len(running) < workers:
-                    job = waiting.pop(0)
-                    running[job] = start(job)
-                    progress.set_postfix_str(f"{len(running)} at work")
-                time.sleep(0.2)
-                for job in [job for job, process in running.items() if process.poll() is not None]:
-                    if running.pop(job).returncode:
-                        failed.append(job)
-                    progress.update()
-        except KeyboardInterrupt:
-            for process in running.values():
-                process.send_signal(signal.SIGINT)
-            for process in running.values():
-                process.wait()
-            raise
-    return failed
+    def wait(self) -> int:
+        """Waits for the process's end and returns its exit code."""
 
 
 def start(job: Job) -> subprocess.Popen[bytes]:
@@ -142,5 +126,66 @@ def start(job: Job) -> subprocess.Popen[bytes]:
     with job.log.open("ab") as log:
         # A session of its own: the terminal's Ctrl-C reaches this process, which passes it on.
         return subprocess.Popen(
-            job.command(), stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+            [sys.executable, "-m", __package__, *job.words()],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
         )
+
+
+def run_jobs(
+    jobs: list[Job],
+    workers: int,
+    start: Callable[[Job], Worker] = start,
+    at_work: Callable[[Collection[Any]], int] = len,
+) -> list[Job]:
+    """Runs what is not complete yet, some at a time; a run that was killed goes on where it was.
+
+    A run that another process is at work on is left to that process, and gone on with afterwards.
+    Ctrl-C (or SIGTERM) is passed on: every worker saves a checkpoint and stops.
+
+    Args:
+        jobs: the runs.
+        workers: runs at a time.
+        start: starts or resumes a run, in a process on this machine unless told otherwise.
+        at_work: how many of the runs that were started wait for nothing.
+
+    Returns:
+        The runs that failed; what they printed is in their logs.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, once all workers have stopped.
+    """
+    waiting = [job for job in jobs if not job.is_complete()]
+    running: dict[Job, Worker] = {}
+    failed = []
+    done = len(jobs) - len(waiting)
+    with raise_on_signals(), tqdm(total=len(jobs), initial=done, unit=" runs") as progress:
+        try:
+            while waiting or running:
+                idle = (job for job in waiting if not job.is_in_use())
+                for job in list(islice(idle, workers - len(running))):
+                    waiting.remove(job)
+                    running[job] = start(job)
+                text = f"{at_work(running.values())} at work"
+                if waiting and len(running) < workers:
+                    text += ", others in use by other processes"
+                if text != progress.postfix:
+                    progress.set_postfix_str(text)
+                time.sleep(0.2)
+                for job in list(running):
+                    code = running[job].poll()
+                    if code is None:
+                        continue
+                    del running[job]
+                    if code:
+                        failed.append(job)
+                    progress.update()
+        except KeyboardInterrupt:
+            for worker in running.values():
+                worker.send_signal(signal.SIGINT)
+            for worker in running.values():
+                worker.wait()
+            raise
+    return failed

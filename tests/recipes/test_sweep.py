@@ -73,6 +73,23 @@ def test_failures_are_named(tmp_path):
     assert "error: " in job.log.read_text()
 
 
+def test_a_run_in_use_is_waited_for(tmp_path):
+    free, used = (sweep.Job(replace(TINY, seed=seed), tmp_path / f"{seed}") for seed in range(2))
+    for job in (free, used):
+        create(job, job.recipe)
+    lock = Run.open(used.folder)
+    lock.__enter__()
+    begun = []
+
+    def start(job):
+        begun.append((job, job.is_in_use()))
+        lock.__exit__()  # the other process ends once the free run has begun
+        return subprocess.Popen([sys.executable, "-c", ""])
+
+    assert sweep.run_jobs([used, free], workers=2, start=start) == []
+    assert begun == [(free, False), (used, False)]
+
+
 def test_other_settings_under_the_same_name_are_refused(tmp_path, capsys):
     job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], tmp_path)[0]
     create(job, TINY)
