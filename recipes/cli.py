@@ -230,14 +230,28 @@ def _sweep(words: list[str]) -> None:
         "names", nargs="+", help="names of recipes, or patterns such as 'ppo/*/mlp'"
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each recipe")
-    parser.add_argument("--workers", type=int, default=1, help="runs at a time, a process each")
+    parser.add_argument(
+        "--workers", type=int, help="runs at a time, a process each: 1, on Ray what fits"
+    )
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="run on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/sweep"), help="folder of the runs")
     options = parser.parse_args(words)
-    if options.workers < 1:
+    if options.workers is not None and options.workers < 1:
         _fail(f"--workers must be at least 1, not {options.workers}")
     jobs = make_jobs(options.names, options.seeds, options.out)
     try:
-        failed = run_jobs(jobs, options.workers)
+        if options.ray is None:
+            failed = run_jobs(jobs, options.workers or 1)
+        else:
+            # Not at the top: Ray is an extra.
+            from .sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
+
+            connect(options.ray)
+            for note in find_unmet_needs(jobs):
+                print(f"note: {note}", file=sys.stderr)
+            failed = run_jobs(jobs, options.workers or len(jobs), RayWorker, count_begun)
     except KeyboardInterrupt:
         print("stopped; the same command goes on", file=sys.stderr)
         raise

@@ -1,0 +1,200 @@
+"""Sweeps on a Ray cluster: two machines, which are both this one."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from recipes import sweep_ray
+from recipes.cli import main
+from recipes.metrics import read_metrics
+from recipes.ppo import PPO
+from recipes.run import Run
+from recipes.sweep import Job, run_jobs
+from recipes.sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
+from torchrl_tit.checkpoint import checkpoint_steps
+from torchrl_tit.networks import MLPConfig
+
+ROOT = Path(__file__).parents[2]
+TINY = PPO(
+    name="ppo/cartpole/mlp",
+    env="CartPole-v1",
+    backbone=MLPConfig(hidden_dim=8),
+    total_steps=128,
+    steps_per_batch=64,
+    minibatch_size=32,
+    epochs=1,
+    checkpoint_interval=64,
+    evaluation_episodes=2,
+    compile="off",
+)
+LONG = replace(TINY, total_steps=1_000_000)
+
+# What `sweep --ray ADDRESS` does, with runs that are there already.
+DRIVER = """
+import sys
+from pathlib import Path
+from recipes.run import Run
+from recipes.sweep import Job, run_jobs
+from recipes.sweep_ray import RayWorker, connect
+
+connect(sys.argv[1])
+run_jobs([Job(Run.open(Path(f)).recipe, Path(f)) for f in sys.argv[2:]], 9, RayWorker)
+"""
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """The address of a cluster of two machines with a CPU each; this process is connected to it."""
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    folder = tempfile.mkdtemp(prefix="ray-")  # pytest's is too long a name for sockets
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_TMPDIR", folder)
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        machines = Cluster(
+            initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
+        )
+        machines.add_node(num_cpus=1)
+        ray.init(machines.address, log_to_driver=False)
+        yield machines.address
+        ray.shutdown()
+        machines.shutdown()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def begin(folder: Path, recipe: PPO) -> Job:
+    """Begins a run as a worker would, so that workers resume it with these small settings."""
+    Run.create(folder, recipe)
+    return Job(recipe, folder)
+
+
+def meanwhile(act: Callable[[], None]) -> None:
+    """Does something beside the sweep, which is not left alone if that fails."""
+
+    def guarded() -> None:
+        try:
+            act()
+        except BaseException:
+            os.kill(os.getpid(), signal.SIGINT)
+            raise
+
+    Thread(target=guarded, daemon=True).start()
+
+
+def wait_until_trained(job: Job) -> None:
+    metrics = job.folder / "metrics.csv"
+    before = len(metrics.read_text().splitlines()) if metrics.exists() else 1
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > before):
+        time.sleep(0.05)
+
+
+def actor_of(job: Job) -> int:
+    """The process that started the run's."""
+    table = subprocess.run(["ps", "-ewwo", "ppid,args"], capture_output=True, text=True).stdout
+    [line] = [line for line in table.splitlines() if line.endswith(f"--resume {job.folder}")]
+    return int(line.split()[0])
+
+
+@pytest.mark.slow
+def test_a_sweep_goes_on_after_its_driver_was_killed_and_stops_at_ctrl_c(
+    cluster: str, tmp_path: Path
+) -> None:
+    short = begin(tmp_path / "seed-0", TINY)
+    long = begin(tmp_path / "seed-1", LONG)
+    command = [sys.executable, "-c", DRIVER, cluster, str(short.folder), str(long.folder)]
+    driver = subprocess.Popen(command, cwd=ROOT)
+    while not (short.is_complete() and checkpoint_steps(long.folder / "checkpoints")):
+        assert driver.poll() is None, long.log.read_text()
+        time.sleep(0.05)
+    driver.kill()
+    driver.wait()
+    finished = (short.folder / "evaluation.json").stat().st_mtime_ns
+
+    def press_ctrl_c() -> None:
+        wait_until_trained(long)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    meanwhile(press_ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs([short, long], 9, RayWorker, count_begun)
+    assert (short.folder / "evaluation.json").stat().st_mtime_ns == finished
+    assert not long.is_in_use()
+    steps = [row["step"] for row in read_metrics(long.folder / "metrics.csv")]
+    assert steps == [64 * (i + 1) for i in range(len(steps))]  # none lost, none twice
+    assert checkpoint_steps(long.folder / "checkpoints")[-1] == steps[-1]
+    assert "stopped; go on: " in long.log.read_text()
+
+
+@pytest.mark.slow
+def test_runs_whose_worker_dies_fail_and_the_others_go_on(cluster: str, tmp_path: Path) -> None:
+    killed = begin(tmp_path / "seed-0", LONG)
+    damaged = begin(tmp_path / "seed-1", TINY)
+    queued = begin(tmp_path / "seed-2", TINY)
+    (damaged.folder / "checkpoints" / "000000000064").mkdir(parents=True)  # no checkpoint of ours
+
+    def kill() -> None:
+        wait_until_trained(killed)
+        os.kill(actor_of(killed), signal.SIGKILL)
+
+    meanwhile(kill)
+    failed = run_jobs([killed, damaged, queued], 9, RayWorker, count_begun)
+    assert set(failed) == {killed, damaged}
+    assert queued.is_complete()
+    assert "error: " in damaged.log.read_text()
+    assert "error: the worker died" in killed.log.read_text()
+    while killed.is_in_use():  # the run's own process saves a checkpoint and stops
+        time.sleep(0.05)
+    last = list(read_metrics(killed.folder / "metrics.csv"))[-1]["step"]
+    assert checkpoint_steps(killed.folder / "checkpoints")[-1] == last
+
+
+@pytest.mark.slow
+def test_runs_that_fit_no_machine_are_named(cluster: str, tmp_path: Path) -> None:
+    jobs = [
+        Job(replace(TINY, threads=2), tmp_path / "a"),
+        Job(replace(TINY, device="cuda"), tmp_path / "b"),
+        Job(replace(TINY, device="auto"), tmp_path / "c"),  # the processor, where there is no GPU
+    ]
+    cpus, gpus = find_unmet_needs(jobs)
+    assert "2 CPUs and 0 GPUs" in cpus
+    assert "1 CPUs and 1 GPUs" in gpus
+
+
+def test_without_ray_the_message_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SystemExit) as exit_:
+        main(["sweep", "ppo/cartpole/mlp", "--out", str(tmp_path / "out"), "--ray", "auto"])
+    assert exit_.value.code == 2
+    assert "pip install 'torchrl-tit[ray]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [
+        ("127.0.0.1:1", "no Ray cluster answered at '127.0.0.1:1'"),
+        ("nowhere", "no connection to Ray at 'nowhere': ValueError: .*nowhere"),
+    ],
+)
+def test_addresses_without_a_cluster_are_refused(monkeypatch, address, reason):
+    pytest.importorskip("ray")
+    monkeypatch.setattr(sweep_ray, "_PATIENCE", 30.0 if address == "nowhere" else 5.0)
+    with pytest.raises(ValueError, match=reason):
+        connect(address)
+
+
+def test_a_machine_that_does_not_see_the_folder_says_so(tmp_path):
+    actor = sweep_ray._actor_class()
+    with pytest.raises(FileNotFoundError, match="must share a file system"):
+        actor("recipes.sweep_ray", [], tmp_path, tmp_path / "missing.log")
