@@ -14,12 +14,13 @@ from torchrl_tit.networks import EnhancedTITConfig, MLPConfig
 
 from .networks import NetworkConfig
 from .ppo import PPO
+from .tuned import TUNED_TIT
 
-# Beyond the protocol's settings those of the tuned recipes of TIT: docs/results/classic_control.md.
+# Beyond the protocol's settings those that TIT needs, for all networks alike.
 _SETTINGS: dict[str, dict[str, Any]] = {
-    "cartpole": {"env": "CartPole-v1", "total_steps": 100_000, "critic_coeff": 0.02},
-    "acrobot": {"env": "Acrobot-v1", "total_steps": 100_000, "reward_scale": 0.01},
-    "hopper": {"env": "Hopper-v5", "total_steps": 1_000_000, "reward_scale": 0.01},
+    "cartpole": {"env": "CartPole-v1", "total_steps": 100_000},
+    "acrobot": {"env": "Acrobot-v1", "total_steps": 100_000},
+    "hopper": {"env": "Hopper-v5", "total_steps": 1_000_000},
 }
 _NETWORKS: dict[str, tuple[int, NetworkConfig]] = {  # with the history K
     "mlp": (1, MLPConfig()),
@@ -34,15 +35,17 @@ _NETWORKS: dict[str, tuple[int, NetworkConfig]] = {  # with the history K
 
 def _named(task: str, network: str) -> PPO:
     history, backbone = _NETWORKS[network]
-    if task == "acrobot" and isinstance(backbone, EnhancedTITConfig):
-        backbone = replace(backbone, patch_size=2)  # cosine and sine of an angle
+    tuned = dict(TUNED_TIT[task])
+    for_tit = tuned.pop("backbone", {})
+    if isinstance(backbone, EnhancedTITConfig):
+        backbone = replace(backbone, **for_tit)
     return PPO(
         name=f"ppo/{task}-no-velocity/{network}",
         hide_velocities=True,
         history=history,
         backbone=backbone,
-        num_envs=8,
         **_SETTINGS[task],
+        **tuned,
     )
 
 

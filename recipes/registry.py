@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from torchrl_tit.networks import (
     D2RLConfig,
@@ -22,6 +21,7 @@ from .networks import NetworkConfig
 from .no_velocity import NO_VELOCITY_RECIPES
 from .ppo import PPO
 from .recipe import Recipe, nearest, recipe_from_json
+from .tuned import TUNED_TIT
 
 # Task name: environment and steps (arXiv 2212.14538, appendix). The paper ran MuJoCo's v3.
 _TASKS = {
@@ -52,27 +52,6 @@ _MOUNTAINCAR_NETWORKS: dict[str, NetworkConfig] = {
     ),
 }
 
-# What makes TIT learn where the settings above do not: docs/results/classic_control.md says why.
-# Environments side by side are for speed.
-_FOR_SPARSE_GOALS: dict[str, Any] = {
-    "num_envs": 16,
-    "steps_per_batch": 1024,
-    "learning_rate": 2e-4,
-    "gae_lambda": 0.98,
-    "entropy_coeff": 0.01,
-    "reward_scale": 0.1,
-    "backbone": {"patch_size": 2, "activation_head": "relu"},
-}
-_TUNED_TIT: dict[str, dict[str, Any]] = {
-    "acrobot": _FOR_SPARSE_GOALS,
-    "cartpole": {"num_envs": 8, "critic_coeff": 0.02},
-    "mountaincar": _FOR_SPARSE_GOALS,
-    "ant": {"num_envs": 8, "reward_scale": 0.01},
-    "halfcheetah": {"num_envs": 8, "reward_scale": 0.01},
-    "hopper": {"num_envs": 8, "reward_scale": 0.01},
-    "walker2d": {"num_envs": 8, "reward_scale": 0.01},
-}
-
 
 def _named() -> dict[str, Recipe]:
     recipes: dict[str, Recipe] = {}
@@ -84,7 +63,7 @@ def _named() -> dict[str, Recipe]:
             recipes[name] = recipe
             if isinstance(backbone, EnhancedTITConfig | VanillaTITConfig):
                 name += "-tuned"
-                tuned = dict(_TUNED_TIT[task])
+                tuned = dict(TUNED_TIT[task])
                 other = replace(backbone, **tuned.pop("backbone", {}))
                 recipes[name] = replace(recipe, name=name, backbone=other, **tuned)
     return recipes | NO_VELOCITY_RECIPES | ATARI_RECIPES | CQL_RECIPES | DT_RECIPES
