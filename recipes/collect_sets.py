@@ -144,7 +144,9 @@ class SetMaker:
             ),
             **self._provenance,
         }
-        if score is not None:
+        if score is None:
+            attributes.pop("recipe", None)  # that of the other sets
+        else:
             name, mark = self._settings.mark(kind)
             attributes |= {
                 "agent": self._settings.agent,

@@ -203,6 +203,7 @@ def test_provenance_is_in_both_formats(cartpole: Path, pendulum: Path, agent: st
             assert dataset.action_space == gymnasium.make(settings.env).action_space
             assert dataset.storage.metadata["algorithm_name"] == noted["algorithm"]
     assert json.loads(attributes(cartpole / "medium.hdf5")["recipe"])["learning_rate"] == 1e-3
+    assert "recipe" not in attributes(cartpole / "random.hdf5")
     assert "recipe" not in attributes(pendulum / "medium.hdf5")
     # The end of the training, for want of a mark.
     assert attributes(pendulum / "expert.hdf5")["agent_steps"] == 600
