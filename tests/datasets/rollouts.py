@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 Transitions = dict[str, NDArray]
 
 
-def roll(steps: int = 300, max_episode_steps: int = 15, seed: int = 0) -> Transitions:
-    """Random actions in Hopper-v5: some episodes fall (terminal), some meet the time limit.
+def roll(
+    steps: int = 300, max_episode_steps: int = 15, seed: int = 0, task: str = "Hopper-v5"
+) -> Transitions:
+    """Random actions: some episodes fall (terminal), some meet the time limit.
 
     Ends with an episode's end.
     """
-    env = gymnasium.make("Hopper-v5", max_episode_steps=max_episode_steps)
+    env = gymnasium.make(task, max_episode_steps=max_episode_steps)
     env.action_space.seed(seed)
     rows: dict[str, list] = {name: [] for name in NAMES}
     observation, _ = env.reset(seed=seed)
@@ -32,7 +34,7 @@ def roll(steps: int = 300, max_episode_steps: int = 15, seed: int = 0) -> Transi
     arrays = {name: np.array(values) for name, values in rows.items()}
     assert arrays["terminals"].any()
     assert arrays["timeouts"].any()
-    return {n: a if a.dtype == bool else a.astype(np.float32) for n, a in arrays.items()}
+    return {n: a.astype(np.float32) if a.dtype.kind == "f" else a for n, a in arrays.items()}
 
 
 NAMES = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")

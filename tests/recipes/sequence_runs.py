@@ -1,4 +1,4 @@
-"""Small runs of the recipes of Decision Transformer, on random rollouts."""
+"""Small runs of the recipes of Decision Transformer, and of other recipes on data sets."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import torch
 from recipes.dt import DT
 from recipes.metrics import read_metrics
 from recipes.odt import ODT
+from recipes.offline_recipe import OfflineRecipe
 from recipes.run import Run
-from recipes.sequence_recipe import SequenceRecipe
 from tests.datasets.rollouts import roll, write
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.networks import DecisionTransformerConfig
@@ -68,13 +68,13 @@ def make_odt(folder: Path, **settings: Any) -> ODT:
     return ODT(**{**SETTINGS, **fields, **settings})
 
 
-def train(recipe: SequenceRecipe, folder: Path) -> Run:
+def train(recipe: OfflineRecipe[Any], folder: Path) -> Run:
     with Run.create(folder, recipe) as run:
         recipe.train(run)
     return run
 
 
-def assert_resumes_bit_for_bit(recipe: SequenceRecipe, folder: Path) -> None:
+def assert_resumes_bit_for_bit(recipe: OfflineRecipe[Any], folder: Path) -> None:
     """Goes on from the checkpoint before the last, which falls within an interval of metrics."""
     whole = train(recipe, folder / "whole")
     expected = load_checkpoint(whole.checkpoints)

@@ -1,0 +1,454 @@
+"""Recipes of conservative Q-learning: training, resuming, evaluation, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+
+from recipes.cli import main
+from recipes.cql import CQL
+from recipes.discrete_cql import DiscreteCQL
+from recipes.metrics import read_metrics
+from recipes.offline_state import TrainingState
+from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.registry import RECIPES, get_recipe
+from recipes.run import Run
+from tests.datasets.rollouts import roll, write
+from tests.recipes.cql_runs import (
+    TIT,
+    make_cql,
+    make_discrete_cql,
+    roll_pong,
+)
+from tests.recipes.sequence_runs import (
+    assert_resumes_bit_for_bit,
+    assert_same,
+    make_data,
+    train,
+    without_time,
+)
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.datasets import normalized_score, normalized_spread
+from torchrl_tit.networks import CatformerConfig, EnhancedTIT, EnhancedTITConfig, MLPConfig
+
+CQL_TERMS = ["loss_actor", "loss_qvalue", "loss_cql", "loss_alpha", "alpha", "entropy"]
+DISCRETE_TERMS = ["loss_qvalue", "loss_cql", "value"]
+
+
+def assert_trains(recipe, folder, terms):
+    """Trains, with evaluations and metrics; returns the rows and the newest state."""
+    recipe.check()
+    run = train(recipe, folder / "run")
+    rows = read_metrics(run.folder / "metrics.csv")
+    assert [row["step"] for row in rows] == [5, 9, 10, 15, 18]
+    assert list(rows[0]) == ["step", "time", "return_mean", *terms]
+    assert all(np.isfinite(row[term]) for row in rows for term in terms)
+    assert [row["step"] for row in rows if np.isfinite(row["return_mean"])] == [9, 18]
+    step, state = load_checkpoint(run.checkpoints)
+    assert step == 18
+    built = recipe.make_agent()
+    built.load_state_dict(state["agent"])  # everything that is trained is in there
+    return rows, state
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"backbone": MLPConfig(hidden_dim=16, activation="relu")},
+        {"backbone": TIT},
+        {"backbone": TIT, "history": 4},
+        {"backbone": TIT, "history": 4, "critic": "backbone", "over_critics": "sum"},
+    ],
+    ids=["mlp", "tit", "tit-4", "backbone"],
+)
+def test_continuous_actions(tmp_path, settings):
+    recipe = make_cql(tmp_path, **settings)
+    rows, state = assert_trains(recipe, tmp_path, CQL_TERMS)
+    assert rows[-1]["alpha"] != 1.0
+    torch.manual_seed(recipe.seed)
+    untrained = recipe.make_agent().state_dict()
+    trained = {n for n, w in state["agent"].items() if not torch.equal(w, untrained[n])}
+    networks = {name.partition("_params")[0] for name in trained}
+    assert networks == {"actor_network", "qvalue_network", "target_qvalue_network", "log_alpha"}
+    backbones = any("frame_encoder" in name for name in trained if "qvalue_network" in name)
+    assert backbones == (recipe.critic == "backbone")
+    online, target = (
+        next(w for n, w in state["agent"].items() if n.startswith(f"{name}_params"))
+        for name in ("qvalue_network", "target_qvalue_network")
+    )
+    assert not torch.equal(online, target)
+
+
+@pytest.mark.parametrize("history", [1, 3])
+def test_discrete_actions(tmp_path, history):
+    _, state = assert_trains(make_discrete_cql(tmp_path, history=history), tmp_path, DISCRETE_TERMS)
+    online, target = (
+        next(w for n, w in state["agent"].items() if n.startswith(f"{name}_params"))
+        for name in ("value_network", "target_value_network")
+    )
+    assert not torch.equal(online, target)
+
+
+def test_pictures_of_a_game(tmp_path):
+    recipe = make_discrete_cql(
+        tmp_path,
+        dataset=str(write(tmp_path / "pong.hdf5", roll_pong())),
+        env="ALE/Pong-v5",
+        backbone=replace(TIT, patch_size=42),
+        history=4,
+        padding="constant",
+        total_updates=4,
+        evaluation_interval=4,
+        evaluation_episodes=1,
+        log_interval=2,
+    )
+    recipe.check()
+    batch = recipe.make_buffer().sample()
+    assert batch["history"].dtype is torch.uint8
+    assert batch["history"].shape == (8, 4, 84, 84)
+    with train(recipe, tmp_path / "run") as run:
+        evaluation = recipe.evaluate(run)
+        rows = read_metrics(run.folder / "metrics.csv")
+    assert [row["step"] for row in rows] == [2, 4]
+    assert -21 <= evaluation["mean"] <= 21
+    # A game without reference returns counts as it is.
+    assert evaluation["score"] == {"best": evaluation["mean"], "last": evaluation["mean"]}
+
+
+class Camera(gymnasium.Env):
+    """Pictures by chance, and continuous actions."""
+
+    observation_space = Box(0, 255, (8, 8), np.uint8)
+    action_space = Box(-1, 1, (2,), np.float32)
+
+    def _observe(self):
+        return self.np_random.integers(0, 256, (8, 8), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._observe(), {}
+
+    def step(self, action):
+        return self._observe(), float(action.sum()), bool(self.np_random.random() < 0.2), False, {}
+
+
+@pytest.fixture
+def camera(tmp_path):
+    gymnasium.register("Camera-v0", entry_point=lambda **_: Camera())
+    data = write(tmp_path / "camera.hdf5", roll(100, max_episode_steps=5, task="Camera-v0"))
+    yield {"env": "Camera-v0", "dataset": str(data), "backbone": replace(TIT, patch_size=4)}
+    del gymnasium.registry["Camera-v0"]
+
+
+def test_pictures_and_continuous_actions(tmp_path, camera):
+    assert_trains(make_cql(tmp_path, critic="backbone", **camera), tmp_path, CQL_TERMS)
+    with pytest.raises(ValueError, match=r"cannot value images \(8, 8\): set critic to 'backbone'"):
+        make_cql(tmp_path, critic="mlp", **camera).check()
+
+
+def test_evaluation(tmp_path):
+    recipe = make_cql(tmp_path)
+    with train(recipe, tmp_path / "run") as run:
+        rows = read_metrics(run.folder / "metrics.csv")
+        played = [row["return_mean"] for row in rows if np.isfinite(row["return_mean"])]
+        evaluation = recipe.evaluate(run)
+        other = replace(recipe, evaluation_seed=5, evaluation_episodes=2).evaluate(run)
+    assert evaluation["mean"] == np.mean(evaluation["returns"]) == played[-1]
+    assert evaluation["std"] == pytest.approx(np.std(evaluation["returns"]))
+    assert evaluation["score_std"] == pytest.approx(normalized_spread(evaluation["std"], "hopper"))
+    assert evaluation["score"] == pytest.approx(
+        {
+            "best": normalized_score(max(played), "hopper"),
+            "last": normalized_score(played[-1], "hopper"),
+        }
+    )
+    assert (evaluation["episodes"], evaluation["steps"]) == (3, 18)
+    assert len(other["returns"]) == 2
+    assert other["returns"] != evaluation["returns"][:2]
+    # The network without dropout, with tanh of the mean: it repeats itself.
+    agent = recipe.load_agent(Run.open(run.folder))[1]
+    assert agent.play(3, recipe.evaluation_seed).tolist() == evaluation["returns"]
+
+
+@pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
+def test_resumes_bit_for_bit(tmp_path, make):
+    settings = {"critic": "backbone"} if make is make_cql else {}
+    assert_resumes_bit_for_bit(make(tmp_path, history=4, **settings), tmp_path)
+
+
+def test_a_run_that_was_stopped_goes_on_bit_for_bit(tmp_path, monkeypatch):
+    recipe = make_cql(tmp_path, history=4, critic="backbone")
+    whole = train(recipe, tmp_path / "whole")
+    add = TrainingState.add
+
+    def stop_at_seventh(state, terms):
+        add(state, terms)
+        if state.saved_step == 4 and state._count == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(TrainingState, "add", stop_at_seventh)
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe, tmp_path / "stopped")
+    monkeypatch.undo()
+    with Run.open(tmp_path / "stopped") as run:
+        assert load_checkpoint(run.checkpoints)[0] == 7
+        torch.manual_seed(123)  # where the process that resumes happens to be
+        recipe.train(run)
+        assert_same(load_checkpoint(run.checkpoints), load_checkpoint(whole.checkpoints))
+    rows = [
+        [without_time(row) for row in read_metrics(folder / "metrics.csv")]
+        for folder in (run.folder, whole.folder)
+    ]
+    assert rows[0] == rows[1]
+
+
+@pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
+def test_dropout_is_on_in_updates_and_off_in_evaluations(tmp_path, make, monkeypatch):
+    recipe = make(tmp_path, **({"critic": "backbone"} if make is make_cql else {}))
+    seen = set()
+    forward = EnhancedTIT.forward
+
+    def watch(network, history):
+        modes = {module.training for module in network.modules()}
+        seen.add(("update" if len(history) == recipe.batch_size else "evaluation", *modes))
+        return forward(network, history)
+
+    monkeypatch.setattr(EnhancedTIT, "forward", watch)
+    train(recipe, tmp_path / "run")
+    assert seen == {("update", True), ("evaluation", False)}
+    agent, batch = recipe.make_agent(), recipe.make_buffer().sample()
+
+    def loss():
+        if isinstance(recipe, DiscreteCQL):
+            return agent.loss(batch.clone())["loss_qvalue"]
+        return agent.loss.actor_loss(batch, samples)[0]  # through the critics
+
+    samples = agent.loss.sample_policy(batch) if make is make_cql else None
+    agent.train()
+    assert loss() != loss()
+    agent.eval()
+    assert loss() == loss()
+
+
+def test_critics_start_as_they_were_built(tmp_path):
+    """The loss would draw each entry uniformly between the extremes of its tensor: a wider std."""
+    config = EnhancedTITConfig(embed_dim=64, num_blocks=1)
+    agent = make_cql(tmp_path, critic="backbone", backbone=config).make_agent()
+    weights = dict(agent.loss.qvalue_network_params.items(True, True))
+    embeddings = [w for key, w in weights.items() if key[-3:] == ("ffn", "0", "weight")]
+    assert len(embeddings) == 2
+    for first, second in embeddings:
+        assert first.std().item() == pytest.approx(0.02, rel=0.05)
+        assert second.std().item() == pytest.approx(0.02, rel=0.05)
+        assert not torch.equal(first, second)
+
+
+def test_command_line(tmp_path, capsys):
+    path = tmp_path / "recipe.json"
+    path.write_text(recipe_to_json(make_cql(tmp_path)))
+    out = tmp_path / "run"
+    main(
+        f"train {path} --history 2 --backbone.embed-dim 16 --critic-hidden 8 8 --over-critics sum "
+        f"--out {out}".split()
+    )
+    assert "over 3 episodes after 18 steps" in capsys.readouterr().out
+    recipe = Run.open(out).recipe
+    assert isinstance(recipe, CQL)
+    assert (recipe.history, recipe.critic_hidden, recipe.over_critics) == (2, (8, 8), "sum")
+    assert json.loads((out / "evaluation.json").read_text())["score"].keys() == {"best", "last"}
+    assert (out / "learning_curve.png").is_file()
+    main(["evaluate", str(out), "--episodes", "2"])
+    assert "over 2 episodes" in capsys.readouterr().out
+    main(["table", str(out)])
+    assert "| cql/hopper/small | 1 |" in capsys.readouterr().out
+
+
+# What the authors of arXiv 2212.14538 released: blocks, features, width, outer heads, dropout of
+# outer attention and FFN, activation of the head, outer expansion, shared blocks.
+RELEASED: dict[str, tuple[Any, ...]] = {
+    "halfcheetah-medium": (2, 512, 256, 4, 0, 0.1, "gelu", 1, False),
+    "hopper-medium": (1, 512, 32, 2, 0, 0, "relu", 1, True),
+    "walker2d-medium": (1, 512, 32, 2, 0, 0, "relu", 1, True),
+    "halfcheetah-medium-replay": (2, 1024, 128, 2, 0, 0, "tanh", 1, True),
+    "hopper-medium-replay": (2, 1024, 128, 1, 0.1, 0, "relu", 1, True),
+    "walker2d-medium-replay": (2, 512, 32, 2, 0, 0, "relu", 2, True),
+}
+SIZES = {"halfcheetah": 17, "hopper": 11, "walker2d": 17}
+
+
+@pytest.mark.parametrize("data", RELEASED)
+def test_named_recipes_have_the_papers_settings(data):
+    task = data.split("-")[0]
+    mlp, tit = (get_recipe(f"cql/{data}-v0/{network}") for network in ("mlp", "enhanced-tit"))
+    for recipe in (mlp, tit):
+        assert isinstance(recipe, CQL)
+        assert recipe.dataset == f"{data}-v0"
+        assert recipe.env.lower().startswith(task)
+        rates = (recipe.actor_learning_rate, recipe.critic_learning_rate)
+        assert (*rates, recipe.temperature_learning_rate) == (1e-4, 3e-4, 1e-4)
+        assert (recipe.temperature_init, recipe.adam_eps) == (1.0, 1e-8)
+        # 10 for the medium sets of version 0.
+        assert recipe.conservative_weight == (5.0 if data.endswith("replay") else 10.0)
+        assert (recipe.batch_size, recipe.action_samples) == (256, 10)
+        assert (recipe.gamma, recipe.tau) == (0.99, 0.005)
+        assert (recipe.critic, recipe.critic_hidden) == ("mlp", (256, 256, 256))
+        assert (recipe.history, recipe.over_critics) == (1, "mean")
+        assert (recipe.time_limits, recipe.terminal_observations) == ("drop", "zero")
+        assert recipe.unfinished == "drop"
+        assert (recipe.final_step, recipe.evaluation_interval) == (500_000, 1000)
+        assert recipe.evaluation_episodes == 10
+        assert recipe_from_json(recipe_to_json(recipe), "it") == recipe
+    assert mlp.backbone == MLPConfig(hidden_dim=256, num_layers=3, activation="relu")
+    config = tit.backbone
+    assert isinstance(config, EnhancedTITConfig)
+    assert RELEASED[data] == (
+        config.num_blocks,
+        config.features_dim,
+        config.embed_dim,
+        config.num_heads_outer,
+        config.attention_dropout_outer,
+        config.ffn_dropout_outer,
+        config.activation_head,
+        config.ffn_expansion_outer,
+        config.share_blocks,
+    )
+    assert config.patch_size == SIZES[task]  # the whole observation
+    assert (config.num_heads_inner, config.ffn_expansion_inner) == (1, 1)
+    assert (config.attention_dropout_inner, config.ffn_dropout_inner) == (0, 0)
+    assert (config.activation_inner, config.activation_outer) == ("gelu", "gelu")
+    assert (config.position_encoding, config.temporal_position_encoding) == (False, False)
+
+
+def test_there_are_no_other_named_recipes():
+    names = {f"cql/{data}-v0/{network}" for data in RELEASED for network in ("mlp", "enhanced-tit")}
+    assert {name for name in RECIPES if name.startswith("cql/")} == names
+
+
+def refused(recipe, folder, capsys):
+    """What the command line says of a recipe; nothing is written."""
+    path = folder / "recipe.json"
+    path.write_text(recipe_to_json(recipe))
+    with pytest.raises(SystemExit) as stop:
+        main(["train", str(path), "--out", str(folder / "run")])
+    assert stop.value.code == 2
+    assert not (folder / "run").exists()
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"env": "CartPole-v1"},
+            "error: cql needs continuous actions within bounds, but those of CartPole-v1 are "
+            "discrete",
+        ),
+        ({"env": "ALE/Pong-v5"}, "those of ALE/Pong-v5 are discrete"),
+        ({"env": "Hoper-v5"}, "Unknown task 'Hoper-v5'; did you mean one of 'Hopper-v5'"),
+        ({"env": "Walker2d-v5"}, "[11], but in Walker2d-v5 it is [17]; these data are of another"),
+        ({"dataset": "hopper"}, "'hopper' is no data set: give an HDF5 file"),
+        ({"dataset": "./no.hdf5"}, "no.hdf5"),
+        (
+            {"backbone": CatformerConfig()},
+            "a catformer is a transformer over time: set history to 2 or more, not 1",
+        ),
+        (
+            {"backbone": EnhancedTITConfig(temporal_position_encoding=True)},
+            "no temporal positions in one observation: set history to more",
+        ),
+        (
+            {"backbone": EnhancedTITConfig(num_heads_inner=3)},
+            "the width 32 cannot be split over 3 attention heads",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_before_anything_is_written(
+    tmp_path, capsys, settings, message
+):
+    assert message in refused(make_cql(tmp_path, **settings), tmp_path, capsys)
+
+
+def test_data_of_the_other_kind(tmp_path, capsys):
+    discrete = make_discrete_cql(tmp_path)
+    message = refused(replace(discrete, env="Hopper-v5"), tmp_path, capsys)
+    assert "discrete-cql needs a few discrete actions, but those of Hopper-v5 are cont" in message
+    message = refused(replace(discrete, dataset=str(make_data(tmp_path))), tmp_path, capsys)
+    assert "these data are of another task" in message
+    message = refused(make_cql(tmp_path, dataset=discrete.dataset), tmp_path, capsys)
+    assert "these data are of another task" in message
+
+
+def test_actions_of_the_right_shape_but_the_other_kind(tmp_path):
+    floats = roll(task="CartPole-v1", max_episode_steps=20)
+    floats["actions"] = floats["actions"][:, None] * np.float32(0.5)
+    data = str(write(tmp_path / "floats.hdf5", floats))
+    message = "are floats, but those of CartPole-v1 are integers: take other data"
+    with pytest.raises(ValueError, match=message):
+        make_discrete_cql(tmp_path, dataset=data).check()
+    integers = roll()
+    integers["actions"] = np.sign(integers["actions"]).astype(np.int64)
+    data = str(write(tmp_path / "integers.hdf5", integers))
+    message = "are integers, but those of Hopper-v5 are floats: take other data"
+    with pytest.raises(ValueError, match=message):
+        make_cql(tmp_path, dataset=data).check()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"history": 0}, "history must be at least 1, not 0"),
+        ({"total_updates": 0}, "total_updates must be at least 1, not 0"),
+        ({"batch_size": 0}, "batch_size must be at least 1, not 0"),
+        ({"gamma": 1.01}, r"gamma must be at most 1, not 1\.01"),
+        ({"gamma": float("nan")}, "gamma must be at least 0, not nan"),
+        ({"tau": -0.1}, r"tau must be at least 0, not -0\.1"),
+        ({"conservative_weight": -1.0}, "conservative_weight must be at least 0"),
+        ({"evaluation_interval": 0}, "evaluation_interval must be at least 1"),
+    ],
+)
+@pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
+def test_impossible_settings_of_both(tmp_path, make, settings, message):
+    with pytest.raises(ValueError, match=message):
+        make(tmp_path, **settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"action_samples": 0}, "action_samples must be at least 1, not 0"),
+        ({"temperature_init": 0.0}, r"temperature_init must be positive, not 0\.0"),
+        ({"critic_hidden": ()}, r"critic_hidden must be at least one width .*, not \(\)"),
+        ({"critic_hidden": (8, 0)}, r"critic_hidden must be at least one width .*, not \(8, 0\)"),
+        ({"actor_learning_rate": -1.0}, "actor_learning_rate must be at least 0"),
+        ({"critic_learning_rate": -1.0}, "critic_learning_rate must be at least 0"),
+        ({"temperature_learning_rate": -1.0}, "temperature_learning_rate must be at least 0"),
+        ({"critic": "tit"}, "critic must be 'mlp' or 'backbone', not 'tit'"),
+    ],
+)
+def test_impossible_settings(tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        make_cql(tmp_path, **settings)
+
+
+def test_an_unknown_way_over_critics(tmp_path):
+    with pytest.raises(ValueError, match="over_critics must be 'mean' or 'sum', not 'max'"):
+        make_cql(tmp_path, over_critics="max").check()
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
+    recipe = make_cql(tmp_path)
+    with Run.create(tmp_path / "run", recipe) as run:
+        replace(recipe, total_updates=9).train(run)
+        poisoned = replace(recipe, conservative_weight=float("inf"))
+        with pytest.raises(FloatingPointError, match=r"in the update at step 9.*of step 9 is good"):
+            poisoned.train(run)
+    assert load_checkpoint(run.checkpoints)[0] == 9
