@@ -12,10 +12,12 @@ from torchrl.envs import EnvBase
 from torchrl_tit.envs import make_env
 from torchrl_tit.files import write_text_atomic
 
-from . import ppo, sac
+from . import sac
 from .collect_settings import Collection
 from .collect_training import Score, score_policy
+from .ppo import PPO
 from .ppo_agent import Agent
+from .ppo_training import train as train_ppo
 from .recipe import Recipe, recipe_to_json
 from .registry import find_recipe
 from .run import Run
@@ -113,7 +115,7 @@ class PPOLearner:
         folder.mkdir(parents=True, exist_ok=True)
         write_text_atomic(folder / "recipe.json", recipe_to_json(self.recipe))
         with Run(folder, self.recipe) as run:
-            ppo.train(self.recipe, run, watcher)
+            train_ppo(self.recipe, run, watcher)
 
 
 class FinishedRun:
@@ -193,9 +195,9 @@ def find_agent(settings: Collection) -> Source | None:
     return PPOLearner(find_recipe(settings.agent), settings)
 
 
-def _check(recipe: Recipe, env: str) -> ppo.PPO:
+def _check(recipe: Recipe, env: str) -> PPO:
     """The recipe, if data of a task can be collected with it."""
-    if not isinstance(recipe, ppo.PPO):
+    if not isinstance(recipe, PPO):
         raise ValueError(
             f"data are collected with sac or a PPO recipe, but {recipe.name or 'that'} is one of "
             f"{recipe.algorithm}"

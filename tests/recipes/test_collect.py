@@ -12,11 +12,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from recipes import ppo
 from recipes.collect import collect
 from recipes.collect_agents import PPOLearner, SACLearner
 from recipes.collect_settings import KINDS, Collection
 from recipes.ppo import PPO
+from recipes.ppo_training import train
 from recipes.recipe import recipe_to_json
 from recipes.run import Run
 from tests.recipes.collected import (
@@ -156,7 +156,7 @@ def test_mixed_is_everything_that_training_saw(cartpole: Path, agent: str, tmp_p
     recorder = Recorder(noted["agent_steps"])
     recipe = PPOLearner(RECIPE, replace(CARTPOLE, agent=agent)).recipe
     with Run.create(tmp_path / "run", recipe) as run:
-        ppo.train(recipe, run, recorder)
+        train(recipe, run, recorder)
 
     seen: Any = torch.cat(recorder.batches, 1).reshape(-1)  # one environment after the other
     assert len(seen) == len(mixed["rewards"]) == noted["agent_steps"]

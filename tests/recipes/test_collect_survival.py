@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from recipes import collect_sets, collect_training, ppo
+from recipes import collect_agents, collect_sets, collect_training
 from recipes.collect import collect
 from recipes.collect_settings import KINDS
 from tests.recipes.collected import (
@@ -71,7 +71,7 @@ def test_what_is_finished_is_not_done_again(cartpole: Path, agent: str, monkeypa
         raise AssertionError("this was done already")
 
     before = {path: path.stat().st_mtime_ns for path in cartpole.rglob("*.hdf5")}
-    monkeypatch.setattr(ppo, "train", refuse)
+    monkeypatch.setattr(collect_agents, "train_ppo", refuse)
     monkeypatch.setattr(collect_sets, "roll_out", refuse)
     monkeypatch.setattr(collect_sets, "write_hdf5", refuse)
     monkeypatch.setattr(collect_sets, "write_minari", refuse)
