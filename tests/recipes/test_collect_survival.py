@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from recipes import collect_agents, collect_sets, collect_training
@@ -18,6 +19,8 @@ from tests.recipes.collected import (
     PENDULUM,
     assert_same,
     attributes,
+    check_episodes,
+    read,
 )
 from torchrl_tit.checkpoint import checkpoint_steps
 
@@ -79,6 +82,30 @@ def test_what_is_finished_is_not_done_again(cartpole: Path, agent: str, monkeypa
     assert [line.split(":")[0] for line in lines] == list(KINDS)
     assert {path: path.stat().st_mtime_ns for path in cartpole.rglob("*.hdf5")} == before
     assert not list(cartpole.glob("*.parts"))
+
+
+def test_a_task_that_cannot_be_saved(tmp_path: Path, monkeypatch: Any) -> None:
+    """Begins anew at each checkpoint, whether or not it is killed there."""
+    for place in ("recipes.ppo_state", "torchrl_tit.checkpoint.collector"):
+        monkeypatch.setattr(f"{place}.can_save_env", lambda env: False)
+    settings = replace(PENDULUM, sets=("mixed",), medium_return=None)
+    collect(settings, tmp_path / "whole")
+    data = read(tmp_path / "whole" / "mixed.hdf5")
+    assert np.flatnonzero(data["timeouts"]).tolist() == [149, 299, 449, 599]
+    check_episodes(data)
+
+    def die_late(self: object, step: int, policy: object) -> bool:
+        if step > 400:
+            raise Kill
+        return False
+
+    with monkeypatch.context() as patch:
+        patch.setattr(collect_training.Training, "updated", die_late)
+        with pytest.raises(Kill):
+            collect(settings, tmp_path / "killed")
+    collect(settings, tmp_path / "killed")
+    for name, array in read(tmp_path / "killed" / "mixed.hdf5").items():
+        np.testing.assert_array_equal(array, data[name])
 
 
 @pytest.mark.slow
