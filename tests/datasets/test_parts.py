@@ -28,8 +28,7 @@ def split(arrays: Transitions, streams: int, steps: list[int]) -> list[Transitio
     }
     bounds = np.cumsum([0, *steps])
     return [
-        {name: array[:, a:b] for name, array in side_by_side.items()}
-        for a, b in pairwise(bounds)
+        {name: array[:, a:b] for name, array in side_by_side.items()} for a, b in pairwise(bounds)
     ]
 
 
