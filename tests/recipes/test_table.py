@@ -71,10 +71,34 @@ def test_scores_count_where_there_are_some(tmp_path):
     assert (cell.mean, cell.std, cell.std_episodes) == (55, 5, 4)
 
 
+def test_offline_results_stand_beside_the_papers(tmp_path):
+    """Best normalised scores, in the paper's order, each network beside its own number."""
+    numbers = {"mlp": (58.8, 12.7), "enhanced-tit": (99.2, 1.7)}
+    for network in numbers:
+        for seed, best in enumerate([70.0, 80.0, 90.0]):
+            name = f"cql/hopper-medium-replay-v0/{network}"
+            folder = write_run(tmp_path / network / str(seed), name, seed, [1000.0, 1200.0])
+            evaluation = json.loads((folder / "evaluation.json").read_text())
+            evaluation |= {"score": {"best": best, "last": 30.0}, "score_std": 3.0}
+            (folder / "evaluation.json").write_text(json.dumps(evaluation))
+    cells, notes = make_table([tmp_path])
+    assert not notes
+    for cell, (network, paper) in zip(cells, numbers.items(), strict=True):
+        assert (cell.table, cell.recipe.rsplit("/")[-1], cell.runs) == ("offline", network, 3)
+        assert (cell.mean, cell.std) == pytest.approx((80, np.std([70, 80, 90])))
+        assert (cell.steps, cell.std_episodes) == (500_000, 3)
+        assert (cell.paper_mean, cell.paper_std) == paper
+    text = to_markdown(cells)
+    assert "### Offline" in text
+    assert "| cql/hopper-medium-replay-v0/enhanced-tit | 3 | 80.0 ± 8.2 | 3.0 |" in text
+    assert text.count("| 99.2 ± 1.7 |") == 1
+
+
 def test_every_value_of_the_paper_belongs_to_a_recipe():
+    assert set(paper_results()) <= set(RECIPES)
     online = {name for name, result in paper_results().items() if name.startswith("ppo/")}
-    assert online <= set(RECIPES)
     assert len(online) == 30 + 29 + 12  # arrays, images, ablation
+    assert len(paper_results()) - len(online) == 12 + 12  # CQL, Decision Transformer
 
 
 def test_command(runs, tmp_path, capsys):
