@@ -20,6 +20,9 @@ from .offline_training import run_updates
 from .recipe import check_at_least
 from .run import Run
 
+# What critics of three layers of 256 keep of so many actions, 12 MB, fits into a CPU's cache.
+_ACTIONS_IN_CACHE = 2000
+
 
 @dataclass(frozen=True, kw_only=True)
 class CQL(CQLRecipe[CQLAgent]):
@@ -121,6 +124,12 @@ def make_update(recipe: CQL, agent: CQLAgent) -> tuple[CQLUpdate, dict[str, torc
             parameters_of(loss.actor_network_params), lr=recipe.actor_learning_rate
         ),
     }
-    options = recipe.compile_options()
-    update = CQLUpdate(loss, **optimizers, target=SoftUpdate(loss, tau=recipe.tau), options=options)
+    in_cache = max(1, _ACTIONS_IN_CACHE // (3 * recipe.action_samples + 1))
+    update = CQLUpdate(
+        loss,
+        **optimizers,
+        target=SoftUpdate(loss, tau=recipe.tau),
+        states_at_once=in_cache if recipe.torch_device().type == "cpu" else None,
+        options=recipe.compile_options(),
+    )
     return update, optimizers

@@ -157,7 +157,11 @@ class CQLAgent(QAgent):
                 f"an MLP cannot value images {tuple(self.shape)}: set critic to 'backbone'"
             )
         mlp = MLP(
-            size + self.action_spec.shape[0], 1, num_cells=list(hidden), activation_class=nn.ReLU
+            size + self.action_spec.shape[0],
+            1,
+            num_cells=list(hidden),
+            activation_class=nn.ReLU,
+            activation_kwargs={"inplace": True},
         )
         value = ValueOperator(mlp, in_keys=[key, "action"], out_keys=["state_action_value"])
         return TensorDictSequential(*first, value)

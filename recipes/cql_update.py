@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
-from torchrl_tit.objectives import ContinuousCQLLoss
+from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples
 
 from .compilation import compile_and_time
 from .ppo_update import check_finite
@@ -28,7 +28,10 @@ class CQLUpdate:
         critic_optimizer: of the critics.
         actor_optimizer: of the actor.
         target: moves the target critics.
-        options: of ``torch.compile``; without any nothing is compiled.
+        states_at_once: states on which the critics' losses pass forth and back at a time; all
+            where not given. A few are faster on a CPU.
+        options: of ``torch.compile``; without any nothing is compiled. With ``states_at_once``
+            the policy alone is: what the critics do is matrix products.
     """
 
     TERMS: ClassVar = ["loss_actor", "loss_qvalue", "loss_cql", "loss_alpha", "alpha", "entropy"]
@@ -41,6 +44,8 @@ class CQLUpdate:
         critic_optimizer: torch.optim.Optimizer,
         actor_optimizer: torch.optim.Optimizer,
         target: SoftUpdate,
+        *,
+        states_at_once: int | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
         self.loss = loss
@@ -48,10 +53,12 @@ class CQLUpdate:
         self.critic_optimizer = critic_optimizer
         self.actor_optimizer = actor_optimizer
         self.target = target
+        self.states_at_once = states_at_once
         self.sample_policy, self.critic_losses = loss.sample_policy, loss.critic_losses
         self.actor_loss = loss.actor_loss
         if options is not None:
             self.sample_policy = compile_and_time(loss.sample_policy, options, "the policy")
+        if options is not None and states_at_once is None:
             self.critic_losses = compile_and_time(loss.critic_losses, options, "the critics' loss")
             self.actor_loss = compile_and_time(loss.actor_loss, options, "the actor's loss")
 
@@ -72,16 +79,17 @@ class CQLUpdate:
         samples = self.sample_policy(batch)
         loss_alpha = self.loss.alpha_loss(samples)
         _descend(loss_alpha, self.temperature_optimizer)
-        loss_qvalue, loss_cql = self.critic_losses(batch, samples)
-        _descend(loss_qvalue + loss_cql, self.critic_optimizer)
+        self.critic_optimizer.zero_grad()
+        loss_qvalue, loss_cql = self._critic_gradients(batch, samples)
+        self.critic_optimizer.step()
         loss_actor, _ = self.actor_loss(batch, samples)
         _descend(loss_actor, self.actor_optimizer)
         self.target.step()
         terms = torch.stack(
             [
                 loss_actor.detach(),
-                loss_qvalue.detach(),
-                loss_cql.detach(),
+                loss_qvalue,
+                loss_cql,
                 loss_alpha.detach(),
                 self.loss.log_alpha.detach().exp(),
                 -samples.log_prob.detach().mean(),
@@ -89,6 +97,16 @@ class CQLUpdate:
         )
         check_finite(self.TERMS, terms, step, saved_step)
         return terms
+
+    def _critic_gradients(
+        self, batch: TensorDictBase, samples: PolicySamples
+    ) -> tuple[Tensor, Tensor]:
+        """Adds them to the critics' weights; returns the squared error and the other term."""
+        if self.states_at_once is not None:
+            return self.loss.critic_gradients(batch, samples, self.states_at_once)
+        loss_qvalue, loss_cql = self.critic_losses(batch, samples)
+        (loss_qvalue + loss_cql).backward()
+        return loss_qvalue.detach(), loss_cql.detach()
 
 
 def _descend(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:

@@ -82,10 +82,10 @@ def make_samples(seed=2):
     )
 
 
-def make_loss(**settings):
+def make_loss(critic=None, **settings):
     """The actor reads "observation", the critics "state": their own key."""
     actor = make_squashed_actor(OBSERVATION, SPEC, in_key="observation").double()
-    critic = ValueOperator(Quadratic(), in_keys=["state", "action"])
+    critic = critic or ValueOperator(Quadratic(), in_keys=["state", "action"])
     options = {"min_q_weight": WEIGHT, "num_random": SAMPLES, "alpha_init": 0.3, **settings}
     loss = ContinuousCQLLoss(actor, critic, action_spec=SPEC, **options)
     loss.make_value_estimator(gamma=GAMMA)
@@ -137,6 +137,30 @@ def test_critics(monkeypatch, over_critics):
     assert loss_cql.item() == pytest.approx(WEIGHT * gap, rel=1e-6)
     assert loss.q_loss(batch, samples)[0].item() == pytest.approx(loss_qvalue.item())
     assert loss.cql_loss(batch, samples)[0].item() == pytest.approx(loss_cql.item())
+
+
+@pytest.mark.parametrize("over_critics", ["mean", "sum"])
+@pytest.mark.parametrize("states_at_once", [1, 2, BATCH, BATCH + 1])
+def test_a_few_states_at_a_time_give_the_same_gradients(monkeypatch, over_critics, states_at_once):
+    relu = {"activation_class": nn.ReLU, "activation_kwargs": {"inplace": True}}
+    mlp = MLP(OBSERVATION + ACTION, 1, num_cells=[8, 8], **relu).double()
+    critic = ValueOperator(mlp, in_keys=["state", "action"])
+    loss, batch = make_loss(critic, over_critics=over_critics), make_batch()
+    samples = make_samples()
+    uniform_actions(monkeypatch)
+    losses = loss.critic_losses(batch, samples)
+    sum(losses).backward()
+    params = dict(loss.qvalue_network_params.items(True, True))
+    whole = {key: weight.grad for key, weight in params.items()}
+    assert all(gradient.abs().sum() > 0 for gradient in whole.values())
+    loss.zero_grad()
+    for times in (1, 2):  # added to what is there
+        in_parts = loss.critic_gradients(batch, samples, states_at_once)
+        torch.testing.assert_close(in_parts, tuple(term.detach() for term in losses))
+        for key, weight in params.items():
+            torch.testing.assert_close(weight.grad, times * whole[key])
+    assert samples.action.grad is None
+    assert all(w.grad is None for w in loss.actor_network_params.values(True, True))
 
 
 def test_actor():
@@ -258,6 +282,9 @@ def test_backbones_run_once_a_state_and_all_of_it_trains():
     sum(terms[name] for name in ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha")).backward()
     for params in (loss.actor_network_params, loss.qvalue_network_params):
         assert all(w.grad is not None for w in params.values(True, True) if w.requires_grad)
+    calls["critic"].clear()
+    loss.critic_gradients(batch, loss.sample_policy(batch), states_at_once=2)
+    assert sorted(calls["critic"]) == [1, 1, 2, 2, 2, 2, BATCH, BATCH]  # the target's of all
     target = SoftUpdate(loss, tau=0.5)
     before = loss.target_qvalue_network_params.clone()
     with torch.no_grad():

@@ -10,7 +10,7 @@ class ManyActions(TensorDictModuleBase):
     """Lets a Q network value several actions in every state.
 
     Of a sequence of modules, those before the first that reads the action (a backbone, say) run
-    once a state; what they wrote is then repeated for each action, without a copy.
+    once a state; what they wrote is then repeated for each action.
 
     Args:
         qvalue_network: Reads state entries [*batch, ...] and an action [*batch, A], and writes
@@ -56,10 +56,13 @@ class ManyActions(TensorDictModuleBase):
         first = next(i for i, m in enumerate(modules) if self.action_key in m.in_keys)
         for module in modules[:first]:
             states = module(states)
-        each = states.unsqueeze(-1).expand(*tensordict.shape, action.shape[-2]).copy()
-        each.set(self.action_key, action)
+        shape = (*tensordict.shape, action.shape[-2])
+        # One batch dimension: products of more are views of products of one, and writing into
+        # a view (a ReLU in place) would cost autograd a copy.
+        each = states.unsqueeze(-1).expand(shape).reshape(-1)
+        each.set(self.action_key, action.flatten(0, -2))
         for module in modules[first:]:
             each = module(each)
         for key in self.out_keys:
-            tensordict.set(key, each.get(key))
+            tensordict.set(key, each.get(key).unflatten(0, shape))
         return tensordict
