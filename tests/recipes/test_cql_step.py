@@ -18,7 +18,7 @@ from torchrl_tit.networks import MLPConfig
 from torchrl_tit.objectives import PolicySamples
 
 ORDER = ("temperature", "critic", "actor", "target")
-WEIGHT, SAMPLES, GAMMA, TAU = 3.0, 4, 0.97, 0.1
+BATCH, WEIGHT, SAMPLES, GAMMA, TAU = 200, 3.0, 4, 0.97, 0.1
 RATES = {"temperature": 0.02, "critic": 3e-3, "actor": 1e-3}
 ENTRIES = 3  # of an action of Hopper, each from -1 to 1
 
@@ -161,12 +161,12 @@ def step(tmp_path, monkeypatch):
     )
     agent = recipe.make_agent()
     agent.loss.double()
-    batch = recipe.make_buffer().sample(32)
+    batch = recipe.make_buffer().sample(BATCH)
     batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
     batch["action"] *= 0.9  # off the bounds, where densities have no end
     draws: list[tuple[PolicySamples, Tensor]] = []
     sample_policy = agent.loss.sample_policy
-    uniform = torch.rand(32, SAMPLES, ENTRIES, dtype=torch.float64)
+    uniform = torch.rand(BATCH, SAMPLES, ENTRIES, dtype=torch.float64)
 
     def record(tensordict):
         draws.append((sample_policy(tensordict), uniform))
