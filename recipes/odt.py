@@ -6,20 +6,18 @@ import math
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import numpy as np
 import torch
 from pytorch_optimizer import Lamb
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import OnlineDTLoss
 
 from torchrl_tit.datasets import Episodes, SequenceStorage
-from torchrl_tit.modules import acting, make_dt_actor
+from torchrl_tit.modules import make_dt_actor
 from torchrl_tit.networks import DecisionTransformerConfig
 
-from .dt_agent import DTAgent
 from .dt_data import load_data, warn_of_targets
-from .odt_data import OnlineData, as_episodes
+from .odt_data import OnlineData
+from .odt_exploration import explore
 from .offline_state import TrainingState
 from .offline_training import run_updates
 from .ppo_update import check_finite
@@ -29,7 +27,7 @@ from .sequence_recipe import SequenceRecipe
 
 LOSSES = ["loss_log_likelihood", "loss_entropy", "entropy", "alpha", "gradient_norm"]
 TERMS = [*LOSSES, "online_return"]
-"""What a row of metrics has the means of; online_return is that of the newest episode."""
+"""What a row of metrics has the means of; online_return is the newest episodes'."""
 
 NETWORK = DecisionTransformerConfig(
     action_space="gaussian", embed_dim=512, num_blocks=4, num_heads=4, timestep_embedding=False
@@ -63,11 +61,16 @@ class ODT(SequenceRecipe):
     pretraining_updates: int = 5000
     """Gradient steps on the data set."""
     rounds: int = 1500
-    """Rounds of one episode and some gradient steps after that."""
+    """Rounds of new episodes and some gradient steps after that."""
+    episodes_per_round: int = 1
+    """Episodes that a round begins with, played side by side."""
     updates_per_round: int = 300
     """Gradient steps in each round."""
     online_return: float
     """Return that the network is asked for in the episodes that it trains on."""
+    exploration_scale: float = 1.0
+    """What the standard deviation of actions is multiplied by in those episodes: below 1 where the
+    data's policies are noisy, whose noise is learnt with their actions."""
     capacity: int = 1000
     """Episodes that are kept to train on."""
     evaluation_interval: int = 1
@@ -82,12 +85,15 @@ class ODT(SequenceRecipe):
             alpha_learning_rate=0,
             pretraining_updates=1,
             rounds=0,
+            episodes_per_round=1,
             updates_per_round=1,
             capacity=1,
             evaluation_interval=1,
         )
         if not self.alpha_init > 0:
             raise ValueError(f"alpha_init must be positive, not {self.alpha_init}")
+        if not self.exploration_scale > 0:
+            raise ValueError(f"exploration_scale must be positive, not {self.exploration_scale}")
         if not math.isfinite(self.online_return):
             raise ValueError(f"online_return must be finite, not {self.online_return}")
         if self.backbone.action_space != "gaussian":
@@ -189,24 +195,6 @@ def train(recipe: ODT, run: Run) -> None:
         return torch.cat([values, values.new_tensor([data.newest_return])])
 
     run_updates(recipe, run, agent, state, TERMS, update)
-
-
-def explore(agent: DTAgent, recipe: ODT, number: int) -> Episodes:
-    """Plays one episode with actions that are drawn.
-
-    Args:
-        agent: the network, which is put into evaluation mode for it.
-        recipe: the settings.
-        number: of the episode, which its seed follows from together with the recipe's.
-    """
-    seed = int(np.random.SeedSequence([recipe.seed, number]).generate_state(1)[0]) % 2**31
-    env = agent.make_env(1, recipe.online_return, seed)
-    agent.eval()
-    with torch.no_grad(), acting(agent.actor), set_exploration_type(ExplorationType.RANDOM):
-        rollout = env.rollout(recipe.backbone.max_ep_len, agent.actor)
-    agent.train()
-    env.close()
-    return as_episodes(rollout)
 
 
 def make_lamb(parameters: list[nn.Parameter], learning_rate: float, weight_decay: float) -> Lamb:

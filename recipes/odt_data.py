@@ -13,7 +13,6 @@ from torchrl.data import ReplayBuffer
 from torchrl_tit.datasets import (
     Episodes,
     SequenceStorage,
-    episodes_from_arrays,
     join_episodes,
     make_replay_buffer,
     select_episodes,
@@ -48,17 +47,14 @@ class OnlineData:
     ) -> None:
         self.rounds = 0
         """Times that episodes were added."""
+        self.newest_return = math.nan
+        """Mean return of the episodes that were added last."""
         self._episodes = episodes
         self._make_storage = make_storage
         self._batch_size = batch_size
         self._capacity = capacity
         self._seed = seed
         self._buffer = self._make_buffer()
-
-    @property
-    def newest_return(self) -> float:
-        """Return of the episode that was added last; NaN before any was."""
-        return self._episodes.returns[-1].item() if self.rounds else math.nan
 
     def sample(self) -> TensorDictBase:
         """Draws a batch, its actions within what a squashed Gaussian can give."""
@@ -78,12 +74,14 @@ class OnlineData:
         index = joined.lengths.new_tensor(range(oldest, len(joined.lengths)))
         self._episodes = select_episodes(joined, index)
         self.rounds += 1
+        self.newest_return = episodes.returns.mean().item()
         self._buffer = self._make_buffer()
 
     def state_dict(self) -> dict[str, Any]:
         """What the store holds, without the data set, and the state of what is drawn."""
         state: dict[str, Any] = {"rounds": self.rounds, "buffer": self._buffer.state_dict()}
         if self.rounds:
+            state["newest_return"] = self.newest_return
             state["rows"] = dict(self._episodes.rows.items())
             state["lengths"] = self._episodes.lengths
             state["final_known"] = self._episodes.final_known
@@ -93,6 +91,7 @@ class OnlineData:
         """Takes a state over."""
         self.rounds = state_dict["rounds"]
         if self.rounds:
+            self.newest_return = state_dict["newest_return"]
             rows = TensorDict(state_dict["rows"])
             rows.auto_batch_size_(1)
             self._episodes = Episodes(
@@ -107,23 +106,3 @@ class OnlineData:
     def _make_buffer(self) -> ReplayBuffer:
         seed = np.random.SeedSequence([self._seed, self.rounds]).generate_state(1).item()
         return make_replay_buffer(self._make_storage(self._episodes), self._batch_size, seed=seed)
-
-
-def as_episodes(rollout: TensorDictBase) -> Episodes:
-    """Makes an episode of a rollout [1, T] of one environment; its last step is taken for its end.
-
-    Args:
-        rollout: what :meth:`torchrl.envs.EnvBase.rollout` returned.
-    """
-    steps = rollout[0]
-    terminated = steps["next", "terminated"].flatten()
-    cut_off = ~terminated
-    cut_off[:-1] = False
-    return episodes_from_arrays(
-        steps["observation"].cpu(),
-        steps["action"].cpu(),
-        steps["next", "reward"].flatten().cpu(),
-        terminated.cpu(),
-        cut_off.cpu(),
-        steps["next", "observation"].cpu(),
-    )

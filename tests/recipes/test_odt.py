@@ -11,8 +11,9 @@ import torch
 from torch import nn
 
 from recipes.metrics import read_metrics
-from recipes.odt import ODT, explore, make_lamb
+from recipes.odt import ODT, make_lamb
 from recipes.odt_data import OnlineData
+from recipes.odt_exploration import explore, scale_noise
 from recipes.recipe import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
 from tests.datasets.rollouts import roll
@@ -87,6 +88,26 @@ def test_explores_with_drawn_actions_and_keeps_observations_as_they_are(tmp_path
     assert agent.training
 
 
+def test_episodes_side_by_side_are_whole_and_differ(tmp_path):
+    recipe = make_odt(tmp_path, episodes_per_round=4)
+    agent = recipe.make_agent()
+    episodes = explore(agent, recipe, 0)
+    assert len(episodes.lengths) == 4
+    assert episodes.finished.all()
+    assert len(set(episodes.returns.tolist())) == 4
+    starts = episodes.rows["observation"][episodes.last_rows - episodes.lengths + 1]
+    assert (starts[:, 0] > 1.2).all()  # each upright, as an episode begins
+
+
+def test_noise_is_scaled(tmp_path):
+    agent = make_odt(tmp_path).make_agent().eval()
+    start = agent.make_env(5, 60.0, 0).reset()
+    plain, scaled = (scale_noise(agent.actor, factor)(start.clone()) for factor in (1.0, 0.25))
+    torch.testing.assert_close(scaled["scale"], 0.25 * plain["scale"])
+    torch.testing.assert_close(scaled["loc"], plain["loc"])
+    assert scale_noise(agent.actor, 1.0) is agent.actor
+
+
 def make_data(capacity):
     episodes = episodes_from_arrays(**roll())
 
@@ -110,6 +131,7 @@ def test_the_store_begins_with_the_best_episodes_and_forgets_the_oldest():
     restored = make_data(capacity=4)[1]
     restored.load_state_dict(data.state_dict())
     assert (restored._episodes.rows == data._episodes.rows).all()
+    assert restored.newest_return == data.newest_return
     assert all((restored.sample() == data.sample()).all() for _ in range(3))
 
 
@@ -157,6 +179,8 @@ def test_lamb_is_that_of_the_release():
         ({"alpha_init": 0.0}, "alpha_init must be positive, not 0"),
         ({"online_return": math.inf}, "online_return must be finite, not inf"),
         ({"capacity": 0}, "capacity must be at least 1"),
+        ({"episodes_per_round": 0}, "episodes_per_round must be at least 1"),
+        ({"exploration_scale": 0.0}, "exploration_scale must be positive, not 0"),
         (
             {"backbone": DecisionTransformerConfig()},
             "action_space is 'continuous', but exploration takes a distribution",
