@@ -1,10 +1,15 @@
-"""The paper's runs of CQL and CQL_TIT as data."""
+"""The paper's runs of CQL and CQL_TIT as data, and runs on sets that `data collect` makes."""
 
 from __future__ import annotations
 
-from torchrl_tit.networks import Activation, EnhancedTITConfig, MLPConfig
+from dataclasses import replace
 
+from torchrl_tit.networks import Activation, EnhancedTITConfig, MLPConfig, NatureCNNConfig
+
+from .atari import ATARI_RECIPES
 from .cql import CQL
+from .cql_recipe import CQLRecipe
+from .discrete_cql import DiscreteCQL
 from .networks import NetworkConfig
 
 # Task name: environment and entries of an observation. The paper evaluated in D4RL's own
@@ -45,8 +50,45 @@ def _tit(dataset: str, observation_dim: int) -> EnhancedTITConfig:
     )
 
 
-def _named() -> dict[str, CQL]:
-    recipes = []
+def _discrete() -> list[DiscreteCQL]:
+    """The paper ran no discrete task offline; the data are those of docs/datasets.md."""
+    cartpole = DiscreteCQL(
+        name="discrete-cql/cartpole-mixed/mlp",
+        dataset="data/cartpole/mixed.hdf5",
+        env="CartPole-v1",
+        backbone=MLPConfig(activation="relu"),
+        batch_size=64,
+        total_updates=10_000,
+        evaluation_episodes=20,
+    )
+    pong = DiscreteCQL(
+        name="discrete-cql/pong-mixed/nature-cnn",
+        dataset="data/pong/mixed.hdf5",
+        env="ALE/Pong-v5",
+        history=4,
+        padding="constant",
+        backbone=NatureCNNConfig(),
+        batch_size=32,
+        learning_rate=1e-4,
+        total_updates=20_000,
+        evaluation_interval=4_000,
+        evaluation_episodes=5,
+    )
+    images = ATARI_RECIPES["ppo/pong/enhanced-tit"].backbone
+    return [
+        cartpole,
+        replace(
+            cartpole,
+            name="discrete-cql/cartpole-mixed/enhanced-tit",
+            backbone=EnhancedTITConfig(patch_size=2),
+        ),
+        pong,
+        replace(pong, name="discrete-cql/pong-mixed/enhanced-tit", backbone=images),
+    ]
+
+
+def _named() -> dict[str, CQLRecipe]:
+    recipes: list[CQLRecipe] = [*_discrete()]
     for task, (env, observation_dim) in _TASKS.items():
         for data in (f"{task}-medium", f"{task}-medium-replay"):
             networks: dict[str, NetworkConfig] = {
@@ -67,4 +109,5 @@ def _named() -> dict[str, CQL]:
 
 
 CQL_RECIPES = _named()
-"""``cql/DATASET/mlp`` and ``cql/DATASET/enhanced-tit`` for D4RL's sets of version 0."""
+"""``cql/DATASET/mlp`` and ``cql/DATASET/enhanced-tit`` for D4RL's sets of version 0, and
+``discrete-cql/...`` for collected ones."""

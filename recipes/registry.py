@@ -15,7 +15,6 @@ from torchrl_tit.networks import (
 
 from .atari import ATARI_RECIPES
 from .cql_named import CQL_RECIPES
-from .discrete_cql import DiscreteCQL  # noqa: F401 - recipes in JSON name it
 from .dt_named import DT_RECIPES
 from .networks import NetworkConfig
 from .no_velocity import NO_VELOCITY_RECIPES

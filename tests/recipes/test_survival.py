@@ -18,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO
 from recipes.recipe import recipe_to_json
-from recipes.registry import RECIPES, get_recipe
+from recipes.registry import RECIPES
 from recipes.run import Run
 from torchrl_tit.checkpoint import CheckpointError, latest_step, load_checkpoint
 from torchrl_tit.networks import EnhancedTITConfig
@@ -227,5 +227,9 @@ def test_run_folder_holds_what_it_says(tmp_path):
 
 
 def test_every_named_recipe_builds_its_agent():
-    for name in RECIPES:
-        get_recipe(name).check()
+    for name, recipe in RECIPES.items():
+        if name.startswith("discrete-cql/"):  # on data that its user collects
+            with pytest.raises(FileNotFoundError, match=r"no data file data/.*make it first"):
+                recipe.check()
+        else:
+            recipe.check()

@@ -45,7 +45,9 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"There is no data file {path}.")
+        raise FileNotFoundError(
+            f"There is no data file {path} in {Path.cwd()}: name another, or make it first."
+        )
     try:
         file = h5py.File(path, "r")
     except OSError as error:
