@@ -53,7 +53,11 @@ class Run:
         Raises:
             FileExistsError: if the folder is there already and not empty.
         """
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        # recipe.json comes last: without it, what a killed process began here is no run yet.
+        begun = {"versions.json", ".lock"}
+        if folder.exists() and (
+            not folder.is_dir() or any(path.name not in begun for path in folder.iterdir())
+        ):
             raise FileExistsError(
                 f"{folder} exists already: continue it with `train --resume {folder}`, or name "
                 "another folder with --out"

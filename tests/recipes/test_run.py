@@ -68,6 +68,19 @@ def fails(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     return capsys.readouterr().err.splitlines()[-1]
 
 
+def test_a_folder_that_a_killed_process_had_only_begun_becomes_a_run(tmp_path, monkeypatch):
+    def killed(path, text):
+        if path.name == "recipe.json":
+            raise SystemExit
+        path.write_text(text)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        patch.setattr("recipes.run.write_text_atomic", killed)
+        Run.create(tmp_path / "run", SMALL)
+    assert Run.create(tmp_path / "run", SMALL).recipe == SMALL
+    assert Run.open(tmp_path / "run").recipe == SMALL
+
+
 def test_only_a_new_or_empty_folder_becomes_a_run(tmp_path):
     (tmp_path / "empty").mkdir()
     assert Run.create(tmp_path / "empty", SMALL).folder == tmp_path / "empty"
