@@ -74,9 +74,10 @@ def test_a_folder_that_a_killed_process_had_only_begun_becomes_a_run(tmp_path, m
             raise SystemExit
         path.write_text(text)
 
-    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+    with monkeypatch.context() as patch:
         patch.setattr("recipes.run.write_text_atomic", killed)
-        Run.create(tmp_path / "run", SMALL)
+        with pytest.raises(SystemExit):
+            Run.create(tmp_path / "run", SMALL)
     assert Run.create(tmp_path / "run", SMALL).recipe == SMALL
     assert Run.open(tmp_path / "run").recipe == SMALL
 
