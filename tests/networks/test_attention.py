@@ -52,6 +52,29 @@ def test_names_equal_slices(read: str) -> None:
     torch.testing.assert_close(ours(x, read), expected)
 
 
+@pytest.mark.parametrize("length", [2, 5])
+@pytest.mark.parametrize("dropping", [False, True])
+def test_a_first_position_that_all_sequences_share(length: int, dropping: bool) -> None:
+    ours, _ = make(causal=False)
+    if dropping:
+        ours.train()
+        ours.dropout.p = 1e-30
+    first, rest = torch.randn(1, 1, 12), torch.randn(5, length - 1, 12)
+    results = []
+    for joined in (False, True):
+        inputs = [first.clone().requires_grad_(), rest.clone().requires_grad_()]
+        if joined:
+            out = ours(torch.cat([inputs[0].expand(5, 1, 12), inputs[1]], dim=1), "first")
+        else:
+            out = ours.read_first(*inputs)
+        weights = torch.arange(out.numel()).view_as(out) / out.numel()
+        results.append(
+            [out, *torch.autograd.grad((out * weights).sum(), [*inputs, *ours.parameters()])]
+        )
+    for own, expected in zip(*results, strict=True):
+        torch.testing.assert_close(own, expected, rtol=1e-5, atol=1e-5)
+
+
 def test_a_mask_for_every_row() -> None:
     ours, reference = make(causal=False)
     x = torch.randn(2, 4, 12)

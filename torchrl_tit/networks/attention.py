@@ -105,12 +105,17 @@ class SelfAttention(nn.Module):
             mask = self._past(x)
         if mask is not None:
             mask = mask[..., positions, :]
-        return self._attend(query, key, value, mask, is_causal=fused)
+        if dropping:
+            mixed = self.dropout(self._weights(query, key, mask)) @ value
+        else:
+            mixed = F.scaled_dot_product_attention(query, key, value, mask, is_causal=fused)
+        return self.out_proj(mixed.transpose(1, 2).flatten(2))
 
     def read_first(self, first: Tensor, rest: Tensor) -> Tensor:
         """Reads the first position where it is the same in all sequences: it is projected once.
 
-        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")``.
+        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")`` of
+        attention that is not causal.
 
         Args:
             first: float [1, 1, D].
@@ -119,11 +124,19 @@ class SelfAttention(nn.Module):
         Returns:
             float [N, 1, D].
         """
-        expand = (rest.shape[0], -1, -1)
-        query = self._project(first, 0, 1).expand(expand)
-        keys_and_values = [self._project(first, 1, 3).expand(expand), self._project(rest, 1, 3)]
-        key, value = torch.cat(keys_and_values, dim=1).chunk(2, dim=-1)
-        return self._attend(self._split(query), self._split(key), self._split(value))
+        count, width = rest.shape[0], first.shape[-1]
+        # One query for all: instead of all keys, it is projected, q (K x) = (q K) x. The keys' bias
+        # adds the same to all scores of a head, so the softmax does not see it.
+        query = self._project(first, 0, 1).reshape(self.num_heads, 1, -1)
+        keys = self.in_proj_weight[width : 2 * width].unflatten(0, (self.num_heads, -1))
+        probe = (query @ keys).squeeze(1).t() / math.sqrt(keys.shape[1])  # [D, heads]
+        scores = torch.cat([(first @ probe).expand(count, -1, -1), rest @ probe], dim=1)
+        weights = self.dropout(scores.softmax(dim=1)).unsqueeze(-1)  # [N, S, heads, 1]
+        own, other = (
+            self._project(x, 2, 3).unflatten(-1, (self.num_heads, -1)) for x in (first, rest)
+        )  # values, [1, 1, heads, D / heads] and [N, S - 1, heads, D / heads]
+        mixed = weights[:, :1] * own + (weights[:, 1:] * other).sum(dim=1, keepdim=True)
+        return self.out_proj(mixed.flatten(2))
 
     def weights(self, x: Tensor) -> Tensor:
         """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1."""
@@ -178,22 +191,6 @@ class SelfAttention(nn.Module):
     def _past(self, x: Tensor) -> Tensor:
         """The causal mask: bool [S, S], lower triangular."""
         return torch.ones(x.shape[1], x.shape[1], dtype=torch.bool, device=x.device).tril()
-
-    def _attend(
-        self,
-        query: Tensor,
-        key: Tensor,
-        value: Tensor,
-        mask: Tensor | None = None,
-        *,
-        is_causal: bool = False,
-    ) -> Tensor:
-        """Queries, keys and values [N, heads, S, D / heads] -> what is put out [N, S, D]."""
-        if self.training and self.dropout.p > 0:
-            mixed = self.dropout(self._weights(query, key, mask)) @ value
-        else:
-            mixed = F.scaled_dot_product_attention(query, key, value, mask, is_causal=is_causal)
-        return self.out_proj(mixed.transpose(1, 2).flatten(2))
 
     def _weights(self, query: Tensor, key: Tensor, mask: Tensor | None) -> Tensor:
         scores = query @ key.transpose(-2, -1) / math.sqrt(query.shape[-1])
