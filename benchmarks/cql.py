@@ -11,10 +11,9 @@ here. Install it beside: ``pip install --no-deps -r benchmarks/d3rlpy.txt``.
 
 from __future__ import annotations
 
-import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,7 @@ from d3rlpy.torch_utility import TorchMiniBatch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from recipes.compilation import Compile
 from recipes.cql import CQL, make_update
 from recipes.cql_agent import CQLAgent
 from recipes.registry import RECIPES
@@ -99,9 +99,9 @@ def make_batch() -> TensorDictBase:
     )
 
 
-def make_ours() -> Callable[[TensorDictBase], Any]:
+def make_ours(compiled: Compile) -> Callable[[TensorDictBase], Any]:
     """Our update."""
-    recipe = get_recipe()
+    recipe = replace(get_recipe(), compile=compiled)
     update, _ = make_update(recipe, CQLAgent(recipe))
     return lambda batch: update(batch, 0, 0)
 
@@ -168,11 +168,27 @@ def make_floor() -> Callable[[TensorDictBase], Any]:
     return products
 
 
+def ratios(one: Sequence[float], other: Sequence[float]) -> list[float]:
+    """How many times the other each is."""
+    return [a / b for a, b in zip(one, other, strict=True)]
+
+
+def differences(one: Sequence[float], other: Sequence[float]) -> list[float]:
+    """What each is more than the other."""
+    return [a - b for a, b in zip(one, other, strict=True)]
+
+
 def main(out: Path | None) -> None:
     """Measures on one thread, alternating, and reports."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    updates = {"d3rlpy": make_theirs(), "ours": make_ours(), "floor": make_floor()}
+    updates = {
+        "d3rlpy": make_theirs(),
+        "this library": make_ours("off"),
+        "this library, its policy compiled": make_ours("on"),
+        "the critics' matrix products alone": make_floor(),
+    }
+    theirs, *ours, floor = updates
     batches = [make_batch() for _ in range(STEPS)]
     times: dict[str, list[float]] = {name: [] for name in updates}
     for update in updates.values():
@@ -183,30 +199,25 @@ def main(out: Path | None) -> None:
             for batch in batches:
                 update(batch)
             times[name].append((time.process_time() - start) / STEPS)
-    whole = [a / b for a, b in zip(times["d3rlpy"], times["ours"], strict=True)]
-    rest = [
-        (theirs - floor) / (ours - floor)
-        for theirs, ours, floor in zip(times["d3rlpy"], times["ours"], times["floor"], strict=True)
+    whole = {name: ratios(times[theirs], times[name]) for name in ours}
+    above = {name: differences(times[name], times[floor]) for name in (theirs, *ours)}
+    rest = {name: ratios(above[theirs], above[name]) for name in ours}
+    rows = [
+        [
+            name,
+            spread([1000 * t for t in seconds]),
+            spread(whole[name], 2) if name in ours else "",
+            spread(rest[name], 2) if name in ours else "",
+        ]
+        for name, seconds in times.items()
     ]
-    labels = {
-        "d3rlpy": "d3rlpy",
-        "ours": "this library",
-        "floor": "the critics' matrix products alone",
-    }
-    rows = [[label, spread([1000 * t for t in times[name]])] for name, label in labels.items()]
     markdown = (
         "# Conservative Q-learning\n\n"
         "One update of CQL_TIT with the networks of the paper's hopper-medium-replay, batch 256, "
-        "one thread,\nprocessor time; not compiled, which takes longer on a CPU. "
-        f"{ROUNDS} rounds of {STEPS} updates each, alternating: median (range).\n\n"
-        + table(["", "ms an update"], rows)
-        + f"\nTimes as fast as d3rlpy, round by round: {spread(whole, 2)}; everything but the "
-        f"critics' matrix\nproducts: {spread(rest, 2)}.\n"
+        "one thread,\nprocessor time, compile time apart. "
+        f"{ROUNDS} rounds of {STEPS} updates each, alternating: median (range), round by\nround "
+        "for ratios.\n\n"
+        + table(["", "ms an update", "times as fast", "beside the products"], rows)
     )
-    numbers = {
-        "seconds": times,
-        "ratios": whole,
-        "median_ratio": statistics.median(whole),
-        "ratios_beside_the_floor": rest,
-    }
+    numbers = {"seconds": times, "ratios": whole, "ratios_beside_the_floor": rest}
     publish("cql", markdown, numbers, out)

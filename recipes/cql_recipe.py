@@ -28,6 +28,9 @@ class CQLRecipe(OfflineRecipe[AgentT]):
     continuous: ClassVar[bool]
     """Whether actions are continuous."""
 
+    compiling_pays_on: ClassVar[tuple[str, ...]] = ("cuda",)
+    """Types of device on which "auto" compiles."""
+
     history: int = 1
     """Number K of observations that the backbone sees."""
     padding: Padding = "same"
@@ -57,8 +60,9 @@ class CQLRecipe(OfflineRecipe[AgentT]):
     """Episodes of every evaluation, side by side."""
     compile: Compile = "auto"
     """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
-    at the start: "auto" is on on a GPU, for runs long enough to earn that back. On a CPU the time
-    goes into the critics' matrix products, which compiling does not make faster."""
+    at the start: "auto" is on where it pays, in runs long enough to earn that back. Continuous CQL
+    compiles the policy alone on a CPU, since critics are matrix products, which compiling does not
+    make faster; discrete CQL is compiled on a GPU only."""
     cuda_graphs: Compile = "auto"
     """Whether a GPU launches what is compiled as CUDA graphs; "auto" is on."""
 
@@ -93,7 +97,7 @@ class CQLRecipe(OfflineRecipe[AgentT]):
         """
         device = self.torch_device()
         options = compile_options(self.cuda_graphs, device)
-        pays = self.compile == "on" or device.type == "cuda"
+        pays = self.compile == "on" or device.type in self.compiling_pays_on
         return options if pays and should_compile(self.compile, self.total_updates) else None
 
     def play(self, agent: AgentT, step: int) -> list[Outcome]:
