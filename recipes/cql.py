@@ -20,8 +20,8 @@ from .offline_training import run_updates
 from .recipe import check_at_least
 from .run import Run
 
-# What critics of three layers of 256 keep of so many actions, 10 MB, fits into a CPU's cache.
-_ACTIONS_IN_CACHE = 2700
+# What critics of three layers of 256 keep of so many actions, 8 MB, fits into a CPU's cache.
+_ACTIONS_IN_CACHE = 2000
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,15 +7,20 @@ import pytest
 import torch
 from scipy.stats import norm
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
 from torch import nn
 from torchrl.data import Bounded, Categorical, Unbounded
 from torchrl.modules import MLP, ValueOperator
 from torchrl.objectives import SoftUpdate
 
 from torchrl_tit import Backbone, EnhancedTIT
-from torchrl_tit.modules import make_squashed_actor
+from torchrl_tit.modules import ManyActions, make_squashed_actor
 from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples
+from torchrl_tit.objectives.relu_mlp import ReLUMLP
 
 BATCH, SAMPLES, OBSERVATION, ACTION = 5, 3, 4, 2
 GAMMA, WEIGHT = 0.9, 7.0
@@ -65,6 +70,11 @@ def make_batch(seed=1):
         },
         [BATCH],
     )
+
+
+def make_mlp(**settings):
+    mlp = MLP(OBSERVATION + ACTION, 1, num_cells=[8, 8], **settings).double()
+    return ValueOperator(mlp, in_keys=["action", "state"])
 
 
 def make_samples(seed=2):
@@ -141,10 +151,11 @@ def test_critics(monkeypatch, over_critics):
 
 @pytest.mark.parametrize("over_critics", ["mean", "sum"])
 @pytest.mark.parametrize("states_at_once", [1, 2, BATCH, BATCH + 1])
-def test_a_few_states_at_a_time_give_the_same_gradients(monkeypatch, over_critics, states_at_once):
-    relu = {"activation_class": nn.ReLU, "activation_kwargs": {"inplace": True}}
-    mlp = MLP(OBSERVATION + ACTION, 1, num_cells=[8, 8], **relu).double()
-    critic = ValueOperator(mlp, in_keys=["state", "action"])
+@pytest.mark.parametrize("activation", [nn.ReLU, nn.Tanh], ids=["by hand", "autograd"])
+def test_a_few_states_at_a_time_give_the_same_gradients(
+    monkeypatch, over_critics, states_at_once, activation
+):
+    critic = make_mlp(activation_class=activation)
     loss, batch = make_loss(critic, over_critics=over_critics), make_batch()
     samples = make_samples()
     uniform_actions(monkeypatch)
@@ -161,6 +172,26 @@ def test_a_few_states_at_a_time_give_the_same_gradients(monkeypatch, over_critic
             torch.testing.assert_close(weight.grad, times * whole[key])
     assert samples.action.grad is None
     assert all(w.grad is None for w in loss.actor_network_params.values(True, True))
+
+
+@pytest.mark.parametrize(
+    ("plain", "settings"),
+    [
+        (True, {}),
+        (True, {"activation_kwargs": {"inplace": True}}),
+        (False, {"activation_class": nn.LeakyReLU}),
+        (False, {"dropout": 0.1}),
+        (False, {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": 8}] * 2}),
+        (False, {"bias_last_layer": False}),
+        (False, {"activate_last_layer": True}),
+    ],
+)
+def test_only_plain_mlps_are_computed_by_hand(plain, settings):
+    critic = make_mlp(**{"activation_class": nn.ReLU, **settings})
+    alone = TensorDictSequential(critic)
+    behind = TensorDictSequential(TensorDictModule(nn.ReLU(), ["raw"], ["state"]), critic)
+    found = [ReLUMLP.of(ManyActions(c)) is not None for c in (critic, alone, behind)]
+    assert found == [plain, plain, False]
 
 
 def test_actor():

@@ -14,6 +14,7 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import CQLLoss, distance_loss
 
 from torchrl_tit.modules.many_actions import ManyActions
+from torchrl_tit.objectives.relu_mlp import ReLUMLP
 
 OverCritics = Literal["mean", "sum"]
 
@@ -219,8 +220,8 @@ class ContinuousCQLLoss(CQLLoss):
         """
         samples = samples or self.sample_policy(tensordict)
         questions = self._questions(tensordict, samples)
-        answers = self._vmap_qvalue_networkN0(questions.inputs, self.qvalue_network_params)
-        return self._losses(answers, questions, len(questions.target))
+        values = self._values(questions.inputs, self.qvalue_network_params)
+        return self._losses(values, questions, len(questions.target))
 
     def critic_gradients(
         self, tensordict: TensorDictBase, samples: PolicySamples, states_at_once: int
@@ -240,12 +241,13 @@ class ContinuousCQLLoss(CQLLoss):
         """
         questions = self._questions(tensordict, samples)
         parts = questions.split(states_at_once)
+        values_of = ReLUMLP.of(self.qvalue_network) or self._values_of_one
         losses = []
         for critic in self._critics():
             with critic.to_module(self.qvalue_network, preserve_module_state=False):
                 for part in parts:
-                    answers = self.qvalue_network(part.inputs.copy())
-                    loss_qvalue, loss_cql = self._losses(answers, part, len(questions.target))
+                    values = values_of(part.inputs)  # [b, 3n + 1]
+                    loss_qvalue, loss_cql = self._losses(values, part, len(questions.target))
                     (loss_qvalue + loss_cql).backward()
                     losses.append(torch.stack([loss_qvalue, loss_cql]).detach())
         loss_qvalue, loss_cql = torch.stack(losses).sum(dim=0).unbind()
@@ -273,18 +275,16 @@ class ContinuousCQLLoss(CQLLoss):
             samples: of :meth:`sample_policy`; drawn anew where not given.
         """
         samples = samples or self.sample_policy(tensordict)
-        values = self._values(
-            tensordict, samples.action.unsqueeze(1), self._cached_detach_qvalue_params
-        )
+        inputs = self._inputs(tensordict, samples.action.unsqueeze(1))
+        values = self._values(inputs, self._cached_detach_qvalue_params)  # [critics, B, 1]
         value = values.squeeze(-1).amin(0)  # [B]
         return (self._alpha * samples.log_prob - value).mean(), {}
 
     def _target(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
         """What the critics aim at, without gradient; float [B]."""
         with torch.no_grad():
-            values = self._values(
-                tensordict["next"], next_action.unsqueeze(1), self.target_qvalue_network_params
-            )
+            inputs = self._inputs(tensordict["next"], next_action.unsqueeze(1))
+            values = self._values(inputs, self.target_qvalue_network_params)  # [critics, B, 1]
             outcome = tensordict["next"].select(
                 self.tensor_keys.reward, self.tensor_keys.terminated, self.tensor_keys.done
             )
@@ -292,11 +292,15 @@ class ContinuousCQLLoss(CQLLoss):
             batch = TensorDict({"next": outcome}, tensordict.batch_size)
             return self.value_estimator.value_estimate(batch).squeeze(-1)
 
-    def _values(self, tensordict: TensorDictBase, actions: Tensor, params: TensorDict) -> Tensor:
-        """Values of several actions in each state; [B, m, A] -> [critics, B, m]."""
-        inputs = self._inputs(tensordict, actions)
-        values = self._vmap_qvalue_networkN0(inputs, params)
-        return values.get(self.tensor_keys.state_action_value).squeeze(-1)
+    def _values(self, inputs: TensorDictBase, params: TensorDict) -> Tensor:
+        """What all critics say of m actions in each state; [critics, B, m]."""
+        answers = self._vmap_qvalue_networkN0(inputs, params)
+        return answers.get(self.tensor_keys.state_action_value).squeeze(-1)
+
+    def _values_of_one(self, inputs: TensorDictBase) -> Tensor:
+        """What the critic says whose weights are in the network; [B, m]."""
+        answers = self.qvalue_network(inputs.copy())
+        return answers.get(self.tensor_keys.state_action_value).squeeze(-1)
 
     def _inputs(self, tensordict: TensorDictBase, actions: Tensor) -> TensorDictBase:
         """What critics read of each state, and several actions there, [B, m, A]."""
@@ -319,17 +323,14 @@ class ContinuousCQLLoss(CQLLoss):
             target=self._target(tensordict, samples.next_action),
         )
 
-    def _losses(
-        self, answers: TensorDictBase, questions: _Questions, batch: int
-    ) -> tuple[Tensor, Tensor]:
+    def _losses(self, values: Tensor, questions: _Questions, batch: int) -> tuple[Tensor, Tensor]:
         """The share of b states, and of one critic or all, in the losses of a batch [B].
 
         Args:
-            answers: with the values, float [b, 3n + 1, 1], or [critics, b, 3n + 1, 1].
+            values: of the actions, float [b, 3n + 1] or [critics, b, 3n + 1].
             questions: what was asked in the states.
             batch: B.
         """
-        values = answers.get(self.tensor_keys.state_action_value).squeeze(-1)
         value = values[..., -1]  # of the action taken; [b] or [critics, b]
         errors = distance_loss(value, questions.target.expand_as(value), self.loss_function)
         optimism = torch.logsumexp(values[..., :-1] - questions.log_density, dim=-1)
