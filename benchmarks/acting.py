@@ -3,7 +3,8 @@
 Windows move on by one observation a step, as environments hand them over; every 25 steps one
 environment starts anew. Ours is the ``Backbone`` in acting mode, checks of frames and weights
 included, as it is and with its two parts compiled; the other is the straightforward network on the
-same windows. Milliseconds a step.
+same windows. Milliseconds a step: of one thread's processor time on a CPU, where what else runs on
+the machine then counts for little.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import statistics
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -51,12 +53,13 @@ def make_windows(case: Case, steps: int, device: str = "cpu") -> list[Tensor]:
 
 def milliseconds(act: Callable[[Tensor], Any], windows: list[Tensor]) -> float:
     """Milliseconds a step."""
+    clock = time.perf_counter if windows[0].is_cuda else time.thread_time
     synchronize(windows[0])
-    start = time.perf_counter()
+    start = clock()
     for window in windows:
         act(window)
     synchronize(windows[0])
-    return 1000 * (time.perf_counter() - start) / len(windows)
+    return 1000 * (clock() - start) / len(windows)
 
 
 def synchronize(tensor: Tensor) -> None:
@@ -65,31 +68,35 @@ def synchronize(tensor: Tensor) -> None:
         torch.cuda.synchronize()
 
 
+def our_step(
+    case: Case, stack: ExitStack, *, compiled: bool, device: str
+) -> Callable[[Tensor], object]:
+    """Our backbone in acting mode, for as long as the stack is open."""
+    backbone = Backbone(case.ours()).eval().to(device)
+    if compiled:
+        backbone.compile_parts(dynamic=False)
+    stack.enter_context(backbone.acting())
+    return lambda window: backbone(TensorDict({"history": window}, [len(window)]))
+
+
+@torch.no_grad()
 def measure(
     case: Case, steps: int, repeats: int, *, compiled: bool = False, device: str = "cpu"
 ) -> dict[str, Any]:
     """Measures ours, ours compiled, and the straightforward network, alternating."""
     torch.manual_seed(0)
     other = case.straightforward().eval().to(device)
-    backbones = {"ours": Backbone(case.ours()).eval().to(device)}
-    if compiled:
-        backbones["compiled"] = Backbone(case.ours()).eval().to(device)
-        backbones["compiled"].compile_parts(dynamic=False)
-    times: dict[str, list[float]] = {name: [] for name in (*backbones, "straightforward")}
-    with torch.no_grad(), ExitStack() as stack:
-        for backbone in backbones.values():
-            stack.enter_context(backbone.acting())
+    with ExitStack() as stack:
+        acts = {"ours": our_step(case, stack, compiled=False, device=device)}
+        if compiled:
+            acts["compiled"] = our_step(case, stack, compiled=True, device=device)
+        acts["straightforward"] = other
+        times: dict[str, list[float]] = {name: [] for name in acts}
         for _ in range(repeats):
             windows = make_windows(case, steps + 2, device)
-            for name, backbone in backbones.items():
-
-                def act(window: Tensor, backbone: Backbone = backbone) -> None:
-                    backbone(TensorDict({"history": window}, [len(window)]))
-
+            for name, act in acts.items():
                 milliseconds(act, windows[:2])  # fills what is kept
                 times[name].append(milliseconds(act, windows[2:]))
-            milliseconds(other, windows[:1])
-            times["straightforward"].append(milliseconds(other, windows[2:]))
     row: dict[str, Any] = {**case.record(), "dtype": "float32"}
     for name, values in times.items():
         row[f"{name}_ms"] = values
@@ -99,14 +106,23 @@ def measure(
     return row
 
 
-def growth(rows: list[dict[str, Any]], variant: str, inputs: str, name: str) -> float:
-    """How much longer our step takes with K = 64 than with K = 4."""
-    time_of = {
-        row["history"]: statistics.median(row[f"{name}_ms"])
-        for row in rows
-        if (row["variant"], row["inputs"]) == (variant, inputs) and f"{name}_ms" in row
-    }
-    return time_of[64] / time_of[4]
+@torch.no_grad()
+def growth(
+    case: Case, steps: int, repeats: int, *, compiled: bool = False, device: str = "cpu"
+) -> list[float]:
+    """How much longer our step takes with K = 64 than in a case, alternating."""
+    cases = [case, replace(case, history=64)]
+    ratios = []
+    with ExitStack() as stack:
+        acts = [our_step(each, stack, compiled=compiled, device=device) for each in cases]
+        for _ in range(repeats):
+            times = []
+            for each, act in zip(cases, acts, strict=True):
+                windows = make_windows(each, steps + 2, device)
+                milliseconds(act, windows[:2])
+                times.append(milliseconds(act, windows[2:]))
+            ratios.append(times[1] / times[0])
+    return ratios
 
 
 def cells(row: dict[str, Any]) -> list[str]:
@@ -131,21 +147,20 @@ def main(out: Path | None) -> None:
     ]
     lines = [[*case.columns(), *cells(row)] for case, row in zip(CASES, rows, strict=True)]
     grows = {
-        f"{variant}, {inputs}": growth(rows, variant, inputs, "ours")
-        for inputs in ("arrays", "images")
-        for variant in ("Enhanced", "Vanilla")
-    } | {
-        f"{variant}, images, compiled": growth(rows, variant, "images", "compiled")
-        for variant in ("Enhanced", "Vanilla")
+        f"{case.variant}, {case.inputs}{', compiled' if compiled else ''}": growth(
+            case, STEPS, REPEATS, compiled=compiled, device=device
+        )
+        for case in CASES
+        if case.history == 4
+        for compiled in ((False, True) if case in COMPILED else (False,))
     }
     header = ["dtype", "ours", "ours, compiled", "straightforward", "ratio", "ratio, compiled"]
     markdown = (
-        f"# Acting\n\nMilliseconds a step of all environments together, float32, on {device}. "
-        f"{REPEATS} rounds of\n{STEPS} steps, alternating: median (range); ratios are taken round "
-        "by round.\n\n"
+        f"# Acting\n\nMilliseconds a step of all environments together, float32, on {device}"
+        f"{' (processor time)' if device == 'cpu' else ''}. {REPEATS} rounds of\n{STEPS} steps, "
+        "alternating: median (range); ratios are taken round by round.\n\n"
         + table([*COLUMNS, *header], lines)
-        + "\nFrom K = 4 to K = 64 our step takes longer by these factors: "
-        + ", ".join(f"{name} {factor:.2f}" for name, factor in grows.items())
-        + ".\n"
+        + "\nHow much longer our step takes with K = 64 than with K = 4, both alternating:\n\n"
+        + table(["network", "factor"], [[name, spread(x, 2)] for name, x in grows.items()])
     )
     publish("acting", markdown, {"rows": rows, "growth_from_4_to_64": grows}, out)

@@ -34,6 +34,10 @@ def test_acting(case):
     ]
 
 
+def test_growth_with_the_history():
+    assert len(acting.growth(CASES[0], steps=2, repeats=3)) == 3
+
+
 def test_windows_move_on_and_start_anew():
     case = Case("Enhanced", "arrays", 4, 3)
     windows = acting.make_windows(case, 14)
