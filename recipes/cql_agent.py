@@ -118,7 +118,8 @@ class CQLAgent(QAgent):
                 f"{_describe(self.action_spec)}: use a discrete-cql recipe where they are discrete"
             )
         backbone, features_dim = self.make_backbone("features")
-        head = make_squashed_actor(features_dim, self.action_spec)
+        # The bounds too are where the networks are: a CUDA graph reads nothing of the CPU.
+        head = make_squashed_actor(features_dim, self.action_spec.to(self.device))
         self.policy = ProbabilisticTensorDictSequential(backbone, *head).to(self.device)
         critics = [self._make_critic(recipe.critic, recipe.critic_hidden) for _ in range(2)]
         self.loss = ContinuousCQLLoss(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Protocol
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl_tit.checkpoint import global_rng_state, set_global_rng_state
 
 from .outcomes import Outcome
+from .ppo_update import check_finite
 from .run import Run
 
 
@@ -40,19 +41,33 @@ class TrainingState:
         """Step of the newest checkpoint."""
         self._parts = parts
         self._evaluation_seed = evaluation_seed
-        self._sums: list[float] = []  # of the terms since the last row of metrics
+        self._sums: Tensor | None = None  # of the terms since the last row of metrics
         self._count = 0
 
     def add(self, terms: Tensor) -> None:
-        """Takes in what one gradient step gave, float [terms]."""
-        values = terms.tolist()
-        self._sums = [a + b for a, b in zip(self._sums or [0.0] * len(values), values, strict=True)]
+        """Takes in what one gradient step gave, float [terms], without waiting for a GPU."""
+        terms = terms.double()
+        self._sums = terms if self._sums is None else self._sums.to(terms.device) + terms
         self._count += 1
+
+    def check(self, names: Sequence[str], step: int) -> None:
+        """Stops a run where what it took in is not finite.
+
+        Args:
+            names: of the terms.
+            step: gradient steps so far, for messages.
+
+        Raises:
+            FloatingPointError: naming the term and the newest checkpoint.
+        """
+        if self._sums is not None:
+            check_finite(names, self._sums, step, self.saved_step)
 
     def take_means(self) -> list[float]:
         """Returns the means of the terms since it was asked last."""
-        means = [total / self._count for total in self._sums]
-        self._sums, self._count = [], 0
+        assert self._sums is not None
+        means = [total / self._count for total in self._sums.tolist()]
+        self._sums, self._count = None, 0
         return means
 
     def save(self, run: Run, step: int) -> None:
@@ -64,7 +79,7 @@ class TrainingState:
                 "rng": global_rng_state(),
                 "outcomes": [asdict(outcome) for outcome in self.outcomes],
                 "evaluation_seed": self._evaluation_seed,
-                "sums": self._sums,
+                "sums": [] if self._sums is None else self._sums.tolist(),
                 "count": self._count,
             },
         )
@@ -80,7 +95,9 @@ class TrainingState:
             for name, part in self._parts.items():
                 _load(part, state[name])
             self.outcomes = [Outcome(**outcome) for outcome in state["outcomes"]]
-            self._sums, self._count = state["sums"], state["count"]
+            sums = state["sums"]
+            self._sums = torch.tensor(sums, dtype=torch.float64) if sums else None
+            self._count = state["count"]
         set_global_rng_state(state["rng"])
         self.saved_step = step
         return step

@@ -35,6 +35,9 @@ def run_updates(
         state: all that belongs into a checkpoint.
         terms: names of what a gradient step gives.
         update: takes one, the first where it is given 0, and returns its terms, float [terms].
+
+    Raises:
+        FloatingPointError: if a term is not finite, before it is logged and before a checkpoint.
     """
     step = state.load(run)
     returns_of = recipe.outcome_columns()
@@ -51,6 +54,7 @@ def run_updates(
             step += 1
             evaluation_due = recipe.evaluation_due(step)
             if evaluation_due or step % recipe.log_interval == 0:
+                state.check(terms, step)
                 returns = dict.fromkeys(["return_mean", *returns_of.values()], math.nan)
                 if evaluation_due:
                     outcomes = recipe.play(agent, step)
@@ -67,6 +71,7 @@ def run_updates(
             progress.update()
             checkpoint_due = evaluation_due or step % recipe.checkpoint_interval == 0
             if checkpoint_due or interrupt.requested:
+                state.check(terms, step)
                 state.save(run, step)
             if interrupt.requested:
                 raise KeyboardInterrupt
