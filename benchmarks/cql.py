@@ -217,7 +217,7 @@ def main(out: Path | None) -> None:
         "one thread,\nprocessor time, compile time apart. "
         f"{ROUNDS} rounds of {STEPS} updates each, alternating: median (range), round by\nround "
         "for ratios.\n\n"
-        + table(["", "ms an update", "times as fast", "beside the products"], rows)
+        + table(["", "ms an update", "times as fast as d3rlpy", "without the products"], rows)
     )
     numbers = {"seconds": times, "ratios": whole, "ratios_beside_the_floor": rest}
     publish("cql", markdown, numbers, out)

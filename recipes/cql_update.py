@@ -76,6 +76,7 @@ class CQLUpdate:
         Raises:
             FloatingPointError: if a term is not finite, on a CPU.
         """
+        torch.compiler.cudagraph_mark_step_begin()  # graphs may write over the last step's tensors
         samples = self.sample_policy(batch)
         loss_alpha = self.loss.alpha_loss(samples)
         _descend(loss_alpha, self.temperature_optimizer)
