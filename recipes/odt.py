@@ -194,7 +194,8 @@ def train(recipe: ODT, run: Run) -> None:
         alpha_optimizer.step()
         return torch.cat([values, values.new_tensor([data.newest_return])])
 
-    run_updates(recipe, run, agent, state, TERMS, update)
+    # There is no online return before the first round.
+    run_updates(recipe, run, agent, state, TERMS, update, finite=len(LOSSES))
 
 
 def make_lamb(parameters: list[nn.Parameter], learning_rate: float, weight_decay: float) -> Lamb:

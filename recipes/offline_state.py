@@ -54,14 +54,14 @@ class TrainingState:
         """Stops a run where what it took in is not finite.
 
         Args:
-            names: of the terms.
+            names: of the terms, or of the first ones if only these are looked at.
             step: gradient steps so far, for messages.
 
         Raises:
             FloatingPointError: naming the term and the newest checkpoint.
         """
         if self._sums is not None:
-            check_finite(names, self._sums, step, self.saved_step)
+            check_finite(names, self._sums[: len(names)], step, self.saved_step)
 
     def take_means(self) -> list[float]:
         """Returns the means of the terms since it was asked last."""

@@ -25,6 +25,8 @@ def run_updates(
     state: TrainingState,
     terms: Sequence[str],
     update: Callable[[int], Tensor],
+    *,
+    finite: int | None = None,
 ) -> None:
     """Takes gradient steps to the end of a run, with evaluations, metrics and checkpoints.
 
@@ -35,6 +37,7 @@ def run_updates(
         state: all that belongs into a checkpoint.
         terms: names of what a gradient step gives.
         update: takes one, the first where it is given 0, and returns its terms, float [terms].
+        finite: how many of the terms, from the first on, have to be finite; all where not given.
 
     Raises:
         FloatingPointError: if a term is not finite, before it is logged and before a checkpoint.
@@ -54,7 +57,7 @@ def run_updates(
             step += 1
             evaluation_due = recipe.evaluation_due(step)
             if evaluation_due or step % recipe.log_interval == 0:
-                state.check(terms, step)
+                state.check(terms[:finite], step)
                 returns = dict.fromkeys(["return_mean", *returns_of.values()], math.nan)
                 if evaluation_due:
                     outcomes = recipe.play(agent, step)
@@ -71,7 +74,7 @@ def run_updates(
             progress.update()
             checkpoint_due = evaluation_due or step % recipe.checkpoint_interval == 0
             if checkpoint_due or interrupt.requested:
-                state.check(terms, step)
+                state.check(terms[:finite], step)
                 state.save(run, step)
             if interrupt.requested:
                 raise KeyboardInterrupt
