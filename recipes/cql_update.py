@@ -34,8 +34,9 @@ class CQLUpdate:
             the policy alone is: what the critics do is matrix products.
     """
 
-    TERMS: ClassVar = ["loss_actor", "loss_qvalue", "loss_cql", "loss_alpha", "alpha", "entropy"]
-    """What a gradient step gives."""
+    TERMS: ClassVar = ["loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy"]
+    """What a gradient step gives; the losses in the order of the steps, so that the first that is
+    not finite is the one to blame."""
 
     def __init__(
         self,
@@ -88,10 +89,10 @@ class CQLUpdate:
         self.target.step()
         terms = torch.stack(
             [
-                loss_actor.detach(),
+                loss_alpha.detach(),
                 loss_qvalue,
                 loss_cql,
-                loss_alpha.detach(),
+                loss_actor.detach(),
                 self.loss.log_alpha.detach().exp(),
                 -samples.log_prob.detach().mean(),
             ]

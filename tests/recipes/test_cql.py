@@ -32,7 +32,7 @@ from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import normalized_score, normalized_spread
 from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig, MLPConfig
 
-CQL_TERMS = ["loss_actor", "loss_qvalue", "loss_cql", "loss_alpha", "alpha", "entropy"]
+CQL_TERMS = ["loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy"]
 DISCRETE_TERMS = ["loss_qvalue", "loss_cql", "value"]
 
 
