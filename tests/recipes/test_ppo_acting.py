@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from recipes import ppo
+from recipes import ppo_training
 from recipes.ppo import PPO
 from recipes.ppo_agent import Agent
 from recipes.run import Run
@@ -63,6 +63,6 @@ def test_keeping_frames_changes_no_result(tmp_path, monkeypatch):
             return load_checkpoint(run.checkpoints)[1]["agent"]
 
     kept = weights("kept")
-    monkeypatch.setattr(ppo, "while_acting", lambda policy, collector: collector)
+    monkeypatch.setattr(ppo_training, "while_acting", lambda policy, collector: collector)
     for name, weight in weights("plain").items():
         torch.testing.assert_close(kept[name], weight, rtol=0, atol=2e-5)
