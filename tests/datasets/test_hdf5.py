@@ -236,6 +236,8 @@ def test_other_files(tmp_path: Path) -> None:
         load_episodes(tmp_path / "b.hdf5")
     with pytest.raises(ValueError, match="'hopper' is no data set"):
         load_episodes("hopper")
+    with pytest.raises(ValueError, match=r"no data set: did you mean hopper-medium-v.*Minari has"):
+        load_episodes("hopper-medium-v9")
     with h5py.File(tmp_path / "c.hdf5", "w") as file:
         file["observations/state"] = [1.0]
     with pytest.raises(DatasetError, match="'observations': is missing; there is observations/st"):

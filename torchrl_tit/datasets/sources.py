@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 from pathlib import Path
 
+import minari
 import torch
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
@@ -75,6 +77,8 @@ def load_episodes(
             directory=directory,
         )
     if path.is_dir() or is_minari_name(name):
+        if not path.is_dir() and "/" not in name:
+            _check_spelling(name)
         return read_minari(source, task=spaces, dtype=dtype, directory=directory)
     if path.is_absolute() or name.startswith("."):
         raise FileNotFoundError(f"There is no data set {name}.")
@@ -82,3 +86,13 @@ def load_episodes(
         f"{name!r} is no data set: give an HDF5 file, a Minari folder, D4RL's name (as "
         f"'hopper-medium-replay-v0') or Minari's (as 'mujoco/hopper/medium-v0')."
     )
+
+
+def _check_spelling(name: str) -> None:
+    """Refuses what is nearly one of D4RL's names, which Minari would look for in vain."""
+    nearest = difflib.get_close_matches(name, D4RL_DATASETS, n=3, cutoff=0.8)
+    if nearest and name not in minari.list_local_datasets():
+        raise ValueError(
+            f"{name!r} is no data set: did you mean {' or '.join(nearest)}? Minari has none "
+            "of that name on this machine."
+        )
