@@ -22,7 +22,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-demo: $(VENV)/installed-run  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 10 minutes) into runs/
+demo: $(VENV)/installed-run  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 5 minutes) into runs/
 	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit-tuned --out $(OUT) $(ARGS)
 
 test: lint types unit  ## Check style, types and behaviour: all that must pass
