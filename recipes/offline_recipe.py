@@ -129,10 +129,7 @@ class OfflineRecipe(Recipe, Generic[AgentT]):
         Raises:
             FileNotFoundError: if there is no checkpoint.
         """
-        loaded = run.load()
-        if loaded is None:
-            raise FileNotFoundError(f"{run.checkpoints} holds no checkpoint: train the run first")
-        step, state = loaded
+        step, state = run.load_trained()
         torch.set_num_threads(self.threads)
         agent = self.make_agent()
         with run.restoring(step):

@@ -279,10 +279,7 @@ class PPO(Recipe):
         Raises:
             FileNotFoundError: if there is no checkpoint.
         """
-        loaded = run.load()
-        if loaded is None:
-            raise FileNotFoundError(f"{run.checkpoints} holds no checkpoint: train the run first")
-        step, state = loaded
+        step, state = run.load_trained()
         torch.set_num_threads(self.threads)
         agent = Agent(self, self.make_env(1, self.evaluation_seed))
         with run.restoring(step):

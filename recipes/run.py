@@ -109,6 +109,18 @@ class Run:
         """
         return load_checkpoint(self.checkpoints) if checkpoint_steps(self.checkpoints) else None
 
+    def load_trained(self) -> tuple[int, dict[str, Any]]:
+        """Loads the newest checkpoint of a run that has been trained: (step, state).
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+            CheckpointError: as :meth:`load`.
+        """
+        loaded = self.load()
+        if loaded is None:
+            raise FileNotFoundError(f"{self.checkpoints} holds no checkpoint: train the run first")
+        return loaded
+
     @contextmanager
     def restoring(self, step: int) -> Iterator[None]:
         """Says what is wrong where a checkpoint's state does not fit what the recipe builds."""
