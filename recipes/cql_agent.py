@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import torch
-from tensordict import TensorDict
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
     TensorDictModule,
@@ -21,7 +19,7 @@ from torchrl.objectives.common import LossModule
 
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.modules import Backbone, ManyActions, acting, make_squashed_actor
+from torchrl_tit.modules import Backbone, make_squashed_actor
 from torchrl_tit.networks import TwoTrunkNetwork
 from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
 
@@ -71,8 +69,7 @@ class QAgent:
 
     def play(self, episodes: int, seed: int) -> Tensor:
         """Plays episodes side by side and returns what each returned; float64 [episodes]."""
-        with acting(self.policy):
-            return evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=True)
+        return evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=True)
 
     def networks(self) -> list[nn.Module]:
         """Everything that may hold dropout; the loss does not list its networks as modules."""
@@ -124,7 +121,7 @@ class CQLAgent(QAgent):
         critics = [self._make_critic(recipe.critic, recipe.critic_hidden) for _ in range(2)]
         self.loss = ContinuousCQLLoss(
             self.policy,
-            critics[0].to(self.device),
+            [critic.to(self.device) for critic in critics],
             action_spec=self.action_spec.to(self.device),
             min_q_weight=recipe.conservative_weight,
             num_random=recipe.action_samples,
@@ -134,12 +131,6 @@ class CQLAgent(QAgent):
             deactivate_vmap=self.device.type == "cpu",
         )
         self.loss.make_value_estimator(gamma=recipe.gamma)
-        # The loss has drawn the weights of both anew, each entry uniformly between the smallest and
-        # the largest of its tensor. Targets are made copies where they are first moved.
-        with torch.no_grad():
-            for index, critic in enumerate(critics):
-                built = TensorDict.from_module(ManyActions(critic)).data
-                self.loss.qvalue_network_params.data[index].update_(built)
 
     def networks(self) -> list[nn.Module]:
         """Actor and critics."""

@@ -14,7 +14,7 @@ from torchrl.envs import Compose, EnvBase, ObservationNorm, TargetReturn, Transf
 from torchrl_tit.datasets import Episodes
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.modules import acting, make_dt_actor
+from torchrl_tit.modules import make_dt_actor
 from torchrl_tit.networks import DecisionTransformer, DecisionTransformerConfig
 from torchrl_tit.transforms import SequenceHistory
 
@@ -105,14 +105,13 @@ class DTAgent(nn.Module):
 
     def play(self, target_return: float, episodes: int, seed: int) -> Tensor:
         """Plays episodes side by side and returns what each returned; float64 [episodes]."""
-        with acting(self.actor):
-            return evaluate(
-                lambda num_envs: self.make_env(num_envs, target_return),
-                self.actor,
-                episodes,
-                seed=seed,
-                shrink=True,
-            )
+        return evaluate(
+            lambda num_envs: self.make_env(num_envs, target_return),
+            self.actor,
+            episodes,
+            seed=seed,
+            shrink=True,
+        )
 
 
 def _check_task(env: str, action_spec: Any, config: DecisionTransformerConfig) -> int:

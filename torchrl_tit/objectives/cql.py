@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -84,7 +85,8 @@ class ContinuousCQLLoss(CQLLoss):
         actor_network: Policy with a distribution that has a ``deterministic_sample``, such as that
             of :func:`~torchrl_tit.modules.make_squashed_actor`.
         qvalue_network: Reads what keys it likes (of "next", in the target) and the action, and
-            writes "state_action_value", float [..., 1]. Two copies are made of one module.
+            writes "state_action_value", float [..., 1]. Two of them, which start as they were
+            built; of a single one TorchRL makes two, and draws their weights anew.
         action_spec: The bounds of an action, a ``Bounded`` spec of shape [A].
         min_q_weight: Weight w of the conservative term.
         num_random: Samples m of each kind.
@@ -129,7 +131,7 @@ class ContinuousCQLLoss(CQLLoss):
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
-        qvalue_network: TensorDictModuleBase,
+        qvalue_network: TensorDictModuleBase | Sequence[TensorDictModuleBase],
         *,
         action_spec: Bounded,
         min_q_weight: float = 5.0,
@@ -151,7 +153,9 @@ class ContinuousCQLLoss(CQLLoss):
             raise ValueError(f"over_critics must be 'mean' or 'sum', not {over_critics!r}")
         super().__init__(
             actor_network,
-            ManyActions(qvalue_network),
+            [ManyActions(critic) for critic in qvalue_network]
+            if isinstance(qvalue_network, Sequence)
+            else ManyActions(qvalue_network),
             loss_function=loss_function,
             alpha_init=alpha_init,
             action_spec=action_spec,
