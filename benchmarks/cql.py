@@ -26,7 +26,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from recipes.compilation import Compile
-from recipes.cql import CQL, make_update
+from recipes.cql import CQL
 from recipes.cql_agent import CQLAgent
 from recipes.registry import RECIPES
 from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig
@@ -102,7 +102,7 @@ def make_batch() -> TensorDictBase:
 def make_ours(compiled: Compile) -> Callable[[TensorDictBase], Any]:
     """Our update."""
     recipe = replace(get_recipe(), compile=compiled)
-    update, _ = make_update(recipe, CQLAgent(recipe))
+    update, _ = recipe.make_update(CQLAgent(recipe))
     return lambda batch: update(batch, 0, 0)
 
 

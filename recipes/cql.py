@@ -7,7 +7,6 @@ from functools import partial
 from typing import ClassVar, Literal
 
 import torch
-from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
 from torchrl_tit.objectives.cql import OverCritics
@@ -15,10 +14,7 @@ from torchrl_tit.objectives.cql import OverCritics
 from .cql_agent import CQLAgent, parameters_of
 from .cql_recipe import CQLRecipe
 from .cql_update import CQLUpdate
-from .offline_state import TrainingState
-from .offline_training import run_updates
 from .recipe import check_at_least
-from .run import Run
 
 # What critics of three layers of 256 keep of so many actions, 8 MB, fits into a CPU's cache.
 _ACTIONS_IN_CACHE = 2000
@@ -76,61 +72,22 @@ class CQL(CQLRecipe[CQLAgent]):
         """Builds actor and critics, untrained."""
         return CQLAgent(self)
 
-    def train(self, run: Run) -> None:
-        """Trains in a run folder; see :func:`train`."""
-        train(self, run)
-
-
-def train(recipe: CQL, run: Run) -> None:
-    """Trains an agent, from the newest checkpoint of the run where there is one.
-
-    Args:
-        recipe: the settings.
-        run: an open run folder.
-
-    Raises:
-        FloatingPointError: if a loss is not finite.
-    """
-    torch.set_num_threads(recipe.threads)
-    torch.manual_seed(recipe.seed)
-    buffer = recipe.make_buffer()
-    agent = recipe.make_agent()
-    update, optimizers = make_update(recipe, agent)
-    state = TrainingState({"agent": agent, **optimizers, "buffer": buffer}, recipe.evaluation_seed)
-
-    def step(number: int) -> Tensor:
-        return update(buffer.sample(), number, state.saved_step)
-
-    run_updates(recipe, run, agent, state, CQLUpdate.TERMS, step)
-
-
-def make_update(recipe: CQL, agent: CQLAgent) -> tuple[CQLUpdate, dict[str, torch.optim.Optimizer]]:
-    """Builds the gradient step of an agent.
-
-    Args:
-        recipe: the settings.
-        agent: what is trained.
-
-    Returns:
-        The step, and its optimizers by name.
-    """
-    loss = agent.loss
-    adam = partial(torch.optim.Adam, eps=recipe.adam_eps, fused=True)
-    optimizers: dict[str, torch.optim.Optimizer] = {
-        "temperature_optimizer": adam([loss.log_alpha], lr=recipe.temperature_learning_rate),
-        "critic_optimizer": adam(
-            parameters_of(loss.qvalue_network_params), lr=recipe.critic_learning_rate
-        ),
-        "actor_optimizer": adam(
-            parameters_of(loss.actor_network_params), lr=recipe.actor_learning_rate
-        ),
-    }
-    in_cache = max(1, _ACTIONS_IN_CACHE // (3 * recipe.action_samples + 1))
-    update = CQLUpdate(
-        loss,
-        **optimizers,
-        target=SoftUpdate(loss, tau=recipe.tau),
-        states_at_once=in_cache if recipe.torch_device().type == "cpu" else None,
-        options=recipe.compile_options(),
-    )
-    return update, optimizers
+    def make_update(self, agent: CQLAgent) -> tuple[CQLUpdate, dict[str, torch.optim.Optimizer]]:
+        """Builds the gradient step of an agent, and its optimizers by name."""
+        loss = agent.loss
+        adam = partial(torch.optim.Adam, eps=self.adam_eps, fused=True)
+        critics, actor = map(parameters_of, (loss.qvalue_network_params, loss.actor_network_params))
+        optimizers: dict[str, torch.optim.Optimizer] = {
+            "temperature_optimizer": adam([loss.log_alpha], lr=self.temperature_learning_rate),
+            "critic_optimizer": adam(critics, lr=self.critic_learning_rate),
+            "actor_optimizer": adam(actor, lr=self.actor_learning_rate),
+        }
+        in_cache = max(1, _ACTIONS_IN_CACHE // (3 * self.action_samples + 1))
+        update = CQLUpdate(
+            loss,
+            **optimizers,
+            target=SoftUpdate(loss, tau=self.tau),
+            states_at_once=in_cache if self.torch_device().type == "cpu" else None,
+            options=self.compile_options(),
+        )
+        return update, optimizers

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import torch
+from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.data import ReplayBuffer
 
 from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buffer
@@ -15,10 +18,23 @@ from torchrl_tit.transforms.history import Padding
 from .compilation import Compile, compile_options, should_compile
 from .cql_agent import QAgent
 from .offline_recipe import OfflineRecipe, is_remote
+from .offline_state import TrainingState
+from .offline_training import run_updates
 from .outcomes import Outcome
 from .recipe import check_at_least, check_at_most
+from .run import Run
 
 AgentT = TypeVar("AgentT", bound=QAgent)
+
+
+class Update(Protocol):
+    """One gradient step."""
+
+    TERMS: ClassVar[list[str]]
+    """What it gives."""
+
+    def __call__(self, batch: TensorDictBase, step: int, saved_step: int) -> Tensor:
+        """Takes it on a batch; ``step`` and ``saved_step`` are for messages."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,6 +135,32 @@ class CQLRecipe(OfflineRecipe[AgentT]):
         env.close()
         if not is_remote(self.dataset):
             self.make_buffer()
+
+    def make_update(self, agent: AgentT) -> tuple[Update, Mapping[str, torch.optim.Optimizer]]:
+        """Builds the gradient step of an agent, and its optimizers by name."""
+        raise NotImplementedError
+
+    def train(self, run: Run) -> None:
+        """Trains an agent, from the newest checkpoint of the run where there is one.
+
+        Args:
+            run: an open run folder.
+
+        Raises:
+            FloatingPointError: if a loss is not finite.
+        """
+        torch.set_num_threads(self.threads)
+        torch.manual_seed(self.seed)
+        buffer = self.make_buffer()
+        agent = self.make_agent()
+        update, optimizers = self.make_update(agent)
+        parts = {"agent": agent, **optimizers, "buffer": buffer}
+        state = TrainingState(parts, self.evaluation_seed)
+
+        def step(number: int) -> Tensor:
+            return update(buffer.sample(), number, state.saved_step)
+
+        run_updates(self, run, agent, state, update.TERMS, step)
 
     def make_buffer(self) -> ReplayBuffer:
         """Loads the data set and makes a replay buffer of its transitions with histories.

@@ -34,7 +34,14 @@ class CQLUpdate:
             the policy alone is: what the critics do is matrix products.
     """
 
-    TERMS: ClassVar = ["loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy"]
+    TERMS: ClassVar[list[str]] = [
+        "loss_alpha",
+        "loss_qvalue",
+        "loss_cql",
+        "loss_actor",
+        "alpha",
+        "entropy",
+    ]
     """What a gradient step gives; the losses in the order of the steps, so that the first that is
     not finite is the one to blame."""
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import SoftUpdate
+
+from torchrl_tit.objectives import DelayedDiscreteCQLLoss
 
 from .compilation import compile_and_time
 from .cql_agent import DiscreteCQLAgent, parameters_of
 from .cql_recipe import CQLRecipe
-from .offline_state import TrainingState
-from .offline_training import run_updates
 from .ppo_update import check_finite
 from .recipe import check_at_least
-from .run import Run
-
-TERMS = ["loss_qvalue", "loss_cql", "value"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,49 +43,76 @@ class DiscreteCQL(CQLRecipe[DiscreteCQLAgent]):
         """Builds the Q network, untrained."""
         return DiscreteCQLAgent(self)
 
-    def train(self, run: Run) -> None:
-        """Trains in a run folder; see :func:`train`."""
-        train(self, run)
+    def make_update(
+        self, agent: DiscreteCQLAgent
+    ) -> tuple[DiscreteCQLUpdate, dict[str, torch.optim.Optimizer]]:
+        """Builds the gradient step of an agent, and its optimizer."""
+        optimizer = torch.optim.Adam(
+            parameters_of(agent.loss.value_network_params),
+            lr=self.learning_rate,
+            eps=self.adam_eps,
+            fused=True,
+        )
+        update = DiscreteCQLUpdate(
+            agent.loss,
+            optimizer,
+            SoftUpdate(agent.loss, tau=self.tau),
+            conservative_weight=self.conservative_weight,
+            options=self.compile_options(),
+        )
+        return update, {"optimizer": optimizer}
 
 
-def train(recipe: DiscreteCQL, run: Run) -> None:
-    """Trains an agent, from the newest checkpoint of the run where there is one.
+class DiscreteCQLUpdate:
+    """Steps the Q network and moves its target, on one batch.
 
     Args:
-        recipe: the settings.
-        run: an open run folder.
-
-    Raises:
-        FloatingPointError: if a loss is not finite.
+        loss: the losses, with all weights.
+        optimizer: of the Q network.
+        target: moves the target network.
+        conservative_weight: weight of the conservative term.
+        options: of ``torch.compile``; without any nothing is compiled.
     """
-    torch.set_num_threads(recipe.threads)
-    torch.manual_seed(recipe.seed)
-    buffer = recipe.make_buffer()
-    agent = recipe.make_agent()
-    optimizer = torch.optim.Adam(
-        parameters_of(agent.loss.value_network_params),
-        lr=recipe.learning_rate,
-        eps=recipe.adam_eps,
-        fused=True,
-    )
-    target = SoftUpdate(agent.loss, tau=recipe.tau)
-    state = TrainingState(
-        {"agent": agent, "optimizer": optimizer, "buffer": buffer}, recipe.evaluation_seed
-    )
-    objective = agent.loss.forward
-    options = recipe.compile_options()
-    if options is not None:
-        objective = compile_and_time(objective, options, "the loss")
 
-    def update(step: int) -> Tensor:
-        losses = objective(buffer.sample())
-        total = losses["loss_qvalue"] + recipe.conservative_weight * losses["loss_cql"]
+    TERMS: ClassVar[list[str]] = ["loss_qvalue", "loss_cql", "value"]
+    """What a gradient step gives."""
+
+    def __init__(
+        self,
+        loss: DelayedDiscreteCQLLoss,
+        optimizer: torch.optim.Optimizer,
+        target: SoftUpdate,
+        *,
+        conservative_weight: float,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.optimizer = optimizer
+        self.target = target
+        self.conservative_weight = conservative_weight
+        self.objective = loss.forward
+        if options is not None:
+            self.objective = compile_and_time(loss.forward, options, "the loss")
+
+    def __call__(self, batch: TensorDictBase, step: int, saved_step: int) -> Tensor:
+        """Takes a step.
+
+        Args:
+            batch: transitions [B].
+            step: gradient steps before this one, for messages.
+            saved_step: step of the newest checkpoint, for messages.
+
+        Returns:
+            ``TERMS``, float [terms].
+
+        Raises:
+            FloatingPointError: if a term is not finite.
+        """
+        losses = self.objective(batch)
+        total = losses["loss_qvalue"] + self.conservative_weight * losses["loss_cql"]
         terms = torch.stack([losses[n].detach() for n in ("loss_qvalue", "loss_cql", "pred_value")])
-        check_finite(TERMS, terms, step, state.saved_step)
-        optimizer.zero_grad()
+        check_finite(self.TERMS, terms, step, saved_step)
+        self.optimizer.zero_grad()
         total.backward()
-        optimizer.step()
-        target.step()
+        self.optimizer.step()
+        self.target.step()
         return terms
-
-    run_updates(recipe, run, agent, state, TERMS, update)

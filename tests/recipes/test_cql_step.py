@@ -12,7 +12,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from recipes.cql import make_update
 from tests.recipes.cql_runs import make_cql
 from torchrl_tit.networks import MLPConfig
 from torchrl_tit.objectives import PolicySamples
@@ -173,7 +172,7 @@ def step(tmp_path, monkeypatch):
         return draws[-1][0]
 
     monkeypatch.setattr(agent.loss, "sample_policy", record)
-    update, _ = make_update(recipe, agent)
+    update, _ = recipe.make_update(agent)
     before = {name: weight.clone() for name, weight in agent.state_dict().items()}
     monkeypatch.setattr(torch, "rand", lambda *shape, **_: uniform.reshape(shape))
     for number in range(2):
