@@ -12,28 +12,11 @@ import pytest
 
 from recipes import sweep
 from recipes.cli import main
-from recipes.ppo import PPO
 from recipes.registry import RECIPES
 from recipes.run import Run
-from torchrl_tit.networks import MLPConfig
+from tests.recipes.sweep_runs import TINY, begin
 
 ROOT = Path(__file__).parents[2]
-TINY = PPO(
-    name="ppo/cartpole/mlp",
-    env="CartPole-v1",
-    backbone=MLPConfig(hidden_dim=8),
-    total_steps=128,
-    steps_per_batch=64,
-    minibatch_size=32,
-    epochs=1,
-    checkpoint_interval=64,
-    evaluation_episodes=2,
-)
-
-
-def create(job, recipe):
-    """Begins a run as a worker would, so that workers resume it with these small settings."""
-    Run.create(job.folder, recipe)
 
 
 def test_patterns_and_seeds_make_the_runs(tmp_path):
@@ -51,7 +34,7 @@ def test_sweep_resumes_runs_and_leaves_complete_ones(tmp_path, capsys):
         for seed in range(3)
     ]
     for job in jobs:
-        create(job, job.recipe)
+        begin(job.folder, job.recipe)
     with Run.open(jobs[0].folder) as run:  # complete already
         run.recipe.train(run)
         run.save_evaluation(run.recipe.evaluate(run))
@@ -67,7 +50,7 @@ def test_sweep_resumes_runs_and_leaves_complete_ones(tmp_path, capsys):
 @pytest.mark.slow
 def test_failures_are_named(tmp_path):
     job = sweep.Job(TINY, tmp_path / "seed-0")
-    create(job, TINY)
+    begin(job.folder, TINY)
     (job.folder / "checkpoints" / "000000000064").mkdir(parents=True)  # no checkpoint of ours
     assert sweep.run_jobs([job], workers=1) == [job]
     assert "error: " in job.log.read_text()
@@ -76,7 +59,7 @@ def test_failures_are_named(tmp_path):
 def test_a_run_in_use_is_waited_for(tmp_path):
     free, used = (sweep.Job(replace(TINY, seed=seed), tmp_path / f"{seed}") for seed in range(2))
     for job in (free, used):
-        create(job, job.recipe)
+        begin(job.folder, job.recipe)
     lock = Run.open(used.folder)
     lock.__enter__()
     begun = []
@@ -92,7 +75,7 @@ def test_a_run_in_use_is_waited_for(tmp_path):
 
 def test_other_settings_under_the_same_name_are_refused(tmp_path, capsys):
     job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], tmp_path)[0]
-    create(job, TINY)
+    begin(job.folder, TINY)
     with pytest.raises(SystemExit) as exit_:
         main(["sweep", "ppo/acrobot/mlp", "ppo/cartpole/mlp", "--out", str(tmp_path)])
     assert exit_.value.code == 2

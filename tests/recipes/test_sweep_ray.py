@@ -17,27 +17,13 @@ import pytest
 from recipes import sweep_ray
 from recipes.cli import main
 from recipes.metrics import read_metrics
-from recipes.ppo import PPO
-from recipes.run import Run
 from recipes.sweep import Job, run_jobs
 from recipes.sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
+from tests.recipes.sweep_runs import TINY, begin
 from torchrl_tit.checkpoint import checkpoint_steps
-from torchrl_tit.networks import MLPConfig
 
 ROOT = Path(__file__).parents[2]
-TINY = PPO(
-    name="ppo/cartpole/mlp",
-    env="CartPole-v1",
-    backbone=MLPConfig(hidden_dim=8),
-    total_steps=128,
-    steps_per_batch=64,
-    minibatch_size=32,
-    epochs=1,
-    checkpoint_interval=64,
-    evaluation_episodes=2,
-    compile="off",
-)
-LONG = replace(TINY, total_steps=1_000_000)
+LONG = replace(TINY, total_steps=1_000_000, compile="off")
 
 # What `sweep --ray ADDRESS` does, with runs that are there already.
 DRIVER = """
@@ -72,12 +58,6 @@ def cluster() -> Iterator[str]:
         ray.shutdown()
         machines.shutdown()
     shutil.rmtree(folder, ignore_errors=True)
-
-
-def begin(folder: Path, recipe: PPO) -> Job:
-    """Begins a run as a worker would, so that workers resume it with these small settings."""
-    Run.create(folder, recipe)
-    return Job(recipe, folder)
 
 
 def meanwhile(act: Callable[[], None]) -> None:
