@@ -90,3 +90,17 @@ def test_another_output_width(length: int) -> None:
     features = ours(x)
     assert features.shape == (5, length, 7)
     torch.testing.assert_close(features, expect(reference, x, torch.ones(length, length) > 0))
+
+
+def test_one_position_attends_to_itself_under_dropout() -> None:
+    """A weight of 1, dropped with the probability p in each head, or scaled by 1 / (1 - p)."""
+    torch.manual_seed(0)
+    attention = SelfAttention(8, 2, causal=True, dropout=0.4)
+    attention.out_proj = nn.Identity()  # type: ignore[assignment]
+    x = torch.randn(2000, 1, 8)
+    value = attention.eval()(x).unflatten(-1, (2, 4))
+    heads = attention.train()(x).unflatten(-1, (2, 4))
+    dropped = (heads == 0).all(-1)
+    torch.testing.assert_close(heads[~dropped], value[~dropped] / 0.6, rtol=1e-4, atol=1e-6)
+    assert dropped.float().mean().item() == pytest.approx(0.4, abs=0.03)
+    assert not torch.equal(dropped[..., 0], dropped[..., 1])

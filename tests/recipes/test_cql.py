@@ -244,6 +244,19 @@ def test_critics_start_as_they_were_built(tmp_path):
         assert not torch.equal(first, second)
 
 
+def test_the_discrete_target_follows_the_trained_network_slowly(tmp_path):
+    recipe = make_discrete_cql(tmp_path, tau=0.25)
+    agent = recipe.make_agent()
+    update, _ = recipe.make_update(agent)
+    before = agent.loss.target_value_network_params.data.clone()
+    update(recipe.make_buffer().sample(), 0, 0)
+    trained, target = agent.loss.value_network_params.data, agent.loss.target_value_network_params
+    for name, weight in target.data.items(True, True):
+        if weight.is_floating_point():
+            torch.testing.assert_close(weight, 0.75 * before[name] + 0.25 * trained[name])
+    assert not (trained == before).all()
+
+
 def test_command_line(tmp_path, capsys):
     path = tmp_path / "recipe.json"
     path.write_text(recipe_to_json(make_cql(tmp_path)))
