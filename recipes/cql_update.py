@@ -13,7 +13,7 @@ from torchrl.objectives import SoftUpdate
 from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples
 
 from .compilation import compile_and_time
-from .ppo_update import check_finite
+from .finite import check_finite
 
 
 class CQLUpdate:

@@ -16,7 +16,7 @@ from torchrl_tit.objectives import DelayedDiscreteCQLLoss
 from .compilation import compile_and_time
 from .cql_agent import DiscreteCQLAgent, parameters_of
 from .cql_recipe import CQLRecipe
-from .ppo_update import check_finite
+from .finite import check_finite
 from .recipe import check_at_least
 
 

@@ -16,11 +16,11 @@ from torchrl_tit.modules import make_dt_actor
 from torchrl_tit.networks import DecisionTransformerConfig
 
 from .dt_data import load_data, warn_of_targets
+from .finite import check_finite
 from .odt_data import OnlineData
 from .odt_exploration import explore
 from .offline_state import TrainingState
 from .offline_training import run_updates
-from .ppo_update import check_finite
 from .recipe import check_at_least
 from .run import Run
 from .sequence_recipe import SequenceRecipe

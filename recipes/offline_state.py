@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchrl_tit.checkpoint import global_rng_state, set_global_rng_state
 
+from .finite import check_finite
 from .outcomes import Outcome
-from .ppo_update import check_finite
 from .run import Run
 
 

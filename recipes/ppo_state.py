@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torchrl.collectors import BaseCollector, Collector
 
 from torchrl_tit.checkpoint import (
-    can_save_env,
     collector_state,
     global_rng_state,
+    reset_unsavable_env,
     set_collector_state,
     set_global_rng_state,
 )
@@ -67,21 +66,3 @@ class TrainingState:
         reset_unsavable_env(self.collector, self.seed, step)
         set_global_rng_state(state["rng"])
         return step
-
-
-def reset_unsavable_env(collector: BaseCollector, seed: int, step: int) -> None:
-    """Starts new episodes where an environment cannot be saved.
-
-    That happens at each checkpoint, whether or not the run is stopped there, and with a seed that
-    follows from the run's and the step: so both go on alike.
-
-    Args:
-        collector: the run's collector.
-        seed: the run's seed.
-        step: of the checkpoint.
-    """
-    if not isinstance(collector, Collector):
-        return
-    # After its last batch a collector has closed the environment.
-    if not can_save_env(collector.env) and not collector.env.is_closed:
-        collector.reset(seed=np.random.SeedSequence([seed, step]).generate_state(1).item())

@@ -19,6 +19,7 @@ from torchrl_tit.evaluation import finished_returns
 from torchrl_tit.modules import while_acting
 
 from .compilation import compile_options, should_compile
+from .finite import check_finite
 from .interrupt import Interrupt
 from .ppo_agent import Agent
 from .ppo_collector import make_collector
@@ -27,7 +28,6 @@ from .ppo_update import (
     TERMS,
     add_advantages,
     check_agent,
-    check_finite,
     make_objective,
     make_optimizer,
     make_weight_update,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,6 +12,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from .compilation import compile_and_time
+from .finite import check_finite
 from .ppo_agent import Agent
 
 if TYPE_CHECKING:
@@ -151,27 +152,6 @@ def minibatches(batch: TensorDictBase, recipe: PPO) -> Iterator[TensorDict]:
     for _ in range(recipe.epochs):
         for index in torch.randperm(len(samples), device=samples.device).split(size):
             yield samples[index]
-
-
-def check_finite(terms: Sequence[str], values: Tensor, step: int, saved_step: int) -> None:
-    """Stops a run where a loss, say, is not finite.
-
-    Args:
-        terms: names of the values.
-        values: float [terms].
-        step: environment steps so far.
-        saved_step: step of the last checkpoint.
-
-    Raises:
-        FloatingPointError: naming the term, the step and the last good checkpoint.
-    """
-    finite = values.isfinite()
-    if not finite.all():
-        index = int(finite.logical_not().nonzero()[0])
-        saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
-        raise FloatingPointError(
-            f"{terms[index]} became {values[index].item()} in the update at step {step}; {saved}"
-        )
 
 
 def check_agent(agent: Agent, minibatch: TensorDictBase, step: int, saved_step: int) -> None:

@@ -26,16 +26,16 @@ from torchrl_tit.checkpoint import (
     collector_state,
     global_rng_state,
     load_checkpoint,
+    reset_unsavable_env,
     save_checkpoint,
     set_collector_state,
     set_global_rng_state,
 )
 from torchrl_tit.evaluation import finished_returns
 
+from .finite import check_finite
 from .interrupt import Interrupt
 from .metrics import Metrics
-from .ppo_state import reset_unsavable_env
-from .ppo_update import check_finite
 from .recipe import check_at_least, check_at_most
 from .watcher import RecallingWatcher
 

@@ -6,7 +6,11 @@ env_state, collector_state, ...     the state of what TorchRL cannot save
 """
 
 from torchrl_tit.checkpoint.codec import decode, encode
-from torchrl_tit.checkpoint.collector import collector_state, set_collector_state
+from torchrl_tit.checkpoint.collector import (
+    collector_state,
+    reset_unsavable_env,
+    set_collector_state,
+)
 from torchrl_tit.checkpoint.environment import can_save_env, env_state, set_env_state
 from torchrl_tit.checkpoint.errors import CheckpointError, CheckpointNotFoundError
 from torchrl_tit.checkpoint.folder import (
@@ -29,6 +33,7 @@ __all__ = [
     "global_rng_state",
     "latest_step",
     "load_checkpoint",
+    "reset_unsavable_env",
     "save_checkpoint",
     "set_collector_state",
     "set_env_state",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from tensordict import TensorDictBase
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 
 from torchrl_tit.checkpoint.environment import can_save_env, env_state, set_env_state
 
@@ -22,7 +23,7 @@ def collector_state(collector: Collector) -> dict[str, Any]:
     Returns:
         A state that a checkpoint can hold; it shares no memory with the collector. Of an
         environment that :func:`~torchrl_tit.checkpoint.can_save_env` refuses, and of what is
-        carried of it, there is nothing (None): reset the collector right after.
+        carried of it, there is nothing (None): :func:`reset_unsavable_env` starts it anew.
 
     Example:
         >>> from torchrl.collectors import Collector
@@ -80,6 +81,32 @@ def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
         collector._traj_pool.load_state_dict(state["trajectories"])
     collector._frames = state["frames"]
     collector._iter = state["iteration"]
+
+
+def reset_unsavable_env(collector: BaseCollector, seed: int, step: int) -> None:
+    """Start new episodes where an environment cannot be saved.
+
+    Call it at each checkpoint, whether or not the run is stopped there, and after loading one: the
+    seed follows from the run's and the step, so that both go on alike. An environment that can be
+    saved stays as it is, and so do the processes of a collector that has some.
+
+    Args:
+        collector: The run's collector.
+        seed: The run's seed.
+        step: Of the checkpoint.
+
+    Example:
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl.envs import GymEnv
+        >>> collector = Collector(GymEnv("CartPole-v1"), frames_per_batch=8, total_frames=16)
+        >>> reset_unsavable_env(collector, seed=0, step=8)  # CartPole can be saved
+        >>> collector.shutdown()
+    """
+    if not isinstance(collector, Collector):
+        return
+    # After its last batch a collector has closed the environment.
+    if not can_save_env(collector.env) and not collector.env.is_closed:
+        collector.reset(seed=np.random.SeedSequence([seed, step]).generate_state(1).item())
 
 
 def _placed_like(carried: TensorDictBase, present: TensorDictBase) -> TensorDictBase:
