@@ -9,7 +9,6 @@ the machine then counts for little.
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -25,6 +24,7 @@ from torchrl_tit.modules import Backbone
 
 from .cases import COLUMNS, Case
 from .report import publish, spread, table
+from .straightforward_ratios import HEADER, cells, record
 
 STEPS, REPEATS = 20, 7
 CASES = [
@@ -97,13 +97,7 @@ def measure(
             for name, act in acts.items():
                 milliseconds(act, windows[:2])  # fills what is kept
                 times[name].append(milliseconds(act, windows[2:]))
-    row: dict[str, Any] = {**case.record(), "dtype": "float32"}
-    for name, values in times.items():
-        row[f"{name}_ms"] = values
-        if name != "straightforward":
-            ratios = [b / a for a, b in zip(values, times["straightforward"], strict=True)]
-            row |= {f"{name}_ratios": ratios, f"{name}_median_ratio": statistics.median(ratios)}
-    return row
+    return {**case.record(), "dtype": "float32", **record(times)}
 
 
 @torch.no_grad()
@@ -125,19 +119,6 @@ def growth(
     return ratios
 
 
-def cells(row: dict[str, Any]) -> list[str]:
-    """What a row of the table says of the times."""
-    compiled = "compiled_ms" in row
-    return [
-        row["dtype"],
-        spread(row["ours_ms"], 2),
-        spread(row["compiled_ms"], 2) if compiled else "",
-        spread(row["straightforward_ms"], 2),
-        spread(row["ours_ratios"], 1),
-        spread(row["compiled_ratios"], 1) if compiled else "",
-    ]
-
-
 def main(out: Path | None) -> None:
     """Measures on one thread and reports."""
     torch.set_num_threads(1)
@@ -145,7 +126,10 @@ def main(out: Path | None) -> None:
     rows = [
         measure(case, STEPS, REPEATS, compiled=case in COMPILED, device=device) for case in CASES
     ]
-    lines = [[*case.columns(), *cells(row)] for case, row in zip(CASES, rows, strict=True)]
+    lines = [
+        [*case.columns(), *cells(row, ms_digits=2, ratio_digits=1)]
+        for case, row in zip(CASES, rows, strict=True)
+    ]
     grows = {
         f"{case.variant}, {case.inputs}{', compiled' if compiled else ''}": growth(
             case, STEPS, REPEATS, compiled=compiled, device=device
@@ -154,12 +138,11 @@ def main(out: Path | None) -> None:
         if case.history == 4
         for compiled in ((False, True) if case in COMPILED else (False,))
     }
-    header = ["dtype", "ours", "ours, compiled", "straightforward", "ratio", "ratio, compiled"]
     markdown = (
         f"# Acting\n\nMilliseconds a step of all environments together, float32, on {device}"
         f"{' (processor time)' if device == 'cpu' else ''}. {REPEATS} rounds of\n{STEPS} steps, "
         "alternating: median (range); ratios are taken round by round.\n\n"
-        + table([*COLUMNS, *header], lines)
+        + table([*COLUMNS, *HEADER], lines)
         + "\nHow much longer our step takes with K = 64 than with K = 4, both alternating:\n\n"
         + table(["network", "factor"], [[name, spread(x, 2)] for name, x in grows.items()])
     )

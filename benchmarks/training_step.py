@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from .acting import synchronize
 from .cases import COLUMNS, Case
 from .matrix_peak import count_flops, peak_flops
-from .report import publish, spread, table
+from .report import publish, table
+from .straightforward_ratios import HEADER, cells, record
 
 CASES = [
     *(Case("Enhanced", "arrays", history, 64) for history in (1, 4, 16, 64)),
@@ -107,12 +108,8 @@ def measure(
     for _ in range(repeats):
         for name, step in steps.items():
             times[name].append(milliseconds(step, history, seconds))
-    row: dict[str, Any] = {**case.record(), "dtype": "bfloat16" if bfloat16 else "float32"}
-    for name, values in times.items():
-        row[f"{name}_ms"] = values
-        if name != "straightforward":
-            ratios = [b / a for a, b in zip(values, times["straightforward"], strict=True)]
-            row |= {f"{name}_ratios": ratios, f"{name}_median_ratio": statistics.median(ratios)}
+    dtype = "bfloat16" if bfloat16 else "float32"
+    row: dict[str, Any] = {**case.record(), "dtype": dtype, **record(times)}
     if device == "cuda":
         flops = count_flops(steps["ours"])
         peak = peak_flops(device, autocast or torch.float32)
@@ -122,20 +119,6 @@ def measure(
             if name != "straightforward"
         }
     return row | ({"compile_seconds": compile_seconds} if compiled else {})
-
-
-def cells(row: dict[str, Any]) -> list[str]:
-    """What a row of the table says of the times."""
-    compiled = "compiled_ms" in row
-    return [
-        row["dtype"],
-        spread(row["ours_ms"], 1),
-        spread(row["compiled_ms"], 1) if compiled else "",
-        spread(row["straightforward_ms"], 1),
-        spread(row["ours_ratios"], 2),
-        spread(row["compiled_ratios"], 2) if compiled else "",
-        f"{row['compile_seconds']:.0f} s" if compiled else "",
-    ]
 
 
 def main(out: Path | None) -> None:
@@ -159,12 +142,18 @@ def report(out: Path | None) -> None:
         measure(case, REPEATS, SECONDS, compiled=compiled, bfloat16=bfloat16, device=device)
         for case, compiled, bfloat16 in cases
     ]
-    lines = [[*case.columns(), *cells(row)] for (case, _, _), row in zip(cases, rows, strict=True)]
-    header = ["dtype", "ours", "ours, compiled", "straightforward", "ratio", "ratio, compiled"]
+    lines = [
+        [
+            *case.columns(),
+            *cells(row, ms_digits=1, ratio_digits=2),
+            f"{row['compile_seconds']:.0f} s" if compiled else "",
+        ]
+        for (case, compiled, _), row in zip(cases, rows, strict=True)
+    ]
     markdown = (
         f"# Training step\n\nMilliseconds a step on {device}, dropout off. {REPEATS} rounds of "
         f"{SECONDS} seconds each, alternating:\nmedian (range); ratios are taken round by round."
-        "\n\n" + table([*COLUMNS, *header, "compiling"], lines)
+        "\n\n" + table([*COLUMNS, *HEADER, "compiling"], lines)
     )
     if device == "cuda":
         last = rows[-1]["peak_shares"]
