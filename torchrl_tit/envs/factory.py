@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_tit.envs.atari import AtariEnv
 from torchrl_tit.envs.atari_games import AtariGames
+from torchrl_tit.envs.mujoco_warnings import show_mujoco_warnings_once
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.transforms.hide_velocities import HideVelocities
 from torchrl_tit.transforms.history import Padding
@@ -142,14 +143,21 @@ def _tasks(
     # "module:name" makes Gymnasium import the module, which registers the name.
     if name not in gymnasium.registry and ":" not in name:
         raise _unknown(name)
-    # The specs are checked once, in tests; Gymnasium's checker would cost time at every step. What
-    # the vector environment returns is copied at once, so it need not make copies of its own.
-    make = partial(gymnasium.make, name, disable_env_checker=True, **kwargs)
+    # What the vector environment returns is copied at once, so it need not make copies of its own.
+    make = partial(_task, name, **kwargs)
     vectorize = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
     try:
         return vectorize([make] * num_envs, copy=False, autoreset_mode=AutoresetMode.DISABLED)
     except (gymnasium.error.Error, ImportError) as error:  # a package is missing, say
         raise ValueError(f"Task {name!r} cannot be made: {error}") from error
+
+
+def _task(name: str, **kwargs: Any) -> gymnasium.Env:
+    """One copy, in the process that steps it."""
+    if "mujoco" in str(gymnasium.spec(name).entry_point):
+        show_mujoco_warnings_once()
+    # The specs are checked once, in tests; Gymnasium's checker would cost time at every step.
+    return gymnasium.make(name, disable_env_checker=True, **kwargs)
 
 
 def _rom(name: str) -> str:
