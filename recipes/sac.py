@@ -109,10 +109,14 @@ class SAC:
     def make_loss(self, env: EnvBase, actor: ProbabilisticActor) -> SACLoss:
         """Builds TorchRL's loss on an actor, with critics of its own."""
         observation, action = _sizes(env)
-        critic = ValueOperator(
-            MLP(observation + action, 1, **self._layers()), in_keys=["observation", "action"]
-        )
-        loss = SACLoss(actor, critic, loss_function="l2", target_entropy=-float(action))
+        # Two of them start as they were built; a single one TorchRL copies with other weights.
+        critics = [
+            ValueOperator(
+                MLP(observation + action, 1, **self._layers()), in_keys=["observation", "action"]
+            )
+            for _ in range(2)
+        ]
+        loss = SACLoss(actor, critics, loss_function="l2", target_entropy=-float(action))
         loss.make_value_estimator(gamma=self.gamma)
         return loss
 

@@ -1,11 +1,15 @@
 """What `data collect` can be told to make, and what it refuses."""
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from torch import Tensor
+from torchrl.modules import MLP
 
 from recipes.cli import main
 from recipes.collect import collect
@@ -17,6 +21,7 @@ from tests.recipes.collected import (
     read,
 )
 from torchrl_tit.checkpoint import checkpoint_steps
+from torchrl_tit.envs import make_env
 
 
 def test_the_agent_of_a_finished_run(cartpole: Path, tmp_path: Path) -> None:
@@ -112,3 +117,23 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         main([*words, "--out", str(tmp_path / "c"), "--seed", "1"])
     assert stop.value.code == 2
     assert "holds data of other settings" in capsys.readouterr().err
+
+
+def test_critics_start_as_they_were_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a single one, TorchRL's loss makes copies whose weights it draws anew."""
+    built: list[dict[str, Tensor]] = []
+
+    def make_mlp(*sizes: int, **layers: Any) -> MLP:
+        mlp = MLP(*sizes, **layers)
+        built.append({name: weight.clone() for name, weight in mlp.state_dict().items()})
+        return mlp
+
+    with closing(make_env("Pendulum-v1", 1, clip_actions=False)) as env:
+        actor = PENDULUM.sac.make_actor(env)
+        monkeypatch.setattr("recipes.sac.MLP", make_mlp)
+        loss = PENDULUM.sac.make_loss(env, actor)
+    stacked = loss.qvalue_network_params["module"].flatten_keys(".")
+    assert len(built) == 2
+    for name, weights in stacked.items():
+        assert torch.equal(weights, torch.stack([critic[name] for critic in built]))
+        assert not torch.equal(*weights)
