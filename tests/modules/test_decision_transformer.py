@@ -236,11 +236,16 @@ def test_evaluation_side_by_side_equals_one_after_another():
     ],
 )
 def test_actions_of_the_other_kind_are_refused(space, kind, message):
-    predictor = make_dt_predictor(make_network(action_space=space))
+    backbone = SequenceBackbone(make_network(action_space=space))
     with pytest.raises(TypeError, match=message):
-        predictor(make_batch(kind=kind))
+        backbone(make_batch(kind=kind))
 
 
 def test_a_missing_entry_is_named():
     with pytest.raises(KeyError, match=r"no sequence under .*'observation'.*add SequenceHistory"):
         make_dt_actor(make_network())(TensorDict({"observation": torch.zeros(2, 11)}, [2]))
+
+
+def test_a_prediction_is_no_distribution():
+    with pytest.raises(ValueError, match=r"gaussian, .*make_dt_actor.* on TorchRL's OnlineDTLoss"):
+        make_dt_predictor(make_network(action_space="gaussian"))

@@ -76,3 +76,20 @@ def test_gradients_reach_every_weight_and_train_them():
         loss(batch)["loss"].backward()
         optimizer.step()
     assert loss(batch)["loss"] < first / 3
+
+
+@pytest.mark.parametrize("kind", ["continuous", "discrete", "one-hot"])
+def test_actions_of_the_other_kind_are_refused(kind):
+    """One-hot vectors and logits have a squared error, too, and the largest entry an index."""
+    discrete = kind != "continuous"
+    predictor = make_dt_predictor(make_network(action_space="discrete" if discrete else kind))
+    loss = MaskedDTLoss(predictor, loss_function="l2" if discrete else "cross_entropy")
+    message = "'l2' .*int64: take 'cross_ent" if discrete else r"'cross_.*float32: .* \('l2', "
+    with pytest.raises(TypeError, match=message):
+        loss(make_batch(kind=kind))
+
+
+def test_an_unknown_loss_function_is_refused_at_once():
+    predictor = make_dt_predictor(make_network())
+    with pytest.raises(ValueError, match=r"unknown loss_function 'l3': choose one of \('l2', "):
+        MaskedDTLoss(predictor, loss_function="l3")

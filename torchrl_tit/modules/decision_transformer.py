@@ -28,12 +28,21 @@ def make_dt_predictor(network: DecisionTransformer) -> TensorDictSequential:
         discrete ones. TorchRL's `DTLoss` takes it, and
         :class:`~torchrl_tit.objectives.MaskedDTLoss`.
 
+    Raises:
+        ValueError: if the network predicts distributions (``action_space="gaussian"``).
+
     Example:
         >>> import torch
         >>> from torchrl.objectives import DTLoss
         >>> loss = DTLoss(make_dt_predictor(DecisionTransformer((11,), 3)))
         >>> loss.loss_mask_key = "mask"  # or padding counts
     """
+    if network.config.action_space == "gaussian":
+        raise ValueError(
+            "this network's actions are gaussian, which have no error, but a likelihood: train "
+            "make_dt_actor(network, group=None, newest=False) on TorchRL's OnlineDTLoss, or set "
+            "action_space='continuous'"
+        )
     return TensorDictSequential(
         SequenceBackbone(network), TensorDictModule(network.action_head, ["features"], ["action"])
     )

@@ -10,6 +10,9 @@ from tensordict.nn import TensorDictModule
 from torch.nn import functional as F
 from torchrl.objectives import DTLoss
 
+_LOSSES = ("l2", "l1", "smooth_l1", "cross_entropy")
+"""Between continuous actions, and the last one between discrete ones."""
+
 
 class MaskedDTLoss(DTLoss):
     """TorchRL's `DTLoss` over the steps that are no padding.
@@ -28,6 +31,10 @@ class MaskedDTLoss(DTLoss):
 
     Returns:
         In ``forward``, a tensordict with "loss", float [].
+
+    Raises:
+        ValueError: if there is no such ``loss_function``.
+        TypeError: in ``forward``, if it is not for actions of the batch's kind.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3.
 
@@ -57,15 +64,24 @@ class MaskedDTLoss(DTLoss):
         mask_key: NestedKey = "mask",
         **settings: Any,
     ) -> None:
+        if loss_function not in _LOSSES:
+            raise ValueError(f"unknown loss_function {loss_function!r}: choose one of {_LOSSES}")
         super().__init__(actor_network, loss_function=loss_function, **settings)
         self.loss_mask_key = mask_key
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the loss of a batch [...], which is left as it is."""
-        if self.loss_function != "cross_entropy":
+        target = tensordict[self.tensor_keys.action_target]
+        discrete = self.loss_function == "cross_entropy"
+        if discrete == target.is_floating_point():
+            other = "'cross_entropy'" if not discrete else f"one of {_LOSSES[:-1]}"
+            raise TypeError(
+                f"loss_function {self.loss_function!r} does not fit actions of {target.dtype}: "
+                f"take {other}"
+            )
+        if not discrete:
             return super().forward(tensordict)
         tensordict = tensordict.copy()
-        target = tensordict.get(self.tensor_keys.action_target)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             logits = self.actor_network(tensordict).get(self.tensor_keys.action_pred)
         if target.ndim == logits.ndim:  # one-hot
