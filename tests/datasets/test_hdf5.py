@@ -145,12 +145,14 @@ def test_existing_file_is_not_overwritten(tmp_path: Path, rolled: Transitions) -
 
 
 def _break(arrays: Transitions, case: str) -> None:
-    zeros = np.zeros(len(arrays["rewards"]), dtype=bool)
+    n = len(arrays["rewards"])
+    zeros = np.zeros(n, dtype=bool)
     changes = {
         "missing": lambda: arrays.pop("actions"),
         "length": lambda: arrays.update(rewards=arrays["rewards"][:-1]),
         "nan": lambda: arrays["rewards"].__setitem__(7, np.nan),
         "infinity": lambda: arrays["observations"].__setitem__((8, 2), -np.inf),
+        "too large": lambda: arrays.update(rewards=arrays["rewards"] + np.eye(1, n, 7)[0] * 1e300),
         "next nan": lambda: arrays["next_observations"].__setitem__((9, 0), np.nan),
         "bounds": lambda: arrays["actions"].__setitem__((10, 1), 1.01),
         "flag": lambda: arrays.update(terminals=arrays["rewards"] * 0 + 3),
@@ -173,6 +175,10 @@ def _break(arrays: Transitions, case: str) -> None:
         ("length", r"field 'rewards': has \d+ rows, but 'observations' has \d+"),
         ("nan", "field 'rewards', row 7: is nan"),
         ("infinity", "field 'observations', row 8: is -inf"),
+        (
+            "too large",
+            r"field 'rewards', row 7: is 1e\+300, but all values must be finite as fl",
+        ),
         ("next nan", "field 'next_observations', row 9: is nan"),
         ("bounds", r"field 'actions', row 10: is 1.0\d*, but the task's actions go from -1.0"),
         ("flag", "field 'terminals', row 0: is 3.0, but must be 0 or 1"),

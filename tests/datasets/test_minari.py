@@ -1,6 +1,7 @@
 """Minari data sets, read and written."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import gymnasium
@@ -11,6 +12,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box, Dict
 from minari.data_collector import EpisodeBuffer
+from numpy.typing import NDArray
 
 from tests.datasets.rollouts import Transitions, spans, write
 from torchrl_tit.datasets import (
@@ -176,6 +178,25 @@ def test_damaged_sets(rolled: Transitions, tmp_path: Path) -> None:
         load_episodes("walk/random-v0")
     (data / "metadata.json").write_text("{")
     with pytest.raises(DatasetError, match="is not a whole Minari data set"):
+        load_episodes("walk/random-v0")
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "message"),
+    [
+        ("actions", lambda x: x.astype(int), "episode 1: field 'actions': holds float32, but in e"),
+        ("rewards", lambda x: x + 1e300, "episode 0: field 'rewards', row 0: is 1e.300, but all"),
+    ],
+)
+def test_numbers_that_would_be_changed(
+    rolled: Transitions, field: str, values: Callable[[NDArray], NDArray], message: str
+) -> None:
+    dataset = make_with_minari(rolled)
+    with h5py.File(dataset.storage.data_path / "main_data.hdf5", "a") as file:
+        array = file["episode_0"][field][:].astype(np.float64)
+        del file["episode_0"][field]
+        file["episode_0"][field] = values(array)
+    with pytest.raises(DatasetError, match=message):
         load_episodes("walk/random-v0")
 
 

@@ -15,8 +15,7 @@ from torch import Tensor
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.envs import is_atari, make_games
 
-FLAGS = ("terminals", "timeouts", "terminated", "truncated")
-_REWARDS = ("rewards", "reward")
+FLAGS = ("terminals", "timeouts", "terminations", "truncations")  # D4RL's names and Minari's
 
 # Actions of a squashed policy stand at the bounds, and rounding puts some a little beyond.
 _ACTION_TOLERANCE = 1e-5
@@ -98,14 +97,21 @@ def check_shape(
         )
 
 
-def check_finite(source: str, field: str, values: NDArray, first_row: int = 0) -> None:
-    """Checks that there is no NaN and no infinity.
+def check_finite(
+    source: str,
+    field: str,
+    values: NDArray,
+    first_row: int = 0,
+    kept_as: torch.dtype = torch.float64,
+) -> None:
+    """Checks that there is no NaN and no infinity, and will be none.
 
     Args:
         source: What the data came from, for messages.
         field: Name of the field.
         values: Some rows of it.
         first_row: The number of the first of them.
+        kept_as: The dtype that they are turned into, which may hold smaller numbers only.
 
     Raises:
         DatasetError: If there is one; names the first row that has one.
@@ -119,11 +125,15 @@ def check_finite(source: str, field: str, values: NDArray, first_row: int = 0) -
     if not np.issubdtype(values.dtype, np.floating):
         return
     wrong = ~np.isfinite(values)
+    if not wrong.any():
+        wrong = ~plain_tensor(values).to(kept_as).isfinite().numpy()
     if wrong.any():
         row = int(wrong.reshape(len(values), -1).any(1).argmax())
         value = values[row][wrong[row]].flat[0] if values.ndim > 1 else values[row]
+        kind = str(kept_as).removeprefix("torch.")
+        problem = f"finite as {kind}" if np.isfinite(value) else "finite"
         raise DatasetError(
-            source, f"is {value}, but all values must be finite.", field, first_row + row
+            source, f"is {value}, but all values must be {problem}.", field, first_row + row
         )
 
 
@@ -189,7 +199,7 @@ def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | N
         return torch.bool
     if dtype.kind == "f":
         return floats or plain_tensor(np.empty(0, dtype)).dtype
-    if field in _REWARDS:
+    if field == "rewards":
         return floats or torch.float32
     return torch.uint8 if dtype == np.uint8 else torch.int64
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from torchrl_tit.datasets.checks import (
+    FLAGS,
     TaskSpaces,
     check_actions,
     check_finite,
@@ -97,15 +98,14 @@ def read_minari(
         fields = _checked(place, episode, stop - start - 1, task)
         if number == 0:
             kept = {
-                field: (array.shape[1:], kept_dtype(place, field, array.dtype, dtype))
+                field: (array.shape[1:], kept_dtype(place, FIELDS[field][0], array.dtype, dtype))
                 for field, array in fields.items()
             }
             rows = memory_mapped_rows(bounds[-1], kept, directory)
         for field, array in fields.items():
-            if array.shape[1:] != (shape := tuple(rows[field].shape[1:])):
-                problem = f"one row has the shape {list(array.shape[1:])}, not {list(shape)}."
-                raise DatasetError(place, problem, FIELDS[field][0])
-            rows[field][start : start + len(array)] = plain_tensor(array)
+            target = rows[field][start : start + len(array)]
+            _check_alike(place, FIELDS[field][0], array, target)
+            target[:] = plain_tensor(array)
     return Episodes(
         rows=rows,
         lengths=lengths,
@@ -189,7 +189,6 @@ def _checked(
             raise DatasetError(
                 place, f"has the shape {list(array.shape)}, but needs {length + more} rows.", name
             )
-        check_finite(place, name, array)
         # One number a row is one column, but for actions, which are then discrete.
         fields[field] = array[:, None] if array.ndim == 1 and field != "action" else array
     if task is not None:
@@ -202,3 +201,13 @@ def _checked(
             place, "ends the episode, but it goes on.", "terminations", int(inside.argmax())
         )
     return fields
+
+
+def _check_alike(place: str, name: str, array: NDArray, target: torch.Tensor) -> None:
+    """Checks that an episode's field fits into the rows made for that of the first."""
+    if array.shape != tuple(target.shape):
+        problem = f"one row has the shape {list(array.shape[1:])}, not {list(target.shape[1:])}."
+        raise DatasetError(place, problem, name)
+    if array.dtype.kind == "f" and not target.is_floating_point() and name not in FLAGS:
+        raise DatasetError(place, f"holds {array.dtype}, but in episode 0 integers.", name)
+    check_finite(place, name, array, kept_as=target.dtype)

@@ -133,13 +133,12 @@ class TransitionReader:
     def read(self, name: str, start: int, stop: int) -> Tensor:
         """Checked rows as they are kept; [n, *row]."""
         values = self._slice(name, start, stop)
-        check_finite(self.source, name, values, start)
+        dtype = self.torch_dtype("observations" if name == "next_observations" else name)
+        check_finite(self.source, name, values, start, dtype)
         if name == "actions" and self.task is not None:
             check_actions(self.source, values, self.task.action, start)
         shape = (1,) if name == "rewards" else self.shapes[name]
-        tensor = plain_tensor(values)
-        kept_as = "observations" if name == "next_observations" else name
-        return tensor.reshape(len(values), *shape).to(self.torch_dtype(kept_as))
+        return plain_tensor(values).reshape(len(values), *shape).to(dtype)
 
     def _slice(self, name: str, start: int, stop: int) -> NDArray:
         try:
