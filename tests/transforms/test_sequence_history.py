@@ -100,6 +100,16 @@ def test_wrong_settings(settings, message):
         SequenceHistory(**settings)
 
 
-def test_a_target_is_needed():
+@pytest.mark.parametrize("ask", ["observation_spec", "reset"])
+@pytest.mark.parametrize("late", [False, True])
+def test_a_target_is_needed(ask, late):
+    transforms = [SequenceHistory(3), TargetReturn(1.0)] if late else [SequenceHistory(3)]
+    env = TransformedEnv(make_env("CartPole-v1"), Compose(*transforms))
     with pytest.raises(KeyError, match=r"no 'target_return'.*put TorchRL's TargetReturn before it"):
-        _ = TransformedEnv(make_env("CartPole-v1"), SequenceHistory(3)).observation_spec
+        env.observation_spec if ask == "observation_spec" else env.reset()
+
+
+def test_an_action_of_another_shape_is_refused():
+    env = add_history(GymEnv("CartPole-v1"), 3)  # which takes one-hot actions
+    with pytest.raises(ValueError, match=r"action of shape \[\], but .* has \[2\].*one-hot"):
+        env.rollout(3, lambda td: td.set("action", torch.tensor(1)))

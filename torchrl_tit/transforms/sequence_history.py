@@ -29,7 +29,8 @@ class SequenceHistory(Transform):
         out_key: Where the sequence goes.
 
     Raises:
-        ValueError: If ``context`` is less than 1 or ``return_scale`` is not positive.
+        ValueError: If ``context`` is less than 1, ``return_scale`` is not positive, or the policy
+            writes an action of another shape than the environment's.
         KeyError: If the environment has no such entry.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3.
@@ -81,7 +82,14 @@ class SequenceHistory(Transform):
         (out_key,) = self.out_keys
         before = tensordict.get(out_key)
         axis = before.ndim
-        action = tensordict.get(self.action_key).unsqueeze(axis)
+        action = tensordict.get(self.action_key)
+        expected = before["action"].select(axis, 0).shape
+        if action.shape != expected:
+            raise ValueError(
+                f"The policy wrote an action of shape {list(action.shape)}, but the environment's "
+                f"has {list(expected)}; discrete ones are indices or one-hot, as its spec says."
+            )
+        action = action.unsqueeze(axis)
         # The newest step gets the action that was taken there; then one more step follows.
         taken = torch.cat([before["action"].narrow(axis, 0, self.context - 1), action], axis)
         newest = {
@@ -111,6 +119,7 @@ class SequenceHistory(Transform):
 
     def _first(self, tensordict: TensorDictBase) -> TensorDict:
         """The sequence of an episode's first step, behind padding."""
+        self._check_keys(tensordict)
         axis = tensordict.ndim
         step = self._newest(tensordict, axis)
         step["timestep"] = torch.zeros_like(step["mask"], dtype=torch.int64)
@@ -123,16 +132,19 @@ class SequenceHistory(Transform):
             padded[name] = _push(value.new_zeros(shape), value, axis)
         return TensorDict(padded, tensordict.batch_size, device=tensordict.device)
 
+    def _check_keys(self, entries: TensorDictBase | Composite) -> None:
+        for key in self.in_keys:
+            if key not in entries.keys(True, True):
+                raise KeyError(
+                    f"SequenceHistory found no {key!r} in the environment, which has "
+                    f"{sorted(map(str, entries.keys(True, True)))}; put TorchRL's TargetReturn "
+                    "before it, or name other keys."
+                )
+
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Adds the sequence to what the environment is known to write."""
         observation_key, target_return_key = self.in_keys
-        for key in self.in_keys:
-            if key not in observation_spec.keys(True, True):
-                raise KeyError(
-                    f"SequenceHistory found no {key!r} in the environment, which has "
-                    f"{sorted(map(str, observation_spec.keys(True, True)))}; put TorchRL's "
-                    "TargetReturn before it, or name other keys."
-                )
+        self._check_keys(observation_spec)
         axis = observation_spec.ndim
         specs = {
             "observation": observation_spec[observation_key],
