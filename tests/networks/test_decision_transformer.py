@@ -278,3 +278,9 @@ def test_wrong_shapes_and_types_are_named() -> None:
         network.encode_states(torch.randn(11))
     with pytest.raises(TypeError, match="float64 does not fit"):
         network(inputs[0].double(), *inputs[1:])
+    for step in (-1, 30):
+        late = inputs[3].clone()
+        late[1, 2] = step
+        message = rf"timesteps reach from {min(step, 0)} to {max(step, 4)}, .* below max_ep_len 30"
+        with pytest.raises(ValueError, match=message):
+            network(*inputs[:3], late)

@@ -41,7 +41,8 @@ class DecisionTransformer(nn.Module):
             ``config``.
 
     Raises:
-        ValueError: if a hyperparameter is not possible, or the inputs do not fit.
+        ValueError: if a hyperparameter is not possible, or the inputs do not fit, such as time
+            steps beyond ``max_ep_len`` (on a CPU).
         TypeError: if there is no such hyperparameter, or ``config`` is that of another network.
 
     Example:
@@ -163,7 +164,7 @@ class DecisionTransformer(nn.Module):
             dim=-2,
         )  # [..., K, 3, D]
         if self.timestep_embedding is not None:
-            tokens = tokens + self.timestep_embedding(timesteps).unsqueeze(-2)
+            tokens = tokens + self._embed_time(timesteps).unsqueeze(-2)
         # Up to the last state: no state sees the last action.
         x = tokens.reshape(math.prod(leading), 3 * steps, width)[:, :-1]  # [N, 3K - 1, D]
         mask = torch.ones(x.shape[1], x.shape[1], dtype=torch.bool, device=x.device).tril()
@@ -179,6 +180,18 @@ class DecisionTransformer(nn.Module):
             x = block(x, mask)
         x = self.blocks[-1](x, mask, slice(-1, None) if newest else _STATES)
         return self.norm(x).reshape(*leading, x.shape[1], width)
+
+    def _embed_time(self, timesteps: Tensor) -> Tensor:
+        """int64 [..., K] -> [..., K, D]."""
+        assert self.timestep_embedding is not None
+        try:
+            return self.timestep_embedding(timesteps)
+        except IndexError as error:  # on a CPU; a GPU does not say more than that it failed
+            raise ValueError(
+                f"timesteps reach from {int(timesteps.min())} to {int(timesteps.max())}, but must "
+                f"be at least 0 and below max_ep_len {self.config.max_ep_len}: raise it to the "
+                "longest episode, or cut episodes off there"
+            ) from error
 
 
 def _check(x: Tensor, expected: tuple[int, ...], name: str) -> None:
