@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.datasets.rollouts import Transitions, spans, write
+from tests.datasets.rollouts import Transitions, roll, spans, write
 from torchrl_tit.datasets import (
     DatasetError,
     Episodes,
@@ -202,6 +202,20 @@ def test_bad_data_are_refused_by_file_field_and_row(
     path = write(tmp_path / "bad.hdf5", arrays)
     with pytest.raises(DatasetError, match=f"^{re.escape(str(path))}: ?{message}"):
         read_hdf5(path, task=task_spaces("Hopper-v5"))
+
+
+def test_a_task_of_the_same_sizes(tmp_path: Path) -> None:
+    rolled = roll(task="Walker2d-v5", max_episode_steps=10)
+    path = write(tmp_path / "a.hdf5", rolled, env_id="Walker2d-v5")
+    assert read_hdf5(path, task=task_spaces("Walker2d-v4")).num_transitions == len(
+        rolled["rewards"]
+    )
+    message = r"a.hdf5: field 'env_id': is Walker2d-v5, but the task is HalfCheetah-v5"
+    with pytest.raises(DatasetError, match=message):
+        load_episodes(path, task="HalfCheetah-v5")
+    with pytest.raises(DatasetError, match="is walker2d, but the task is HalfCheetah-v5"):
+        load_episodes("walker2d-medium-v0", task="HalfCheetah-v5", cache_dir=tmp_path / "none")
+    assert not (tmp_path / "none").exists()  # nothing was downloaded
 
 
 def test_row_is_right_beyond_the_first_chunk(

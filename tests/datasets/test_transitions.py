@@ -1,5 +1,7 @@
 """The rules for data that lack a field."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -105,3 +107,15 @@ def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:
     arrays["timeouts"][row] = True
     assert (episodes.rows == episodes_from_arrays(**arrays).rows).all()
     assert (row + 1 - start) in episodes.lengths
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, but is 0"),
+        ({"gaps": "cutt"}, "gaps must be 'error' or 'cut', but is 'cutt'"),
+    ],
+)
+def test_wrong_settings(arrays: Transitions, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        episodes_from_arrays(**arrays, **settings)

@@ -8,6 +8,7 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import Space
+from gymnasium.envs.registration import parse_env_id
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from torch import Tensor
@@ -65,6 +66,39 @@ def task_spaces(env_name: str) -> TaskSpaces:
         return TaskSpaces(env.observation_space, env.action_space, env_name)
     finally:
         env.close()
+
+
+def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
+    """Checks that data that say what task they are of are of that which is asked for.
+
+    Tasks of the same sizes, such as HalfCheetah and Walker2d, cannot be told apart otherwise.
+
+    Args:
+        source: What the data came from, for messages.
+        recorded: The name of the data's task; anything but text where they do not say.
+        task: The task. Its version may be another, and nothing is known of one without a name of
+            Gymnasium's form.
+
+    Raises:
+        DatasetError: If it is another task.
+
+    Example:
+        >>> check_task_name("a.hdf5", "Pendulum-v0", task_spaces("Pendulum-v1"))
+        >>> check_task_name("a.hdf5", "CartPole-v1", task_spaces("Pendulum-v1"))
+        Traceback (most recent call last):
+        ...
+        torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'env_id': is CartPole-v1, but t...
+    """
+    if not isinstance(recorded, str):
+        return
+    try:
+        (space, name, _), (task_space, task_name, _) = map(parse_env_id, (recorded, task.name))
+    except gymnasium.error.Error:
+        return
+    if space == task_space and name.lower() != task_name.lower():
+        raise DatasetError(
+            source, f"is {recorded}, but the task is {task.name}: take data of that.", "env_id"
+        )
 
 
 def check_shape(

@@ -10,11 +10,12 @@ import minari
 import torch
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
-from torchrl_tit.datasets.checks import TaskSpaces, task_spaces
+from torchrl_tit.datasets.checks import TaskSpaces, check_task_name, task_spaces
 from torchrl_tit.datasets.d4rl import download_d4rl
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.hdf5 import read_hdf5
 from torchrl_tit.datasets.minari import is_minari_name, read_minari
+from torchrl_tit.datasets.scores import has_reference
 from torchrl_tit.datasets.transitions import Gaps
 
 HDF5_SUFFIXES = (".hdf5", ".h5")
@@ -36,8 +37,9 @@ def load_episodes(
         source: An HDF5 file in D4RL's layout (".hdf5" or ".h5"); a folder with a Minari data set;
             D4RL's name of a data set, such as "hopper-medium-replay-v0"; or Minari's, such as
             "mujoco/hopper/medium-v0". What has a name is downloaded once.
-        task: The task whose sizes and action bounds the data must have: a name that Gymnasium has
-            registered, such as "Hopper-v5", or its spaces. Not checked where None.
+        task: The task whose sizes and action bounds the data must have, and whose name, where they
+            give one: a name that Gymnasium has registered, such as "Hopper-v5", or its spaces. Not
+            checked where None.
         max_episode_steps: The time limit of an HDF5 file that does not say where it struck: see
             :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
         gaps: What to do where an HDF5 file's episode goes on with another observation than its
@@ -66,6 +68,8 @@ def load_episodes(
     name = os.fspath(source)
     path = Path(source)
     if name in D4RL_DATASETS and not path.exists():
+        if spaces is not None and has_reference(name):  # such a name begins with the task's
+            check_task_name(name, name.split("-")[0], spaces)
         path = download_d4rl(name, cache_dir)
     if path.is_file() or path.suffix in HDF5_SUFFIXES:
         return read_hdf5(

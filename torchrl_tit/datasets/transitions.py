@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from torchrl_tit.datasets.checks import TaskSpaces
+from torchrl_tit.datasets.checks import TaskSpaces, check_task_name
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.memory import memory_mapped_rows
@@ -95,12 +95,14 @@ def episodes_from_transitions(
         dtype: What floats are turned into; each field keeps its own where None. Integers stay.
         directory: Where the memory-mapped rows go on the disk; see
             :func:`~torchrl_tit.datasets.memory.memory_mapped_rows`.
-        attributes: What the source says about itself.
+        attributes: What the source says about itself; where that includes "env_id", the name of
+            the task, it must be that of ``task``, though the version may be another.
 
     Returns:
         The episodes. The last one may be unfinished, where the data break off.
 
     Raises:
+        ValueError: If ``max_episode_steps`` is less than 1, or ``gaps`` is none of the above.
         DatasetError: If a field is missing, empty, of another length, shape or dtype than it must
             be, holds NaN, infinity, or actions out of bounds, if no episode ends, or an episode
             goes on with another observation than ``next_observations`` says.
@@ -112,6 +114,12 @@ def episodes_from_transitions(
         ...
         torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'actions': is missing; there...
     """
+    if max_episode_steps is not None and max_episode_steps < 1:
+        raise ValueError(f"max_episode_steps must be at least 1, but is {max_episode_steps}.")
+    if gaps not in get_args(Gaps):
+        raise ValueError(f"gaps must be 'error' or 'cut', but is {gaps!r}.")
+    if task is not None:
+        check_task_name(source, (attributes or {}).get("env_id"), task)
     reader = TransitionReader(fields, source, task, dtype)
     terminated = reader.flags("terminals")
     truncated, ends = _ends(reader, terminated, max_episode_steps, gaps)
