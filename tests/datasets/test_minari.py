@@ -21,6 +21,7 @@ from torchrl_tit.datasets import (
     episodes_from_arrays,
     load_episodes,
     read_hdf5,
+    task_spaces,
     write_hdf5,
     write_minari,
 )
@@ -112,6 +113,41 @@ def test_hdf5_to_minari_and_back_is_lossless(rolled: Transitions, tmp_path: Path
             np.testing.assert_array_equal(before[name][:], after[name][:], err_msg=name)
 
 
+def test_what_a_set_says_about_itself_survives(tmp_path: Path) -> None:
+    episode = EpisodeBuffer(
+        seed=3,
+        options={"low": 1},
+        observations=np.zeros((2, 11)),
+        actions=np.zeros((1, 3), np.float32),
+        rewards=[0.0],
+        terminations=[True],
+        truncations=[False],
+        infos={"x": np.zeros(2)},
+    )
+    told = {
+        "algorithm_name": "SAC",
+        "author": {"Ann", "Bob"},
+        "author_email": {"ann@example.org"},
+        "code_permalink": "https://example.org/code",
+        "description": "hops",
+    }
+    env = gymnasium.make("Hopper-v5", terminate_when_unhealthy=False).spec
+    minari.create_dataset_from_buffers("hop/sac-v0", [episode], env=env, **told)
+
+    episodes = load_episodes("hop/sac-v0", dtype=None)
+    write_hdf5(episodes, tmp_path / "a.hdf5")
+    write_minari(load_episodes(tmp_path / "a.hdf5", dtype=None), "hop/sac-v1", "Hopper-v5")
+
+    assert episodes.left_out == ("env_spec", "infos", "options", "seed")
+    again = minari.load_dataset("hop/sac-v1")
+    assert {name: again.storage.metadata[name] for name in told} == told
+    assert again.env_spec.id == "Hopper-v5"
+    assert again.action_space == Box(-1, 1, (3,), np.float32)
+    attributes = load_episodes("hop/sac-v1").attributes
+    assert attributes == episodes.attributes == load_episodes(tmp_path / "a.hdf5").attributes
+    assert attributes["env_id"] == "Hopper-v5"
+
+
 def test_images_and_discrete_actions_survive(tmp_path: Path) -> None:
     frames = np.random.default_rng(0).integers(0, 256, (6, 16, 16, 3), dtype=np.uint8)
     ends = np.array([False, False, True] * 2)
@@ -170,8 +206,11 @@ def test_bad_data_are_refused_by_episode_field_and_row(
 
 def test_damaged_sets(rolled: Transitions, tmp_path: Path) -> None:
     data = Path(make_with_minari(rolled).storage.data_path)
-    with pytest.raises(DatasetError, match="episode 0: field 'observations': one row has the sh"):
+    with pytest.raises(DatasetError, match="field 'env_id': is Hopper-v5, but the task is Walker2"):
         load_episodes("walk/random-v0", task="Walker2d-v5")
+    walker = task_spaces("Walker2d-v5")._replace(name="a walker")
+    with pytest.raises(DatasetError, match="episode 0: field 'observations': one row has the sh"):
+        load_episodes("walk/random-v0", task=walker)
     main = (data / "main_data.hdf5").read_bytes()
     (data / "main_data.hdf5").write_bytes(main[:-1000])
     with pytest.raises(DatasetError, match="its episodes cannot be listed"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import minari
 import numpy as np
@@ -21,6 +22,7 @@ from torchrl_tit.datasets.checks import (
     check_actions,
     check_finite,
     check_shape,
+    check_task_name,
     kept_dtype,
     plain_tensor,
 )
@@ -31,6 +33,14 @@ from torchrl_tit.datasets.memory import memory_mapped_rows
 # What a damaged data set, or one that cannot be downloaded, makes Minari raise.
 _FAILURES = (AssertionError, ImportError, KeyError, OSError, TypeError, ValueError)
 ATTRIBUTES = "attributes"  # our entry in Minari's metadata
+# What Minari itself has a place for there, by the names of our attributes.
+TOLD = {
+    "algorithm": "algorithm_name",
+    "description": "description",
+    "author": "author",
+    "author_email": "author_email",
+    "code_permalink": "code_permalink",
+}
 
 # Minari's name of each field, and how many rows an episode has beside its steps.
 FIELDS = {
@@ -60,12 +70,13 @@ def read_minari(
             :func:`~torchrl_tit.datasets.memory.memory_mapped_rows`.
 
     Returns:
-        The episodes. One that ends without a flag is unfinished.
+        The episodes. One that ends without a flag is unfinished. What the set says about itself is
+        among the attributes, the name of its task as "env_id".
 
     Raises:
         FileNotFoundError: If Minari has no such data set, or cannot download it.
-        DatasetError: If it is damaged, or a field is missing, of the wrong length, shape or dtype,
-            or holds NaN, infinity, or actions out of bounds.
+        DatasetError: If it is damaged or of another task, or a field is missing, of the wrong
+            length, shape or dtype, or holds NaN, infinity, or actions out of bounds.
 
     Example:
         >>> import tempfile
@@ -87,14 +98,19 @@ def read_minari(
             raise DatasetError(
                 source, f"its {kind}s are a {type(space).__name__} space, but must be one array."
             )
-    lengths = _lengths(dataset, source)
+    attributes = _attributes(dataset)
+    if task is not None:
+        check_task_name(source, attributes.get("env_id"), task)
+    lengths, left_out = _lengths(dataset, source)
+    spec = dataset.env_spec
+    if spec is not None and (spec.kwargs or spec.additional_wrappers):
+        left_out.add("env_spec")  # but for the name
     bounds = [0, *(lengths + 1).cumsum(0).tolist()]
     rows = TensorDict({}, [0])
-    has_infos = False
     for number, (start, stop) in enumerate(pairwise(bounds)):
         place = f"{source}: episode {number}"
         episode = _episode(dataset, number, place)
-        has_infos |= bool(episode.infos)
+        left_out |= {"infos"} if episode.infos else set()
         fields = _checked(place, episode, stop - start - 1, task)
         if number == 0:
             kept = {
@@ -111,8 +127,8 @@ def read_minari(
         lengths=lengths,
         final_known=torch.ones(len(lengths), dtype=torch.bool),
         source=source,
-        attributes=dataset.storage.metadata.get(ATTRIBUTES, {}),
-        left_out=("infos",) if has_infos else (),
+        attributes=attributes,
+        left_out=tuple(sorted(left_out)),
     )
 
 
@@ -154,21 +170,36 @@ def _open(name: str | os.PathLike[str]) -> minari.MinariDataset:
         return minari.MinariDataset(data)
     except _FAILURES as error:
         raise DatasetError(
-            str(name), f"is not a whole Minari data set ({error}); see or delete {data}."
+            str(name), f"is not a whole Minari data set ({error}): look into {data}."
         ) from error
 
 
-def _lengths(dataset: minari.MinariDataset, source: str) -> torch.Tensor:
+def _attributes(dataset: minari.MinariDataset) -> dict[str, Any]:
+    """What the data set says about itself, as text, numbers and lists of them."""
+    metadata = dataset.storage.metadata
+    told = {name: metadata[place] for name, place in TOLD.items() if place in metadata}
+    told = {name: sorted(v) if isinstance(v, set) else v for name, v in told.items()}
+    if dataset.env_spec is not None:
+        told["env_id"] = dataset.env_spec.id
+    return {**told, **metadata.get(ATTRIBUTES, {})}
+
+
+def _lengths(dataset: minari.MinariDataset, source: str) -> tuple[torch.Tensor, set[str]]:
+    """Steps of each episode, and what else is noted of episodes, which is not read."""
+    noted: set[str] = set()
+    steps = []
     try:
-        metadata = dataset.storage.get_episode_metadata(dataset.episode_indices)
-        lengths = torch.tensor([int(episode["total_steps"]) for episode in metadata])
+        for episode in dataset.storage.get_episode_metadata(dataset.episode_indices):
+            steps.append(int(episode["total_steps"]))
+            noted |= {name for name in ("seed", "options") if episode.get(name) is not None}
+        lengths = torch.tensor(steps)
     except _FAILURES as error:
         raise DatasetError(source, f"its episodes cannot be listed ({error}).") from error
     if not len(lengths):
         raise DatasetError(source, "has no episodes.")
     if lengths.min() < 1:
         raise DatasetError(source, f"episode {int(lengths.argmin())} has no steps.")
-    return lengths
+    return lengths, noted
 
 
 def _episode(dataset: minari.MinariDataset, number: int, place: str) -> minari.EpisodeData:

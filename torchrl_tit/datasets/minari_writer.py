@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import minari
@@ -18,7 +19,7 @@ from minari.storage.datasets_root_dir import get_dataset_path
 
 from torchrl_tit.datasets.checks import task_spaces
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
-from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, is_minari_name
+from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, TOLD, is_minari_name
 from torchrl_tit.envs import is_atari
 from torchrl_tit.files import whole_or_not_at_all
 
@@ -29,8 +30,8 @@ def write_minari(
     """Writes episodes as a Minari data set, one at a time.
 
     Every field has the dtype it has in memory. It is written from Minari's episode buffers, since
-    Minari's collector needs packages that a conversion does not. The data's attributes "algorithm"
-    and "description" are also what Minari lists under these names.
+    Minari's collector needs packages that a conversion does not. The data's attributes "algorithm",
+    "description", "author", "author_email" and "code_permalink" are also what Minari lists as such.
 
     Args:
         episodes: The data.
@@ -98,11 +99,13 @@ def _env_spec(env_name: str | None) -> EnvSpec | None:
     return None if env_name is None or is_atari(env_name) else gymnasium.spec(env_name)
 
 
-def _listed(episodes: Episodes) -> dict[str, str]:
+def _listed(episodes: Episodes) -> dict[str, Any]:
     """Those of the data's attributes that Minari has a place for."""
-    names = {"algorithm": "algorithm_name", "description": "description"}
-    known = {place: episodes.attributes.get(name) for name, place in names.items()}
-    return {place: value for place, value in known.items() if isinstance(value, str)}
+    known = {place: episodes.attributes.get(name) for name, place in TOLD.items()}
+    people = {place: known.pop(place) for place in ("author", "author_email")}
+    texts = {place: value for place, value in known.items() if isinstance(value, str)}
+    names = {place: [v] if isinstance(v, str) else v for place, v in people.items()}
+    return {**texts, **{place: set(v) for place, v in names.items() if isinstance(v, list)}}
 
 
 def _action_space(episodes: Episodes) -> gymnasium.Space:
