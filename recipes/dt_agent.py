@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -12,7 +11,7 @@ from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose, EnvBase, ObservationNorm, TargetReturn, TransformedEnv
 
 from torchrl_tit.datasets import Episodes
-from torchrl_tit.envs import make_env
+from torchrl_tit.envs import make_env, time_limit
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.modules import make_dt_actor
 from torchrl_tit.networks import DecisionTransformer, DecisionTransformerConfig
@@ -41,6 +40,7 @@ class DTAgent(nn.Module):
         super().__init__()
         self.env = env
         self.context = context
+        self._max_ep_len = config.max_ep_len
         self.return_scale = return_scale
         task = make_env(env, clip_actions=False)
         spec = task.observation_spec["observation"]
@@ -72,6 +72,9 @@ class DTAgent(nn.Module):
     ) -> EnvBase:
         """Builds the task with all that the policy reads; actions go to it as they are.
 
+        Where the task itself has no time limit, its episodes are cut off after ``max_ep_len``
+        steps.
+
         Args:
             num_envs: environments that are stepped side by side.
             target_return: the return that is to be reached.
@@ -79,6 +82,8 @@ class DTAgent(nn.Module):
             **settings: of the task.
         """
         device = self.mean.device
+        if time_limit(self.env) is None:
+            settings = {"max_episode_steps": self._max_ep_len, **settings}
         env = make_env(
             self.env,
             num_envs,
@@ -116,11 +121,11 @@ class DTAgent(nn.Module):
 
 def _check_task(env: str, action_spec: Any, config: DecisionTransformerConfig) -> int:
     """Entries of a continuous action, or the number of discrete ones, if the network can act."""
-    spec = gymnasium.spec(env)
-    if config.timestep_embedding and (spec.max_episode_steps or 0) > config.max_ep_len:
+    limit = time_limit(env)
+    if config.timestep_embedding and limit is not None and limit > config.max_ep_len:
         raise ValueError(
-            f"episodes of {env} have up to {spec.max_episode_steps} steps, but max_ep_len is "
-            f"{config.max_ep_len}: raise backbone.max_ep_len to {spec.max_episode_steps} or more"
+            f"episodes of {env} have up to {limit} steps, but max_ep_len is "
+            f"{config.max_ep_len}: raise backbone.max_ep_len to {limit} or more"
         )
     discrete = isinstance(action_spec, Categorical)
     if discrete != (config.action_space == "discrete"):

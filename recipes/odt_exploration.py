@@ -44,7 +44,7 @@ def explore(agent: DTAgent, recipe: ODT, number: int) -> Episodes:
     actor = scale_noise(agent.actor, recipe.exploration_scale)
     agent.eval()
     with torch.no_grad(), acting(actor), set_exploration_type(ExplorationType.RANDOM):
-        episodes = play_episodes(env, actor, recipe.backbone.max_ep_len)
+        episodes = play_episodes(env, actor)
     agent.train()
     env.close()
     return episodes
@@ -65,18 +65,17 @@ def scale_noise(actor: TensorDictModuleBase, factor: float) -> TensorDictModuleB
     return ProbabilisticTensorDictSequential(*network, scale, draw)
 
 
-def play_episodes(env: EnvBase, policy: TensorDictModuleBase, max_steps: int) -> Episodes:
+def play_episodes(env: EnvBase, policy: TensorDictModuleBase) -> Episodes:
     """Plays one episode in each of the environments that are stepped side by side.
 
     Args:
         env: the environments, [N].
         policy: acts in them.
-        max_steps: longer episodes are cut off.
     """
     steps: list[TensorDictBase] = []
     tensordict = env.reset()
     playing = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
-    while playing.any() and len(steps) < max_steps:
+    while playing.any():
         step, tensordict = env.step_and_maybe_reset(policy(tensordict))
         steps.append(step.select(*_STEP).cpu())
         playing &= ~step["next", "done"].squeeze(-1)
@@ -84,9 +83,9 @@ def play_episodes(env: EnvBase, policy: TensorDictModuleBase, max_steps: int) ->
 
 
 def _first_episode(steps: TensorDictBase) -> Episodes:
-    """Makes an episode of the steps [T] of an environment, to its first end or the last step."""
+    """Makes an episode of the steps [T] of an environment, up to its first end."""
     ends = steps["next", "done"].flatten().nonzero()
-    steps = steps[: int(ends[0]) + 1] if len(ends) else steps
+    steps = steps[: int(ends[0]) + 1]
     terminated = steps["next", "terminated"].flatten()
     cut_off = ~terminated
     cut_off[:-1] = False

@@ -2,7 +2,13 @@
 
 from torchrl_tit.envs.atari import AtariEnv
 from torchrl_tit.envs.atari_games import AtariGames
-from torchrl_tit.envs.factory import VectorizationMode, is_atari, make_env, make_games
+from torchrl_tit.envs.factory import (
+    VectorizationMode,
+    is_atari,
+    make_env,
+    make_games,
+    time_limit,
+)
 from torchrl_tit.envs.vector import GymVectorEnv
 
 __all__ = [
@@ -13,4 +19,5 @@ __all__ = [
     "is_atari",
     "make_env",
     "make_games",
+    "time_limit",
 ]

@@ -12,7 +12,8 @@ from gymnasium.vector.utils import batch_space
 _NOOP, _FIRE = 0, 1
 _HEIGHT, _WIDTH = 210, 160  # of the screen
 _SIZE = 84  # height and width of an observation
-_FRAME_SKIP = 4
+FRAME_SKIP = 4
+MAX_NUM_FRAMES = 108_000  # of a game: half an hour
 _GREY = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue (ITU-R BT.601)
 
 
@@ -60,7 +61,7 @@ class AtariGames(VectorEnv):
     metadata = {  # noqa: RUF012 (Gymnasium's)
         "autoreset_mode": AutoresetMode.DISABLED,
         "render_modes": ["rgb_array"],
-        "render_fps": 60 // _FRAME_SKIP,
+        "render_fps": 60 // FRAME_SKIP,
     }
 
     def __init__(
@@ -69,7 +70,7 @@ class AtariGames(VectorEnv):
         num_envs: int = 1,
         *,
         noop_max: int = 30,
-        max_num_frames_per_episode: int = 108_000,
+        max_num_frames_per_episode: int = MAX_NUM_FRAMES,
         render_mode: str | None = None,
     ) -> None:
         from ale_py import roms  # an extra, which few need
@@ -237,7 +238,7 @@ def _emulator(game: str, height: int, width: int, noop_max: int, max_frames: int
         img_width=width,
         grayscale=False,
         stack_num=1,
-        frameskip=_FRAME_SKIP,
+        frameskip=FRAME_SKIP,
         noop_max=noop_max + 1,  # it draws one less at most
         max_num_frames_per_episode=max_frames,
         repeat_action_probability=0.0,

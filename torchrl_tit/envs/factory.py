@@ -10,7 +10,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_tit.envs.atari import AtariEnv
-from torchrl_tit.envs.atari_games import AtariGames
+from torchrl_tit.envs.atari_games import FRAME_SKIP, MAX_NUM_FRAMES, AtariGames
 from torchrl_tit.envs.mujoco_warnings import show_mujoco_warnings_once
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.transforms.hide_velocities import HideVelocities
@@ -114,6 +114,24 @@ def is_atari(name: str) -> bool:
         (True, False)
     """
     return name.startswith("ALE/")
+
+
+def time_limit(name: str) -> int | None:
+    """Says after how many steps the episodes of a task are cut off.
+
+    Args:
+        name: A name as :func:`make_env` takes it.
+
+    Returns:
+        The number of steps, or None where the task goes on until it ends by itself.
+
+    Example:
+        >>> time_limit("Hopper-v5"), time_limit("ALE/Pong-v5")
+        (1000, 27000)
+    """
+    if is_atari(name):
+        return MAX_NUM_FRAMES // FRAME_SKIP
+    return gymnasium.spec(name).max_episode_steps
 
 
 def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
