@@ -135,10 +135,11 @@ def _check_task(env: str, action_spec: Any, config: DecisionTransformerConfig) -
             f"backbone.action_space to {kind!r}, or take another task"
         )
     if isinstance(action_spec, Bounded):
-        low, high = action_spec.low.min().item(), action_spec.high.max().item()
-        if (low, high) != (-1, 1):
-            raise ValueError(
-                f"actions of {env} reach from {low:g} to {high:g}, but the head's from -1 to 1: "
-                "take a task whose actions are scaled to that"
-            )
+        bounds = [x.flatten().tolist() for x in (action_spec.low, action_spec.high)]
+        for low, high in zip(*bounds, strict=True):
+            if (low, high) != (-1, 1):
+                raise ValueError(
+                    f"actions of {env} reach from {low:g} to {high:g}, but the head's from -1 to "
+                    "1: take a task whose actions are all scaled to that"
+                )
     return action_spec.space.n if discrete else action_spec.shape[0]

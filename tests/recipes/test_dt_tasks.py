@@ -18,7 +18,9 @@ class Endless(gymnasium.Env[Any, Any]):
     """Never ends by itself."""
 
     observation_space = Box(-1.0, 1.0, (3,), np.float32)
-    action_space = Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self, lowest: float = -1.0) -> None:
+        self.action_space = Box(np.array([-1.0, lowest], np.float32), np.ones(2, np.float32))
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
         super().reset(seed=seed)
@@ -29,6 +31,7 @@ class Endless(gymnasium.Env[Any, Any]):
 
 
 gymnasium.register("tests/Endless-v0", lambda **_: Endless())
+gymnasium.register("tests/Lopsided-v0", lambda **_: Endless(lowest=0.0), max_episode_steps=10)
 gymnasium.register("tests/Long-v0", lambda **_: Endless(), max_episode_steps=30)
 
 
@@ -49,6 +52,11 @@ def test_episodes_that_are_explored_are_as_long_as_those_of_the_evaluation(tmp_p
         episodes = explore(agent, recipe, 0)
         assert episodes.lengths.tolist() == agent.play(20.0, 1, 0).tolist() == [length]
         assert episodes.truncated.all()
+
+
+def test_every_entry_of_an_action_must_reach_as_far_as_the_heads(tmp_path):
+    with pytest.raises(ValueError, match="actions of tests/Lopsided-v0 reach from 0 to 1, but"):
+        make_dt(tmp_path, env="tests/Lopsided-v0").make_agent()
 
 
 def test_whole_atari_games_need_as_many_time_steps(tmp_path):
