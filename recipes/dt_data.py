@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 from torchrl_tit.datasets import Episodes, load_episodes
 from torchrl_tit.networks import DecisionTransformerConfig
@@ -11,19 +12,19 @@ from torchrl_tit.networks import DecisionTransformerConfig
 from .offline_recipe import is_remote
 
 
-def load_data(dataset: str, env: str, config: DecisionTransformerConfig) -> Episodes:
+def load_data(dataset: str, config: DecisionTransformerConfig, **reading: Any) -> Episodes:
     """Loads episodes and checks that a network can be trained on them.
 
     Args:
-        dataset: a name or a path: see :func:`~torchrl_tit.datasets.load_episodes`.
-        env: name of the task that they are from.
+        dataset: a name or a path.
         config: the network's settings.
+        **reading: as for :func:`~torchrl_tit.datasets.load_episodes`.
 
     Raises:
         ValueError: if its actions are of the other kind, or episodes are longer than it allows.
         FileNotFoundError: if there are no such data.
     """
-    episodes = load_episodes(dataset, task=env)
+    episodes = load_episodes(dataset, **reading)
     continuous = episodes.rows["action"].is_floating_point()
     if continuous == (config.action_space == "discrete"):
         kind = "continuous" if continuous else "discrete"
@@ -31,7 +32,7 @@ def load_data(dataset: str, env: str, config: DecisionTransformerConfig) -> Epis
             f"the actions in {dataset} are {kind}, but the head's are {config.action_space}: set "
             f"backbone.action_space to {kind!r}, or take other data"
         )
-    longest = int(episodes.lengths.max())
+    longest = int(episodes.lengths[episodes.finished].max())  # the others are not trained on
     if config.timestep_embedding and longest > config.max_ep_len:
         raise ValueError(
             f"episodes in {dataset} have up to {longest} steps, but max_ep_len is "
@@ -40,10 +41,10 @@ def load_data(dataset: str, env: str, config: DecisionTransformerConfig) -> Epis
     return episodes
 
 
-def check_source(dataset: str, env: str, config: DecisionTransformerConfig) -> None:
+def check_source(dataset: str, config: DecisionTransformerConfig, **reading: Any) -> None:
     """Checks what can be checked without a download: local data wholly, else the name alone."""
     if not is_remote(dataset):
-        load_data(dataset, env, config)
+        load_data(dataset, config, **reading)
 
 
 def warn_of_targets(target_returns: Sequence[float], episodes: Episodes) -> None:

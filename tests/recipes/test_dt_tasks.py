@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
+from recipes.dt_data import load_data
 from recipes.odt_exploration import explore
+from tests.datasets.rollouts import roll, write
 from tests.recipes.sequence_runs import SMALL, make_dt, make_odt
 from torchrl_tit.networks import DecisionTransformerConfig
 
@@ -69,3 +71,13 @@ def test_whole_atari_games_need_as_many_time_steps(tmp_path):
     agent = make_dt(tmp_path, env="ALE/Pong-v5", backbone=config).make_agent()
     state = agent.make_env(2, 21.0).reset()
     assert agent.actor(state)["action"].shape == (2,)
+
+
+def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):
+    """The last one, which the data break off in, is left out."""
+    arrays = roll(max_episode_steps=15)
+    arrays["terminals"][-40:] = arrays["timeouts"][-40:] = False
+    arrays["next_observations"][-41:-1] = arrays["observations"][-40:]
+    path = str(write(tmp_path / "hopper.hdf5", arrays))
+    config = DecisionTransformerConfig(context=5, max_ep_len=15)
+    assert load_data(path, "Hopper-v5", config).lengths.max() > 15
