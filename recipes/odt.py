@@ -47,7 +47,8 @@ class ODT(SequenceRecipe):
     backbone: DecisionTransformerConfig = field(default_factory=lambda: NETWORK)
     """The network and its hyperparameters."""
     acting_context: int | None = 5
-    """Steps that the network sees when it acts; those of a training window where not given."""
+    """Steps that the network sees when it acts; those of a training window where not given, which
+    are the most."""
     batch_size: int = 256
     """Subsequences in one gradient step."""
     learning_rate: float = 1e-4
@@ -135,7 +136,7 @@ def train(recipe: ODT, run: Run) -> None:
     """
     torch.set_num_threads(recipe.threads)
     torch.manual_seed(recipe.seed)
-    episodes = load_data(recipe.dataset, recipe.env, recipe.backbone)
+    episodes = load_data(recipe.dataset, recipe.backbone, **recipe.reading())
     warn_of_targets(recipe.target_returns, episodes)
     agent = recipe.make_agent()
     agent.fit_statistics(episodes)

@@ -11,7 +11,7 @@ from .dt_agent import DTAgent
 from .dt_data import check_source
 from .offline_recipe import OfflineRecipe
 from .outcomes import Outcome
-from .recipe import check_at_least
+from .recipe import check_at_least, check_at_most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +25,8 @@ class SequenceRecipe(OfflineRecipe[DTAgent]):
     return_scale: float = 1000.0
     """Returns-to-go are divided by it."""
     acting_context: int | None = None
-    """Steps that the network sees when it acts; those of a training window where not given."""
+    """Steps that the network sees when it acts; those of a training window where not given, which
+    are the most."""
     batch_size: int = 64
     """Subsequences in one gradient step."""
     learning_rate: float = 1e-4
@@ -55,11 +56,16 @@ class SequenceRecipe(OfflineRecipe[DTAgent]):
         )
         if self.acting_context is not None:
             check_at_least(self, acting_context=1)
+            check_at_most(self, acting_context=self.backbone.context)
         if not self.return_scale > 0:
             raise ValueError(f"return_scale must be positive, not {self.return_scale}")
         if not self.target_returns or not all(map(math.isfinite, self.target_returns)):
             raise ValueError(
                 f"target_returns must be at least one finite number, not {self.target_returns}"
+            )
+        if len(set(self.outcome_columns().values())) < len(self.target_returns):
+            raise ValueError(
+                f"target_returns must differ within six digits, unlike {self.target_returns}"
             )
 
     def learning_rate_at(self, step: int) -> float:
@@ -85,7 +91,7 @@ class SequenceRecipe(OfflineRecipe[DTAgent]):
         env = agent.make_env(1, self.target_returns[0])
         agent.actor(env.reset())
         env.close()
-        check_source(self.dataset, self.env, self.backbone)
+        check_source(self.dataset, self.backbone, **self.reading())
 
     def play(self, agent: DTAgent, step: int) -> list[Outcome]:
         """Plays the evaluation's episodes for each target return."""

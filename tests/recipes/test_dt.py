@@ -195,6 +195,9 @@ def test_a_target_that_the_data_never_reach_is_said(tmp_path):
         ({"return_scale": 0.0}, "return_scale must be positive, not 0"),
         ({"iterations": 0}, "iterations must be at least 1"),
         ({"acting_context": 0}, "acting_context must be at least 1"),
+        ({"acting_context": 7}, "acting_context must be at most 6, not 7"),
+        ({"target_returns": (10.0, 5.0, 10.0)}, "must differ within six digits, unlike"),
+        ({"target_returns": (1234567.0, 1234568.0)}, "must differ within six digits, unlike"),
         ({"backbone": MLPConfig()}, "backbone is MLPConfig, but this recipe trains a decision-tr"),
         (
             {"backbone": DecisionTransformerConfig(action_space="gaussian")},
@@ -246,10 +249,10 @@ def test_data_that_do_not_fit_the_network(tmp_path):
 
     config = DecisionTransformerConfig(context=5, max_ep_len=long - 1)
     with pytest.raises(ValueError, match=f"have up to {long} steps, but max_ep_len is {long - 1}"):
-        load_data(str(path), "Hopper-v5", config)
+        load_data(str(path), config, task="Hopper-v5")
     discrete = DecisionTransformerConfig(action_space="discrete")
     with pytest.raises(ValueError, match=r"actions in .* are continuous, but the head's are disc"):
-        load_data(str(path), "Hopper-v5", discrete)
+        load_data(str(path), discrete, task="Hopper-v5")
 
 
 def test_other_algorithms_refuse_the_network():
