@@ -170,7 +170,7 @@ class CQLRecipe(OfflineRecipe[AgentT]):
             DatasetError: if they cannot be used, or are not of the task.
             ValueError: if their actions are of the other kind.
         """
-        episodes = load_episodes(self.dataset, task=self.env)
+        episodes = load_episodes(self.dataset, **self.reading())
         if episodes.rows["action"].is_floating_point() != self.continuous:
             found, expected = ("integers", "floats") if self.continuous else ("floats", "integers")
             raise ValueError(

@@ -72,7 +72,7 @@ def train(recipe: DT, run: Run) -> None:
     """
     torch.set_num_threads(recipe.threads)
     torch.manual_seed(recipe.seed)
-    episodes = load_data(recipe.dataset, recipe.env, recipe.backbone)
+    episodes = load_data(recipe.dataset, recipe.backbone, **recipe.reading())
     warn_of_targets(recipe.target_returns, episodes)
     agent = recipe.make_agent()
     agent.fit_statistics(episodes)

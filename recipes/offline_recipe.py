@@ -9,6 +9,8 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 import torch
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
+from torchrl_tit.datasets.transitions import Gaps
+
 from .outcomes import Outcome, summarize
 from .recipe import Recipe, check_at_least
 from .run import Run
@@ -48,6 +50,11 @@ class OfflineRecipe(Recipe, Generic[AgentT]):
     """A data set: a file in D4RL's layout, or D4RL's or Minari's name."""
     env: str
     """Name of the Gymnasium environment that the network is evaluated in."""
+    max_episode_steps: int | None = None
+    """Time limit of a data file that does not say where it struck; see docs/datasets.md."""
+    gaps: Gaps = "error"
+    """What to do where an episode of a data file goes on with another observation than its next
+    observation: "error" refuses the data, "cut" ends the episode there."""
     batch_size: int = 64
     """Items of the data set in one gradient step."""
     evaluation_episodes: int = 100
@@ -69,6 +76,12 @@ class OfflineRecipe(Recipe, Generic[AgentT]):
             log_interval=1,
             checkpoint_interval=1,
         )
+        if self.max_episode_steps is not None:
+            check_at_least(self, max_episode_steps=1)
+
+    def reading(self) -> dict[str, Any]:
+        """How the data are read: settings of :func:`~torchrl_tit.datasets.load_episodes`."""
+        return {"task": self.env, "max_episode_steps": self.max_episode_steps, "gaps": self.gaps}
 
     def make_agent(self) -> AgentT:
         """Builds what is trained, untrained."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -147,12 +148,32 @@ def test_actions_of_the_right_shape_but_the_other_kind(tmp_path):
         make_cql(tmp_path, dataset=data).check()
 
 
+def test_files_that_do_not_mark_time_limits(tmp_path):
+    rolled = roll()
+    bare = {name: rolled[name] for name in ("observations", "actions", "rewards", "terminals")}
+    bare["terminals"] = np.zeros_like(bare["terminals"])
+    data = str(write(tmp_path / "bare.hdf5", bare))
+    with pytest.raises(ValueError, match=r"no episode ends in its .* give max_episode_steps"):
+        make_cql(tmp_path, dataset=data).check()
+    limited = make_cql(tmp_path, dataset=data, max_episode_steps=20, unfinished="keep")
+    steps = len(rolled["rewards"])
+    assert len(limited.make_buffer()) == steps - math.ceil(steps / 20)  # the last of each
+
+    rolled["next_observations"] = rolled["next_observations"] + np.float32(1)
+    data = str(write(tmp_path / "torn.hdf5", rolled))
+    with pytest.raises(ValueError, match='gaps="cut" ends it there'):
+        make_cql(tmp_path, dataset=data).check()
+    recipe = make_cql(tmp_path, dataset=data, gaps="cut", time_limits="keep")
+    assert len(recipe.make_buffer()) == steps
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"history": 0}, "history must be at least 1, not 0"),
         ({"total_updates": 0}, "total_updates must be at least 1, not 0"),
         ({"batch_size": 0}, "batch_size must be at least 1, not 0"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, not 0"),
         ({"gamma": 1.01}, r"gamma must be at most 1, not 1\.01"),
         ({"gamma": float("nan")}, "gamma must be at least 0, not nan"),
         ({"tau": -0.1}, r"tau must be at least 0, not -0\.1"),

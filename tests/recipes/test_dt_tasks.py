@@ -80,4 +80,4 @@ def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):
     arrays["next_observations"][-41:-1] = arrays["observations"][-40:]
     path = str(write(tmp_path / "hopper.hdf5", arrays))
     config = DecisionTransformerConfig(context=5, max_ep_len=15)
-    assert load_data(path, "Hopper-v5", config).lengths.max() > 15
+    assert load_data(path, config, task="Hopper-v5").lengths.max() > 15
