@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal
@@ -9,6 +10,7 @@ from typing import ClassVar, Literal
 import torch
 from torchrl.objectives import SoftUpdate
 
+from torchrl_tit.objectives import ContinuousCQLLoss, StackedCQLLoss
 from torchrl_tit.objectives.cql import OverCritics
 
 from .cql_agent import CQLAgent, parameters_of
@@ -74,7 +76,26 @@ class CQL(CQLRecipe[CQLAgent]):
 
     def make_update(self, agent: CQLAgent) -> tuple[CQLUpdate, dict[str, torch.optim.Optimizer]]:
         """Builds the gradient step of an agent, and its optimizers by name."""
-        loss = agent.loss
+        in_cache = max(1, _ACTIONS_IN_CACHE // (3 * self.action_samples + 1))
+        return self._make_update(
+            agent.loss,
+            SoftUpdate(agent.loss, tau=self.tau).step,
+            states_at_once=in_cache if self.torch_device().type == "cpu" else None,
+        )
+
+    def make_stacked_update(
+        self, agents: Sequence[CQLAgent]
+    ) -> tuple[CQLUpdate, dict[str, torch.optim.Optimizer]]:
+        """Builds one gradient step of several agents, and the optimizers by name."""
+        loss = StackedCQLLoss([agent.loss for agent in agents])
+        return self._make_update(loss, partial(loss.update_targets, self.tau))
+
+    def _make_update(
+        self,
+        loss: ContinuousCQLLoss | StackedCQLLoss,
+        update_targets: Callable[[], None],
+        states_at_once: int | None = None,
+    ) -> tuple[CQLUpdate, dict[str, torch.optim.Optimizer]]:
         adam = partial(torch.optim.Adam, eps=self.adam_eps, fused=True)
         critics, actor = map(parameters_of, (loss.qvalue_network_params, loss.actor_network_params))
         optimizers: dict[str, torch.optim.Optimizer] = {
@@ -82,12 +103,11 @@ class CQL(CQLRecipe[CQLAgent]):
             "critic_optimizer": adam(critics, lr=self.critic_learning_rate),
             "actor_optimizer": adam(actor, lr=self.actor_learning_rate),
         }
-        in_cache = max(1, _ACTIONS_IN_CACHE // (3 * self.action_samples + 1))
         update = CQLUpdate(
             loss,
             **optimizers,
-            target=SoftUpdate(loss, tau=self.tau),
-            states_at_once=in_cache if self.torch_device().type == "cpu" else None,
+            update_targets=update_targets,
+            states_at_once=states_at_once,
             options=self.compile_options(),
         )
         return update, optimizers

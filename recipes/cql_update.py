@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import SoftUpdate
 
-from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples
+from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples, StackedCQLLoss
 
 from .compilation import compile_and_time
 from .finite import check_finite
@@ -23,13 +22,13 @@ class CQLUpdate:
     steps, as in d3rlpy.
 
     Args:
-        loss: the losses, with all weights.
+        loss: the losses, with all weights; of one agent, or of several stacked.
         temperature_optimizer: of the temperature.
         critic_optimizer: of the critics.
         actor_optimizer: of the actor.
-        target: moves the target critics.
+        update_targets: moves the target critics.
         states_at_once: states on which the critics' losses pass forth and back at a time; all
-            where not given. A few are faster on a CPU.
+            where not given, as it must be for stacked losses. A few are faster on a CPU.
         options: of ``torch.compile``; without any nothing is compiled. With ``states_at_once``
             the policy alone is: what the critics do is matrix products.
     """
@@ -47,11 +46,11 @@ class CQLUpdate:
 
     def __init__(
         self,
-        loss: ContinuousCQLLoss,
+        loss: ContinuousCQLLoss | StackedCQLLoss,
         temperature_optimizer: torch.optim.Optimizer,
         critic_optimizer: torch.optim.Optimizer,
         actor_optimizer: torch.optim.Optimizer,
-        target: SoftUpdate,
+        update_targets: Callable[[], None],
         *,
         states_at_once: int | None = None,
         options: Mapping[str, Any] | None = None,
@@ -60,7 +59,7 @@ class CQLUpdate:
         self.temperature_optimizer = temperature_optimizer
         self.critic_optimizer = critic_optimizer
         self.actor_optimizer = actor_optimizer
-        self.target = target
+        self.update_targets = update_targets
         self.states_at_once = states_at_once
         self.sample_policy, self.critic_losses = loss.sample_policy, loss.critic_losses
         self.actor_loss = loss.actor_loss
@@ -74,15 +73,15 @@ class CQLUpdate:
         """Takes a step.
 
         Args:
-            batch: transitions [B].
+            batch: transitions [B]; of each of N stacked losses, [N, B].
             step: gradient steps before this one, for messages.
             saved_step: step of the newest checkpoint, for messages.
 
         Returns:
-            ``TERMS``, float [terms].
+            ``TERMS``, float [terms] or [N, terms].
 
         Raises:
-            FloatingPointError: if a term is not finite, on a CPU.
+            FloatingPointError: if a term is not finite, on a CPU, of losses that are not stacked.
         """
         torch.compiler.cudagraph_mark_step_begin()  # graphs may write over the last step's tensors
         samples = self.sample_policy(batch)
@@ -93,7 +92,7 @@ class CQLUpdate:
         self.critic_optimizer.step()
         loss_actor, _ = self.actor_loss(batch, samples)
         _descend(loss_actor, self.actor_optimizer)
-        self.target.step()
+        self.update_targets()
         terms = torch.stack(
             [
                 loss_alpha.detach(),
@@ -101,10 +100,13 @@ class CQLUpdate:
                 loss_cql,
                 loss_actor.detach(),
                 self.loss.log_alpha.detach().exp(),
-                -samples.log_prob.detach().mean(),
-            ]
+                -samples.log_prob.detach().mean(dim=-1),
+            ],
+            dim=-1,
         )
-        if terms.device.type == "cpu":  # a GPU would be waited for: there the run looks, less often
+        # A GPU would be waited for, and stacked losses bear no names: there the run looks, less
+        # often.
+        if terms.device.type == "cpu" and terms.ndim == 1:
             check_finite(self.TERMS, terms, step, saved_step)
         return terms
 
@@ -113,13 +115,14 @@ class CQLUpdate:
     ) -> tuple[Tensor, Tensor]:
         """Adds them to the critics' weights; returns the squared error and the other term."""
         if self.states_at_once is not None:
+            assert isinstance(self.loss, ContinuousCQLLoss)
             return self.loss.critic_gradients(batch, samples, self.states_at_once)
         loss_qvalue, loss_cql = self.critic_losses(batch, samples)
-        (loss_qvalue + loss_cql).backward()
+        (loss_qvalue + loss_cql).sum().backward()
         return loss_qvalue.detach(), loss_cql.detach()
 
 
 def _descend(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:
     optimizer.zero_grad()
-    loss.backward()
+    loss.sum().backward()  # of stacked losses, each has weights of its own
     optimizer.step()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -15,45 +14,10 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import CQLLoss, distance_loss
 
 from torchrl_tit.modules.many_actions import ManyActions
+from torchrl_tit.objectives.cql_terms import CQLWeights, PolicySamples, Questions
 from torchrl_tit.objectives.relu_mlp import ReLUMLP
 
 OverCritics = Literal["mean", "sum"]
-
-
-@dataclass(frozen=True)
-class PolicySamples:
-    """What one pass of the actor over a batch, at s and at s', gives to all terms of the loss.
-
-    B states, n samples of each distribution, A entries of an action.
-    """
-
-    action: Tensor
-    """Drawn at s, with a gradient to the actor; float [B, A]."""
-    log_prob: Tensor
-    """Its log density, with a gradient too; float [B]."""
-    actions: Tensor
-    """n drawn at s and n at s', without gradient; float [B, 2n, A]."""
-    log_probs: Tensor
-    """Their log densities; float [B, 2n]."""
-    next_action: Tensor
-    """The deterministic action at s' (tanh of the mean), without gradient; float [B, A]."""
-
-
-@dataclass(frozen=True)
-class _Questions:
-    """What critics are asked of B states: values of 3n drawn actions in each, and of that taken."""
-
-    inputs: TensorDictBase
-    """What critics read; the actions are float [B, 3n + 1, A], that taken last."""
-    log_density: Tensor
-    """How likely the drawn actions were; float [B, 3n]."""
-    target: Tensor
-    """What the value of the action taken should be; float [B]."""
-
-    def split(self, size: int) -> list[_Questions]:
-        """Splits the states."""
-        fields = (self.inputs, self.log_density, self.target)
-        return [_Questions(*part) for part in zip(*(f.split(size) for f in fields), strict=True)]
 
 
 class ContinuousCQLLoss(CQLLoss):
@@ -188,43 +152,78 @@ class ContinuousCQLLoss(CQLLoss):
             }
         )
 
-    def sample_policy(self, tensordict: TensorDictBase) -> PolicySamples:
+    def sample_policy(
+        self, tensordict: TensorDictBase, weights: CQLWeights | None = None
+    ) -> PolicySamples:
         """Runs the actor once at s and once at s', and draws what the terms need.
 
         Args:
             tensordict: a batch [B].
+            weights: to use instead of the loss's own.
         """
-        keys = self.actor_network.in_keys
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            dist = self.actor_network.get_dist(tensordict.select(*keys))
+        return self.draw(*self.run_policy(tensordict, weights))
+
+    def run_policy(
+        self, tensordict: TensorDictBase, weights: CQLWeights | None = None
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Runs the actor once at s and, without gradient, once at s'.
+
+        Args:
+            tensordict: a batch [B].
+            weights: to use instead of the loss's own.
+
+        Returns:
+            Parameters of the distributions at s and at s', [B].
+        """
+        network = self.actor_network
+        keys, outputs = network.in_keys, network.dist_params_keys
+        actor = (weights or CQLWeights.of(self)).actor
+        with actor.to_module(network, preserve_module_state=False):
+            here = network.get_dist_params(tensordict.select(*keys))
             with torch.no_grad():
-                next_dist = self.actor_network.get_dist(tensordict["next"].select(*keys))
+                after = network.get_dist_params(tensordict["next"].select(*keys))
+        return here.select(*outputs), after.select(*outputs)
+
+    def draw(self, here: TensorDictBase, after: TensorDictBase) -> PolicySamples:
+        """Draws what the terms need.
+
+        Args:
+            here: parameters of distributions at s, of any batch shape.
+            after: those at s'.
+        """
+        dist, next_dist = map(self.actor_network.build_dist_from_params, (here, after))
         action, log_prob = rsample_and_log_prob(dist)
         with torch.no_grad():
             shape = torch.Size([self.num_random])
             drawn = [rsample_and_log_prob(d, shape) for d in (dist, next_dist)]
-            actions = torch.cat([a for a, _ in drawn]).movedim(0, 1)  # [B, 2n, A]
-            log_probs = torch.cat([p for _, p in drawn]).movedim(0, 1)  # [B, 2n]
+            actions = torch.cat([a for a, _ in drawn]).movedim(0, -2)  # [B, 2n, A]
+            log_probs = torch.cat([p for _, p in drawn]).movedim(0, -1)  # [B, 2n]
             next_action = next_dist.deterministic_sample
         return PolicySamples(action, log_prob, actions, log_probs, next_action)
 
-    def alpha_loss(self, samples: PolicySamples) -> Tensor:
+    def alpha_loss(self, samples: PolicySamples, weights: CQLWeights | None = None) -> Tensor:
         """The temperature's loss, float []."""
         surprise = samples.log_prob.detach() + self.target_entropy
-        return -(self.log_alpha.exp() * surprise).mean()
+        log_alpha = (weights or CQLWeights.of(self)).log_alpha
+        return -(log_alpha.exp() * surprise).mean()
 
     def critic_losses(
-        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
+        self,
+        tensordict: TensorDictBase,
+        samples: PolicySamples | None = None,
+        weights: CQLWeights | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The critics' squared error and weighted conservative term, float [] each.
 
         Args:
             tensordict: a batch [B].
             samples: of :meth:`sample_policy`; drawn anew where not given.
+            weights: to use instead of the loss's own.
         """
-        samples = samples or self.sample_policy(tensordict)
-        questions = self._questions(tensordict, samples)
-        values = self._values(questions.inputs, self.qvalue_network_params)
+        weights = weights or CQLWeights.of(self)
+        samples = samples or self.sample_policy(tensordict, weights)
+        questions = self._questions(tensordict, samples, weights.target_critics)
+        values = self._values(questions.inputs, weights.critics)
         return self._losses(values, questions, len(questions.target))
 
     def critic_gradients(
@@ -243,7 +242,7 @@ class ContinuousCQLLoss(CQLLoss):
         Returns:
             what :meth:`critic_losses` gives, without gradient.
         """
-        questions = self._questions(tensordict, samples)
+        questions = self._questions(tensordict, samples, self.target_qvalue_network_params)
         parts = questions.split(states_at_once)
         values_of = ReLUMLP.of(self.qvalue_network) or self._values_of_one
         losses = []
@@ -270,25 +269,32 @@ class ContinuousCQLLoss(CQLLoss):
         return self.critic_losses(tensordict, samples)[1], {}
 
     def actor_loss(
-        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
+        self,
+        tensordict: TensorDictBase,
+        samples: PolicySamples | None = None,
+        weights: CQLWeights | None = None,
     ) -> tuple[Tensor, dict[str, Any]]:
         """The actor's loss, float [], through critics that get no gradient.
 
         Args:
             tensordict: a batch [B].
             samples: of :meth:`sample_policy`; drawn anew where not given.
+            weights: to use instead of the loss's own.
         """
-        samples = samples or self.sample_policy(tensordict)
+        weights = weights or CQLWeights.of(self)
+        samples = samples or self.sample_policy(tensordict, weights)
         inputs = self._inputs(tensordict, samples.action.unsqueeze(1))
-        values = self._values(inputs, self._cached_detach_qvalue_params)  # [critics, B, 1]
+        values = self._values(inputs, weights.critics.detach())  # [critics, B, 1]
         value = values.squeeze(-1).amin(0)  # [B]
-        return (self._alpha * samples.log_prob - value).mean(), {}
+        return (weights.log_alpha.detach().exp() * samples.log_prob - value).mean(), {}
 
-    def _target(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
+    def _target(
+        self, tensordict: TensorDictBase, next_action: Tensor, critics: TensorDictBase
+    ) -> Tensor:
         """What the critics aim at, without gradient; float [B]."""
         with torch.no_grad():
             inputs = self._inputs(tensordict["next"], next_action.unsqueeze(1))
-            values = self._values(inputs, self.target_qvalue_network_params)  # [critics, B, 1]
+            values = self._values(inputs, critics)  # [critics, B, 1]
             outcome = tensordict["next"].select(
                 self.tensor_keys.reward, self.tensor_keys.terminated, self.tensor_keys.done
             )
@@ -296,7 +302,7 @@ class ContinuousCQLLoss(CQLLoss):
             batch = TensorDict({"next": outcome}, tensordict.batch_size)
             return self.value_estimator.value_estimate(batch).squeeze(-1)
 
-    def _values(self, inputs: TensorDictBase, params: TensorDict) -> Tensor:
+    def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> Tensor:
         """What all critics say of m actions in each state; [critics, B, m]."""
         answers = self._vmap_qvalue_networkN0(inputs, params)
         return answers.get(self.tensor_keys.state_action_value).squeeze(-1)
@@ -311,7 +317,9 @@ class ContinuousCQLLoss(CQLLoss):
         keys = [key for key in self.qvalue_network.in_keys if key != self.tensor_keys.action]
         return tensordict.select(*keys).set(self.tensor_keys.action, actions)
 
-    def _questions(self, tensordict: TensorDictBase, samples: PolicySamples) -> _Questions:
+    def _questions(
+        self, tensordict: TensorDictBase, samples: PolicySamples, targets: TensorDictBase
+    ) -> Questions:
         """What the critics are asked, and what the answers are held against."""
         action = tensordict.get(self.tensor_keys.action)
         batch, size = action.shape
@@ -321,13 +329,13 @@ class ContinuousCQLLoss(CQLLoss):
         )
         log_uniform = -width.log().sum().expand(batch, self.num_random)
         actions = torch.cat([uniform, samples.actions, action.unsqueeze(1)], dim=1)
-        return _Questions(
+        return Questions(
             inputs=self._inputs(tensordict, actions),
             log_density=torch.cat([log_uniform, samples.log_probs], dim=1),
-            target=self._target(tensordict, samples.next_action),
+            target=self._target(tensordict, samples.next_action, targets),
         )
 
-    def _losses(self, values: Tensor, questions: _Questions, batch: int) -> tuple[Tensor, Tensor]:
+    def _losses(self, values: Tensor, questions: Questions, batch: int) -> tuple[Tensor, Tensor]:
         """The share of b states, and of one critic or all, in the losses of a batch [B].
 
         Args:
