@@ -74,7 +74,7 @@ class ODT(SequenceRecipe):
     data's policies are noisy, whose noise is learnt with their actions."""
     capacity: int = 1000
     """Episodes that are kept to train on."""
-    evaluation_interval: int = 1
+    evaluation_interval: int = 10
     """Rounds between evaluations; there is one before the first, too, and one after the last."""
     evaluation_episodes: int = 10
     """Episodes for each target return, in every evaluation."""

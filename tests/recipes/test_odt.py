@@ -44,6 +44,8 @@ def test_named_recipes_have_the_protocols_settings():
         assert (recipe.learning_rate, recipe.weight_decay) == (1e-4, 5e-4)
         assert (recipe.warmup_updates, recipe.pretraining_updates) == (10_000, 5000)
         assert (recipe.updates_per_round, recipe.alpha_init) == (300, 0.1)
+        assert (recipe.rounds, recipe.evaluation_interval) == (1500, 10)
+        assert recipe.evaluation_episodes == 10
         assert (recipe.online_return, recipe.target_returns) == (7200, (3600,))
         assert recipe_from_json(recipe_to_json(recipe), "it") == recipe
         get_recipe(f"odt/hopper-medium-replay-v2/{network}-small").check()
