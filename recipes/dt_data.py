@@ -48,7 +48,7 @@ def check_source(dataset: str, config: DecisionTransformerConfig, **reading: Any
 
 
 def warn_of_targets(target_returns: Sequence[float], episodes: Episodes) -> None:
-    """Warns of returns that are asked for, but that no episode of the data comes near."""
+    """Warns of returns that are asked for, but lie outside those of the data's episodes."""
     returns = episodes.returns[episodes.finished.cpu()]
     low, high = returns.min().item(), returns.max().item()
     outside = [target for target in target_returns if not low <= target <= high]
