@@ -65,7 +65,6 @@ def _named() -> dict[str, Recipe]:
                 pretraining_updates=500,
                 rounds=60,
                 updates_per_round=30,
-                evaluation_interval=10,
                 evaluation_episodes=20,
                 log_interval=30,
             )
