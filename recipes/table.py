@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .offline_recipe import OfflineRecipe
 from .recipe import Recipe
 from .run import Run
 
@@ -96,7 +97,12 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         )
     cells = [_cell(name, runs) for name, runs in groups.items()]
     order = {name: index for index, name in enumerate(paper_results())}
-    cells.sort(key=lambda cell: (order.get(_plain(cell.recipe), len(order)), cell.recipe))
+
+    def rank(cell: Cell) -> tuple[bool, int, str]:
+        place = order.get(_plain(cell.recipe), len(order))
+        return cell.table == OTHER, place, cell.recipe
+
+    cells.sort(key=rank)
     return cells, notes
 
 
@@ -190,7 +196,7 @@ def _cell(name: str, runs: Sequence[tuple[Run, dict]]) -> Cell:
             (values,), iqm, n_resamples=10_000, method="percentile", rng=0
         ).confidence_interval
         low, high = float(interval.low), float(interval.high)
-    paper = paper_results().get(name) or paper_results().get(_plain(name))
+    paper = _paper_result(first.recipe)
     return Cell(
         table=paper.table if paper else OTHER,
         recipe=name,
@@ -205,6 +211,19 @@ def _cell(name: str, runs: Sequence[tuple[Run, dict]]) -> Cell:
         paper_mean=paper.mean if paper else float("nan"),
         paper_std=paper.std if paper else float("nan"),
     )
+
+
+def _paper_result(recipe: Recipe) -> Result | None:
+    """What the paper reports of a recipe, unless it was trained on other data than there."""
+    plain = _plain(recipe.name)
+    if isinstance(recipe, OfflineRecipe) and _stem(recipe.dataset) not in plain.split("/"):
+        return None
+    return paper_results().get(plain)
+
+
+def _stem(dataset: str) -> str:
+    """A data set's name, also where D4RL's file of it is given: "hopper_medium-v2.hdf5"."""
+    return Path(dataset).name.removesuffix(".hdf5").replace("_", "-")
 
 
 def _plain(name: str) -> str:

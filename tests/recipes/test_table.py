@@ -94,6 +94,20 @@ def test_offline_results_stand_beside_the_papers(tmp_path):
     assert text.count("| 99.2 ± 1.7 |") == 1
 
 
+def test_other_data_do_not_stand_beside_the_papers_numbers(tmp_path):
+    name = "dt/hopper-medium-replay-v2/dt"
+    known = {"hopper-medium-replay-v2": True, "data/hopper_medium_replay-v2.hdf5": True}
+    for number, (dataset, expected) in enumerate({**known, "mine.hdf5": False}.items()):
+        folder = tmp_path / str(number)
+        write_run(folder, name, 0, [1000.0, 1200.0], dataset=dataset)
+        ((cell,), _) = make_table([folder])
+        assert (cell.table == "offline") == expected
+        assert (cell.paper_mean == 71.0) == expected
+    write_run(tmp_path / "other", "dt/walker2d-medium-replay-v2/dt", 0, [1.0])
+    cells, _ = make_table([tmp_path / "2", tmp_path / "other"])
+    assert [cell.table for cell in cells] == ["offline", "not in the paper"]
+
+
 def test_every_value_of_the_paper_belongs_to_a_recipe():
     assert set(paper_results()) <= set(RECIPES)
     online = {name for name, result in paper_results().items() if name.startswith("ppo/")}
