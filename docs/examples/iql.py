@@ -34,18 +34,18 @@ def main(updates: int = 200, dropout: float = 0.0) -> IQLLoss:
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
     )
-    q_backbone, width = backbone("q_features")
-    q_network = TensorDictSequential(
-        q_backbone,
-        ValueOperator(
+    q_networks = []
+    for _ in range(2):
+        q_backbone, width = backbone("q_features")
+        q_head = ValueOperator(
             QHead(width, 1), in_keys=["q_features", "action"], out_keys=["state_action_value"]
-        ),
-    )
+        )
+        q_networks.append(TensorDictSequential(q_backbone, q_head))
     v_backbone, width = backbone("v_features")
     value = TensorDictSequential(
         v_backbone, ValueOperator(nn.Linear(width, 1), in_keys=["v_features"])
     )
-    loss = IQLLoss(actor, q_network, value, num_qvalue_nets=2)
+    loss = IQLLoss(actor, q_networks, value)
     loss.make_value_estimator(gamma=0.99)
     target = SoftUpdate(loss, tau=0.005)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)

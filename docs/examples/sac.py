@@ -47,16 +47,19 @@ def main(steps: int = 1_000, dropout: float = 0.0) -> SACLoss:
         distribution_kwargs={"low": env.action_spec.space.low, "high": env.action_spec.space.high},
     )
     # Critics have a backbone of their own: SAC stacks the parameters of its critics and runs them
-    # in one vmap, and an actor's update must not move what the critics see.
-    critic_tit = EnhancedTIT((3,), history=2, ffn_dropout_inner=dropout)
-    critic = TensorDictSequential(
-        Backbone(critic_tit, out_keys=["critic_features"]),
-        ValueOperator(
+    # in one vmap, and an actor's update must not move what the critics see. Two are given, since
+    # copies of a single one would start with other weights than a TIT is built with.
+    critics = []
+    for _ in range(2):
+        critic_tit = EnhancedTIT((3,), history=2, ffn_dropout_inner=dropout)
+        head = ValueOperator(
             QHead(critic_tit.features_dim, 1),
             in_keys=["critic_features", "action"],
             out_keys=["state_action_value"],
-        ),
-    )
+        )
+        critics.append(
+            TensorDictSequential(Backbone(critic_tit, out_keys=["critic_features"]), head)
+        )
     collector = Collector(
         env,
         actor,
@@ -65,7 +68,7 @@ def main(steps: int = 1_000, dropout: float = 0.0) -> SACLoss:
         auto_register_policy_transforms=False,
     )
     buffer = ReplayBuffer(storage=LazyTensorStorage(10_000), batch_size=64)
-    loss = SACLoss(actor, critic, num_qvalue_nets=2, action_spec=env.action_spec)
+    loss = SACLoss(actor, critics, action_spec=env.action_spec)
     loss.make_value_estimator(gamma=0.99)
     target = SoftUpdate(loss, tau=0.005)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)

@@ -45,13 +45,19 @@ def test_gradients_reach_the_backbone_and_targets_follow(example, short, dropout
     )
 
 
-def test_critics_are_stacked():
-    loss = sac.main(steps=50)
-    stacked = [
-        parameter
+@pytest.mark.parametrize(
+    ("example", "short"), [(sac, {"steps": 50}), (iql, {"updates": 3})], ids=["sac", "iql"]
+)
+def test_critics_are_stacked_and_start_as_they_were_built(example, short):
+    loss = example.main(**short)
+    stacked = {
+        name: parameter
         for name, parameter in loss.named_parameters()
         if name.startswith("qvalue_network_params") and "frame_encoder" in name
-    ]
-    assert stacked
-    assert all(parameter.shape[0] == 2 for parameter in stacked)
-    assert any(not torch.equal(parameter[0], parameter[1]) for parameter in stacked)
+    }
+    assert all(parameter.shape[0] == 2 for parameter in stacked.values())
+    assert any(not torch.equal(parameter[0], parameter[1]) for parameter in stacked.values())
+    layers = [w for name, w in stacked.items() if "ffn" in name and name.endswith("weight")]
+    assert layers
+    for layer in layers:  # drawn anew, they would be spread more than twice as far
+        assert layer.std().item() == pytest.approx(0.02, rel=0.1)
