@@ -29,8 +29,9 @@ def load_data(dataset: str, config: DecisionTransformerConfig, **reading: Any) -
     if continuous == (config.action_space == "discrete"):
         kind = "continuous" if continuous else "discrete"
         raise ValueError(
-            f"the actions in {dataset} are {kind}, but the head's are {config.action_space}: set "
-            f"backbone.action_space to {kind!r}, or take other data"
+            f"the actions in {dataset} are {kind} ({episodes.rows['action'].dtype}), but the "
+            f"head's are {config.action_space}: set backbone.action_space to {kind!r}, or take "
+            "other data (discrete actions are integers)"
         )
     longest = int(episodes.lengths[episodes.finished].max())  # the others are not trained on
     if config.timestep_embedding and longest > config.max_ep_len:

@@ -251,7 +251,8 @@ def test_data_that_do_not_fit_the_network(tmp_path):
     with pytest.raises(ValueError, match=f"have up to {long} steps, but max_ep_len is {long - 1}"):
         load_data(str(path), config, task="Hopper-v5")
     discrete = DecisionTransformerConfig(action_space="discrete")
-    with pytest.raises(ValueError, match=r"actions in .* are continuous, but the head's are disc"):
+    message = r"actions in .* are continuous \(torch.float32\), but .* \(discrete actions are int"
+    with pytest.raises(ValueError, match=message):
         load_data(str(path), discrete, task="Hopper-v5")
 
 
