@@ -1,13 +1,22 @@
 """The rules for data that lack a field."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from tests.datasets.rollouts import Transitions, spans
-from torchrl_tit.datasets import DatasetError, HistoryStorage, episodes_from_arrays, write_hdf5
+from tests.datasets.rollouts import Transitions, roll, spans
+from torchrl_tit.datasets import (
+    DatasetError,
+    HistoryStorage,
+    episodes_from_arrays,
+    read_minari,
+    task_spaces,
+    write_hdf5,
+    write_minari,
+)
 
 
 def test_without_timeouts_an_episode_ends_where_the_next_observation_is_another(
@@ -87,6 +96,19 @@ def test_images_and_discrete_actions_stay_integers() -> None:
     assert sample["history"].shape == (6, 2, 8, 8)
     assert sample["action"].tolist() == [0, 1, 2, 3, 4, 5]
     assert sample["next", "reward"].dtype == torch.float32
+
+
+def test_a_choice_in_a_column_of_its_own(tmp_path: Path) -> None:
+    rolled = roll(task="CartPole-v1", max_episode_steps=20)
+    column = {**rolled, "actions": rolled["actions"][:, None]}
+    task = task_spaces("CartPole-v1")
+    expected = episodes_from_arrays(**rolled, task=task)
+    assert expected.rows["action"].ndim == 1
+    assert (episodes_from_arrays(**column, task=task).rows == expected.rows).all()
+    without_task = episodes_from_arrays(**column)
+    assert without_task.rows["action"].shape[1:] == (1,)
+    write_minari(without_task, tmp_path / "column-v0")
+    assert (read_minari(tmp_path / "column-v0", task=task).rows == expected.rows).all()
 
 
 def test_other_byte_orders_are_read(arrays: Transitions) -> None:

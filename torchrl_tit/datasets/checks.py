@@ -121,7 +121,7 @@ def check_shape(
         >>> check_shape("a.hdf5", "actions", (1,), task.action, task)
     """
     expected = space.shape or ()
-    # One discrete action may stand in a column of its own.
+    # One number is kept in a column of its own.
     if shape != expected and not (expected == () and shape == (1,)):
         raise DatasetError(
             source,

@@ -223,6 +223,9 @@ def _checked(
         # One number a row is one column, but for actions, which are then discrete.
         fields[field] = array[:, None] if array.ndim == 1 and field != "action" else array
     if task is not None:
+        actions = fields["action"]
+        if task.action.shape == () and actions.shape[1:] == (1,):
+            fields["action"] = actions[:, 0]  # a choice, which stands in a column of its own
         check_shape(place, "observations", fields["observation"].shape[1:], task.observation, task)
         check_shape(place, "actions", fields["action"].shape[1:], task.action, task)
         check_actions(place, fields["action"], task.action)

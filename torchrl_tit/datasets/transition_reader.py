@@ -68,7 +68,10 @@ class TransitionReader:
         if not shape:
             raise DatasetError(self.source, "is not an array with a row a transition.", name)
         row = tuple(shape[1:])
-        return () if row == (1,) and name in (*FLAGS, "rewards") else row
+        numbers = {*FLAGS, "rewards"}
+        if self.task is not None and self.task.action.shape == ():
+            numbers.add("actions")  # a choice, which may stand in a column of its own
+        return () if row == (1,) and name in numbers else row
 
     def _check_sizes(self) -> None:
         for name, shape in self.shapes.items():
