@@ -110,6 +110,16 @@ def test_wrong_settings(rolled: Transitions, settings: dict[str, Any], message: 
         SequenceStorage(episodes_from_arrays(**rolled), **settings)
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.int64, bool])
+@pytest.mark.parametrize("shape", [(), (2,)])  # indices, and one-hot
+def test_padding_of_discrete_actions(dtype: type, shape: tuple[int, ...]) -> None:
+    actions, ends = np.ones((6, *shape), dtype), np.arange(6) == 5
+    episodes = episodes_from_arrays(np.zeros((6, 3)), actions, np.ones(6), ends)
+    action = SequenceStorage(episodes, 3)[4]["action"]
+    assert action.dtype == torch.int64
+    assert action.reshape(3, -1).unique(dim=1).flatten().tolist() == [-10, 1, 1]
+
+
 def test_returns_to_go_of_long_data_stay_exact() -> None:
     rewards = np.concatenate([np.full(200_000, 1e3), [0.1, 0.2], np.full(200_000, 1e3)])
     ends = np.zeros(len(rewards), dtype=bool)

@@ -14,9 +14,10 @@ from torchrl_tit.datasets.storage import EpisodeStorage
 class SequenceStorage(EpisodeStorage):
     """Up to K steps from any step of a finished episode on, padded on the left.
 
-    An item has "observation" [K, *obs], "action" [K, *action], "return_to_go" [K, 1], "timestep"
-    int64 [K] and "mask" bool [K], which is False at padding. Drawing indices uniformly draws an
-    episode with a probability proportional to its length, and then a uniform start inside it.
+    An item has "observation" [K, *obs], "action" [K, *action] (int64 if it is discrete),
+    "return_to_go" [K, 1], "timestep" int64 [K] and "mask" bool [K], which is False at padding.
+    Drawing indices uniformly draws an episode with a probability proportional to its length, and
+    then a uniform start inside it.
 
     Args:
         episodes: The data.
@@ -76,12 +77,15 @@ class SequenceStorage(EpisodeStorage):
         observation = self._take("observation", rows)  # [..., K, *obs]
         if self._mean is not None and self._std is not None:
             observation = (observation - self._mean) / self._std
+        action = self._take("action", rows)  # [..., K, *action]
+        if not action.is_floating_point():
+            action = action.long()  # padding is negative
         return_to_go = self._returns_to_go[rows]
         timestep = rows - self._first_rows[episode].unsqueeze(-1)
         return TensorDict(
             {
                 "observation": _fill(observation, mask, 0),
-                "action": _fill(self._take("action", rows), mask, self._action_padding),
+                "action": _fill(action, mask, self._action_padding),
                 "return_to_go": _fill(return_to_go, mask, 0).unsqueeze(-1),
                 "timestep": _fill(timestep, mask, 0),
                 "mask": mask,
