@@ -115,6 +115,16 @@ def test_samples_can_be_changed_without_changing_the_data(rolled: Transitions) -
     np.testing.assert_array_equal(storage[:10]["observation"].numpy(), rolled["observations"][:10])
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.int64])
+def test_discrete_actions_are_indices(dtype: type) -> None:
+    ends = np.arange(4) == 3
+    actions = np.array([3, 1, 0, 2], dtype)
+    episodes = episodes_from_arrays(np.zeros((4, 2)), actions, np.ones(4), ends)
+    action = HistoryStorage(episodes)[:]["action"]
+    assert action.dtype == torch.int64
+    assert action.tolist() == [3, 1, 0, 2]
+
+
 def test_drawing_is_uniform_with_replacement(arrays: Transitions) -> None:
     start, stop = spans(arrays)[2]
     few = {name: array[start:stop] for name, array in arrays.items()}

@@ -20,10 +20,10 @@ Unfinished = Literal["keep", "drop"]
 class HistoryStorage(EpisodeStorage):
     """Transitions whose observation and next observation come as histories.
 
-    An item has "observation" [*obs], "history" [K, *obs], "action", and under "next"
-    "observation", "history", "reward" [1], "terminated" [1], "truncated" [1] and "done" [1]: what
-    an environment with :class:`~torchrl_tit.transforms.History` gives on the same stream. A history
-    never reaches into another episode.
+    An item has "observation" [*obs], "history" [K, *obs], "action" (int64 if it is discrete), and
+    under "next" "observation", "history", "reward" [1], "terminated" [1], "truncated" [1] and
+    "done" [1]: what an environment with :class:`~torchrl_tit.transforms.History` gives on the same
+    stream. A history never reaches into another episode.
 
     Args:
         episodes: The data.
@@ -89,6 +89,9 @@ class HistoryStorage(EpisodeStorage):
         time, ndim = row.ndim, window.ndim - rows.ndim
         if self._constant:
             window.masked_fill_(_expand(rows < first, ndim), 0)
+        action = self._take("action", row)
+        if not action.is_floating_point():
+            action = action.long()  # losses take it for an index
         if self._zero_terminals:
             window.select(time, -1).masked_fill_(_expand(terminated, ndim - 1), 0)
         return TensorDict(
@@ -96,7 +99,7 @@ class HistoryStorage(EpisodeStorage):
                 "observation": window.select(time, self._num_frames - 1),
                 # A copy, so that the two histories can be changed apart.
                 "history": window.narrow(time, 0, self._num_frames).clone(),
-                "action": self._take("action", row),
+                "action": action,
                 "next": TensorDict(
                     {
                         "observation": window.select(time, self._num_frames),
