@@ -21,7 +21,8 @@ def load_data(dataset: str, config: DecisionTransformerConfig, **reading: Any) -
         **reading: as for :func:`~torchrl_tit.datasets.load_episodes`.
 
     Raises:
-        ValueError: if its actions are of the other kind, or episodes are longer than it allows.
+        ValueError: if its actions are of the other kind, no episode is finished, or one is longer
+            than the network allows.
         FileNotFoundError: if there are no such data.
     """
     episodes = load_episodes(dataset, **reading)
@@ -33,6 +34,8 @@ def load_data(dataset: str, config: DecisionTransformerConfig, **reading: Any) -
             f"head's are {config.action_space}: set backbone.action_space to {kind!r}, or take "
             "other data (discrete actions are integers)"
         )
+    if not episodes.finished.any():
+        raise ValueError(f"no episode in {dataset} is finished, so what it returns is not known")
     longest = int(episodes.lengths[episodes.finished].max())  # the others are not trained on
     if config.timestep_embedding and longest > config.max_ep_len:
         raise ValueError(

@@ -7,12 +7,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from gymnasium.spaces import Box
 
 from recipes.dt_data import load_data
 from recipes.odt_exploration import explore
 from tests.datasets.rollouts import roll, write
 from tests.recipes.sequence_runs import SMALL, make_dt, make_odt
+from torchrl_tit.datasets import select_episodes, write_minari
 from torchrl_tit.networks import DecisionTransformerConfig
 
 
@@ -80,4 +82,9 @@ def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):
     arrays["next_observations"][-41:-1] = arrays["observations"][-40:]
     path = str(write(tmp_path / "hopper.hdf5", arrays))
     config = DecisionTransformerConfig(context=5, max_ep_len=15)
-    assert load_data(path, config, task="Hopper-v5").lengths.max() > 15
+    episodes = load_data(path, config, task="Hopper-v5")
+    assert episodes.lengths.max() > 15
+
+    write_minari(select_episodes(episodes, torch.tensor([-1])), folder := tmp_path / "hopper-v0")
+    with pytest.raises(ValueError, match=r"no episode in .*hopper-v0 is finished"):
+        load_data(str(folder), config, task="Hopper-v5")
