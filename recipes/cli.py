@@ -7,7 +7,7 @@ import io
 import shlex
 import sys
 import time
-from contextlib import redirect_stderr
+from contextlib import ExitStack, redirect_stderr
 from dataclasses import make_dataclass, replace
 from itertools import takewhile
 from pathlib import Path
@@ -21,6 +21,7 @@ from .plot import plot_comparison, plot_table
 from .recipe import Recipe, recipe_to_json
 from .registry import RECIPES, find_recipe
 from .run import Run
+from .side_by_side import check_side_by_side, common_step
 from .sweep import make_jobs, run_jobs
 from .table import make_table, to_csv, to_markdown
 
@@ -31,7 +32,8 @@ usage: {program} COMMAND ...
   show NAME                   a recipe's settings as JSON
   train NAME [--FIELD VALUE]  train a named recipe, or one in a JSON file;
                               `train NAME --help` explains every field
-  train --resume RUN          go on with a run that was stopped or killed
+  train NAME --seeds 0 1 2    train several seeds side by side, in one gradient step (cql)
+  train --resume RUN [RUN]    go on with runs that were stopped or killed; several side by side
   evaluate RUN                evaluate a run's newest checkpoint
   render RUN --out FILE       film a run's agent: a GIF or MP4
   sweep NAME [NAME ...]       train many recipes and seeds side by side; names can be patterns
@@ -98,45 +100,67 @@ def _show(words: list[str]) -> None:
 
 
 def _train(words: list[str]) -> None:
-    run = _resume(words) if words and words[0].startswith("--resume") else _start(words)
-    with run:
-        if run.is_complete():
-            print(f"{run.folder} is complete: trained for {run.recipe.final_step} steps, evaluated")
+    runs = _resume(words) if words and words[0].startswith("--resume") else _start(words)
+    recipe = runs[0].recipe
+    with ExitStack() as stack:
+        for run in runs:
+            stack.enter_context(run)
+        if all(run.is_complete() for run in runs):
+            for run in runs:
+                print(f"{run.folder} is complete: trained for {recipe.final_step} steps, evaluated")
             return
         try:
-            run.recipe.train(run)
-            evaluation = run.recipe.evaluate(run)
+            if len(runs) == 1:
+                recipe.train(runs[0])
+            else:
+                recipe.train_side_by_side(runs)
+            evaluations = [run.recipe.evaluate(run) for run in runs]
         except KeyboardInterrupt:
-            print(f"stopped; go on: {_program()} train --resume {run.folder}", file=sys.stderr)
+            folders = shlex.join(str(run.folder) for run in runs)
+            print(f"stopped; go on: {_program()} train --resume {folders}", file=sys.stderr)
             raise
-        run.save_evaluation(evaluation)
-        curve = run.plot()
-    print(_summary(run.recipe, evaluation))
-    print(f"run folder: {run.folder}\nlearning curve: {curve}")
+        for run, evaluation in zip(runs, evaluations, strict=True):
+            run.save_evaluation(evaluation)
+            curve = run.plot()
+            print(_summary(run.recipe, evaluation))
+            print(f"run folder: {run.folder}\nlearning curve: {curve}")
 
 
-def _start(words: list[str]) -> Run:
-    """A new run; nothing is written where its recipe cannot be run."""
+def _start(words: list[str]) -> list[Run]:
+    """New runs, one a seed; nothing is written where their recipe cannot be run."""
     if words and words[0] in ("-h", "--help"):
         print(_USAGE.format(program=_program()))
         sys.exit(0)
     if not words or words[0].startswith("-"):
         _fail("train needs a recipe's name first, or --resume RUN")
-    recipe, out = _parse(find_recipe(words[0]), words[1:])
+    recipe, seeds, out = _parse(find_recipe(words[0]), words[1:])
+    recipes = [replace(recipe, seed=seed) for seed in seeds] or [recipe]
+    check_side_by_side(recipes)
     recipe.check()
-    return Run.create(out or _default_folder(recipe), recipe)
+    if out is None:
+        folders = [_default_folder(recipe) for recipe in recipes]
+    else:
+        folders = [out / f"seed-{seed}" for seed in seeds] or [out]
+    for folder in folders:
+        Run.check_new(folder)
+    return [Run.create(*pair) for pair in zip(folders, recipes, strict=True)]
 
 
-def _resume(words: list[str]) -> Run:
+def _resume(words: list[str]) -> list[Run]:
     parser = _Parser(f"{_program()} train")
-    parser.add_argument("--resume", type=Path, required=True, help="run folder to go on with")
+    parser.add_argument(
+        "--resume", type=Path, nargs="+", required=True, help="run folders to go on with"
+    )
     _add_machine_options(parser)
     options = parser.parse_args(words)
-    run = Run.open(options.resume)
-    run.recipe = _override(run.recipe, device=options.device, threads=options.threads)
-    if changes := run.version_changes():
-        print(f"note: other versions than at the start: {'; '.join(changes)}", file=sys.stderr)
-    return run
+    runs = [Run.open(folder) for folder in options.resume]
+    for run in runs:
+        run.recipe = _override(run.recipe, device=options.device, threads=options.threads)
+        if changes := run.version_changes():
+            print(f"note: other versions than at the start: {'; '.join(changes)}", file=sys.stderr)
+    check_side_by_side([run.recipe for run in runs])
+    common_step(runs)
+    return runs
 
 
 def _summary(recipe: Recipe, evaluation: dict[str, Any]) -> str:
@@ -146,19 +170,26 @@ def _summary(recipe: Recipe, evaluation: dict[str, Any]) -> str:
     )
 
 
-def _parse(recipe: Recipe, words: list[str]) -> tuple[Recipe, Path | None]:
-    """Overrides a recipe's fields, its network's included, and reads --out."""
-    out = tyro.conf.arg(help="Run folder to make; runs/NAME/seed-SEED-DATE where missing.")
+def _parse(recipe: Recipe, words: list[str]) -> tuple[Recipe, tuple[int, ...], Path | None]:
+    """Overrides a recipe's fields, its network's included, and reads --seeds and --out."""
+    seeds = tyro.conf.arg(
+        help="Seeds to train side by side instead of --seed, in one gradient step of all (cql)."
+    )
+    out = tyro.conf.arg(
+        help="Run folder to make, or with --seeds the folder of a seed-SEED for each; "
+        "runs/NAME/seed-SEED-DATE where missing."
+    )
     parsed = _parse_fields(
         [
             ("recipe", Annotated[type(recipe), tyro.conf.arg(name="")], recipe),
+            ("seeds", Annotated[tuple[int, ...], seeds], ()),
             ("out", Annotated[Path | None, out], None),
         ],
         words,
         f"train {recipe.name}",
         type(recipe).__doc__,
     )
-    return parsed.recipe, parsed.out
+    return parsed.recipe, parsed.seeds, parsed.out
 
 
 def _parse_fields(

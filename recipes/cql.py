@@ -15,8 +15,10 @@ from torchrl_tit.objectives.cql import OverCritics
 
 from .cql_agent import CQLAgent, parameters_of
 from .cql_recipe import CQLRecipe
+from .cql_seeds import train_seeds
 from .cql_update import CQLUpdate
 from .recipe import check_at_least
+from .run import Run
 
 # What critics of three layers of 256 keep of so many actions, 8 MB, fits into a CPU's cache.
 _ACTIONS_IN_CACHE = 2000
@@ -32,6 +34,7 @@ class CQL(CQLRecipe[CQLAgent]):
     algorithm: ClassVar[str] = "cql"
     compiling_pays_on: ClassVar[tuple[str, ...]] = ("cpu", "cuda")
     continuous: ClassVar[bool] = True
+    trains_side_by_side: ClassVar[bool] = True
 
     actor_learning_rate: float = 1e-4
     """Learning rate of Adam for the actor."""
@@ -89,6 +92,10 @@ class CQL(CQLRecipe[CQLAgent]):
         """Builds one gradient step of several agents, and the optimizers by name."""
         loss = StackedCQLLoss([agent.loss for agent in agents])
         return self._make_update(loss, partial(loss.update_targets, self.tau))
+
+    def train_side_by_side(self, runs: Sequence[Run]) -> None:
+        """Trains runs of several seeds; see :func:`~recipes.cql_seeds.train_seeds`."""
+        train_seeds(self, runs)
 
     def _make_update(
         self,

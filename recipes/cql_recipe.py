@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
-from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buffer
+from torchrl_tit.datasets import Episodes, HistoryStorage, load_episodes, make_replay_buffer
 from torchrl_tit.datasets.histories import TerminalObservations, TimeLimits, Unfinished
 from torchrl_tit.transforms.history import Padding
 
@@ -19,7 +19,7 @@ from .compilation import Compile, compile_options, should_compile
 from .cql_agent import QAgent
 from .offline_recipe import OfflineRecipe, is_remote
 from .offline_state import TrainingState
-from .offline_training import run_updates
+from .offline_training import Training, run_updates
 from .outcomes import Outcome
 from .recipe import check_at_least, check_at_most
 from .run import Run
@@ -160,10 +160,10 @@ class CQLRecipe(OfflineRecipe[AgentT]):
         def step(number: int) -> Tensor:
             return update(buffer.sample(), number, state.saved_step)
 
-        run_updates(self, run, agent, state, update.TERMS, step)
+        run_updates([Training(self, run, agent, state)], update.TERMS, step)
 
-    def make_buffer(self) -> ReplayBuffer:
-        """Loads the data set and makes a replay buffer of its transitions with histories.
+    def load_data(self) -> Episodes:
+        """Loads the data set.
 
         Raises:
             FileNotFoundError: if there are no such data.
@@ -177,8 +177,16 @@ class CQLRecipe(OfflineRecipe[AgentT]):
                 f"the actions in {self.dataset} are {found}, but those of {self.env} are "
                 f"{expected}: take other data"
             )
+        return episodes.to(self.torch_device())
+
+    def make_buffer(self, episodes: Episodes | None = None) -> ReplayBuffer:
+        """Makes a replay buffer of transitions with histories.
+
+        Args:
+            episodes: of :meth:`load_data`; loaded where not given.
+        """
         storage = HistoryStorage(
-            episodes.to(self.torch_device()),
+            self.load_data() if episodes is None else episodes,
             self.history,
             padding=self.padding,
             time_limits=self.time_limits,

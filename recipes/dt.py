@@ -15,7 +15,7 @@ from torchrl_tit.objectives import MaskedDTLoss
 from .dt_data import load_data, warn_of_targets
 from .finite import check_finite
 from .offline_state import TrainingState
-from .offline_training import run_updates
+from .offline_training import Training, run_updates
 from .recipe import check_at_least
 from .run import Run
 from .sequence_recipe import SequenceRecipe
@@ -107,4 +107,4 @@ def train(recipe: DT, run: Run) -> None:
         optimizer.step()
         return terms
 
-    run_updates(recipe, run, agent, state, TERMS, update)
+    run_updates([Training(recipe, run, agent, state)], TERMS, update)

@@ -20,7 +20,7 @@ from .finite import check_finite
 from .odt_data import OnlineData
 from .odt_exploration import explore
 from .offline_state import TrainingState
-from .offline_training import run_updates
+from .offline_training import Training, run_updates
 from .recipe import check_at_least
 from .run import Run
 from .sequence_recipe import SequenceRecipe
@@ -196,7 +196,8 @@ def train(recipe: ODT, run: Run) -> None:
         return torch.cat([values, values.new_tensor([data.newest_return])])
 
     # There is no online return before the first round.
-    run_updates(recipe, run, agent, state, TERMS, update, finite=len(LOSSES))
+    training = Training(recipe, run, agent, state)
+    run_updates([training], TERMS, update, finite=len(LOSSES))
 
 
 def make_lamb(parameters: list[nn.Parameter], learning_rate: float, weight_decay: float) -> Lamb:

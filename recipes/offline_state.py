@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from torchrl_tit.checkpoint import global_rng_state, set_global_rng_state
+from torchrl_tit.checkpoint import global_rng_state, load_checkpoint, set_global_rng_state
 
 from .finite import check_finite
 from .outcomes import Outcome
@@ -85,12 +85,11 @@ class TrainingState:
         )
         self.saved_step = step
 
-    def load(self, run: Run) -> int:
-        """Loads the newest checkpoint and returns its step, 0 where there is none."""
-        loaded = run.load()
-        if loaded is None:
-            return 0
-        step, state = loaded
+    def load(self, run: Run, step: int) -> None:
+        """Loads the checkpoint of a step; where that is 0, there is none."""
+        if step == 0:
+            return
+        _, state = load_checkpoint(run.checkpoints, step)
         with run.restoring(step):
             for name, part in self._parts.items():
                 _load(part, state[name])
@@ -100,7 +99,6 @@ class TrainingState:
             self._count = state["count"]
         set_global_rng_state(state["rng"])
         self.saved_step = step
-        return step
 
 
 def _load(part: Stateful, state: dict[str, Any]) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
@@ -36,6 +36,8 @@ class Recipe:
     algorithm: ClassVar[str]
     offline: ClassVar[bool] = False
     """Whether steps are gradient steps, and returns those of evaluations."""
+    trains_side_by_side: ClassVar[bool] = False
+    """Whether several seeds can be trained in one process; see :meth:`train_side_by_side`."""
 
     name: Annotated[str, tyro.conf.Suppress] = ""
     """The recipe's name, such as ppo/cartpole/enhanced-tit."""
@@ -72,6 +74,10 @@ class Recipe:
 
     def train(self, run: Run) -> None:
         """Trains in a run folder, from its newest checkpoint where there is one."""
+        raise NotImplementedError
+
+    def train_side_by_side(self, runs: Sequence[Run]) -> None:
+        """Trains runs whose recipes are this one with seeds of their own, all at once."""
         raise NotImplementedError
 
     def evaluate(self, run: Run) -> dict[str, Any]:

@@ -53,6 +53,15 @@ class Run:
         Raises:
             FileExistsError: if the folder is there already and not empty.
         """
+        cls.check_new(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(folder / "versions.json", json.dumps(package_versions(), indent=2) + "\n")
+        write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
+        return cls(folder, recipe)
+
+    @staticmethod
+    def check_new(folder: Path) -> None:
+        """Raises FileExistsError where :meth:`create` would."""
         # recipe.json comes last: without it, what a killed process began here is no run yet.
         begun = {"versions.json", ".lock"}
         if folder.exists() and (
@@ -62,10 +71,6 @@ class Run:
                 f"{folder} exists already: continue it with `train --resume {folder}`, or name "
                 "another folder with --out"
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(folder / "versions.json", json.dumps(package_versions(), indent=2) + "\n")
-        write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
-        return cls(folder, recipe)
 
     @classmethod
     def open(cls, folder: Path) -> Run:
