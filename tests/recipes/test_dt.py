@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -71,16 +72,17 @@ def test_resumes_bit_for_bit(tmp_path):
 def test_a_step_is_the_protocols(tmp_path):
     """Weights after two steps are those of AdamW on the masked error, with clipped gradients."""
     config = DecisionTransformerConfig(**SMALL, dropout=0.0)
-    recipe = make_dt(tmp_path, backbone=config, iterations=1, updates_per_iteration=2)
+    settings: dict[str, Any] = {"iterations": 1, "updates_per_iteration": 2}
+    recipe = make_dt(tmp_path, backbone=config, return_scale=50.0, weight_decay=10.0, **settings)
     _, state = load_checkpoint(train(recipe, tmp_path / "run").checkpoints)
 
     episodes = load_episodes(recipe.dataset)
     mean, std = episodes.observation_statistics()
-    storage = SequenceStorage(episodes, 6, mean=mean, std=std)
+    storage = SequenceStorage(episodes, 6, mean=mean, std=std, return_scale=50.0)
     generator = torch.Generator().manual_seed(recipe.seed)
     torch.manual_seed(recipe.seed)
     network = recipe.make_agent().network
-    optimizer = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=1e-4)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=10.0)
     for step in range(2):
         batch = storage[torch.randint(len(storage), (8,), generator=generator)]
         names = ("observation", "action", "return_to_go", "timestep", "mask")
@@ -94,6 +96,29 @@ def test_a_step_is_the_protocols(tmp_path):
         trained = state["agent"][f"network.{name}"]
         torch.testing.assert_close(trained, weight.detach(), rtol=1e-4, atol=1e-6, msg=name)
     torch.testing.assert_close(state["agent"]["mean"], mean)
+
+
+def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
+    """Step by step in Gymnasium: normalised states, return to go and actions of the last steps."""
+    recipe = make_dt(tmp_path, acting_context=4, return_scale=50.0)
+    agent = recipe.make_agent().eval()
+    agent.fit_statistics(load_episodes(recipe.dataset))
+    env = gymnasium.make("Hopper-v5")
+    observation, _ = env.reset(seed=3)
+    states, actions, to_go, ended = [], [torch.zeros(3)], [60.0], False
+    while not ended:
+        states.append((torch.as_tensor(observation, dtype=torch.float32) - agent.mean) / agent.std)
+        steps = torch.arange(len(states))[-4:]
+        window = [torch.stack(x)[steps] for x in (states, actions)]
+        returns_to_go = torch.tensor(to_go)[steps].unsqueeze(-1) / 50
+        with torch.no_grad():
+            actions[-1] = agent.network(*window, returns_to_go, steps)[-1]
+        observation, reward, terminated, truncated, _ = env.step(actions[-1].numpy())
+        actions.append(torch.zeros(3))
+        to_go.append(to_go[-1] - float(reward))
+        ended = terminated or truncated
+    assert len(states) > 6
+    assert agent.play(60.0, episodes=1, seed=3).item() == pytest.approx(60 - to_go[-1], rel=1e-4)
 
 
 def test_evaluation_is_of_both_targets_and_the_best_of_all(tmp_path):

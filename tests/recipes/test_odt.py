@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from torch import nn
+from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
 from recipes.metrics import read_metrics
 from recipes.odt import ODT, make_lamb
@@ -17,8 +18,14 @@ from recipes.odt_exploration import explore, scale_noise
 from recipes.recipe import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
 from tests.datasets.rollouts import roll
-from tests.recipes.sequence_runs import assert_resumes_bit_for_bit, make_odt, train
-from torchrl_tit.datasets import SequenceStorage, episodes_from_arrays, select_episodes
+from tests.recipes.sequence_runs import SMALL, assert_resumes_bit_for_bit, make_odt, train
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.datasets import (
+    SequenceStorage,
+    episodes_from_arrays,
+    load_episodes,
+    select_episodes,
+)
 from torchrl_tit.networks import DecisionTransformerConfig
 
 pytestmark = pytest.mark.filterwarnings("ignore:target_returns")
@@ -60,6 +67,53 @@ def test_resumes_bit_for_bit(tmp_path, rounds):
     assert_resumes_bit_for_bit(recipe, tmp_path)
 
 
+def test_a_step_is_the_protocols(tmp_path):
+    """Weights and temperature after two steps: likelihood and entropy of steps that are no padding.
+
+    Gradients are clipped, LAMB warms up, and the temperature follows the entropy.
+    """
+    config = DecisionTransformerConfig(
+        action_space="gaussian", timestep_embedding=False, dropout=0.0, **SMALL
+    )
+    settings: dict[str, Any] = {"pretraining_updates": 2, "rounds": 0, "evaluation_episodes": 1}
+    settings |= {"return_scale": 50.0, "weight_decay": 1.0, "alpha_learning_rate": 0.1}
+    recipe = make_odt(tmp_path, backbone=config, **settings)
+    _, state = load_checkpoint(train(recipe, tmp_path / "run").checkpoints)
+
+    episodes = load_episodes(recipe.dataset)
+    mean, std = episodes.observation_statistics()
+    storage = SequenceStorage(episodes, 6, mean=mean, std=std, return_scale=50.0)
+    seed = np.random.SeedSequence([recipe.seed, 0]).generate_state(1).item()
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(recipe.seed)
+    network = recipe.make_agent().network
+    optimizer = make_lamb(list(network.parameters()), 1.0, 1.0)
+    log_alpha = torch.tensor(0.1).log().requires_grad_()
+    alpha_optimizer = torch.optim.Adam([log_alpha], lr=0.1)
+    for step in range(2):
+        batch = storage[torch.randint(len(storage), (8,), generator=generator)]
+        names = ("observation", "action", "return_to_go", "timestep", "mask")
+        normal = Normal(*network(*(batch[name] for name in names)))
+        policy = TransformedDistribution(normal, TanhTransform())
+        action = batch["action"].clamp(-1 + 1e-6, 1 - 1e-6)
+        likelihood = policy.log_prob(action).sum(-1)[batch["mask"]].mean()
+        drawn = normal.rsample()
+        surprise = normal.log_prob(drawn) - TanhTransform().log_abs_det_jacobian(drawn, drawn)
+        entropy = -surprise.sum(-1)[batch["mask"]].mean()
+        optimizer.zero_grad()
+        (-likelihood - log_alpha.exp().detach() * entropy).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.25)
+        optimizer.param_groups[0]["lr"] = 1e-3 * (step + 1) / 4
+        optimizer.step()
+        alpha_optimizer.zero_grad()
+        (log_alpha.exp() * (entropy.detach() + 3)).backward()
+        alpha_optimizer.step()
+    for name, weight in network.named_parameters():
+        trained = state["agent"][f"network.{name}"]
+        torch.testing.assert_close(trained, weight.detach(), rtol=1e-4, atol=1e-6, msg=name)
+    torch.testing.assert_close(state["alpha"]["value"], log_alpha.detach(), rtol=1e-4, atol=1e-5)
+
+
 def test_what_a_run_writes(tmp_path):
     recipe = make_odt(tmp_path)
     with train(recipe, tmp_path / "run") as run:
@@ -88,6 +142,21 @@ def test_explores_with_drawn_actions_and_keeps_observations_as_they_are(tmp_path
     actions = [episode.rows["action"][0] for episode in (first, again)]
     assert not torch.equal(*actions)
     assert agent.training
+
+
+def test_explores_with_its_own_target_and_noise(tmp_path, monkeypatch):
+    recipe = make_odt(tmp_path, exploration_scale=1e-6)
+    agent = recipe.make_agent()
+    targets = []
+
+    def make_env(num_envs, target_return, *settings):
+        targets.append(target_return)
+        return type(agent).make_env(agent, num_envs, target_return, *settings)
+
+    monkeypatch.setattr(agent, "make_env", make_env)
+    first, again = (explore(agent, recipe, 0).rows["action"] for _ in range(2))
+    assert targets == [recipe.online_return] * 2
+    torch.testing.assert_close(first, again, rtol=0, atol=1e-3)  # nor is anything dropped out
 
 
 def test_episodes_side_by_side_are_whole_and_differ(tmp_path):
