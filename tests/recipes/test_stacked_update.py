@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.recipes.cql_runs import TIT, make_cql
 from torchrl_tit.networks import MLPConfig
@@ -103,3 +104,30 @@ def test_dropout_and_samples_differ_between_agents(tmp_path):
     )
     assert losses[0][0] == losses[0][1]
     assert losses[1][0] != losses[1][1]  # uniform actions
+
+
+class Count(TorchDispatchMode):
+    """Counts operations, each of which a GPU would be launched for."""
+
+    number = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.number += 1
+        return func(*args, **(kwargs or {}))
+
+
+def test_more_agents_take_no_more_operations(tmp_path):
+    recipe = make_cql(tmp_path, backbone=MLPConfig())
+    batch = recipe.make_buffer().sample()
+    numbers = []
+    for size in (2, 5):
+        agents = [recipe.make_agent() for _ in range(size)]
+        for agent in agents:
+            agent.loss.deactivate_vmap = False
+            agent.loss._make_vmap()
+        update, _ = recipe.make_stacked_update(agents)
+        update(batch.expand(size, *batch.shape), 0, 0)  # Adam begins
+        with Count() as count:
+            update(batch.expand(size, *batch.shape), 1, 0)
+        numbers.append(count.number)
+    assert numbers[0] == numbers[1] > 100
