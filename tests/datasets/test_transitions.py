@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box, Discrete
 
 from tests.datasets.rollouts import Transitions, roll, spans
 from torchrl_tit.datasets import (
@@ -17,6 +18,7 @@ from torchrl_tit.datasets import (
     write_hdf5,
     write_minari,
 )
+from torchrl_tit.datasets.checks import check_actions
 
 
 def test_without_timeouts_an_episode_ends_where_the_next_observation_is_another(
@@ -141,3 +143,12 @@ def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:
 def test_wrong_settings(arrays: Transitions, settings: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         episodes_from_arrays(**arrays, **settings)
+
+
+def test_bounds_are_those_of_the_entry_that_is_wrong() -> None:
+    space = Box(np.array([-1.0, 0.0], np.float32), np.ones(2, np.float32))
+    message = "row 6: is -0.5, but the task's actions go from 0.0 to 1.0 there"
+    with pytest.raises(DatasetError, match=message):
+        check_actions("a.hdf5", np.array([[-0.5, 0.5], [0.5, -0.5]]), space, first_row=5)
+    with pytest.raises(DatasetError, match="row 1: is 3, but the task's actions go from 0 to 2"):
+        check_actions("a.hdf5", np.array([[2], [3]]), Discrete(3))

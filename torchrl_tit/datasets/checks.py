@@ -189,22 +189,23 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
         ...
         torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'actions', row 0: is 1.5, but...
     """
-    low: NDArray | float
-    high: NDArray | float
     if isinstance(space, Box):
-        low, high = space.low - _ACTION_TOLERANCE, space.high + _ACTION_TOLERANCE
-        bounds = f"from {space.low.min()} to {space.high.max()}"
+        low, high, tolerance = space.low, space.high, _ACTION_TOLERANCE
     elif isinstance(space, Discrete):
-        low, high = float(space.start), float(space.start + space.n - 1)
-        bounds = f"from {low:.0f} to {high:.0f}"
+        low, high = np.array(space.start), np.array(space.start + space.n - 1)
+        tolerance = 0.0
     else:
         return
-    wrong = (values < low) | (values > high)
+    wrong = (values < low - tolerance) | (values > high + tolerance)
     if wrong.any():
         row = int(wrong.reshape(len(values), -1).any(1).argmax())
-        value = np.asarray(values[row])[np.asarray(wrong[row])].flat[0]
+        entries = np.broadcast_arrays(values[row], low, high)
+        value, lowest, highest = (x[np.asarray(wrong[row])].flat[0] for x in entries)
         raise DatasetError(
-            source, f"is {value}, but the task's actions go {bounds}.", "actions", first_row + row
+            source,
+            f"is {value}, but the task's actions go from {lowest} to {highest} there.",
+            "actions",
+            first_row + row,
         )
 
 
