@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from tests.datasets.rollouts import Transitions, spans
 from torchrl_tit.datasets import (
@@ -113,7 +114,8 @@ def test_wrong_settings(rolled: Transitions, settings: dict[str, Any], message: 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int8, np.int64, bool])
 @pytest.mark.parametrize("shape", [(), (2,)])  # indices, and one-hot
 def test_padding_of_discrete_actions(dtype: type, shape: tuple[int, ...]) -> None:
-    actions, ends = np.ones((6, *shape), dtype), np.arange(6) == 5
+    actions: NDArray = np.ones((6, *shape), dtype)
+    ends = np.arange(6) == 5
     episodes = episodes_from_arrays(np.zeros((6, 3)), actions, np.ones(6), ends)
     action = SequenceStorage(episodes, 3)[4]["action"]
     assert action.dtype == torch.int64
