@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs import GymEnv, TransformedEnv
 
@@ -118,7 +119,7 @@ def test_samples_can_be_changed_without_changing_the_data(rolled: Transitions) -
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.int64])
 def test_discrete_actions_are_indices(dtype: type) -> None:
     ends = np.arange(4) == 3
-    actions = np.array([3, 1, 0, 2], dtype)
+    actions: NDArray = np.array([3, 1, 0, 2]).astype(dtype)
     episodes = episodes_from_arrays(np.zeros((4, 2)), actions, np.ones(4), ends)
     action = HistoryStorage(episodes)[:]["action"]
     assert action.dtype == torch.int64

@@ -1,5 +1,7 @@
 """Transitions in parts, and the episodes that come out of them."""
 
+import os
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -91,6 +93,22 @@ def test_up_to_a_part(arrays: Transitions, tmp_path: Path) -> None:
         "000000000010.hdf5",
     ]
     assert TransitionParts(tmp_path).num_rows() == 60
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks into /proc")
+def test_more_parts_than_files_may_be_open(arrays: Transitions, tmp_path: Path) -> None:
+    import resource
+
+    parts = write_all(tmp_path, split(arrays, 2, [3] * 50))
+    expected = write_all(tmp_path / "few", split(arrays, 2, [150])).episodes().rows
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    opened = max(int(name) for name in os.listdir("/proc/self/fd"))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (opened + 20, hard))
+    try:
+        rows = parts.episodes().rows
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert (rows == expected).all()
 
 
 def test_pictures_and_discrete_actions_keep_their_dtypes(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.joined_field import JoinedField
 from torchrl_tit.datasets.transition_reader import FIELDS
 from torchrl_tit.datasets.transitions import episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
@@ -134,48 +135,35 @@ class TransitionParts:
         numbers = self.numbers(last)
         if not numbers:
             raise DatasetError(str(self.folder), "holds no transitions.")
-        # HDF5 itself joins the files' data to larger ones, which are then read in slices.
-        with h5py.File("joined", "w", driver="core", backing_store=False) as joined:
-            for name in FIELDS:
-                joined.create_virtual_dataset(name, self._layout(numbers, name))
-            fields: dict[str, Any] = {name: joined[name] for name in FIELDS}
-            streams = self._shape(numbers[0])[0]
-            ends = fields["terminals"][:].reshape(streams, -1)
-            timeouts = fields["timeouts"][:].reshape(streams, -1)
-            timeouts[:, -1] |= ~ends[:, -1]
-            fields["timeouts"] = timeouts.reshape(-1)
-            return episodes_from_transitions(
-                fields, source=str(self.folder), gaps="cut", **{"dtype": None, **settings}
-            )
+        fields: dict[str, Any] = {name: self._joined(numbers, name) for name in FIELDS}
+        streams = self._shape(numbers[0], "rewards")[0]
+        ends = fields["terminals"][:].reshape(streams, -1)
+        timeouts = fields["timeouts"][:].reshape(streams, -1)
+        timeouts[:, -1] |= ~ends[:, -1]
+        fields["timeouts"] = timeouts.reshape(-1)
+        return episodes_from_transitions(
+            fields, source=str(self.folder), gaps="cut", **{"dtype": None, **settings}
+        )
 
-    def _layout(self, numbers: list[int], name: str) -> h5py.VirtualLayout:
+    def _joined(self, numbers: list[int], name: str) -> JoinedField:
         """All rows of a field, stream by stream; [S * T, ...]."""
-        sources = []
-        for number in numbers:
-            with self._open(number) as file:
-                sources.append(h5py.VirtualSource(file[name]))
-        streams, row = sources[0].shape[0], sources[0].shape[2:]
-        for number, source in zip(numbers, sources, strict=True):
-            if (source.shape[0], *source.shape[2:]) != (streams, *row):
+        first = self._shape(numbers[0], name)
+
+        def check(number: int, shape: tuple[int, ...]) -> None:
+            if (shape[0], *shape[2:]) != (first[0], *first[2:]):
                 raise DatasetError(
                     str(self._path(number)),
-                    f"has the shape {list(source.shape)}, which does not go on with that of "
-                    f"{self._path(numbers[0]).name}, {list(sources[0].shape)}.",
+                    f"has the shape {list(shape)}, which does not go on with that of "
+                    f"{self._path(numbers[0]).name}, {list(first)}.",
                     name,
                 )
-        steps = sum(source.shape[1] for source in sources)
-        layout = h5py.VirtualLayout((streams * steps, *row), sources[0].dtype)
-        for stream in range(streams):
-            start = stream * steps
-            for source in sources:
-                layout[start : start + source.shape[1]] = source[stream]
-                start += source.shape[1]
-        return layout
 
-    def _shape(self, number: int) -> tuple[int, int]:
-        """Streams of a part, and steps of each."""
+        return JoinedField(name, numbers, self._open, check)
+
+    def _shape(self, number: int, name: str) -> tuple[int, ...]:
+        """Streams of a part, steps of each, and the shape of a row."""
         with self._open(number) as file:
-            return file["rewards"].shape
+            return file[name].shape
 
     def _open(self, number: int) -> h5py.File:
         path = self._path(number)
