@@ -180,6 +180,13 @@ def test_dropout_only_while_training() -> None:
     assert not torch.equal(network(*inputs), network(*inputs))
 
 
+def test_tokens_are_dropped_before_the_blocks() -> None:
+    network, inputs = make("dt", dropout=0.5), make_inputs("dt", 2)
+    network.blocks.eval()
+    network.dropout.train()
+    assert not torch.equal(network(*inputs), network(*inputs))
+
+
 @pytest.mark.parametrize("part", ["attention", "ffn"])
 def test_both_residuals_of_a_block_are_dropped(part: str) -> None:
     torch.manual_seed(0)
