@@ -1,6 +1,5 @@
 """Data sets for offline RL: D4RL, Minari, HDF5 files and arrays into TorchRL replay buffers."""
 
-from torchrl_tit.datasets.checks import TaskSpaces, task_spaces
 from torchrl_tit.datasets.d4rl import download_d4rl
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
@@ -20,6 +19,7 @@ from torchrl_tit.datasets.selection import join_episodes, select_episodes
 from torchrl_tit.datasets.sequences import SequenceStorage
 from torchrl_tit.datasets.sources import load_episodes
 from torchrl_tit.datasets.storage import EpisodeStorage
+from torchrl_tit.datasets.tasks import TaskSpaces, task_spaces
 from torchrl_tit.datasets.transitions import episodes_from_arrays
 
 __all__ = [

@@ -18,17 +18,15 @@ from tensordict import TensorDict
 
 from torchrl_tit.datasets.checks import (
     FLAGS,
-    TaskSpaces,
     check_actions,
     check_finite,
-    check_shape,
-    check_task_name,
     kept_dtype,
     plain_tensor,
 )
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.memory import memory_mapped_rows
+from torchrl_tit.datasets.tasks import TaskSpaces, check_shape, check_task_name
 
 # What a damaged data set, or one that cannot be downloaded, makes Minari raise.
 _FAILURES = (AssertionError, ImportError, KeyError, OSError, TypeError, ValueError)

@@ -17,9 +17,9 @@ from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
-from torchrl_tit.datasets.checks import task_spaces
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
 from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, TOLD, is_minari_name
+from torchrl_tit.datasets.tasks import task_spaces
 from torchrl_tit.envs import is_atari
 from torchrl_tit.files import whole_or_not_at_all
 

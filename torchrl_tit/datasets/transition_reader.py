@@ -12,15 +12,14 @@ from torch import Tensor
 
 from torchrl_tit.datasets.checks import (
     FLAGS,
-    TaskSpaces,
     check_actions,
     check_finite,
-    check_shape,
     kept_dtype,
     plain_tensor,
 )
 from torchrl_tit.datasets.episodes import rows_per_chunk
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.tasks import TaskSpaces, check_shape
 
 FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
 _REQUIRED = FIELDS[:4]

@@ -12,10 +12,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from torchrl_tit.datasets.checks import TaskSpaces, check_task_name
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.memory import memory_mapped_rows
+from torchrl_tit.datasets.tasks import TaskSpaces, check_task_name
 from torchrl_tit.datasets.transition_reader import FIELDS, TransitionReader
 
 Gaps = Literal["error", "cut"]

@@ -1,0 +1,121 @@
+"""What a Gymnasium task asks of its data."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import gymnasium
+from gymnasium import Space
+from gymnasium.envs.registration import parse_env_id
+
+from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.envs import is_atari, make_games
+
+
+class TaskSpaces(NamedTuple):
+    """What the observations and actions of a task look like.
+
+    Args:
+        observation: Gymnasium's space of one observation.
+        action: Gymnasium's space of one action.
+        name: The task's name, for messages.
+    """
+
+    observation: Space
+    action: Space
+    name: str = "the task"
+
+
+def task_spaces(env_name: str) -> TaskSpaces:
+    """Asks a Gymnasium task for its spaces.
+
+    Args:
+        env_name: A name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
+            "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one picture
+            of 84 x 84 grey levels.
+
+    Returns:
+        Its spaces.
+
+    Raises:
+        ValueError: If the task cannot be made.
+
+    Example:
+        >>> task_spaces("Pendulum-v1").action.shape
+        (1,)
+    """
+    if is_atari(env_name):
+        games = make_games(env_name)
+        games.close()
+        return TaskSpaces(games.single_observation_space, games.single_action_space, env_name)
+    try:
+        env = gymnasium.make(env_name, disable_env_checker=True)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ValueError(f"Task {env_name!r} cannot be made: {error}") from error
+    try:
+        return TaskSpaces(env.observation_space, env.action_space, env_name)
+    finally:
+        env.close()
+
+
+def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
+    """Checks that data that say what task they are of are of that which is asked for.
+
+    Tasks of the same sizes, such as HalfCheetah and Walker2d, cannot be told apart otherwise.
+
+    Args:
+        source: What the data came from, for messages.
+        recorded: The name of the data's task; anything but text where they do not say.
+        task: The task. Its version may be another, and nothing is known of one without a name of
+            Gymnasium's form.
+
+    Raises:
+        DatasetError: If it is another task.
+
+    Example:
+        >>> check_task_name("a.hdf5", "Pendulum-v0", task_spaces("Pendulum-v1"))
+        >>> check_task_name("a.hdf5", "CartPole-v1", task_spaces("Pendulum-v1"))
+        Traceback (most recent call last):
+        ...
+        torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'env_id': is CartPole-v1, but t...
+    """
+    if not isinstance(recorded, str):
+        return
+    try:
+        (space, name, _), (task_space, task_name, _) = map(parse_env_id, (recorded, task.name))
+    except gymnasium.error.Error:
+        return
+    if space == task_space and name.lower() != task_name.lower():
+        raise DatasetError(
+            source, f"is {recorded}, but the task is {task.name}: take data of that.", "env_id"
+        )
+
+
+def check_shape(
+    source: str, field: str, shape: tuple[int, ...], space: Space, task: TaskSpaces
+) -> None:
+    """Checks that observations or actions have the size that a task's have.
+
+    Args:
+        source: What the data came from, for messages.
+        field: Name of the field.
+        shape: Shape of one row.
+        space: The space of that field.
+        task: The task, for messages.
+
+    Raises:
+        DatasetError: If they have another.
+
+    Example:
+        >>> task = task_spaces("Pendulum-v1")
+        >>> check_shape("a.hdf5", "actions", (1,), task.action, task)
+    """
+    expected = space.shape or ()
+    # One number is kept in a column of its own.
+    if shape != expected and not (expected == () and shape == (1,)):
+        raise DatasetError(
+            source,
+            f"one row has the shape {list(shape)}, but in {task.name} it is {list(expected)}; "
+            f"these data are of another task.",
+            field,
+        )
