@@ -49,8 +49,8 @@ class QAgent:
         self.shape = task.observation_spec["history"].shape[2:]
         task.close()
 
-    def make_env(self, num_envs: int) -> EnvBase:
-        """Builds the task, with the history as part of it."""
+    def make_env(self, num_envs: int, **settings: Any) -> EnvBase:
+        """Builds the task, with the history as part of it; settings go to the task."""
         return make_env(
             self.recipe.env,
             num_envs,
@@ -58,6 +58,7 @@ class QAgent:
             padding=self.recipe.padding,
             clip_actions=False,  # the policy keeps within the bounds, which the losses need
             device=None if self.device.type == "cpu" else self.device,
+            **settings,
         )
 
     def make_backbone(self, features_key: str) -> tuple[Backbone, int]:

@@ -8,8 +8,10 @@ from typing import Any, ClassVar, Protocol, TypeVar
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase
 
 from torchrl_tit.datasets import Episodes, HistoryStorage, load_episodes, make_replay_buffer
 from torchrl_tit.datasets.histories import TerminalObservations, TimeLimits, Unfinished
@@ -115,6 +117,12 @@ class CQLRecipe(OfflineRecipe[AgentT]):
         options = compile_options(self.cuda_graphs, device)
         pays = self.compile == "on" or device.type in self.compiling_pays_on
         return options if pays and should_compile(self.compile, self.total_updates) else None
+
+    def load_player(self, run: Run, **settings: Any) -> tuple[TensorDictModuleBase, EnvBase]:
+        """As :meth:`Recipe.load_player`."""
+        _, agent, _ = self.load_agent(run)
+        agent.eval()
+        return agent.policy, agent.make_env(1, **settings)
 
     def play(self, agent: AgentT, step: int) -> list[Outcome]:
         """Plays the evaluation's episodes."""

@@ -57,10 +57,6 @@ class OfflineRecipe(Recipe, Generic[AgentT]):
     observation: "error" refuses the data, "cut" ends the episode there."""
     batch_size: int = 64
     """Items of the data set in one gradient step."""
-    evaluation_episodes: int = 100
-    """Episodes of every evaluation."""
-    evaluation_seed: int = 1_000_000
-    """Seed of the first evaluation episode; the others follow one by one."""
     log_interval: int = 100
     """Gradient steps to a row of metrics."""
     checkpoint_interval: int = 1000
@@ -71,8 +67,6 @@ class OfflineRecipe(Recipe, Generic[AgentT]):
         check_at_least(
             self,
             batch_size=1,
-            evaluation_episodes=1,
-            evaluation_seed=0,
             log_interval=1,
             checkpoint_interval=1,
         )

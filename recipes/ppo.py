@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_tit.envs import VectorizationMode, make_env
@@ -92,10 +93,6 @@ class PPO(Recipe):
     initialization: Literal["orthogonal", "own"] = "orthogonal"
     """How the backbone starts: orthogonal, as Stable-Baselines3 made every network that the paper
     trained online, or as the network's own paper says (TIT: normal with 0.02)."""
-    evaluation_episodes: int = 100
-    """Episodes of the evaluation after training."""
-    evaluation_seed: int = 1_000_000
-    """Seed of the first evaluation episode; the others follow one by one."""
     checkpoint_interval: int = 10_240
     """Environment steps between checkpoints."""
     collectors: int = 1
@@ -139,13 +136,9 @@ class PPO(Recipe):
             reward_scale=0,
             gamma=0,
             gae_lambda=0,
-            evaluation_episodes=1,
-            evaluation_seed=0,
             checkpoint_interval=1,
         )
-        check_at_most(
-            self, clip_epsilon=1, gamma=1, gae_lambda=1, masked_fraction=1, evaluation_seed=2**31
-        )
+        check_at_most(self, clip_epsilon=1, gamma=1, gae_lambda=1, masked_fraction=1)
         if self.steps_per_batch < 2 or self.steps_per_batch % self.num_envs:
             raise ValueError(
                 f"steps_per_batch {self.steps_per_batch} cannot be shared by {self.num_envs} "
@@ -266,6 +259,11 @@ class PPO(Recipe):
             "steps": step,
             "returns": returns.tolist(),
         }
+
+    def load_player(self, run: Run, **settings: Any) -> tuple[TensorDictModuleBase, EnvBase]:
+        """As :meth:`Recipe.load_player`."""
+        _, agent = self.load_agent(run)
+        return agent.eval().policy, self.make_env(1, self.evaluation_seed, **settings)
 
     def load_agent(self, run: Run) -> tuple[int, Agent]:
         """Loads the agent of a run's newest checkpoint.

@@ -18,6 +18,9 @@ import tyro
 from .networks import NETWORKS, NetworkConfig
 
 if TYPE_CHECKING:
+    from tensordict.nn import TensorDictModuleBase
+    from torchrl.envs import EnvBase
+
     from .run import Run
 
 ALGORITHMS: dict[str, type[Recipe]] = {}
@@ -49,6 +52,10 @@ class Recipe:
     """Where the networks are: "auto" is the GPU where there is one."""
     threads: int = 1
     """PyTorch's threads on the CPU; small networks run fastest on one."""
+    evaluation_episodes: int = 100
+    """Episodes of an evaluation."""
+    evaluation_seed: int = 1_000_000
+    """Seed of the first evaluation episode; the others follow one by one."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -56,8 +63,8 @@ class Recipe:
             ALGORITHMS[cls.algorithm] = cls
 
     def __post_init__(self) -> None:
-        check_at_least(self, threads=1, seed=0)
-        check_at_most(self, seed=_MAX_SEED)
+        check_at_least(self, threads=1, seed=0, evaluation_episodes=1, evaluation_seed=0)
+        check_at_most(self, seed=_MAX_SEED, evaluation_seed=_MAX_SEED)
         if self.name and not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", self.name):
             raise ValueError(
                 f"name must be words joined by '/', such as ppo/cartpole/mine, not {self.name!r}"
@@ -82,6 +89,18 @@ class Recipe:
 
     def evaluate(self, run: Run) -> dict[str, Any]:
         """Evaluates a run's newest checkpoint and returns what ``evaluation.json`` is to hold."""
+        raise NotImplementedError
+
+    def load_player(self, run: Run, **settings: Any) -> tuple[TensorDictModuleBase, EnvBase]:
+        """Loads the policy of a run's newest checkpoint, in evaluation mode, and one environment.
+
+        Args:
+            run: a run folder with a checkpoint.
+            **settings: of the task, such as ``render_mode="rgb_array"``.
+
+        Raises:
+            FileNotFoundError: if there is no checkpoint.
+        """
         raise NotImplementedError
 
     def torch_device(self) -> torch.device:

@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.files import whole_or_not_at_all
 
-from .ppo import PPO
+from .recipe import Recipe
 from .run import Run
 
 _SUFFIXES = (".gif", ".mp4")
@@ -48,15 +48,13 @@ def run_render(options: argparse.Namespace) -> None:
     """
     run = Run.open(options.run)
     recipe = run.recipe
-    if not isinstance(recipe, PPO):
-        raise ValueError(f"{options.run} is a run of {recipe.algorithm}; only ppo can be rendered")
     if options.seed is not None:
         recipe = replace(recipe, evaluation_seed=options.seed)
     returns = render(recipe, run, options.out, options.episodes)
     print(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")
 
 
-def render(recipe: PPO, run: Run, video: Path, episodes: int = 1) -> list[float]:
+def render(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float]:
     """Films a run's newest agent while it plays as in the evaluation.
 
     Args:
@@ -76,10 +74,8 @@ def render(recipe: PPO, run: Run, video: Path, episodes: int = 1) -> list[float]
     """
     if video.suffix not in _SUFFIXES:
         raise ValueError(f"a film is one of {', '.join(_SUFFIXES)}, not {video.name!r}")
-    _, agent = recipe.load_agent(run)
-    env = recipe.make_env(1, recipe.evaluation_seed, render_mode="rgb_array")
+    policy, env = recipe.load_player(run, render_mode="rgb_array")
     base = env.base_env  # transforms have no pictures
-    policy = agent.eval().policy
     try:
         with (
             whole_or_not_at_all(video) as hidden,
@@ -96,7 +92,7 @@ def render(recipe: PPO, run: Run, video: Path, episodes: int = 1) -> list[float]
                 returns = evaluate(env, filmed, episodes, seed=recipe.evaluation_seed)
             reel.rename(hidden)
     except gymnasium.error.DependencyNotInstalled as error:
-        raise ValueError(f"{recipe.env} cannot be rendered: {error}") from error
+        raise ValueError(f"{run.folder} cannot be rendered: {error}") from error
     finally:
         env.close()
     return returns.tolist()

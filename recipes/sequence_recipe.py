@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
+
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 
 from torchrl_tit.networks import DecisionTransformerConfig
 
@@ -12,6 +16,7 @@ from .dt_data import check_source
 from .offline_recipe import OfflineRecipe
 from .outcomes import Outcome
 from .recipe import check_at_least, check_at_most
+from .run import Run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,6 +97,12 @@ class SequenceRecipe(OfflineRecipe[DTAgent]):
         agent.actor(env.reset())
         env.close()
         check_source(self.dataset, self.backbone, **self.reading())
+
+    def load_player(self, run: Run, **settings: Any) -> tuple[TensorDictModuleBase, EnvBase]:
+        """As :meth:`Recipe.load_player`; the first target return is asked for."""
+        _, agent, _ = self.load_agent(run)
+        agent.eval()
+        return agent.actor, agent.make_env(1, self.target_returns[0], **settings)
 
     def play(self, agent: DTAgent, step: int) -> list[Outcome]:
         """Plays the evaluation's episodes for each target return."""

@@ -8,7 +8,11 @@ from recipes.cli import main
 from recipes.networks import EnhancedTITConfig, MLPConfig
 from recipes.ppo import PPO
 from recipes.run import Run
+from tests.recipes.cql_runs import make_cartpole_data, make_discrete_cql
+from tests.recipes.sequence_runs import SMALL as SMALL_DT
+from tests.recipes.sequence_runs import make_dt, train
 from torchrl_tit.evaluation import evaluate
+from torchrl_tit.networks import DecisionTransformerConfig
 
 SMALL = {"total_steps": 64, "steps_per_batch": 64, "minibatch_size": 32, "epochs": 1}
 
@@ -44,6 +48,30 @@ def test_one_picture_a_step(cartpole, tmp_path, capsys, suffix):
         assert len(pictures) == returns.sum()
     assert (pictures[0] != pictures[-1]).any()
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
+
+
+def make_cartpole_dt(folder):
+    return make_dt(
+        folder,
+        dataset=str(make_cartpole_data(folder)),
+        env="CartPole-v1",
+        target_returns=(20.0,),
+        backbone=DecisionTransformerConfig(**SMALL_DT, action_space="discrete"),
+    )
+
+
+@pytest.mark.parametrize("make", [make_discrete_cql, make_cartpole_dt])
+def test_runs_on_data(make, tmp_path, capsys):
+    pytest.importorskip("pygame")
+    recipe = make(tmp_path)
+    run = train(recipe, tmp_path / "run")
+    film = tmp_path / "film.gif"
+    main(["render", str(run.folder), "--out", str(film)])
+    (played, *_) = recipe.evaluate(run)["returns"]  # the first episode of the evaluation
+    assert capsys.readouterr().out.splitlines()[0] == f"returns {played:g}"
+    pictures = range(len(imageio.imread(film)))
+    shown = [imageio.immeta(film, index=i)["duration"] for i in pictures]
+    assert sum(shown) == 20 * played
 
 
 def test_atari(tmp_path, capsys):
