@@ -5,6 +5,9 @@ from pathlib import Path
 
 import pytest
 
+import recipes.registry  # noqa: F401  makes all algorithms known
+from recipes.recipe import recipe_from_json
+
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
@@ -29,3 +32,10 @@ def test_python_runs(document):
     namespace: dict[str, object] = {}
     for block in re.findall(r"```python\n(.*?)```", document.read_text(), flags=re.DOTALL):
         exec(compile(block, name(document), "exec"), namespace)
+
+
+def test_results_can_be_run_again():
+    files = sorted(ROOT.glob("docs/results/**/recipe.json"))
+    assert files
+    for file in files:
+        recipe_from_json(file.read_bytes(), name(file))
