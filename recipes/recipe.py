@@ -150,6 +150,8 @@ def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
     Raises:
         ValueError: if it is no JSON, a field is unknown or has the wrong type or value.
     """
+    from . import registry  # noqa: F401  imports, and so registers, every algorithm
+
     try:
         fields = json.loads(text)
         if not isinstance(fields, dict):

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-import recipes.registry  # noqa: F401  makes all algorithms known
 from recipes.recipe import recipe_from_json
 
 ROOT = Path(__file__).parents[2]

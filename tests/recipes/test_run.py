@@ -315,3 +315,14 @@ main(sys.argv[1:])
     assert line.startswith("error: the checkpoint of step 192 could not be saved")
     assert "Traceback" not in result.stderr
     assert contents(run.checkpoints) == before
+
+
+def test_a_run_of_any_algorithm_is_opened_by_a_script_of_its_own():
+    script = (
+        "from pathlib import Path; from recipes.run import Run; "
+        "print(Run.open(Path('docs/results/demo')).recipe.env)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "CartPole-v1\n", done.stderr
