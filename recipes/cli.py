@@ -9,6 +9,7 @@ import sys
 import time
 from contextlib import ExitStack, redirect_stderr
 from dataclasses import make_dataclass, replace
+from fnmatch import fnmatchcase
 from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -85,9 +86,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _list(words: list[str]) -> None:
     parser = _Parser(f"{_program()} list")
-    parser.add_argument("pattern", nargs="?", default="", help="part of a name")
+    parser.add_argument("pattern", nargs="?", default="", help="part of a name; * is any text")
     pattern = parser.parse_args(words).pattern
-    names = [name for name in RECIPES if pattern in name]
+    names = [name for name in RECIPES if fnmatchcase(name, f"*{pattern}*")]
     if not names:
         _fail(f"no recipe contains {pattern!r}: `{_program()} list` names all of them")
     print("\n".join(names))

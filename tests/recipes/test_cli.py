@@ -26,6 +26,10 @@ def fails(capsys, *words: str) -> str:
 
 
 def test_list_and_show(capsys):
+    main(["list", "cql/*-medium-v0/mlp"])
+    assert capsys.readouterr().out.split() == [
+        f"cql/{task}-medium-v0/mlp" for task in ("halfcheetah", "hopper", "walker2d")
+    ]
     main(["list", "cartpole"])
     names = capsys.readouterr().out.split()
     assert "ppo/cartpole/enhanced-tit" in names
