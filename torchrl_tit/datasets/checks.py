@@ -44,9 +44,7 @@ def check_finite(
     """
     if not np.issubdtype(values.dtype, np.floating):
         return
-    wrong = ~np.isfinite(values)
-    if not wrong.any():
-        wrong = ~plain_tensor(values).to(kept_as).isfinite().numpy()
+    wrong = ~plain_tensor(values).to(kept_as).isfinite().numpy()
     if wrong.any():
         row = int(wrong.reshape(len(values), -1).any(1).argmax())
         value = values[row][wrong[row]].flat[0] if values.ndim > 1 else values[row]
