@@ -12,5 +12,8 @@ recipes = find_packages(include=["recipes", "recipes.*"])
 setup(
     packages=[*library, *(f"torchrl_tit.{name}" for name in recipes)],
     package_dir={"torchrl_tit.recipes": "recipes"},
-    package_data={"torchrl_tit": ["py.typed"], "torchrl_tit.recipes": ["*.csv", "*.json"]},
+    package_data={
+        "torchrl_tit": ["py.typed"],
+        "torchrl_tit.recipes": ["*/*.csv", "*/*.json"],
+    },
 )

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from recipes.compilation import Compile
 from recipes.cql import CQL
-from recipes.cql_agent import CQLAgent
+from recipes.cql.agent import CQLAgent
 from recipes.registry import RECIPES
 from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig
 

@@ -30,10 +30,11 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
-from recipes import ppo, ppo_training
+from recipes import ppo
 from recipes.compilation import Compile
 from recipes.metrics import Metrics, read_metrics
-from recipes.ppo_agent import Agent
+from recipes.ppo import training
+from recipes.ppo.agent import Agent
 from recipes.registry import get_recipe
 from recipes.run import Run
 from torchrl_tit.envs import GymVectorEnv
@@ -176,11 +177,11 @@ class Timers:
 def profile(compile: Compile) -> dict[str, float]:
     """Where our time goes: the share of each part, without the first batch."""
     timers = Timers()
-    make_objective = ppo_training.make_objective
+    make_objective = training.make_objective
     parts: list[tuple[Any, str, str]] = [
         (Collector, "rollout", "collect"),
         (GymVectorEnv, "step_and_maybe_reset", "collect: environments"),
-        (ppo_training, "add_advantages", "advantages"),
+        (training, "add_advantages", "advantages"),
         (Tensor, "backward", "update: backward"),
         (nn.utils, "clip_grad_norm_", "update: gradient norm"),
         (torch.optim.Adam, "step", "update: optimizer"),
@@ -193,7 +194,7 @@ def profile(compile: Compile) -> dict[str, float]:
             stack.enter_context(patch.object(owner, name, function))
         stack.enter_context(
             patch.object(
-                ppo_training,
+                training,
                 "make_objective",
                 lambda *args, **kw: timers.around(make_objective(*args, **kw), "update: forward"),
             )

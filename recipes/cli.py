@@ -18,13 +18,13 @@ import tyro
 
 from torchrl_tit.files import write_text_atomic
 
-from .plot import plot_comparison, plot_table
+from .offline.side_by_side import check_side_by_side, common_step
 from .recipe import Recipe, recipe_to_json
 from .registry import RECIPES, find_recipe
+from .results.plot import plot_comparison, plot_table
+from .results.table import make_table, to_csv, to_markdown
 from .run import Run
-from .side_by_side import check_side_by_side, common_step
-from .sweep import make_jobs, run_jobs
-from .table import make_table, to_csv, to_markdown
+from .sweeps.sweep import make_jobs, run_jobs
 
 _USAGE = """\
 usage: {program} COMMAND ...
@@ -249,7 +249,7 @@ def _evaluate(words: list[str]) -> None:
 
 def _render(words: list[str]) -> None:
     # Not at the top: only pictures need what it imports.
-    from .render import add_render_options, run_render
+    from .results.render import add_render_options, run_render
 
     parser = _Parser(f"{_program()} render")
     add_render_options(parser)
@@ -278,7 +278,7 @@ def _sweep(words: list[str]) -> None:
             failed = run_jobs(jobs, options.workers or 1)
         else:
             # Not at the top: Ray is an extra.
-            from .sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
+            from .sweeps.sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
 
             connect(options.ray)
             for note in find_unmet_needs(jobs):
@@ -296,8 +296,8 @@ def _sweep(words: list[str]) -> None:
 
 def _tune(words: list[str]) -> None:
     # Not at the top: Optuna is an extra.
-    from .search_space import load_space
-    from .tune import Search, Settings
+    from .sweeps.search_space import load_space
+    from .sweeps.tune import Search, Settings
 
     parser = _Parser(f"{_program()} tune")
     parser.add_argument("name", help="name of a recipe, or a JSON file")

@@ -16,8 +16,8 @@ from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint, save_check
 from torchrl_tit.files import write_text_atomic
 
 from .metrics import Metrics
-from .plot import plot_learning_curve
 from .recipe import Recipe, recipe_from_json, recipe_to_json
+from .results.plot import plot_learning_curve
 
 _CURVE = "learning_curve.png"
 _PACKAGES = ["torchrl-tit", "torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy"]

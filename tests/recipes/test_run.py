@@ -172,7 +172,7 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("recipes.ppo_training.add_advantages", twice)
+    monkeypatch.setattr("recipes.ppo.training.add_advantages", twice)
     with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
         SMALL.train(run)
     assert checkpoint_steps(run.checkpoints) == []

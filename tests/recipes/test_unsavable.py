@@ -31,7 +31,7 @@ def weights(recipe, folder):
 def test_goes_on_bit_for_bit(tmp_path, monkeypatch, mode, env, backbone):
     if env.startswith("ALE/"):
         pytest.importorskip("ale_py")
-    monkeypatch.setattr("recipes.ppo.make_env", partial(make_env, vectorization_mode=mode))
+    monkeypatch.setattr("recipes.ppo.recipe.make_env", partial(make_env, vectorization_mode=mode))
     recipe = PPO(
         env=env,
         backbone=backbone,

@@ -1,0 +1,165 @@
+"""Learning curves as pictures."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from torchrl_tit.files import write_bytes_atomic
+
+from ..metrics import read_metrics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from .table import Cell
+
+
+def plot_learning_curve(
+    metrics: Path, picture: Path, *, title: str, window: int = 5, offline: bool = False
+) -> None:
+    """Draws returns of training episodes over environment steps.
+
+    Args:
+        metrics: a run's ``metrics.csv`` with the columns ``step`` and ``return_mean``.
+        picture: the PNG file to write.
+        title: title of the picture.
+        window: batches over which the bold line is averaged.
+        offline: whether it is of evaluation episodes over gradient steps instead.
+    """
+    steps, returns = _curve(metrics)
+    smooth = np.array([returns[max(0, i - window + 1) : i + 1].mean() for i in range(len(returns))])
+    figure = _figure(title, offline)
+    (axes,) = figure.axes
+    batch, batches = ("an evaluation", "evaluations") if offline else ("a batch", "batches")
+    axes.plot(steps, returns, color="C0", alpha=0.35, linewidth=1, label=f"mean of {batch}")
+    axes.plot(steps, smooth, color="C0", linewidth=2, label=f"mean of {window} {batches}")
+    _write(figure, picture)
+
+
+def plot_comparison(
+    curves: Mapping[str, Sequence[Path]],
+    picture: Path,
+    *,
+    title: str,
+    points: int = 200,
+    offline: bool = False,
+) -> None:
+    """Draws learning curves of several groups of runs: mean over the runs, band of one deviation.
+
+    Args:
+        curves: ``metrics.csv`` files of the runs (seeds) of each group, by the group's name.
+        picture: the PNG file to write.
+        title: title of the picture.
+        points: steps at which the runs are compared; between batches, returns are interpolated.
+        offline: as for :func:`plot_learning_curve`.
+    """
+    figure = _figure(title, offline)
+    (axes,) = figure.axes
+    for name, runs in curves.items():
+        known = [(steps, returns) for steps, returns in map(_curve, runs) if len(steps)]
+        if not known:
+            continue
+        grid = np.linspace(
+            max(steps[0] for steps, _ in known), min(steps[-1] for steps, _ in known), points
+        )
+        returns = np.stack([np.interp(grid, *run) for run in known])
+        mean, deviation = returns.mean(0), returns.std(0)
+        (line,) = axes.plot(grid, mean, linewidth=2, label=f"{name} ({len(known)} runs)")
+        axes.fill_between(
+            grid, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.2, linewidth=0
+        )
+    _write(figure, picture)
+
+
+def plot_table(cells: Sequence[Cell], picture: Path) -> None:
+    """Draws cells beside the paper's values, a panel a task.
+
+    Args:
+        cells: what :func:`~recipes.results.table.make_table` returns.
+        picture: the PNG file to write.
+    """
+    tasks: dict[str, list[Cell]] = {}
+    for cell in cells:
+        tasks.setdefault(cell.recipe.rpartition("/")[0], []).append(cell)
+    columns = min(3, len(tasks))
+    rows = -(-len(tasks) // columns)
+    height = 0.6 + 0.32 * max(map(len, tasks.values()))
+    figure = _blank((4.2 * columns, height * rows + 0.6))
+    panels = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axes, (task, group) in zip(panels, tasks.items(), strict=False):
+        places = np.arange(len(group))
+        # A single run has no interval.
+        below = [cell.iqm - cell.low if cell.runs > 1 else 0 for cell in group]
+        above = [cell.high - cell.iqm if cell.runs > 1 else 0 for cell in group]
+        axes.errorbar(
+            [cell.iqm for cell in group],
+            places,
+            xerr=[below, above],
+            fmt="o",
+            color="C0",
+            capsize=3,
+            label="interquartile mean, 95%",
+        )
+        axes.errorbar(
+            [cell.paper_mean for cell in group],
+            places + 0.22,
+            xerr=[cell.paper_std for cell in group],
+            fmt="s",
+            color="grey",
+            markersize=4,
+            label="paper",
+        )
+        axes.set_yticks(places, [cell.recipe.rpartition("/")[2] for cell in group])
+        axes.set(title=task, ylim=(len(group) - 0.4, -0.6))
+        axes.grid(alpha=0.3)
+    for axes in panels[len(tasks) :]:
+        axes.set_visible(False)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    _save(figure, picture)
+
+
+def _curve(metrics: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and returns of the batches in which an episode ended."""
+    rows = [row for row in read_metrics(metrics) if not np.isnan(row["return_mean"])]
+    return np.array([row["step"] for row in rows]), np.array([row["return_mean"] for row in rows])
+
+
+def _blank(size: tuple[float, float]) -> Figure:
+    # Not at the top: Matplotlib takes a second that only drawing should cost.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _figure(title: str, offline: bool) -> Figure:
+    figure = _blank((7, 4))
+    axes = figure.add_subplot()
+    steps, episodes = ("gradient", "evaluation") if offline else ("environment", "training")
+    axes.set(title=title, xlabel=f"{steps} steps", ylabel=f"return of {episodes} episodes")
+    axes.grid(alpha=0.3)
+    return figure
+
+
+def _write(figure: Figure, picture: Path) -> None:
+    (axes,) = figure.axes
+    handles, labels = axes.get_legend_handles_labels()
+    if len(handles) > 2:  # they would hide the curves
+        figure.set_figheight(4 + 0.15 * len(handles))
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    else:
+        axes.legend(frameon=False)
+    _save(figure, picture)
+
+
+def _save(figure: Figure, picture: Path) -> None:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    write_bytes_atomic(picture, buffer.getvalue())

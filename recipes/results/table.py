@@ -1,0 +1,252 @@
+"""From run folders to the paper's tables."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from ..offline.recipe import OfflineRecipe
+from ..recipe import Recipe
+from ..run import Run
+
+OTHER = "not in the paper"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What the paper's tables say of an experiment."""
+
+    table: str
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True)
+class Cell:
+    """All runs of one recipe: one cell of a table.
+
+    A run's value is the mean return of its evaluation, or its best normalised score where it has
+    one (offline recipes).
+    """
+
+    table: str
+    """The paper's table that it belongs to."""
+    recipe: str
+    runs: int
+    steps: int
+    """Steps of training, the fewest of all runs."""
+    mean: float
+    """Mean of the runs' values."""
+    std: float
+    """Standard deviation of the runs' values (population)."""
+    std_episodes: float
+    """Standard deviation over the episodes of a run, as the paper's online tables seem to give it;
+    the mean over the runs."""
+    iqm: float
+    """Interquartile mean of the runs' values (arXiv 2108.13264)."""
+    low: float
+    """Lower end of its 95% confidence interval, by bootstrap over runs; NaN for a single run."""
+    high: float
+    """Upper end."""
+    paper_mean: float
+    """The paper's value; NaN where it has none. That of a tuned recipe is that of the plain one."""
+    paper_std: float
+
+
+def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
+    """Reads run folders and puts the runs of each recipe together.
+
+    Args:
+        folders: run folders, or folders with run folders somewhere below.
+
+    Returns:
+        The cells, in the paper's order, and a note for each run that is left out.
+
+    Raises:
+        ValueError: if there is no evaluated run, two runs of a name have other settings beside the
+            seed, or the same seed.
+    """
+    groups: dict[str, list[tuple[Run, dict]]] = {}
+    notes = []
+    for run in _runs(folders):
+        try:
+            text = (run.folder / "evaluation.json").read_text(encoding="utf-8")
+            evaluation = json.loads(text)
+            _value(evaluation), evaluation["returns"], evaluation["steps"]
+        except (OSError, ValueError, LookupError, TypeError):
+            notes.append(f"{run.folder} is left out: it has no evaluation yet")
+            continue
+        if evaluation["steps"] < run.recipe.final_step:
+            notes.append(
+                f"{run.folder} is left out: evaluated after {evaluation['steps']} of "
+                f"{run.recipe.final_step} steps"
+            )
+            continue
+        groups.setdefault(run.recipe.name or str(run.folder), []).append((run, evaluation))
+    if not groups:
+        raise ValueError(
+            f"no evaluated run in {', '.join(map(str, folders))}" + "".join(f"; {n}" for n in notes)
+        )
+    cells = [_cell(name, runs) for name, runs in groups.items()]
+    order = {name: index for index, name in enumerate(paper_results())}
+
+    def rank(cell: Cell) -> tuple[bool, int, str]:
+        place = order.get(_plain(cell.recipe), len(order))
+        return cell.table == OTHER, place, cell.recipe
+
+    cells.sort(key=rank)
+    return cells, notes
+
+
+@cache
+def paper_results() -> dict[str, Result]:
+    """What the paper reports, by the recipe's name.
+
+    arXiv 2212.14538, tables of section 4 and the ablation; the standard deviations of Decision
+    Transformer are taken from the curves that its authors published, since the paper's were put
+    through the score's offset.
+
+    Example:
+        >>> paper_results()["ppo/mountaincar/enhanced-tit"].mean
+        -97.0
+    """
+    text = resources.files(__package__).joinpath("paper_results.csv").read_text(encoding="utf-8")
+    return {
+        row["recipe"]: Result(row["table"], float(row["mean"]), float(row["std"]))
+        for row in csv.DictReader(io.StringIO(text))
+    }
+
+
+def to_markdown(cells: Sequence[Cell]) -> str:
+    """Writes cells as Markdown, one table for each of the paper's."""
+    parts = []
+    for table in dict.fromkeys(cell.table for cell in cells):
+        lines = [
+            f"### {table[0].upper()}{table[1:]}\n",
+            "| recipe | runs | mean ± over runs | ± over episodes | interquartile mean [95%] "
+            "| paper |",
+            "|---|---|---|---|---|---|",
+        ]
+        lines += [_row(cell) for cell in cells if cell.table == table]
+        parts.append("\n".join(lines) + "\n")
+    return "\n".join(parts)
+
+
+def to_csv(cells: Sequence[Cell]) -> str:
+    """Writes cells as CSV, one row each; what is not known is empty."""
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, list(Cell.__dataclass_fields__), lineterminator="\n")
+    writer.writeheader()
+    for cell in cells:
+        writer.writerow({k: "" if v != v else v for k, v in asdict(cell).items()})
+    return buffer.getvalue()
+
+
+def _runs(folders: Iterable[Path]) -> list[Run]:
+    found: dict[Path, Run] = {}
+    for folder in folders:
+        paths = sorted(folder.rglob("recipe.json"))
+        if not paths:
+            raise ValueError(f"{folder} holds no run folder: there is no recipe.json in it")
+        found |= {path.parent.resolve(): Run.open(path.parent) for path in paths}
+    return list(found.values())
+
+
+def _value(evaluation: dict) -> float:
+    return float(evaluation["score"]["best"] if "score" in evaluation else evaluation["mean"])
+
+
+def _cell(name: str, runs: Sequence[tuple[Run, dict]]) -> Cell:
+    # Not at the top: SciPy takes a second that only tables should cost.
+    from scipy.stats import bootstrap, trim_mean
+
+    first = runs[0][0]
+    seeds: dict[int, Run] = {}
+    for run, _ in runs:
+        if replace(run.recipe, seed=0) != replace(first.recipe, seed=0):
+            raise ValueError(
+                f"{first.folder} and {run.folder} are both called {name}, but differ in "
+                f"{', '.join(_differences(first.recipe, run.recipe))}: give them other names"
+            )
+        if run.recipe.seed in seeds:
+            raise ValueError(
+                f"{seeds[run.recipe.seed].folder} and {run.folder} are the same run: {name} with "
+                f"seed {run.recipe.seed}; name one of them only"
+            )
+        seeds[run.recipe.seed] = run
+
+    evaluations = [evaluation for _, evaluation in runs]
+    values = np.array([_value(evaluation) for evaluation in evaluations])
+    spreads = [evaluation.get("score_std", evaluation["std"]) for evaluation in evaluations]
+
+    def iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
+        return trim_mean(x, 0.25, axis=axis)
+
+    low = high = float("nan")
+    if len(values) > 1:
+        interval = bootstrap(
+            (values,), iqm, n_resamples=10_000, method="percentile", rng=0
+        ).confidence_interval
+        low, high = float(interval.low), float(interval.high)
+    paper = _paper_result(first.recipe)
+    return Cell(
+        table=paper.table if paper else OTHER,
+        recipe=name,
+        runs=len(values),
+        steps=min(evaluation["steps"] for evaluation in evaluations),
+        mean=float(values.mean()),
+        std=float(values.std()),
+        std_episodes=float(np.mean(spreads)),
+        iqm=float(iqm(values)),
+        low=low,
+        high=high,
+        paper_mean=paper.mean if paper else float("nan"),
+        paper_std=paper.std if paper else float("nan"),
+    )
+
+
+def _paper_result(recipe: Recipe) -> Result | None:
+    """What the paper reports of a recipe, unless it was trained on other data than there."""
+    plain = _plain(recipe.name)
+    if isinstance(recipe, OfflineRecipe) and _stem(recipe.dataset) not in plain.split("/"):
+        return None
+    return paper_results().get(plain)
+
+
+def _stem(dataset: str) -> str:
+    """A data set's name, also where D4RL's file of it is given: "hopper_medium-v2.hdf5"."""
+    return Path(dataset).name.removesuffix(".hdf5").replace("_", "-")
+
+
+def _plain(name: str) -> str:
+    """The recipe that a tuned one stands beside, or the name itself."""
+    return name if name in paper_results() else name.removesuffix("-tuned")
+
+
+def _differences(left: Recipe, right: Recipe) -> list[str]:
+    ours, others = asdict(left), asdict(right)
+    names = [k for k in ours | others if k != "seed" and ours.get(k) != others.get(k)]
+    return names or ["algorithm"]
+
+
+def _row(cell: Cell) -> str:
+    interval = f" [{_number(cell.low)}, {_number(cell.high)}]" if cell.runs > 1 else ""
+    known = cell.paper_mean == cell.paper_mean
+    paper = f"{_number(cell.paper_mean)} ± {_number(cell.paper_std)}" if known else ""
+    return (
+        f"| {cell.recipe} | {cell.runs} | {_number(cell.mean)} ± {_number(cell.std)} "
+        f"| {_number(cell.std_episodes)} | {_number(cell.iqm)}{interval} | {paper} |"
+    )
+
+
+def _number(value: float) -> str:
+    """Whole numbers from 100 on, one digit behind the point below."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"

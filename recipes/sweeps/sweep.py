@@ -1,0 +1,194 @@
+"""Many recipes and seeds, in worker processes on this machine or others."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from itertools import islice
+from pathlib import Path
+from typing import Any, Protocol
+
+from tqdm import tqdm
+
+from ..interrupt import raise_on_signals
+from ..recipe import Recipe, nearest
+from ..registry import RECIPES
+from ..run import Run
+
+PROGRAM = str(__package__).rpartition(".")[0]
+"""What ``python -m`` runs: ``recipes``, or ``torchrl_tit.recipes`` where it is installed."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep: a recipe with its seed, and the folder it belongs in."""
+
+    recipe: Recipe
+    folder: Path
+    source: str = ""
+    """A JSON file that holds the recipe; where this is empty, it is a named one."""
+
+    @property
+    def log(self) -> Path:
+        """What the worker prints."""
+        return self.folder.with_name(self.folder.name + ".log")
+
+    def words(self) -> list[str]:
+        """The words of the command line that start or resume the run."""
+        if self._exists():
+            return ["train", "--resume", str(self.folder)]
+        return [
+            "train",
+            self.source or self.recipe.name,
+            "--seed",
+            str(self.recipe.seed),
+            "--out",
+            str(self.folder),
+        ]
+
+    def is_complete(self) -> bool:
+        """Whether there is nothing left to do."""
+        return self._exists() and Run.open(self.folder).is_complete()
+
+    def is_in_use(self) -> bool:
+        """Whether a process is at work there, such as one that a killed sweep left behind."""
+        if not self._exists():
+            return False
+        try:
+            with Run.open(self.folder):
+                return False
+        except RuntimeError:
+            return True
+
+    def check(self) -> None:
+        """Raises ValueError where the folder holds a run with other settings."""
+        if self._exists() and Run.open(self.folder).recipe != self.recipe:
+            raise ValueError(
+                f"{self.folder} holds a run of {self.recipe.name} with other settings: name "
+                "another folder with --out, or move it away"
+            )
+
+    def _exists(self) -> bool:
+        return (self.folder / "recipe.json").is_file()
+
+
+def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[Job]:
+    """Lists the runs of a sweep, and checks all of them before any begins.
+
+    Args:
+        patterns: names of recipes, or patterns such as ``ppo/*/mlp``.
+        seeds: seeds, each of which every recipe is run with.
+        out: folder of the sweep; a run's folder is ``out/NAME/seed-SEED``.
+
+    Raises:
+        ValueError: if a pattern fits no recipe, a recipe cannot be built, or a folder holds a run
+            with other settings.
+
+    Example:
+        >>> jobs = make_jobs(["ppo/cartpole/*-tit"], [0, 1], Path("runs/sweep"))
+        >>> [str(job.folder) for job in jobs][:2]
+        ['runs/sweep/ppo/cartpole/vanilla-tit/seed-0', 'runs/sweep/ppo/cartpole/vanilla-tit/seed-1']
+    """
+    names: dict[str, None] = {}  # in order, each once
+    for pattern in patterns:
+        fitting = [name for name in RECIPES if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise ValueError(f"no recipe is called {pattern!r}: {nearest(pattern, RECIPES)}")
+        names.update(dict.fromkeys(fitting))
+    jobs = []
+    for name in names:
+        RECIPES[name].check()
+        for seed in dict.fromkeys(seeds):
+            job = Job(replace(RECIPES[name], seed=seed), out / name / f"seed-{seed}")
+            job.check()
+            jobs.append(job)
+    return jobs
+
+
+class Worker(Protocol):
+    """A run in a process of its own, which may be on another machine."""
+
+    def poll(self) -> int | None:
+        """Returns the exit code, which is 0 where the run is complete; None before the end."""
+
+    def send_signal(self, number: int, /) -> None:
+        """Sends the process a signal; SIGINT lets it save a checkpoint and stop."""
+
+    def wait(self) -> int:
+        """Waits for the process's end and returns its exit code."""
+
+
+def start(job: Job) -> subprocess.Popen[bytes]:
+    """Starts or resumes a run in a process of its own, which prints to the job's log."""
+    job.log.parent.mkdir(parents=True, exist_ok=True)
+    with job.log.open("ab") as log:
+        # A session of its own: the terminal's Ctrl-C reaches this process, which passes it on.
+        return subprocess.Popen(
+            [sys.executable, "-m", PROGRAM, *job.words()],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+        )
+
+
+def run_jobs(
+    jobs: list[Job],
+    workers: int,
+    start: Callable[[Job], Worker] = start,
+    at_work: Callable[[Collection[Any]], int] = len,
+) -> list[Job]:
+    """Runs what is not complete yet, some at a time; a run that was killed goes on where it was.
+
+    A run that another process is at work on is left to that process, and gone on with afterwards.
+    Ctrl-C (or SIGTERM) is passed on: every worker saves a checkpoint and stops.
+
+    Args:
+        jobs: the runs.
+        workers: runs at a time.
+        start: starts or resumes a run, in a process on this machine unless told otherwise.
+        at_work: how many of the runs that were started wait for nothing.
+
+    Returns:
+        The runs that failed; what they printed is in their logs.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C, once all workers have stopped.
+    """
+    waiting = [job for job in jobs if not job.is_complete()]
+    running: dict[Job, Worker] = {}
+    failed = []
+    done = len(jobs) - len(waiting)
+    with raise_on_signals(), tqdm(total=len(jobs), initial=done, unit=" runs") as progress:
+        try:
+            while waiting or running:
+                idle = (job for job in waiting if not job.is_in_use())
+                for job in list(islice(idle, workers - len(running))):
+                    waiting.remove(job)
+                    running[job] = start(job)
+                text = f"{at_work(running.values())} at work"
+                if waiting and len(running) < workers:
+                    text += ", others in use by other processes"
+                if text != progress.postfix:
+                    progress.set_postfix_str(text)
+                time.sleep(0.2)
+                for job in list(running):
+                    code = running[job].poll()
+                    if code is None:
+                        continue
+                    del running[job]
+                    if code:
+                        failed.append(job)
+                    progress.update()
+        except KeyboardInterrupt:
+            for worker in running.values():
+                worker.send_signal(signal.SIGINT)
+            for worker in running.values():
+                worker.wait()
+            raise
+    return failed

@@ -1,0 +1,195 @@
+"""The runs of a sweep on the machines of a Ray cluster, which share a file system.
+
+Each run has an actor, which starts it in a process of its own, as a sweep on one machine does, and
+is asked every now and then whether it has ended.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import runpy
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ..interrupt import raise_on_signals
+from .sweep import PROGRAM, Job
+
+_PATIENCE = 30.0  # seconds in which a cluster has to answer, which takes it two or three
+
+
+def connect(address: str) -> None:
+    """Connects this process to a Ray cluster.
+
+    Args:
+        address: "auto" or ``HOST:PORT`` on a machine of the cluster, ``ray://HOST:PORT`` elsewhere.
+
+    Raises:
+        ValueError: if Ray is missing, or no cluster answers there.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise ValueError("sweep --ray needs Ray: pip install 'torchrl-tit[ray]'") from error
+    # Ray itself waits for ten minutes and more where nobody answers, or not a cluster.
+    program = "import sys, ray; ray.init(sys.argv[1], log_to_driver=False)"
+    try:
+        subprocess.run(
+            [sys.executable, "-c", program, address],
+            check=True,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_PATIENCE,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise ValueError(
+            f"no Ray cluster answered at {address!r} in {_PATIENCE:.0f} seconds: is it the address "
+            "that `ray start --head` printed, or ray://HOST:10001 from outside the cluster?"
+        ) from error
+    except subprocess.CalledProcessError as error:
+        reason = error.stderr.strip().splitlines()[-1:]
+        raise ValueError(f"no connection to Ray at {address!r}: {' '.join(reason)}") from error
+    ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
+
+
+def find_unmet_needs(jobs: Iterable[Job]) -> list[str]:
+    """Names the runs that no machine of the cluster has enough CPUs or GPUs for, and why."""
+    import ray
+
+    machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    return [
+        f"{job.folder} waits until a machine with {needs['CPU']} CPUs and {needs['GPU']} GPUs joins"
+        for job in jobs
+        for needs in [_needs(job)]
+        if not any(all(has.get(kind, 0) >= needs[kind] for kind in needs) for has in machines)
+    ]
+
+
+class RayWorker:
+    """A run on some machine of the cluster; it waits in Ray's queue until there is room for it.
+
+    It takes as many CPUs as the recipe has threads, and a GPU where the recipe's device is "cuda",
+    or "auto" and the cluster has GPUs.
+
+    Args:
+        job: the run.
+    """
+
+    def __init__(self, job: Job) -> None:
+        import ray
+
+        needs = _needs(job)
+        job.log.parent.mkdir(parents=True, exist_ok=True)
+        job.log.touch()
+        self.log = job.log
+        self.has_begun = False
+        self._code: int | None = None
+        actor: Any = ray.remote(_actor_class())
+        self._actor = actor.options(num_cpus=needs["CPU"], num_gpus=needs["GPU"]).remote(
+            f"{__package__}.sweep_ray", job.words(), Path.cwd(), job.log.absolute()
+        )
+        self._answer = self._actor.poll.remote()
+
+    def poll(self) -> int | None:
+        """Returns the exit code, which is 0 where the run is complete; None before the end."""
+        import ray
+
+        if self._code is None and ray.wait([self._answer], timeout=0)[0]:
+            try:
+                self._code = ray.get(self._answer)
+                self.has_begun = True
+                self._answer = self._actor.poll.remote()
+            except ray.exceptions.RayError as error:
+                self._code = 1
+                with self.log.open("a", encoding="utf-8") as log:
+                    log.write(f"error: the worker died: {error}\n")
+        return self._code
+
+    def send_signal(self, number: int, /) -> None:
+        """Sends the process a signal; a run that has not begun does not begin any more."""
+        import ray
+
+        if self.has_begun:
+            self._actor.send_signal.remote(number)
+        else:
+            ray.kill(self._actor)
+            self._code = -number
+
+    def wait(self) -> int:
+        """Waits for the process's end and returns its exit code."""
+        while (code := self.poll()) is None:
+            time.sleep(0.2)
+        return code
+
+
+def _needs(job: Job) -> dict[str, int]:
+    import ray
+
+    device = job.recipe.device
+    gpu = device == "cuda" or (device == "auto" and ray.cluster_resources().get("GPU", 0) > 0)
+    return {"CPU": job.recipe.threads, "GPU": int(gpu)}
+
+
+def count_begun(workers: Iterable[RayWorker]) -> int:
+    """Counts the runs that have got a machine."""
+    return sum(worker.has_begun for worker in workers)
+
+
+def _actor_class() -> type:
+    """What Ray runs beside a run's process; a local class, so that it is sent with its code.
+
+    Otherwise the actor would import this package, and with it PyTorch, for nothing.
+    """
+
+    class Actor:
+        def __init__(self, module: str, words: list[str], folder: Path, log: Path) -> None:
+            if not (folder.is_dir() and log.is_file()):
+                raise FileNotFoundError(
+                    f"{platform.node()} does not see {folder} with {log}: the machines of the "
+                    "cluster must share a file system"
+                )
+            with log.open("ab") as file:
+                # The pipe to the process breaks when this one dies in whatever way.
+                self.process = subprocess.Popen(
+                    [sys.executable, "-m", module, *words],
+                    cwd=folder,
+                    stdin=subprocess.PIPE,
+                    stdout=file,
+                    stderr=file,
+                    start_new_session=True,
+                )
+
+        def poll(self) -> int | None:
+            try:
+                return self.process.wait(timeout=0.5)
+            except subprocess.TimeoutExpired:
+                return None
+
+        def send_signal(self, number: int) -> None:
+            self.process.send_signal(number)
+
+    return Actor
+
+
+def _main() -> None:
+    """The process of a run: the command line, stopped as by Ctrl-C once its actor is gone."""
+
+    def follow() -> None:
+        os.read(sys.stdin.fileno(), 1)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with raise_on_signals():
+        threading.Thread(target=follow, daemon=True).start()
+        runpy.run_module(PROGRAM, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,250 @@
+"""Hyperparameter search over a recipe's fields, with Optuna."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import subprocess
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+from tqdm import tqdm
+
+from torchrl_tit.files import write_text_atomic
+
+from ..interrupt import raise_on_signals
+from ..metrics import read_metrics
+from ..recipe import Recipe, recipe_to_json
+from .search_space import SearchSpace, with_values
+from .sweep import Job, start
+
+if TYPE_CHECKING:
+    import optuna
+
+_WINDOW = 5  # batches over which a trial's return is averaged where trials are compared
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a search is; the folder of a search that is resumed must hold the same."""
+
+    recipe: Recipe
+    space: SearchSpace
+    seeds: tuple[int, ...] = (0,)
+    """Seeds that every trial is run with, one after the other."""
+    startup_trials: int = 5
+    """Trials that run to their end before any is pruned, and that are drawn at random."""
+    warmup: float = 0.3
+    """Share of a trial's first run before which it is not pruned."""
+
+
+class Search:
+    """A search in a folder, which a second process can go on with after the first was killed.
+
+        settings.json   recipe, seeds and pruning
+        space.json      the search space
+        study.log       Optuna's journal of all trials
+        trial-N.json    the recipe of a trial, and trial-N/ its run folders
+        best.json       the recipe of the best trial, which ``train`` takes
+
+    Trials are drawn by Optuna's tree-structured Parzen estimator and stopped early by its median
+    pruner, on returns of training episodes. A trial's value is the mean of its evaluations.
+
+    Args:
+        folder: the folder.
+        settings: the search.
+
+    Raises:
+        ValueError: if Optuna is missing, or the folder holds another search.
+    """
+
+    def __init__(self, folder: Path, settings: Settings) -> None:
+        try:
+            import optuna
+            from optuna.storages import JournalStorage
+            from optuna.storages.journal import JournalFileBackend
+        except ImportError as error:
+            raise ValueError("tune needs Optuna: pip install 'torchrl-tit[tune]'") from error
+        self.folder = folder
+        self.settings = settings
+        _write_or_compare(folder / "settings.json", _to_json(settings))
+        _write_or_compare(folder / "space.json", msgspec.json.encode(settings.space).decode())
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        seed = settings.recipe.seed
+        self.study = optuna.create_study(
+            study_name=settings.recipe.name or settings.recipe.algorithm,
+            storage=JournalStorage(JournalFileBackend(str(folder / "study.log"))),
+            direction="maximize",
+            load_if_exists=True,
+            sampler=optuna.samplers.TPESampler(
+                n_startup_trials=settings.startup_trials, seed=seed, constant_liar=True
+            ),
+            pruner=optuna.pruners.MedianPruner(
+                n_startup_trials=settings.startup_trials,
+                n_warmup_steps=int(settings.warmup * settings.recipe.final_step),
+            ),
+        )
+
+    def run(self, trials: int, workers: int) -> list[int]:
+        """Goes on until there are so many trials that ended, some at a time.
+
+        Args:
+            trials: trials of the whole search, those of earlier calls included.
+            workers: trials at a time, a process each.
+
+        Returns:
+            Numbers of the trials that failed; what they printed is in their logs.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C, once all workers have saved a checkpoint.
+        """
+        import optuna
+        from optuna.trial import TrialState
+
+        ended = [trial for trial in self.study.trials if trial.state.is_finished()]
+        # Those that a killed process left go on where they were.
+        running = [
+            _Trial(self, optuna.trial.Trial(self.study, trial._trial_id))
+            for trial in self.study.trials
+            if trial.state == TrialState.RUNNING
+        ]
+        failed = [t.number for t in ended if t.state == TrialState.FAIL]
+        progress = tqdm(total=trials, initial=len(ended), unit=" trials")
+        with raise_on_signals(), progress:
+            try:
+                while progress.n < trials:
+                    while len(running) < min(workers, trials - progress.n):
+                        running.append(_Trial(self, self.study.ask()))
+                    time.sleep(0.2)
+                    for trial in list(running):
+                        state = trial.advance()
+                        if state is not None:
+                            running.remove(trial)
+                            progress.update()
+                            if state == TrialState.FAIL:
+                                failed.append(trial.number)
+                    best = self.best()
+                    if best is not None:
+                        progress.set_postfix_str(f"best {best.value:.1f}, trial {best.number}")
+            except KeyboardInterrupt:
+                for trial in running:
+                    trial.stop()
+                raise
+        return failed
+
+    def best(self) -> optuna.trial.FrozenTrial | None:
+        """The best trial so far, whose recipe is in ``best.json``; None before the first."""
+        from optuna.trial import TrialState
+
+        if not self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            return None
+        best = self.study.best_trial
+        path = self.folder / "best.json"
+        text = (self.folder / f"trial-{best.number}.json").read_text(encoding="utf-8")
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            write_text_atomic(path, text)
+        return best
+
+
+class _Trial:
+    """A trial at work: its runs, one seed after the other, each in a process of its own."""
+
+    def __init__(self, search: Search, trial: optuna.trial.Trial) -> None:
+        self.study = search.study
+        self.trial = trial
+        self.number = trial.number
+        self.settings = search.settings
+        self.file = search.folder / f"trial-{trial.number}.json"
+        self.folder = search.folder / f"trial-{trial.number}"
+        self.process: subprocess.Popen[bytes] | None = None
+        self.reported = -1
+        self.jobs: list[Job] | None = None
+        try:
+            values = {
+                field: search.settings.space[field].suggest(trial, field)
+                for field in search.settings.space
+            }
+            recipe = with_values(search.settings.recipe, values, search.folder / "space.json")
+            recipe.check()
+        except ValueError as error:  # values that do not go together
+            self.trial.set_user_attr("error", str(error))
+            return
+        write_text_atomic(self.file, recipe_to_json(recipe))
+        self.jobs = [
+            Job(replace(recipe, seed=seed), self.folder / f"seed-{seed}", source=str(self.file))
+            for seed in search.settings.seeds
+        ]
+
+    def advance(self) -> optuna.trial.TrialState | None:
+        """Starts, watches or ends the trial; returns its state once it has ended."""
+        from optuna.trial import TrialState
+
+        if self.jobs is None:
+            return self._end(TrialState.FAIL)
+        if self.process is not None and self.process.poll() is None:
+            if self._should_prune():
+                self.stop()
+                return self._end(TrialState.PRUNED)
+            return None
+        if self.process is not None and self.process.returncode:
+            return self._end(TrialState.FAIL)
+        job = next((job for job in self.jobs if not job.is_complete()), None)
+        if job is None:
+            means = [
+                json.loads((job.folder / "evaluation.json").read_bytes())["mean"]
+                for job in self.jobs
+            ]
+            return self._end(TrialState.COMPLETE, sum(means) / len(means))
+        self.process = start(job)
+        return None
+
+    def stop(self) -> None:
+        """Lets the process save a checkpoint and waits for it."""
+        if self.process is not None and self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            self.process.wait()
+
+    def _should_prune(self) -> bool:
+        """Whether the first seed's returns are below the median of earlier trials."""
+        assert self.jobs is not None
+        path = self.jobs[0].folder / "metrics.csv"
+        if not path.is_file():
+            return False
+        rows = [row for row in read_metrics(path) if not math.isnan(row["return_mean"])]
+        if not rows or rows[-1]["step"] <= self.reported:
+            return False
+        self.reported = int(rows[-1]["step"])
+        returns = [row["return_mean"] for row in rows[-_WINDOW:]]
+        self.trial.report(sum(returns) / len(returns), self.reported)
+        return self.trial.should_prune()
+
+    def _end(
+        self, state: optuna.trial.TrialState, value: float | None = None
+    ) -> optuna.trial.TrialState:
+        self.study.tell(self.number, value, state=state)
+        return state
+
+
+def _to_json(settings: Settings) -> str:
+    fields = {
+        "recipe": json.loads(recipe_to_json(settings.recipe)),
+        "seeds": settings.seeds,
+        "startup_trials": settings.startup_trials,
+        "warmup": settings.warmup,
+    }
+    return json.dumps(fields, indent=2) + "\n"
+
+
+def _write_or_compare(path: Path, text: str) -> None:
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(path, text)
+    elif json.loads(path.read_text(encoding="utf-8")) != json.loads(text):
+        raise ValueError(
+            f"{path.parent} holds a search with other settings: name another folder with --out, "
+            "or move it away"
+        )

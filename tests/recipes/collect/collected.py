@@ -1,0 +1,85 @@
+"""Small collections of data, and how they are read and compared."""
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from recipes.collect.sac import SAC
+from recipes.collect.settings import KINDS, Collection
+from recipes.ppo import PPO
+from torchrl_tit.datasets import load_episodes
+from torchrl_tit.networks import MLPConfig
+
+FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
+RECIPE = PPO(
+    name="ppo/cartpole/small",
+    env="CartPole-v1",
+    backbone=MLPConfig(hidden_dim=32),
+    history=2,
+    num_envs=4,
+    total_steps=100_000,
+    steps_per_batch=256,
+    minibatch_size=64,
+    epochs=4,
+    learning_rate=1e-3,
+    compile="off",
+    decay_learning_rate=True,
+)
+CARTPOLE = Collection(
+    env="CartPole-v1",
+    agent="to be written",
+    transitions=300,
+    medium_return=100,
+    expert_return=180,
+    total_steps=8192,
+    evaluation_interval=256,
+    evaluation_episodes=4,
+    checkpoint_interval=1024,
+    num_envs=3,
+    deterministic=True,
+)
+PENDULUM = Collection(
+    env="Pendulum-v1",
+    transitions=300,
+    medium_return=-2000,
+    total_steps=600,
+    evaluation_interval=200,
+    evaluation_episodes=2,
+    checkpoint_interval=150,
+    num_envs=2,
+    sac=SAC(hidden_dim=16, batch_size=16, random_steps=100, updates_per_step=0.2),
+)
+
+
+def read(path: Path) -> dict[str, NDArray]:
+    with h5py.File(path) as file:
+        assert set(file) == set(FIELDS)
+        return {name: file[name][:] for name in FIELDS}
+
+
+def attributes(path: Path) -> dict[str, Any]:
+    return dict(load_episodes(path, dtype=None).attributes)
+
+
+def sets(folder: Path) -> dict[str, dict[str, NDArray]]:
+    return {kind: read(folder / f"{kind}.hdf5") for kind in KINDS}
+
+
+def assert_same(left: Path, right: Path) -> None:
+    for kind in KINDS:
+        for name, array in read(left / f"{kind}.hdf5").items():
+            np.testing.assert_array_equal(array, read(right / f"{kind}.hdf5")[name])
+        rows = [load_episodes(folder / f"{kind}-v0").rows for folder in (left, right)]
+        assert (rows[0] == rows[1]).all()
+
+
+def check_episodes(data: dict[str, NDArray]) -> None:
+    """Each episode goes on from row to row, and all have an end."""
+    ends = data["terminals"] | data["timeouts"]
+    assert ends[-1]
+    np.testing.assert_array_equal(
+        data["observations"][1:][~ends[:-1]], data["next_observations"][:-1][~ends[:-1]]
+    )

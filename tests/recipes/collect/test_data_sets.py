@@ -1,0 +1,286 @@
+"""`data collect`: what is in the sets, and where they say it is from."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import minari
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from recipes.collect import collect
+from recipes.collect.agents import PPOLearner, SACLearner
+from recipes.collect.settings import KINDS, Collection
+from recipes.ppo import PPO
+from recipes.ppo.training import train
+from recipes.recipe import recipe_to_json
+from recipes.run import Run
+from tests.recipes.collect.collected import (
+    CARTPOLE,
+    PENDULUM,
+    RECIPE,
+    attributes,
+    check_episodes,
+    read,
+    sets,
+)
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buffer
+from torchrl_tit.networks import NatureCNNConfig
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_row_is_a_step_of_cartpole(cartpole: Path, kind: str) -> None:
+    data = read(cartpole / f"{kind}.hdf5")
+    env: Any = gymnasium.make("CartPole-v1").unwrapped
+    env.reset(seed=0)
+    rows = zip(data["observations"], data["actions"], data["next_observations"], strict=True)
+    for observation, action, following in rows:
+        env.state = observation.astype(np.float64)
+        env.steps_beyond_terminated = None
+        np.testing.assert_allclose(env.step(int(action))[0], following, atol=1e-5)
+    x, angle = data["next_observations"][:, 0], data["next_observations"][:, 2]
+    fallen = (np.abs(x) > 2.4) | (np.abs(angle) > 12 * np.pi / 180)
+    np.testing.assert_array_equal(data["terminals"], fallen)
+    np.testing.assert_array_equal(data["rewards"], np.ones(len(x)))
+    assert {name: array.dtype.str for name, array in data.items()} == {
+        "observations": "<f4",
+        "actions": "<i8",
+        "rewards": "<f4",
+        "terminals": "|b1",
+        "timeouts": "|b1",
+        "next_observations": "<f4",
+    }
+    check_episodes(data)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_row_is_a_step_of_pendulum(pendulum: Path, kind: str) -> None:
+    data = read(pendulum / f"{kind}.hdf5")
+    env: Any = gymnasium.make("Pendulum-v1").unwrapped
+    env.reset(seed=0)
+    for row in range(len(data["rewards"])):
+        cosine, sine, speed = data["observations"][row].astype(np.float64)
+        env.state = np.array([np.arctan2(sine, cosine), speed])
+        following, reward, *_ = env.step(data["actions"][row])
+        np.testing.assert_allclose(following, data["next_observations"][row], atol=1e-4)
+        np.testing.assert_allclose(reward, data["rewards"][row], atol=1e-3)
+    assert data["actions"].dtype == np.float32
+    assert data["actions"].shape == (len(data["rewards"]), 1)
+    assert np.abs(data["actions"]).max() <= 2
+    assert not data["terminals"].any()
+    check_episodes(data)
+
+
+def test_rolled_out_sets_are_whole_episodes(cartpole: Path, pendulum: Path) -> None:
+    for kind, data in sets(cartpole).items():
+        lengths = np.diff(np.flatnonzero(data["terminals"] | data["timeouts"]), prepend=-1)
+        if kind != "mixed":
+            assert lengths[:-1].sum() < 300 <= lengths.sum()
+            # CartPole has a time limit of 500; the longest that was asked for is 300.
+            assert (lengths[data["timeouts"][np.cumsum(lengths) - 1]] == 300).all()
+    for kind, data in sets(pendulum).items():
+        if kind != "mixed":
+            assert len(data["rewards"]) == 400  # two episodes
+            assert np.flatnonzero(data["timeouts"]).tolist() == [199, 399]
+
+
+def test_actions_are_those_of_the_agent_at_its_mark(cartpole: Path, agent: str) -> None:
+    settings = replace(CARTPOLE, agent=agent)
+    for kind in ("medium", "expert"):
+        noted = attributes(cartpole / f"{kind}.hdf5")
+        _, weights = load_checkpoint(cartpole / "training" / "agents", noted["agent_steps"])
+        policy = PPOLearner(RECIPE, settings).make_policy()
+        policy.load_state_dict(weights)
+        episodes = load_episodes(cartpole / f"{kind}.hdf5")
+        steps = HistoryStorage(episodes, num_frames=2)[:]
+        with torch.no_grad():
+            logits = policy(TensorDict({"history": steps["history"]}, len(steps)))["logits"]
+        assert torch.equal(logits.argmax(-1), steps["action"])
+        assert noted[f"{kind}_return"] == (100 if kind == "medium" else 180)
+        assert noted["agent_return"] >= noted[f"{kind}_return"]
+
+
+def test_random_actions_are_uniform(cartpole: Path, pendulum: Path) -> None:
+    discrete = read(cartpole / "random.hdf5")["actions"]
+    assert abs(discrete.mean() - 0.5) < 0.1
+    continuous = read(pendulum / "random.hdf5")["actions"]
+    low, middle, high = np.quantile(continuous, [0.25, 0.5, 0.75])
+    np.testing.assert_allclose([low, middle, high], [-1, 0, 1], atol=0.25)
+    assert np.unique(continuous).size == continuous.size
+
+
+def test_sampled_actions_differ_from_the_most_likely(pendulum: Path) -> None:
+    noted = attributes(pendulum / "medium.hdf5")
+    _, weights = load_checkpoint(pendulum / "training" / "agents", noted["agent_steps"])
+    policy = SACLearner(PENDULUM).make_policy()
+    policy.load_state_dict(weights)
+    data = read(pendulum / "medium.hdf5")
+    td = TensorDict({"observation": torch.from_numpy(data["observations"])}, len(data["rewards"]))
+    with torch.no_grad():
+        distribution = policy.get_dist(td)
+    actions = torch.from_numpy(data["actions"])
+    assert not torch.allclose(actions, distribution.deterministic_sample, atol=0.1)
+    # The shares of the distribution below each action, which are uniform if they are its samples.
+    shares = torch.distributions.Normal(td["loc"], td["scale"]).cdf((actions / 2).atanh())
+    torch.testing.assert_close(
+        shares.flatten().quantile(torch.tensor([0.25, 0.5, 0.75])),
+        torch.tensor([0.25, 0.5, 0.75]),
+        atol=0.1,
+        rtol=0,
+    )
+
+
+class Recorder:
+    """A watcher that keeps every batch and stops at a step."""
+
+    def __init__(self, last: int) -> None:
+        self.last = last
+        self.batches: list[Any] = []
+
+    def collected(self, step: int, batch: Any) -> None:
+        names = ["observation", "action", ("next", "reward"), ("next", "terminated")]
+        self.batches.append(batch.select(*names, ("next", "observation")).clone())
+
+    def updated(self, step: int, policy: object) -> bool:
+        return step >= self.last
+
+
+def test_mixed_is_everything_that_training_saw(cartpole: Path, agent: str, tmp_path: Path) -> None:
+    """The same as of a training that nothing is collected from but by a recorder."""
+    mixed, noted = read(cartpole / "mixed.hdf5"), attributes(cartpole / "mixed.hdf5")
+    recorder = Recorder(noted["agent_steps"])
+    recipe = PPOLearner(RECIPE, replace(CARTPOLE, agent=agent)).recipe
+    with Run.create(tmp_path / "run", recipe) as run:
+        train(recipe, run, recorder)
+
+    seen: Any = torch.cat(recorder.batches, 1).reshape(-1)  # one environment after the other
+    assert len(seen) == len(mixed["rewards"]) == noted["agent_steps"]
+    np.testing.assert_array_equal(mixed["observations"], seen["observation"])
+    np.testing.assert_array_equal(mixed["actions"], seen["action"])
+    np.testing.assert_array_equal(mixed["rewards"], seen["next", "reward"].squeeze(-1))
+    np.testing.assert_array_equal(mixed["terminals"], seen["next", "terminated"].squeeze(-1))
+    np.testing.assert_array_equal(mixed["next_observations"], seen["next", "observation"])
+
+
+def test_the_mark_is_the_first_evaluation_that_reaches_it(cartpole: Path) -> None:
+    scores = json.loads((cartpole / "training" / "evaluations.json").read_text())
+    assert [score["step"] for score in scores] == [256 * (i + 1) for i in range(len(scores))]
+    for kind, mark in (("medium", 100), ("expert", 180)):
+        first = next(score for score in scores if score["mean"] >= mark)
+        noted = attributes(cartpole / f"{kind}.hdf5")
+        assert [noted["agent_steps"], noted["agent_return"]] == [first["step"], first["mean"]]
+    assert scores[-1]["mean"] >= 180  # where the training ended
+
+
+def test_provenance_is_in_both_formats(cartpole: Path, pendulum: Path, agent: str) -> None:
+    for folder, settings, algorithm in (
+        (cartpole, replace(CARTPOLE, agent=agent), "PPO"),
+        (pendulum, PENDULUM, "SAC"),
+    ):
+        for kind in KINDS:
+            noted = attributes(folder / f"{kind}.hdf5")
+            assert noted == attributes(folder / f"{kind}-v0")
+            assert noted["env_id"] == settings.env
+            assert noted["kind"] == kind
+            assert noted["seed"] == 0
+            assert noted["command"] == "the command"
+            assert json.loads(noted["settings"])["total_steps"] == settings.total_steps
+            assert json.loads(noted["settings"])["sac"]["gamma"] == 0.99
+            assert json.loads(noted["versions"])["torch"] == torch.__version__
+            if kind == "random":
+                assert noted["algorithm"] == "uniform actions"
+                assert "agent_steps" not in noted
+            else:
+                assert noted["algorithm"] == algorithm
+                assert noted["agent"] == settings.agent
+            dataset = minari.MinariDataset(folder / f"{kind}-v0" / "data")
+            assert dataset.env_spec.id == settings.env
+            assert dataset.action_space == gymnasium.make(settings.env).action_space
+            assert dataset.storage.metadata["algorithm_name"] == noted["algorithm"]
+    assert json.loads(attributes(cartpole / "medium.hdf5")["recipe"])["learning_rate"] == 1e-3
+    assert "recipe" not in attributes(cartpole / "random.hdf5")
+    assert "recipe" not in attributes(pendulum / "medium.hdf5")
+    # The end of the training, for want of a mark.
+    assert attributes(pendulum / "expert.hdf5")["agent_steps"] == 600
+    assert "expert_return" not in attributes(pendulum / "expert.hdf5")
+
+
+def test_minari_holds_the_same(cartpole: Path, pendulum: Path) -> None:
+    for folder in (cartpole, pendulum):
+        for kind in KINDS:
+            rows = load_episodes(folder / f"{kind}.hdf5", dtype=None).rows
+            assert (load_episodes(folder / f"{kind}-v0", dtype=None).rows == rows).all()
+
+
+def test_pictures_are_stored_one_by_one(tmp_path: Path) -> None:
+    recipe = PPO(
+        env="ALE/Pong-v5",
+        backbone=NatureCNNConfig(),
+        history=4,
+        padding="constant",
+        num_envs=2,
+        total_steps=10_000,
+        steps_per_batch=32,
+        epochs=1,
+        clip_rewards=True,
+        compile="off",
+    )
+    (tmp_path / "pong.json").write_text(recipe_to_json(recipe))
+    settings = Collection(
+        env="ALE/Pong-v5",
+        agent=str(tmp_path / "pong.json"),
+        sets=("random", "mixed"),
+        transitions=100,
+        total_steps=128,
+        evaluation_episodes=1,
+        checkpoint_interval=64,
+        num_envs=2,
+    )
+    collect(settings, tmp_path / "pong")
+
+    for kind, count in (("random", 100), ("mixed", 128)):
+        data = read(tmp_path / "pong" / f"{kind}.hdf5")
+        assert data["observations"].shape == (count, 84, 84)
+        assert data["observations"].dtype == data["next_observations"].dtype == np.uint8
+        assert data["actions"].dtype == np.int64
+        assert set(np.unique(data["actions"])) <= set(range(6))
+        assert len(np.unique(data["observations"].reshape(count, -1), axis=0)) > count / 2
+        check_episodes(data)
+        rows = load_episodes(tmp_path / "pong" / f"{kind}-v0", dtype=None).rows
+        assert (rows == load_episodes(tmp_path / "pong" / f"{kind}.hdf5", dtype=None).rows).all()
+        dataset = minari.MinariDataset(tmp_path / "pong" / f"{kind}-v0" / "data")
+        assert dataset.action_space.n == 6
+    # Two games side by side; new ones begin at the checkpoint of step 64.
+    assert np.flatnonzero(data["timeouts"]).tolist() == [31, 63, 95, 127]
+    buffer = make_replay_buffer(
+        HistoryStorage(load_episodes(tmp_path / "pong" / "mixed.hdf5"), 4, padding="constant"), 8
+    )
+    assert buffer.sample()["next", "history"].shape == (8, 4, 84, 84)
+
+
+def test_rewards_are_the_tasks_own(tmp_path: Path) -> None:
+    """Though the recipe clips and scales them, and takes time limits for terminations."""
+    recipe = replace(
+        RECIPE,
+        env="Pendulum-v1",
+        history=1,
+        steps_per_batch=800,
+        clip_rewards=True,
+        reward_scale=0.1,
+        bootstrap_time_limit=False,
+    )
+    (tmp_path / "small.json").write_text(recipe_to_json(recipe))
+    settings = replace(
+        PENDULUM, agent=str(tmp_path / "small.json"), sets=("mixed",), total_steps=800
+    )
+    collect(settings, tmp_path / "c")
+    data = read(tmp_path / "c" / "mixed.hdf5")
+    assert data["rewards"].min() < -2
+    assert not data["terminals"].any()
+    assert np.flatnonzero(data["timeouts"]).tolist() == [199, 399, 599, 799]
+    assert np.abs(data["actions"]).max() == 2  # a Gaussian's, clipped as the task does

@@ -1,0 +1,286 @@
+"""Recipes of conservative Q-learning: training, resuming and evaluation."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+
+from recipes.cli import main
+from recipes.cql import CQL, DiscreteCQL
+from recipes.metrics import read_metrics
+from recipes.offline.state import TrainingState
+from recipes.recipe import recipe_to_json
+from recipes.run import Run
+from tests.datasets.rollouts import roll, write
+from tests.recipes.cql.cql_runs import TIT, make_cql, make_discrete_cql, roll_pong
+from tests.recipes.offline.sequence_runs import (
+    assert_resumes_bit_for_bit,
+    assert_same,
+    train,
+    without_time,
+)
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.datasets import normalized_score, normalized_spread
+from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig, MLPConfig
+
+CQL_TERMS = ["loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy"]
+DISCRETE_TERMS = ["loss_qvalue", "loss_cql", "value"]
+
+
+def assert_trains(recipe, folder, terms):
+    """Trains, with evaluations and metrics; returns the rows and the newest state."""
+    recipe.check()
+    run = train(recipe, folder / "run")
+    rows = read_metrics(run.folder / "metrics.csv")
+    assert [row["step"] for row in rows] == [5, 9, 10, 15, 18]
+    assert list(rows[0]) == ["step", "time", "return_mean", *terms]
+    assert all(np.isfinite(row[term]) for row in rows for term in terms)
+    assert [row["step"] for row in rows if np.isfinite(row["return_mean"])] == [9, 18]
+    step, state = load_checkpoint(run.checkpoints)
+    assert step == 18
+    built = recipe.make_agent()
+    built.load_state_dict(state["agent"])  # everything that is trained is in there
+    return rows, state
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"backbone": MLPConfig(hidden_dim=16, activation="relu")},
+        {"backbone": TIT},
+        {"backbone": TIT, "history": 4},
+        {"backbone": TIT, "history": 4, "critic": "backbone", "over_critics": "sum"},
+    ],
+    ids=["mlp", "tit", "tit-4", "backbone"],
+)
+def test_continuous_actions(tmp_path, settings):
+    recipe = make_cql(tmp_path, **settings)
+    rows, state = assert_trains(recipe, tmp_path, CQL_TERMS)
+    assert rows[-1]["alpha"] != 1.0
+    torch.manual_seed(recipe.seed)
+    untrained = recipe.make_agent().state_dict()
+    trained = {n for n, w in state["agent"].items() if not torch.equal(w, untrained[n])}
+    networks = {name.partition("_params")[0] for name in trained}
+    assert networks == {"actor_network", "qvalue_network", "target_qvalue_network", "log_alpha"}
+    backbones = any("frame_encoder" in name for name in trained if "qvalue_network" in name)
+    assert backbones == (recipe.critic == "backbone")
+    online, target = (
+        next(w for n, w in state["agent"].items() if n.startswith(f"{name}_params"))
+        for name in ("qvalue_network", "target_qvalue_network")
+    )
+    assert not torch.equal(online, target)
+
+
+@pytest.mark.parametrize("history", [1, 3])
+def test_discrete_actions(tmp_path, history):
+    _, state = assert_trains(make_discrete_cql(tmp_path, history=history), tmp_path, DISCRETE_TERMS)
+    online, target = (
+        next(w for n, w in state["agent"].items() if n.startswith(f"{name}_params"))
+        for name in ("value_network", "target_value_network")
+    )
+    assert not torch.equal(online, target)
+
+
+def test_pictures_of_a_game(tmp_path):
+    recipe = make_discrete_cql(
+        tmp_path,
+        dataset=str(write(tmp_path / "pong.hdf5", roll_pong())),
+        env="ALE/Pong-v5",
+        backbone=replace(TIT, patch_size=42),
+        history=4,
+        padding="constant",
+        total_updates=4,
+        evaluation_interval=4,
+        evaluation_episodes=1,
+        log_interval=2,
+    )
+    recipe.check()
+    batch = recipe.make_buffer().sample()
+    assert batch["history"].dtype is torch.uint8
+    assert batch["history"].shape == (8, 4, 84, 84)
+    with train(recipe, tmp_path / "run") as run:
+        evaluation = recipe.evaluate(run)
+        rows = read_metrics(run.folder / "metrics.csv")
+    assert [row["step"] for row in rows] == [2, 4]
+    assert -21 <= evaluation["mean"] <= 21
+    # A game without reference returns counts as it is.
+    assert evaluation["score"] == {"best": evaluation["mean"], "last": evaluation["mean"]}
+
+
+class Camera(gymnasium.Env):
+    """Pictures by chance, and continuous actions."""
+
+    observation_space = Box(0, 255, (8, 8), np.uint8)
+    action_space = Box(-1, 1, (2,), np.float32)
+
+    def _observe(self):
+        return self.np_random.integers(0, 256, (8, 8), np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._observe(), {}
+
+    def step(self, action):
+        return self._observe(), float(action.sum()), bool(self.np_random.random() < 0.2), False, {}
+
+
+@pytest.fixture
+def camera(tmp_path):
+    gymnasium.register("Camera-v0", entry_point=lambda **_: Camera())
+    data = write(tmp_path / "camera.hdf5", roll(100, max_episode_steps=5, task="Camera-v0"))
+    yield {"env": "Camera-v0", "dataset": str(data), "backbone": replace(TIT, patch_size=4)}
+    del gymnasium.registry["Camera-v0"]
+
+
+def test_pictures_and_continuous_actions(tmp_path, camera):
+    assert_trains(make_cql(tmp_path, critic="backbone", **camera), tmp_path, CQL_TERMS)
+    with pytest.raises(ValueError, match=r"cannot value images \(8, 8\): set critic to 'backbone'"):
+        make_cql(tmp_path, critic="mlp", **camera).check()
+
+
+def test_evaluation(tmp_path):
+    recipe = make_cql(tmp_path)
+    with train(recipe, tmp_path / "run") as run:
+        rows = read_metrics(run.folder / "metrics.csv")
+        played = [row["return_mean"] for row in rows if np.isfinite(row["return_mean"])]
+        evaluation = recipe.evaluate(run)
+        other = replace(recipe, evaluation_seed=5, evaluation_episodes=2).evaluate(run)
+    assert evaluation["mean"] == np.mean(evaluation["returns"]) == played[-1]
+    assert evaluation["std"] == pytest.approx(np.std(evaluation["returns"]))
+    assert evaluation["score_std"] == pytest.approx(normalized_spread(evaluation["std"], "hopper"))
+    assert evaluation["score"] == pytest.approx(
+        {
+            "best": normalized_score(max(played), "hopper"),
+            "last": normalized_score(played[-1], "hopper"),
+        }
+    )
+    assert (evaluation["episodes"], evaluation["steps"]) == (3, 18)
+    assert len(other["returns"]) == 2
+    assert other["returns"] != evaluation["returns"][:2]
+    # The network without dropout, with tanh of the mean: it repeats itself.
+    agent = recipe.load_agent(Run.open(run.folder))[1]
+    assert agent.play(3, recipe.evaluation_seed).tolist() == evaluation["returns"]
+
+
+@pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
+def test_resumes_bit_for_bit(tmp_path, make):
+    settings = {"critic": "backbone"} if make is make_cql else {}
+    assert_resumes_bit_for_bit(make(tmp_path, history=4, **settings), tmp_path)
+
+
+def test_a_run_that_was_stopped_goes_on_bit_for_bit(tmp_path, monkeypatch):
+    recipe = make_cql(tmp_path, history=4, critic="backbone")
+    whole = train(recipe, tmp_path / "whole")
+    add = TrainingState.add
+
+    def stop_at_seventh(state, terms):
+        add(state, terms)
+        if state.saved_step == 4 and state._count == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(TrainingState, "add", stop_at_seventh)
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe, tmp_path / "stopped")
+    monkeypatch.undo()
+    with Run.open(tmp_path / "stopped") as run:
+        assert load_checkpoint(run.checkpoints)[0] == 7
+        torch.manual_seed(123)  # where the process that resumes happens to be
+        recipe.train(run)
+        assert_same(load_checkpoint(run.checkpoints), load_checkpoint(whole.checkpoints))
+    rows = [
+        [without_time(row) for row in read_metrics(folder / "metrics.csv")]
+        for folder in (run.folder, whole.folder)
+    ]
+    assert rows[0] == rows[1]
+
+
+@pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
+def test_dropout_is_on_in_updates_and_off_in_evaluations(tmp_path, make, monkeypatch):
+    recipe = make(tmp_path, **({"critic": "backbone"} if make is make_cql else {}))
+    seen = set()
+    forward = EnhancedTIT.forward
+
+    def watch(network, history):
+        modes = {module.training for module in network.modules()}
+        seen.add(("update" if len(history) == recipe.batch_size else "evaluation", *modes))
+        return forward(network, history)
+
+    monkeypatch.setattr(EnhancedTIT, "forward", watch)
+    train(recipe, tmp_path / "run")
+    assert seen == {("update", True), ("evaluation", False)}
+    agent, batch = recipe.make_agent(), recipe.make_buffer().sample()
+
+    def loss():
+        if isinstance(recipe, DiscreteCQL):
+            return agent.loss(batch.clone())["loss_qvalue"]
+        return agent.loss.actor_loss(batch, samples)[0]  # through the critics
+
+    samples = agent.loss.sample_policy(batch) if make is make_cql else None
+    agent.train()
+    assert loss() != loss()
+    agent.eval()
+    assert loss() == loss()
+
+
+def test_critics_start_as_they_were_built(tmp_path):
+    """The loss would draw each entry uniformly between the extremes of its tensor: a wider std."""
+    config = EnhancedTITConfig(embed_dim=64, num_blocks=1)
+    agent = make_cql(tmp_path, critic="backbone", backbone=config).make_agent()
+    weights = dict(agent.loss.qvalue_network_params.items(True, True))
+    embeddings = [w for key, w in weights.items() if key[-3:] == ("ffn", "0", "weight")]
+    assert len(embeddings) == 2
+    for first, second in embeddings:
+        assert first.std().item() == pytest.approx(0.02, rel=0.05)
+        assert second.std().item() == pytest.approx(0.02, rel=0.05)
+        assert not torch.equal(first, second)
+
+
+def test_the_discrete_target_follows_the_trained_network_slowly(tmp_path):
+    recipe = make_discrete_cql(tmp_path, tau=0.25)
+    agent = recipe.make_agent()
+    update, _ = recipe.make_update(agent)
+    before = agent.loss.target_value_network_params.data.clone()
+    update(recipe.make_buffer().sample(), 0, 0)
+    trained, target = agent.loss.value_network_params.data, agent.loss.target_value_network_params
+    for name, weight in target.data.items(True, True):
+        if weight.is_floating_point():
+            torch.testing.assert_close(weight, 0.75 * before[name] + 0.25 * trained[name])
+    assert not (trained == before).all()
+
+
+def test_command_line(tmp_path, capsys):
+    path = tmp_path / "recipe.json"
+    path.write_text(recipe_to_json(make_cql(tmp_path)))
+    out = tmp_path / "run"
+    main(
+        f"train {path} --history 2 --backbone.embed-dim 16 --critic-hidden 8 8 --over-critics sum "
+        f"--out {out}".split()
+    )
+    assert "over 3 episodes after 18 steps" in capsys.readouterr().out
+    recipe = Run.open(out).recipe
+    assert isinstance(recipe, CQL)
+    assert (recipe.history, recipe.critic_hidden, recipe.over_critics) == (2, (8, 8), "sum")
+    assert json.loads((out / "evaluation.json").read_text())["score"].keys() == {"best", "last"}
+    assert (out / "learning_curve.png").is_file()
+    main(["evaluate", str(out), "--episodes", "2"])
+    assert "over 2 episodes" in capsys.readouterr().out
+    main(["table", str(out)])
+    assert "| cql/hopper/small | 1 |" in capsys.readouterr().out
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
+    recipe = make_cql(tmp_path)
+    with Run.create(tmp_path / "run", recipe) as run:
+        replace(recipe, total_updates=9).train(run)
+        poisoned = replace(recipe, conservative_weight=float("inf"))
+        with pytest.raises(FloatingPointError, match=r"in the update at step 9.*of step 9 is good"):
+            poisoned.train(run)
+    assert load_checkpoint(run.checkpoints)[0] == 9

@@ -1,0 +1,297 @@
+"""Recipes of Decision Transformer: training, resuming, evaluation, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from recipes.cli import main
+from recipes.decision_transformer import DT
+from recipes.metrics import read_metrics
+from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.registry import get_recipe
+from recipes.run import Run
+from tests.datasets.rollouts import roll, write
+from tests.recipes.offline.sequence_runs import (
+    SMALL,
+    assert_resumes_bit_for_bit,
+    make_dt,
+    train,
+)
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.datasets import (
+    SequenceStorage,
+    load_episodes,
+    normalized_score,
+    normalized_spread,
+)
+from torchrl_tit.networks import DecisionTransformerConfig, MLPConfig
+
+pytestmark = pytest.mark.filterwarnings("ignore:target_returns")
+
+
+def test_named_recipes_have_the_protocols_settings():
+    encoders: dict[str, Any] = {"dt": "linear", "dt-tit": "inner_transformer"}
+    for task, targets in {
+        "halfcheetah": (12000, 6000),
+        "hopper": (3600, 1800),
+        "walker2d": (5000, 2500),
+    }.items():
+        for dataset in (f"{task}-medium-v2", f"{task}-medium-replay-v2"):
+            for network, encoder in encoders.items():
+                recipe = get_recipe(f"dt/{dataset}/{network}")
+                assert isinstance(recipe, DT)
+                assert recipe.dataset == dataset
+                assert list(recipe.target_returns) == list(targets)
+                assert recipe.backbone == DecisionTransformerConfig(state_encoder=encoder)
+                assert recipe.final_step == 100_000
+                assert (recipe.batch_size, recipe.learning_rate) == (64, 1e-4)
+                assert (recipe.weight_decay, recipe.max_grad_norm) == (1e-4, 0.25)
+                assert (recipe.evaluation_episodes, recipe.return_scale) == (100, 1000)
+                assert recipe_from_json(recipe_to_json(recipe), "it") == recipe
+
+
+def test_warm_up_is_linear():
+    recipe = get_recipe("dt/hopper-medium-v2/dt")
+    assert isinstance(recipe, DT)
+    rates = [recipe.learning_rate_at(step) for step in (0, 4999, 9999, 50_000)]
+    assert rates == pytest.approx([1e-8, 5e-5, 1e-4, 1e-4])
+    assert replace(recipe, warmup_updates=0).learning_rate_at(0) == 1e-4
+
+
+def test_resumes_bit_for_bit(tmp_path):
+    assert_resumes_bit_for_bit(make_dt(tmp_path), tmp_path)
+
+
+def test_a_step_is_the_protocols(tmp_path):
+    """Weights after two steps are those of AdamW on the masked error, with clipped gradients."""
+    config = DecisionTransformerConfig(**SMALL, dropout=0.0)
+    settings: dict[str, Any] = {"iterations": 1, "updates_per_iteration": 2}
+    recipe = make_dt(tmp_path, backbone=config, return_scale=50.0, weight_decay=10.0, **settings)
+    _, state = load_checkpoint(train(recipe, tmp_path / "run").checkpoints)
+
+    episodes = load_episodes(recipe.dataset)
+    mean, std = episodes.observation_statistics()
+    storage = SequenceStorage(episodes, 6, mean=mean, std=std, return_scale=50.0)
+    generator = torch.Generator().manual_seed(recipe.seed)
+    torch.manual_seed(recipe.seed)
+    network = recipe.make_agent().network
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=10.0)
+    for step in range(2):
+        batch = storage[torch.randint(len(storage), (8,), generator=generator)]
+        names = ("observation", "action", "return_to_go", "timestep", "mask")
+        error = (network(*(batch[name] for name in names)) - batch["action"])[batch["mask"]]
+        optimizer.zero_grad()
+        error.square().mean().backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.25)
+        optimizer.param_groups[0]["lr"] = 1e-3 * (step + 1) / 4
+        optimizer.step()
+    for name, weight in network.named_parameters():
+        trained = state["agent"][f"network.{name}"]
+        torch.testing.assert_close(trained, weight.detach(), rtol=1e-4, atol=1e-6, msg=name)
+    torch.testing.assert_close(state["agent"]["mean"], mean)
+
+
+def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
+    """Step by step in Gymnasium: normalised states, return to go and actions of the last steps."""
+    recipe = make_dt(tmp_path, acting_context=4, return_scale=50.0)
+    agent = recipe.make_agent().eval()
+    agent.fit_statistics(load_episodes(recipe.dataset))
+    env = gymnasium.make("Hopper-v5")
+    observation, _ = env.reset(seed=3)
+    states, actions, to_go, ended = [], [torch.zeros(3)], [60.0], False
+    while not ended:
+        states.append((torch.as_tensor(observation, dtype=torch.float32) - agent.mean) / agent.std)
+        steps = torch.arange(len(states))[-4:]
+        window = [torch.stack(x)[steps] for x in (states, actions)]
+        returns_to_go = torch.tensor(to_go)[steps].unsqueeze(-1) / 50
+        with torch.no_grad():
+            actions[-1] = agent.network(*window, returns_to_go, steps)[-1]
+        observation, reward, terminated, truncated, _ = env.step(actions[-1].numpy())
+        actions.append(torch.zeros(3))
+        to_go.append(to_go[-1] - float(reward))
+        ended = terminated or truncated
+    assert len(states) > 6
+    assert agent.play(60.0, episodes=1, seed=3).item() == pytest.approx(60 - to_go[-1], rel=1e-4)
+
+
+def test_evaluation_is_of_both_targets_and_the_best_of_all(tmp_path):
+    recipe = make_dt(tmp_path)
+    with train(recipe, tmp_path / "run") as run:
+        evaluation = recipe.evaluate(run)
+        rows = read_metrics(run.folder / "metrics.csv")
+        last = rows[-1]
+        played = [row for row in rows if not np.isnan(row["return_mean"])]
+    assert [row["step"] for row in played] == [9, 18]
+    assert [row["step"] for row in rows] == [5, 9, 10, 15, 18]
+    targets = evaluation["targets"]
+    assert {name: target["mean"] for name, target in targets.items()} == pytest.approx(
+        {"40": last["return_40"], "10": last["return_10"]}
+    )
+    better = max(targets.values(), key=lambda target: target["mean"])
+    assert evaluation["mean"] == better["mean"] == last["return_mean"]
+    assert evaluation["returns"] == better["returns"]
+    assert evaluation["std"] == pytest.approx(np.std(better["returns"]))
+    assert evaluation["score_std"] == pytest.approx(normalized_spread(evaluation["std"], "hopper"))
+    highest = max(row["return_mean"] for row in played)
+    assert evaluation["score"] == pytest.approx(
+        {
+            "best": normalized_score(highest, "hopper"),
+            "last": normalized_score(last["return_mean"], "hopper"),
+        }
+    )
+    assert evaluation["episodes"] == 3
+    assert (evaluation["steps"], evaluation["seed"]) == (18, recipe.evaluation_seed)
+
+    with Run.open(run.folder) as again:  # other seeds are played, the same ones are not
+        other = replace(recipe, evaluation_seed=5).evaluate(again)
+        assert other["returns"] != evaluation["returns"]
+        more = replace(recipe, evaluation_episodes=4).evaluate(again)
+        assert len(more["returns"]) == 4
+        assert more["targets"]["40"]["returns"][:3] == pytest.approx(
+            targets["40"]["returns"], rel=1e-4
+        )
+
+
+def test_command_line(tmp_path, capsys):
+    path = tmp_path / "recipe.json"
+    path.write_text(recipe_to_json(make_dt(tmp_path)))
+    out = tmp_path / "run"
+    main(
+        ["train", str(path), "--target-returns", "30", "--backbone.dropout", "0", "--out", str(out)]
+    )
+    assert "over 3 episodes after 18 steps" in capsys.readouterr().out
+    assert json.loads((out / "evaluation.json").read_text())["targets"].keys() == {"30"}
+    recipe = Run.open(out).recipe
+    assert isinstance(recipe, DT)
+    assert (recipe.target_returns, recipe.backbone.dropout) == ((30.0,), 0)
+    assert (out / "learning_curve.png").is_file()
+    main(["evaluate", str(out), "--episodes", "2"])
+    assert "over 2 episodes" in capsys.readouterr().out
+
+
+def test_discrete_actions_are_learnt(tmp_path):
+    """CartPole from data in which the action follows from the state."""
+    rng = np.random.default_rng(0)
+    states = rng.normal(size=(200, 4)).astype(np.float32)
+    arrays = {
+        "observations": states,
+        "actions": (states[:, 2] > 0).astype(np.int64),
+        "rewards": np.ones(200, np.float32),
+        "terminals": np.arange(200) % 20 == 19,
+        "timeouts": np.zeros(200, bool),
+    }
+    recipe = make_dt(
+        tmp_path,
+        dataset=str(write(tmp_path / "cartpole.hdf5", arrays)),
+        env="CartPole-v1",
+        backbone=DecisionTransformerConfig(**SMALL, action_space="discrete", dropout=0.0),
+        learning_rate=1e-2,
+        target_returns=(20.0,),
+        updates_per_iteration=50,
+        log_interval=10,
+    )
+    recipe.check()
+    run = train(recipe, tmp_path / "run")
+    losses = [row["loss"] for row in read_metrics(run.folder / "metrics.csv")]
+    assert losses[0] > 0.5
+    assert losses[-1] < 0.35
+    with run:
+        assert "std" in recipe.evaluate(run)  # of a task without reference returns
+
+
+def test_a_target_that_the_data_never_reach_is_said(tmp_path):
+    recipe = make_dt(tmp_path, target_returns=(5000.0, 10.0), updates_per_iteration=1)
+    with pytest.warns(UserWarning, match=r"target_returns 5000: no episode in .*hopper\.hdf5.*rea"):
+        train(recipe, tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"target_returns": ()}, r"target_returns must be at least one finite number, not \(\)"),
+        ({"target_returns": (float("nan"),)}, "target_returns must be at least one finite"),
+        ({"return_scale": 0.0}, "return_scale must be positive, not 0"),
+        ({"iterations": 0}, "iterations must be at least 1"),
+        ({"acting_context": 0}, "acting_context must be at least 1"),
+        ({"acting_context": 7}, "acting_context must be at most 6, not 7"),
+        ({"target_returns": (10.0, 5.0, 10.0)}, "must differ within six digits, unlike"),
+        ({"target_returns": (1234567.0, 1234568.0)}, "must differ within six digits, unlike"),
+        ({"backbone": MLPConfig()}, "backbone is MLPConfig, but this recipe trains a decision-tr"),
+        (
+            {"backbone": DecisionTransformerConfig(action_space="gaussian")},
+            "'gaussian', which this loss cannot train",
+        ),
+    ],
+)
+def test_wrong_settings(tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        make_dt(tmp_path, **settings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            {"backbone": DecisionTransformerConfig(max_ep_len=999)},
+            "episodes of Hopper-v5 have up to 1000 steps, but max_ep_len is 999",
+        ),
+        (
+            {"backbone": DecisionTransformerConfig(action_space="discrete")},
+            "Hopper-v5 has continuous actions, but the head's are discrete",
+        ),
+        (
+            {"env": "CartPole-v1"},
+            "CartPole-v1 has discrete actions, but the head's are continuous",
+        ),
+        ({"env": "Pendulum-v1"}, "actions of Pendulum-v1 reach from -2 to 2, but the head's"),
+        ({"env": "Walker2d-v5"}, r"observations"),
+        ({"dataset": "hopper"}, "'hopper' is no data set"),
+    ],
+)
+def test_tasks_and_data_that_do_not_fit(tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        make_dt(tmp_path, **settings).check()
+
+
+def test_data_that_do_not_fit_the_network(tmp_path):
+    arrays = roll()
+    arrays["timeouts"][:] = arrays["terminals"][:] = False
+    arrays["timeouts"][-1] = True
+    arrays["next_observations"][:-1] = arrays["observations"][1:]
+    path = write(tmp_path / "long.hdf5", arrays)
+    long = len(arrays["rewards"])
+    recipe = make_dt(tmp_path, dataset=str(path), env="InvertedPendulum-v5")
+    with pytest.raises(ValueError, match="reach from -3 to 3"):
+        recipe.check()
+    from recipes.decision_transformer.data import load_data
+
+    config = DecisionTransformerConfig(context=5, max_ep_len=long - 1)
+    with pytest.raises(ValueError, match=f"have up to {long} steps, but max_ep_len is {long - 1}"):
+        load_data(str(path), config, task="Hopper-v5")
+    discrete = DecisionTransformerConfig(action_space="discrete")
+    message = r"actions in .* are continuous \(torch.float32\), but .* \(discrete actions are int"
+    with pytest.raises(ValueError, match=message):
+        load_data(str(path), discrete, task="Hopper-v5")
+
+
+def test_other_algorithms_refuse_the_network():
+    recipe = replace(get_recipe("ppo/cartpole/mlp"), backbone=DecisionTransformerConfig())
+    with pytest.raises(ValueError, match="reads returns and actions beside a history"):
+        recipe.check()
+
+
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
+    recipe = make_dt(tmp_path, max_grad_norm=0.25)
+    with Run.create(tmp_path / "run", recipe) as run:
+        replace(recipe, iterations=1).train(run)
+        poisoned = replace(recipe, return_scale=1e-38)
+        with pytest.raises((FloatingPointError, ValueError)):
+            poisoned.train(run)
+    assert load_checkpoint(run.checkpoints)[0] == 9

@@ -1,0 +1,90 @@
+"""Which tasks Decision Transformer's recipes take, and how long their episodes are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+
+from recipes.decision_transformer.data import load_data
+from recipes.decision_transformer.odt_exploration import explore
+from tests.datasets.rollouts import roll, write
+from tests.recipes.offline.sequence_runs import SMALL, make_dt, make_odt
+from torchrl_tit.datasets import select_episodes, write_minari
+from torchrl_tit.networks import DecisionTransformerConfig
+
+
+class Endless(gymnasium.Env[Any, Any]):
+    """Never ends by itself."""
+
+    observation_space = Box(-1.0, 1.0, (3,), np.float32)
+
+    def __init__(self, lowest: float = -1.0) -> None:
+        self.action_space = Box(np.array([-1.0, lowest], np.float32), np.ones(2, np.float32))
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        return np.zeros(3, np.float32), 1.0, False, False, {}
+
+
+gymnasium.register("tests/Endless-v0", lambda **_: Endless())
+gymnasium.register("tests/Lopsided-v0", lambda **_: Endless(lowest=0.0), max_episode_steps=10)
+gymnasium.register("tests/Long-v0", lambda **_: Endless(), max_episode_steps=30)
+
+
+def test_a_task_without_a_time_limit_is_cut_off_where_time_steps_end(tmp_path):
+    config = DecisionTransformerConfig(**SMALL, max_ep_len=12)
+    agent = make_dt(tmp_path, env="tests/Endless-v0", backbone=config).make_agent()
+    assert agent.play(20.0, episodes=2, seed=0).tolist() == [12, 12]
+
+
+def test_episodes_that_are_explored_are_as_long_as_those_of_the_evaluation(tmp_path):
+    """Without an embedding of time steps nothing ends at max_ep_len but endless tasks."""
+    config = DecisionTransformerConfig(
+        **SMALL, max_ep_len=12, action_space="gaussian", timestep_embedding=False
+    )
+    for env, length in {"tests/Endless-v0": 12, "tests/Long-v0": 30}.items():
+        recipe = make_odt(tmp_path, env=env, backbone=config)
+        agent = recipe.make_agent()
+        episodes = explore(agent, recipe, 0)
+        assert episodes.lengths.tolist() == agent.play(20.0, 1, 0).tolist() == [length]
+        assert episodes.truncated.all()
+
+
+def test_every_entry_of_an_action_must_reach_as_far_as_the_heads(tmp_path):
+    with pytest.raises(ValueError, match="actions of tests/Lopsided-v0 reach from 0 to 1, but"):
+        make_dt(tmp_path, env="tests/Lopsided-v0").make_agent()
+
+
+def test_whole_atari_games_need_as_many_time_steps(tmp_path):
+    pytest.importorskip("ale_py")
+    settings: dict[str, Any] = {**SMALL, "action_space": "discrete", "patch_size": 42}
+    recipe = make_dt(tmp_path, env="ALE/Pong-v5", backbone=DecisionTransformerConfig(**settings))
+    with pytest.raises(ValueError, match="Pong-v5 have up to 27000 steps, but max_ep_len is 1000"):
+        recipe.make_agent()
+    config = DecisionTransformerConfig(**settings, max_ep_len=27_000)
+    agent = make_dt(tmp_path, env="ALE/Pong-v5", backbone=config).make_agent()
+    state = agent.make_env(2, 21.0).reset()
+    assert agent.actor(state)["action"].shape == (2,)
+
+
+def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):
+    """The last one, which the data break off in, is left out."""
+    arrays = roll(max_episode_steps=15)
+    arrays["terminals"][-40:] = arrays["timeouts"][-40:] = False
+    arrays["next_observations"][-41:-1] = arrays["observations"][-40:]
+    path = str(write(tmp_path / "hopper.hdf5", arrays))
+    config = DecisionTransformerConfig(context=5, max_ep_len=15)
+    episodes = load_data(path, config, task="Hopper-v5")
+    assert episodes.lengths.max() > 15
+
+    write_minari(select_episodes(episodes, torch.tensor([-1])), folder := tmp_path / "hopper-v0")
+    with pytest.raises(ValueError, match=r"no episode in .*hopper-v0 is finished"):
+        load_data(str(folder), config, task="Hopper-v5")

@@ -1,0 +1,67 @@
+"""What a PPO run encodes while it acts: the newest frames, and no others."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from recipes.ppo import PPO, training
+from recipes.ppo.agent import Agent
+from recipes.run import Run
+from tests.modules.frames import CountedFrames
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.networks import EnhancedTITConfig
+
+RECIPE = PPO(
+    env="Pendulum-v1",
+    history=4,
+    backbone=EnhancedTITConfig(embed_dim=8, features_dim=8),
+    total_steps=128,
+    steps_per_batch=64,
+    num_envs=2,
+    minibatch_size=32,
+    epochs=1,
+    evaluation_episodes=2,
+)
+
+
+@pytest.fixture
+def frames(monkeypatch):
+    """Counts the frames that are encoded without gradients."""
+    counted = []
+    init = Agent.__init__
+
+    def counting(agent, *args):
+        init(agent, *args)
+        frames = CountedFrames(agent.backbone.module)
+        frames.only_without_gradients = True
+        counted.append(frames)
+
+    monkeypatch.setattr(Agent, "__init__", counting)
+    return counted
+
+
+def test_collection_and_evaluation_encode_each_frame_once(frames, tmp_path):
+    with Run.create(tmp_path / "run", RECIPE) as run:
+        RECIPE.train(run)
+        # A batch has 64 steps, the 3 older frames of both environments at its start, the 4 of both
+        # next histories at its end, and a minibatch of 32 histories that is checked to be finite.
+        # Before the first one the collector tries the policy on both environments.
+        assert frames[0].take() <= 2 + 2 * (64 + 2 * 3 + 2 * 4 + 32 * 4)
+        RECIPE.evaluate(run)
+    assert frames[1].take() <= 2 * (200 + 3)  # two episodes
+
+
+def test_keeping_frames_changes_no_result(tmp_path, monkeypatch):
+    """Beyond rounding: the same actions, episodes and nearly the same weights."""
+    recipe = replace(RECIPE, learning_rate=1e-4)
+
+    def weights(name):
+        with Run.create(tmp_path / name, recipe) as run:
+            recipe.train(run)
+            return load_checkpoint(run.checkpoints)[1]["agent"]
+
+    kept = weights("kept")
+    monkeypatch.setattr(training, "while_acting", lambda policy, collector: collector)
+    for name, weight in weights("plain").items():
+        torch.testing.assert_close(kept[name], weight, rtol=0, atol=2e-5)

@@ -1,0 +1,77 @@
+"""Several collectors in processes of their own."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from recipes.ppo import PPO
+from recipes.ppo.agent import Agent
+from recipes.ppo.collector import make_collector
+from recipes.run import Run
+from torchrl_tit.checkpoint import checkpoint_steps
+from torchrl_tit.networks import EnhancedTITConfig
+
+RECIPE = PPO(
+    env="CartPole-v1",
+    history=2,
+    backbone=EnhancedTITConfig(embed_dim=8, features_dim=8),
+    total_steps=192,
+    steps_per_batch=64,
+    num_envs=4,
+    collectors=2,
+    minibatch_size=16,
+    epochs=1,
+    evaluation_episodes=2,
+    checkpoint_interval=64,
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("async_collection", [False, True])
+def test_batches_are_those_of_the_policy(async_collection):
+    recipe = replace(RECIPE, async_collection=async_collection, reward_scale=1.0)
+    env = recipe.make_env(1, 0)
+    agent = Agent(recipe, env).eval()
+    collector = make_collector(recipe, env, agent, 0, None)
+    envs = 2 if async_collection else 4
+    starts = []
+    for count, batch in enumerate(collector, start=1):
+        assert batch.shape == (envs, 64 // envs)
+        with torch.no_grad():
+            features = agent.backbone.module(batch["history"])
+        if count == 1 or not async_collection:  # a later one of those can be an update behind
+            torch.testing.assert_close(batch["features"], features, rtol=0, atol=1e-5)
+        starts += batch["history"][:, 0, -1].tolist()
+        for parameter in agent.parameters():
+            parameter.data.add_(0.01)
+        collector.update_policy_weights_()
+    collector.shutdown()
+    assert count * 64 == 192
+    first = RECIPE.make_env(4, RECIPE.seed).reset()["history"][:, -1].tolist()
+    assert all(start in first for start in starts[:envs])  # each environment has its own seed
+    assert len(set(map(tuple, starts[:envs]))) == envs
+
+
+@pytest.mark.slow
+def test_a_run_trains_and_goes_on(tmp_path):
+    with Run.create(tmp_path / "run", replace(RECIPE, total_steps=128)) as run:
+        run.recipe.train(run)
+        assert max(checkpoint_steps(run.checkpoints)) == 128
+    with Run(tmp_path / "run", RECIPE) as run:
+        RECIPE.train(run)
+        assert max(checkpoint_steps(run.checkpoints)) == 192
+        assert RECIPE.evaluate(run)["steps"] == 192
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"num_envs": 3, "steps_per_batch": 63}, "num_envs 3 cannot be shared by 2 collectors"),
+        ({"collectors": 1, "async_collection": True}, "one collector: set collectors"),
+        ({"collectors": 0}, "collectors must be at least 1"),
+    ],
+)
+def test_settings_that_do_not_fit(fields, words):
+    with pytest.raises(ValueError, match=words):
+        replace(RECIPE, **fields)

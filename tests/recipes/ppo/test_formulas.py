@@ -1,0 +1,350 @@
+"""PPO's settings against the formulas, computed by other means."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from recipes.compilation import STATIC_SHAPES, should_compile
+from recipes.ppo import PPO
+from recipes.ppo.agent import Agent
+from recipes.ppo.update import add_advantages, make_objective, minibatches
+from recipes.registry import get_recipe
+from recipes.run import Run
+
+RECIPE = get_recipe("ppo/cartpole/enhanced-tit")
+assert isinstance(RECIPE, PPO)
+SMALL = replace(RECIPE, total_steps=64, steps_per_batch=32, num_envs=2, epochs=2, minibatch_size=16)
+
+
+def build(recipe=SMALL):
+    env = recipe.make_env(recipe.num_envs, recipe.seed)
+    return env, Agent(recipe, env)
+
+
+def fake_batch(agent, env, time=7):
+    """Two streams with a termination and a time limit inside, and histories of random numbers."""
+    envs = env.batch_size[0]
+    history = torch.randn(envs, time + 1, 1, 4)
+    terminated = torch.zeros(envs, time, 1, dtype=torch.bool)
+    truncated = terminated.clone()
+    terminated[0, 2] = truncated[1, 4] = True
+    following = history[:, 1:].clone()
+    # Where an episode ends, the next observation is not the one that the next step starts from.
+    following[0, 2] = torch.randn(1, 4)
+    following[1, 4] = torch.randn(1, 4)
+    with torch.no_grad():
+        value = agent.critic(agent.backbone(TensorDict({"history": history}, [envs, time + 1])))
+    return TensorDict(
+        {
+            "history": history[:, :-1],
+            "state_value": value["state_value"][:, :-1],
+            "next": {
+                "history": following,
+                "reward": torch.randn(envs, time, 1),
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+            },
+        },
+        [envs, time],
+    )
+
+
+@pytest.mark.parametrize("bootstrap", [True, False])
+def test_advantages_follow_the_recursion(bootstrap):
+    env, agent = build()
+    batch = fake_batch(agent, env)
+    gamma, lmbda = 0.9, 0.8
+    gae = GAE(gamma=gamma, lmbda=lmbda, value_network=None)
+    with torch.no_grad():
+        add_advantages(batch, agent, gae, bootstrap)
+    with torch.no_grad():
+        after = agent.critic(agent.backbone(batch["next"].select("history").clone()))
+    value, next_value = batch["state_value"].numpy(), after["state_value"].numpy()
+    reward = batch["next", "reward"].numpy()
+    done = batch["next", "done"].numpy()
+    stops = done if not bootstrap else done & ~batch["next", "truncated"].numpy()
+    expected = np.zeros_like(value)
+    for i in range(value.shape[0]):
+        running = 0.0
+        for t in reversed(range(value.shape[1])):
+            # A termination has no value after it, a time limit has that of the true next state.
+            bootstrapped = 0.0 if stops[i, t, 0] else next_value[i, t, 0]
+            delta = reward[i, t, 0] + gamma * bootstrapped - value[i, t, 0]
+            running = delta + gamma * lmbda * (0.0 if done[i, t, 0] else running)
+            expected[i, t, 0] = running
+    np.testing.assert_allclose(batch["advantage"].numpy(), expected, atol=1e-5)
+    np.testing.assert_allclose(batch["value_target"].numpy(), expected + value, atol=1e-5)
+
+
+def sb3_style_loss(agent, minibatch, recipe):
+    """The loss as Stable-Baselines3 writes it, from the layers' weights alone."""
+    features = agent.backbone.module(minibatch["history"])
+    logits = agent.actor[0].module(features)
+    value = agent.critic.module(features).squeeze(-1)
+    log_probs = logits - logits.logsumexp(-1, keepdim=True)
+    log_prob = log_probs.gather(-1, minibatch["action"].unsqueeze(-1)).squeeze(-1)
+    advantage = minibatch["advantage"].squeeze(-1)
+    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    ratio = (log_prob - minibatch["action_log_prob"]).exp()
+    clipped = ratio.clamp(1 - recipe.clip_epsilon, 1 + recipe.clip_epsilon)
+    policy = -torch.min(advantage * ratio, advantage * clipped).mean()
+    critic = ((minibatch["value_target"].squeeze(-1) - value) ** 2).mean()
+    entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
+    return policy + recipe.critic_coeff * critic - recipe.entropy_coeff * entropy
+
+
+def test_loss_and_gradient_are_those_of_the_formulas():
+    recipe = replace(SMALL, entropy_coeff=0.01)
+    _, agent = build(recipe)
+    n = 64
+    minibatch = TensorDict(
+        {
+            "history": torch.randn(n, 1, 4),
+            "action": torch.randint(0, 2, (n,)),
+            "action_log_prob": -torch.rand(n) * 1.5,  # far enough off for clipping to act
+            "advantage": torch.randn(n, 1) * 3 + 1,
+            "value_target": torch.randn(n, 1) * 10,
+        },
+        [n],
+    )
+    expected = sb3_style_loss(agent, minibatch, recipe)
+    expected_grads = torch.autograd.grad(expected, list(agent.parameters()))
+
+    loss = ClipPPOLoss(
+        agent.actor,
+        agent.critic,
+        clip_epsilon=recipe.clip_epsilon,
+        entropy_coeff=recipe.entropy_coeff,
+        critic_coeff=recipe.critic_coeff,
+        loss_critic_type="l2",
+        normalize_advantage=True,
+        functional=False,
+    )
+    agent.backbone(minibatch)
+    terms = loss(minibatch)
+    total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+    grads = torch.autograd.grad(total, list(agent.parameters()))
+    assert terms["clip_fraction"] > 0.1
+    torch.testing.assert_close(total, expected, atol=1e-5, rtol=1e-5)
+    for grad, expected_grad in zip(grads, expected_grads, strict=True):
+        torch.testing.assert_close(grad, expected_grad, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("c++"), reason="torch.compile needs a C++ compiler")
+def test_compiled_objective_is_the_eager_one():
+    _, agent = build()
+    loss = ClipPPOLoss(
+        agent.actor, agent.critic, loss_critic_type="l2", normalize_advantage=True, functional=False
+    )
+    minibatch = TensorDict(
+        {
+            "history": torch.randn(16, 1, 4),
+            "action": torch.randint(0, 2, (16,)),
+            "action_log_prob": -torch.rand(16) * 1.5,
+            "advantage": torch.randn(16, 1),
+            "value_target": torch.randn(16, 1),
+        },
+        [16],
+    )
+    results = []
+    for options in (None, STATIC_SHAPES):
+        total, terms = make_objective(agent, loss, options)(minibatch.copy())
+        results.append((total, terms, *torch.autograd.grad(total, list(agent.parameters()))))
+    for eager, fast in zip(*results, strict=True):
+        torch.testing.assert_close(fast, eager, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("setting", "steps", "compiler", "expected"),
+    [
+        ("off", 10**6, True, False),
+        ("auto", 100, True, False),
+        ("auto", 10**6, False, False),
+        ("auto", 10**6, True, True),
+        ("on", 1, True, True),
+    ],
+)
+def test_compiling_pays_in_long_runs(setting, steps, compiler, expected, monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: name if compiler else None)
+    monkeypatch.setattr("recipes.compilation._works", lambda: True)
+    assert should_compile(setting, steps) is expected
+
+
+def test_compiling_without_a_compiler_is_refused(monkeypatch):
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(ValueError, match=r"no C\+\+ compiler"):
+        should_compile("on", 1)
+
+
+def test_adam_gets_its_settings(monkeypatch, tmp_path):
+    seen = {}
+    original = torch.optim.Adam.__init__
+
+    def spy(self, parameters, **settings):
+        seen.update(settings)
+        original(self, parameters, **settings)
+
+    monkeypatch.setattr(torch.optim.Adam, "__init__", spy)
+    with Run.create(tmp_path / "run", SMALL) as run:
+        SMALL.train(run)
+    assert (seen["lr"], seen["eps"]) == (3e-4, 1e-5)
+    assert seen.get("weight_decay", 0) == 0
+
+
+def test_whole_rollouts_cover_the_steps():
+    assert RECIPE.final_step == 100_352  # 49 batches of 2048 cover 100k
+
+
+def test_protocol_settings_of_arrays():
+    expected = {
+        "learning_rate": 3e-4, "steps_per_batch": 2048, "num_envs": 1, "minibatch_size": 64,
+        "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "clip_epsilon": 0.2,
+        "entropy_coeff": 0.0, "critic_coeff": 0.5, "max_grad_norm": 0.5, "adam_eps": 1e-5,
+        "initialization": "orthogonal", "total_steps": 100_000, "evaluation_episodes": 100,
+        "decay_learning_rate": False, "decay_clip_epsilon": False, "history": 1,
+    }  # fmt: skip
+    assert {name: getattr(RECIPE, name) for name in expected} == expected
+
+
+def test_minibatches_show_every_step_once_an_epoch():
+    n = 40
+    batch = TensorDict(
+        {
+            "history": torch.arange(n).view(2, 20, 1, 1),
+            "action": torch.arange(n).view(2, 20),
+            "action_log_prob": torch.zeros(2, 20),
+            "advantage": torch.zeros(2, 20, 1),
+            "value_target": torch.zeros(2, 20, 1),
+        },
+        [2, 20],
+    )
+    recipe = replace(SMALL, epochs=3, minibatch_size=16)
+    parts = [part["action"].tolist() for part in minibatches(batch, recipe)]
+    assert [len(part) for part in parts] == [16, 16, 8] * 3
+    epochs = [[*parts[i], *parts[i + 1], *parts[i + 2]] for i in (0, 3, 6)]
+    assert all(sorted(epoch) == list(range(n)) for epoch in epochs)
+    assert epochs[0] != epochs[1] != epochs[2]
+
+
+def test_initialisation_is_that_of_stable_baselines3():
+    _, agent = build()
+    network: nn.Module = agent.backbone.module
+    for layer in network.modules():
+        if isinstance(layer, nn.Linear):
+            weight = layer.weight.flatten(1)
+            weight = weight if weight.shape[0] <= weight.shape[1] else weight.T
+            identity = 2 * torch.eye(len(weight))
+            torch.testing.assert_close(weight @ weight.T, identity, atol=1e-4, rtol=0)
+            assert not layer.bias.any()
+    heads: list[tuple[Any, float]] = [(agent.actor[0].module, 0.01), (agent.critic.module, 1.0)]
+    for layer, gain in heads:
+        norms = layer.weight.norm(dim=1)
+        torch.testing.assert_close(norms, torch.full_like(norms, gain))
+        assert not layer.bias.any()
+
+
+class Recorder:
+    """Counts the calls of a network and remembers in which mode they came."""
+
+    def __init__(self, monkeypatch):
+        self.modes = []
+        original = Agent.__init__
+
+        def init(agent, *args):
+            original(agent, *args)
+            agent.backbone.module.register_forward_hook(self)
+
+        monkeypatch.setattr(Agent, "__init__", init)
+
+    def __call__(self, network, inputs, output):
+        kind = "update" if torch.is_grad_enabled() else "act"
+        self.modes.append((kind, network.training, len(inputs[0])))
+
+
+def test_backbone_runs_once_a_step_and_once_a_minibatch(monkeypatch, tmp_path):
+    recorder = Recorder(monkeypatch)
+    with Run.create(tmp_path / "run", SMALL) as run:
+        SMALL.train(run)
+    updates = [mode for mode in recorder.modes if mode[0] == "update"]
+    acts = [mode for mode in recorder.modes if mode[0] == "act"]
+    batches, minibatches_each, epochs = 2, 2, 2
+    assert len(updates) == batches * minibatches_each * epochs
+    # 16 steps of 2 environments in each batch, and the true next observations of its ends.
+    # TorchRL's collector asks once when it is made; each update ends with a check of the values.
+    assert len(acts) == 1 + batches * (16 + 1 + 1)
+    assert all(training for _, training, _ in updates)
+    assert not any(training for _, training, _ in acts)
+
+
+@pytest.mark.parametrize("decay", [True, False])
+def test_schedules_fall_linearly(decay, tmp_path, monkeypatch):
+    recipe = replace(SMALL, total_steps=128, decay_learning_rate=decay, decay_clip_epsilon=decay)
+    ranges = []
+    forward = ClipPPOLoss.forward
+
+    def spy(self, *args, **kwargs):
+        ranges.append(round(self.clip_epsilon.item(), 6))
+        return forward(self, *args, **kwargs)
+
+    monkeypatch.setattr(ClipPPOLoss, "forward", spy)
+    with Run.create(tmp_path / "run", recipe) as run:
+        recipe.train(run)
+    rows = (run.folder / "metrics.csv").read_text().splitlines()
+    column = rows[0].split(",").index("learning_rate")
+    rates = [float(row.split(",")[column]) for row in rows[1:]]
+    fractions = [1, 0.75, 0.5, 0.25] if decay else [1, 1, 1, 1]
+    assert rates == pytest.approx([3e-4 * fraction for fraction in fractions])
+    assert sorted(set(ranges)) == sorted({round(0.2 * fraction, 6) for fraction in fractions})
+
+
+def test_continuous_actions_are_stored_unclipped_and_evaluated_at_the_mean():
+    recipe = replace(SMALL, env="Pendulum-v1")
+    env, agent = build(recipe)
+    with torch.no_grad():
+        td = agent.policy(env.reset())
+    torch.testing.assert_close(td["scale"], torch.ones_like(td["scale"]))  # log std 0
+    collector = Collector(
+        env,
+        agent.policy,
+        frames_per_batch=400,
+        total_frames=400,
+        auto_register_policy_transforms=False,
+    )
+    batch = next(iter(collector))
+    assert batch["action"].abs().max() > 2.0  # Pendulum's bounds are +-2
+    dist = torch.distributions.Normal(batch["loc"], batch["scale"])
+    torch.testing.assert_close(
+        batch["action_log_prob"], dist.log_prob(batch["action"]).sum(-1), atol=1e-5, rtol=1e-5
+    )
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        td = agent.policy(env.reset())
+    torch.testing.assert_close(td["action"], td["loc"])
+
+
+def test_gradient_is_scaled_to_its_largest_norm(monkeypatch, tmp_path):
+    seen = []
+    clip = nn.utils.clip_grad_norm_
+
+    def spy(parameters, max_norm):
+        norm = clip(parameters, max_norm)
+        seen.append(torch.stack([p.grad.norm() for p in parameters if p.grad is not None]).norm())
+        assert max_norm == 0.5
+        return norm
+
+    monkeypatch.setattr(nn.utils, "clip_grad_norm_", spy)
+    with Run.create(Path(tmp_path) / "run", SMALL) as run:
+        SMALL.train(run)
+    assert max(seen) <= 0.5 + 1e-4

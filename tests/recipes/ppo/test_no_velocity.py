@@ -1,0 +1,56 @@
+"""Tasks without their velocities: the networks compared on them."""
+
+from dataclasses import replace
+
+import pytest
+
+from recipes.ppo.no_velocity import NO_VELOCITY_RECIPES
+from recipes.registry import RECIPES
+from recipes.run import Run
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.networks import MLPConfig
+
+
+@pytest.mark.parametrize("name", NO_VELOCITY_RECIPES)
+def test_recipes_can_be_built_and_hide_the_velocities(name):
+    recipe = NO_VELOCITY_RECIPES[name]
+    assert RECIPES[name] == recipe
+    recipe.check()
+    entries = {"CartPole-v1": 2, "Acrobot-v1": 4, "Hopper-v5": 5}[recipe.env]
+    env = recipe.make_env(2, seed=0)
+    assert env.reset()["history"].shape == (2, recipe.history, entries)
+    assert recipe.num_envs == (16 if "acrobot" in name else 8)
+
+
+def test_all_networks_train_with_the_same_settings():
+    any_network = MLPConfig()
+    for task in ("cartpole", "acrobot", "hopper"):
+        settings = {
+            replace(recipe, name="", history=1, backbone=any_network)
+            for name, recipe in NO_VELOCITY_RECIPES.items()
+            if name.startswith(f"ppo/{task}-no-velocity/")
+        }
+        assert len(settings) == 1
+
+
+def test_a_run_in_processes_is_the_run_in_one(tmp_path):
+    recipe = replace(
+        NO_VELOCITY_RECIPES["ppo/cartpole-no-velocity/mlp-stack-8"],
+        num_envs=2,
+        steps_per_batch=32,
+        total_steps=64,
+        minibatch_size=16,
+        epochs=1,
+        evaluation_episodes=3,
+    )
+    results = []
+    for mode in ("sync", "async"):
+        recipe = replace(recipe, vectorization_mode=mode)
+        with Run.create(tmp_path / mode, recipe) as run:
+            recipe.train(run)
+            evaluation = recipe.evaluate(run)
+        results.append((load_checkpoint(run.checkpoints)[1]["agent"], evaluation["returns"]))
+    (sync, returns), (async_, async_returns) = results
+    assert returns == async_returns
+    for name, weight in sync.items():
+        assert (weight == async_[name]).all()

@@ -1,0 +1,123 @@
+"""PPO with a recurrent network: sequences, values across their ends, and going on."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.objectives.value import GAE
+
+from recipes.ppo import PPO
+from recipes.ppo.agent import Agent
+from recipes.ppo.update import add_advantages, minibatches
+from recipes.results.render import render
+from recipes.run import Run
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.modules import LSTMConfig
+from torchrl_tit.networks import MLPConfig
+
+RECIPE = PPO(
+    env="CartPole-v1",
+    hide_velocities=True,
+    backbone=LSTMConfig(embed_dim=8, hidden_dim=8, features_dim=8),
+    num_envs=2,
+    total_steps=256,
+    steps_per_batch=64,
+    minibatch_size=32,
+    sequence_length=8,
+    epochs=2,
+    learning_rate=1e-2,
+    checkpoint_interval=64,
+    evaluation_episodes=3,
+)
+
+
+@pytest.fixture
+def batch():
+    """A batch of 200 steps of 2 environments, and the agent that took them."""
+    torch.manual_seed(0)
+    env = RECIPE.make_env(2, seed=0)
+    agent = Agent(RECIPE, env).eval()
+    torch.nn.init.normal_(agent.critic.module.weight)
+    collector = Collector(
+        env,
+        agent.policy,
+        frames_per_batch=400,
+        total_frames=400,
+        auto_register_policy_transforms=False,
+    )
+    with torch.no_grad():
+        yield next(iter(collector)), agent
+    collector.shutdown()
+
+
+def test_the_next_values_know_the_state_before_them(batch):
+    """At ends of episodes and of the batch too, where the collector computed none."""
+    batch, agent = batch
+    gae = GAE(gamma=0.99, lmbda=0.95, value_network=None)
+    add_advantages(batch, agent, gae, bootstrap_time_limit=True)
+    following = agent.critic(agent.backbone(batch["next"].select(*agent.backbone.in_keys)))
+    torch.testing.assert_close(batch["next", "state_value"], following["state_value"])
+    forgetful = batch["next"].select("history", "is_init").set("is_init", batch["next", "done"])
+    forgetful = agent.critic(agent.backbone(forgetful))["state_value"]
+    assert (batch["next", "state_value"] - forgetful).abs().max() > 1e-3
+
+
+def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
+    batch, agent = batch
+    number = torch.arange(400).view(2, 200, 1)
+    batch["advantage"] = batch["value_target"] = number
+    recipe = replace(RECIPE, steps_per_batch=400)
+    parts = list(minibatches(batch, recipe))
+    assert [part.shape for part in parts] == [(4, 8)] * 12 + [(2, 8)] + [(4, 8)] * 12 + [(2, 8)]
+    for epoch in (parts[:13], parts[13:]):
+        steps = torch.cat([part["advantage"] for part in epoch]).squeeze(-1)  # [sequences, 8]
+        assert (steps.diff(dim=1) == 1).all()
+        assert steps.flatten().sort().values.tolist() == list(range(400))
+    assert not torch.equal(parts[0]["advantage"], parts[13]["advantage"])
+    # Before the first gradient step the features are those that acted.
+    for part in parts:
+        rows = part["advantage"].flatten()
+        features = agent.encode(part)["features"].flatten(0, 1)
+        torch.testing.assert_close(features, batch["features"].flatten(0, 1)[rows])
+
+
+def final(run) -> TensorDict:
+    _, state = load_checkpoint(run.checkpoints)
+    return TensorDict({**state["agent"], "rng": state["rng"]["torch"]})
+
+
+def test_resumed_is_bit_for_bit_the_same_and_evaluated_alike(tmp_path):
+    with Run.create(tmp_path / "whole", RECIPE) as run:
+        RECIPE.train(run)
+        expected, returns = final(run), RECIPE.evaluate(run)["returns"]
+    with Run.create(tmp_path / "parts", RECIPE) as run:
+        replace(RECIPE, total_steps=128).train(run)
+        RECIPE.train(run)
+        assert (final(run) == expected).all()
+        assert RECIPE.evaluate(run)["returns"] == returns
+        # One episode after the other remembers no more of them than all side by side.
+        rendered = replace(RECIPE, evaluation_seed=RECIPE.evaluation_seed)
+        film = tmp_path / "film.gif"
+        assert render(rendered, run, film, episodes=3) == returns
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"sequence_length": 5}, "sequence_length 5 does not divide minibatch_size = 32"),
+        ({"sequence_length": 32, "steps_per_batch": 80}, "steps_per_batch / num_envs = 40"),
+        ({"sequence_length": 0}, "sequence_length must be at least 1"),
+    ],
+)
+def test_sequences_that_do_not_fit_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        replace(RECIPE, **fields)
+    if fields["sequence_length"]:
+        replace(RECIPE, **fields, backbone=MLPConfig())  # which has no use for it
+
+
+def test_a_history_is_refused_before_anything_runs():
+    with pytest.raises(ValueError, match="set history to 1"):
+        replace(RECIPE, history=4).check()

@@ -1,0 +1,183 @@
+"""Whole updates of PPO, repeated by hand: loss, gradient norm, Adam and schedules in one."""
+
+import math
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from recipes.compilation import STATIC_SHAPES
+from recipes.metrics import read_metrics
+from recipes.ppo import PPO, training
+from recipes.ppo.agent import Agent
+from recipes.ppo.update import make_optimizer, make_weight_update, set_learning_rate
+from recipes.run import Run
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.networks import EnhancedTITConfig
+
+RECIPE = PPO(
+    env="CartPole-v1",
+    history=2,
+    backbone=EnhancedTITConfig(embed_dim=8, features_dim=8),
+    total_steps=128,
+    steps_per_batch=64,
+    num_envs=2,
+    minibatch_size=24,  # the last minibatch of an epoch is smaller
+    epochs=2,
+    # Large steps, so that ratios are clipped, and a small value loss, so that it hides no other.
+    learning_rate=1e-2,
+    critic_coeff=0.01,
+    entropy_coeff=0.01,
+    decay_learning_rate=True,
+    decay_clip_epsilon=True,
+    bootstrap_time_limit=False,
+)
+
+
+@pytest.fixture
+def batches(monkeypatch):
+    """For each batch: a copy of the agent before the update, and the minibatches of the update."""
+    recorded: list[tuple[Agent, list[TensorDict]]] = []
+    agents: list[Agent] = []
+    original_init, original_minibatches = Agent.__init__, training.minibatches
+
+    def init(agent, *args):
+        original_init(agent, *args)
+        agents.append(agent)
+
+    def recording(batch, recipe):
+        recorded.append((deepcopy(agents[0]), []))
+        for minibatch in original_minibatches(batch, recipe):
+            recorded[-1][1].append(minibatch.clone())
+            yield minibatch
+
+    monkeypatch.setattr(Agent, "__init__", init)
+    monkeypatch.setattr(training, "minibatches", recording)
+    return recorded
+
+
+def log_prob_and_entropy(agent, features, action):
+    """From the head's weights alone, by the formulas of the two distributions."""
+    if action.dtype == torch.int64:
+        log_probs = agent.actor[0].module(features).log_softmax(-1)
+        return (
+            log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1),
+            -(log_probs.exp() * log_probs).sum(-1),
+        )
+    linear, scale = agent.actor[0].module
+    (log_std,) = scale.parameters()
+    error = (action - linear(features)) / log_std.exp()
+    log_prob = -(error**2) / 2 - log_std - math.log(2 * math.pi) / 2
+    entropy = 0.5 + math.log(2 * math.pi) / 2 + log_std
+    return log_prob.sum(-1), entropy.sum(-1).expand(len(features))
+
+
+def loss_by_hand(agent, minibatch, recipe, clip):
+    features = agent.backbone.module(minibatch["history"])
+    log_prob, entropy = log_prob_and_entropy(agent, features, minibatch["action"])
+    advantage = minibatch["advantage"].squeeze(-1)
+    n = len(advantage)
+    mean = advantage.sum() / n
+    std = (((advantage - mean) ** 2).sum() / (n - 1)).sqrt()
+    advantage = (advantage - mean) / (std + 1e-8)
+    ratio = (log_prob - minibatch["action_log_prob"]).exp()
+    surrogate = torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
+    error = agent.critic.module(features) - minibatch["value_target"]
+    return (
+        -surrogate.mean()
+        + recipe.critic_coeff * (error**2).mean()
+        - recipe.entropy_coeff * entropy.mean()
+    )
+
+
+def updates_by_hand(recipe, batches):
+    """Weights after all updates, with Adam (arXiv 1412.6980, algorithm 1) written out."""
+    agent = batches[0][0]
+    weights = list(agent.parameters())
+    first, second = ([torch.zeros_like(w) for w in weights] for _ in range(2))
+    t = 0
+    for number, (before, minibatches) in enumerate(batches):
+        for weight, recorded in zip(weights, before.parameters(), strict=True):
+            torch.testing.assert_close(weight, recorded, atol=5e-5, rtol=0)
+        remaining = 1 - number / len(batches)
+        for minibatch in minibatches:
+            loss = loss_by_hand(agent, minibatch, recipe, 0.2 * remaining)
+            gradients = torch.autograd.grad(loss, weights)
+            norm = torch.cat([g.flatten() for g in gradients]).norm()
+            t += 1
+            with torch.no_grad():
+                for w, g, m, v in zip(weights, gradients, first, second, strict=True):
+                    g = g * min(1, 0.5 / norm)
+                    m.mul_(0.9).add_(0.1 * g)
+                    v.mul_(0.999).add_(0.001 * g**2)
+                    step = (m / (1 - 0.9**t)) / ((v / (1 - 0.999**t)).sqrt() + 1e-5)
+                    w -= recipe.learning_rate * remaining * step
+    return agent
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
+def test_two_updates_equal_those_by_hand(env, batches, tmp_path):
+    recipe = PPO(**(vars(RECIPE) | {"env": env}))
+    with Run.create(tmp_path / "run", recipe) as run:
+        recipe.train(run)
+    _, state = load_checkpoint(run.checkpoints)
+    sizes = [[len(minibatch) for minibatch in minibatches] for _, minibatches in batches]
+    assert sizes == [[24, 24, 16] * 2] * 2
+    start = deepcopy(batches[0][0].state_dict())
+    expected = updates_by_hand(recipe, batches).state_dict()
+    assert expected.keys() == state["agent"].keys()
+    for name, weight in state["agent"].items():
+        torch.testing.assert_close(weight, expected[name], atol=5e-5, rtol=0, msg=name)
+    moved = max((expected[name] - start[name]).abs().max() for name in start)
+    assert moved > 1e-2  # a tolerance of 5e-5 is a small part of it
+
+
+def test_rewards_are_scaled_for_training_and_returns_are_not(batches, tmp_path):
+    """With gamma 0 the value's target is the reward: 1 at each step of CartPole."""
+    recipe = replace(RECIPE, gamma=0.0, reward_scale=0.25)
+    with Run.create(tmp_path / "run", recipe) as run:
+        recipe.train(run)
+        rows = read_metrics(run.folder / "metrics.csv")
+    for _, minibatches in batches:
+        for minibatch in minibatches:
+            target = minibatch["value_target"]
+            torch.testing.assert_close(target, torch.full_like(target, 0.25))
+    assert rows[-1]["return_mean"] > 5
+
+
+def test_a_compiled_optimizer_takes_the_same_steps():
+    """The gradient's norm, Adam, and learning rates that change without compiling anew."""
+    env = RECIPE.make_env(2, 0)
+    results = []
+    for options in (None, STATIC_SHAPES):
+        torch.manual_seed(0)
+        agent = Agent(RECIPE, env)
+        optimizer = make_optimizer(agent, RECIPE, compiled=options is not None)
+        update_weights = make_weight_update(optimizer, 0.5, options)
+        norms = []
+        for rate in (1e-2, 5e-3, 1e-3):
+            set_learning_rate(optimizer, rate)
+            for parameter in agent.parameters():
+                parameter.grad = torch.randn_like(parameter)
+            norms.append(update_weights())
+        results.append((norms, [p.detach().clone() for p in agent.parameters()]))
+    torch.testing.assert_close(results[0], results[1], rtol=1e-5, atol=1e-6)
+
+
+def test_metrics_tell_how_far_features_are_spread(tmp_path, monkeypatch):
+    batches = []
+    original = training.add_advantages
+
+    def recording(batch, *args):
+        original(batch, *args)
+        batches.append(batch.clone())
+
+    monkeypatch.setattr(training, "add_advantages", recording)
+    with Run.create(tmp_path / "run", RECIPE) as run:
+        RECIPE.train(run)
+        rows = read_metrics(run.folder / "metrics.csv")
+    for row, batch in zip(rows, batches, strict=True):
+        deviations = batch["features"].reshape(-1, 8).std(0)
+        assert row["feature_spread"] == pytest.approx(deviations.mean().item(), rel=1e-5)

@@ -1,0 +1,122 @@
+"""Films of trained agents."""
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from recipes.cli import main
+from recipes.networks import EnhancedTITConfig, MLPConfig
+from recipes.ppo import PPO
+from recipes.run import Run
+from tests.recipes.cql.cql_runs import make_cartpole_data, make_discrete_cql
+from tests.recipes.offline.sequence_runs import SMALL as SMALL_DT
+from tests.recipes.offline.sequence_runs import make_dt, train
+from torchrl_tit.evaluation import evaluate
+from torchrl_tit.networks import DecisionTransformerConfig
+
+SMALL = {"total_steps": 64, "steps_per_batch": 64, "minibatch_size": 32, "epochs": 1}
+
+
+def trained(folder, **fields):
+    recipe = PPO(**{**SMALL, **fields})
+    with Run.create(folder, recipe) as run:
+        recipe.train(run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def cartpole(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("run"), env="CartPole-v1", backbone=MLPConfig())
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".mp4"])
+def test_one_picture_a_step(cartpole, tmp_path, capsys, suffix):
+    pytest.importorskip("pygame")
+    if suffix == ".mp4":
+        pytest.importorskip("imageio_ffmpeg")
+    film = tmp_path / f"film{suffix}"
+    main(["render", str(cartpole.folder), "--out", str(film), "--episodes", "2", "--seed", "5"])
+    _, agent = cartpole.recipe.load_agent(cartpole)
+    returns = evaluate(lambda n: cartpole.recipe.make_env(n, 0), agent.policy, 2, seed=5)
+    assert capsys.readouterr().out.splitlines()[0] == f"returns {returns[0]:g}, {returns[1]:g}"
+    pictures = imageio.imread(film)
+    assert pictures.shape[1:] == (400, 600, 3)
+    if suffix == ".gif":  # where two pictures are the same, one is shown for longer
+        shown = [imageio.immeta(film, index=i)["duration"] for i in range(len(pictures))]
+        assert sum(shown) == 20 * returns.sum()  # milliseconds, at 50 a second
+    else:
+        assert len(pictures) == returns.sum()
+    assert (pictures[0] != pictures[-1]).any()
+    assert [path.name for path in tmp_path.iterdir()] == [film.name]
+
+
+def make_cartpole_dt(folder):
+    return make_dt(
+        folder,
+        dataset=str(make_cartpole_data(folder)),
+        env="CartPole-v1",
+        target_returns=(20.0,),
+        backbone=DecisionTransformerConfig(**SMALL_DT, action_space="discrete"),
+    )
+
+
+@pytest.mark.parametrize("make", [make_discrete_cql, make_cartpole_dt])
+def test_runs_on_data(make, tmp_path, capsys):
+    pytest.importorskip("pygame")
+    recipe = make(tmp_path)
+    run = train(recipe, tmp_path / "run")
+    film = tmp_path / "film.gif"
+    main(["render", str(run.folder), "--out", str(film)])
+    (played, *_) = recipe.evaluate(run)["returns"]  # the first episode of the evaluation
+    assert capsys.readouterr().out.splitlines()[0] == f"returns {played:g}"
+    pictures = range(len(imageio.imread(film)))
+    shown = [imageio.immeta(film, index=i)["duration"] for i in pictures]
+    assert sum(shown) == 20 * played
+
+
+def test_atari(tmp_path, capsys):
+    pytest.importorskip("ale_py")
+    backbone = EnhancedTITConfig(patch_size=42, embed_dim=8, num_blocks=1, features_dim=8)
+    run = trained(tmp_path / "run", env="ALE/Breakout-v5", history=2, num_envs=2, backbone=backbone)
+    # Films only the start, as a game can be long where an agent does nothing.
+    recipe = run.recipe
+    env = recipe.make_env(1, 0, render_mode="rgb_array", max_num_frames_per_episode=400)
+    _, agent = recipe.load_agent(run)
+    screens = []
+
+    def filmed(root):
+        screens.append(env.base_env.render()[0])
+        return agent.policy(root)
+
+    evaluate(env, filmed, 1)
+    assert env.base_env.render_fps == 15
+    assert np.stack(screens).shape[1:] == (210, 160, 3)
+    assert (screens[0] != screens[-1]).any()
+    env.close()
+
+
+def test_bad_input(cartpole, tmp_path, capsys):
+    def error(*words):
+        with pytest.raises(SystemExit):
+            main(["render", *map(str, words)])
+        return capsys.readouterr().err
+
+    folder, film = cartpole.folder, tmp_path / "film.gif"
+    assert "a film is one of .gif, .mp4, not 'film.avi'" in error(
+        folder, "--out", tmp_path / "film.avi"
+    )
+    assert "is no run folder" in error(tmp_path, "--out", film)
+    assert "episodes must be at least 1" in error(folder, "--out", film, "--episodes", 0)
+    assert not any(tmp_path.iterdir())
+    film.write_bytes(b"mine")
+    assert "exists already" in error(folder, "--out", film)
+    assert film.read_bytes() == b"mine"
+    empty = Run.create(tmp_path / "run", cartpole.recipe)
+    assert "holds no checkpoint" in error(empty.folder, "--out", tmp_path / "other.gif")
+
+
+def test_tasks_without_pictures(cartpole):
+    env = cartpole.recipe.make_env(1, 0)
+    env.reset()
+    with pytest.raises(ValueError, match="have no pictures; make them with render_mode"):
+        env.render()

@@ -1,0 +1,157 @@
+"""From run folders to the paper's tables."""
+
+import csv
+import io
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from recipes.cli import main
+from recipes.recipe import recipe_to_json
+from recipes.registry import RECIPES, get_recipe
+from recipes.results.table import make_table, paper_results, to_csv, to_markdown
+
+
+def write_run(folder, name, seed, returns, **fields):
+    recipe = replace(get_recipe(name), seed=seed, **fields)
+    folder.mkdir(parents=True)
+    (folder / "recipe.json").write_text(recipe_to_json(recipe))
+    if returns is not None:
+        evaluation = {
+            "mean": float(np.mean(returns)),
+            "std": float(np.std(returns)),
+            "returns": returns,
+            "steps": recipe.final_step,
+        }
+        (folder / "evaluation.json").write_text(json.dumps(evaluation))
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path):
+    name = "ppo/acrobot/enhanced-tit"
+    for seed, mean in enumerate([-80, -90, -500, -85, -81]):
+        write_run(tmp_path / name / str(seed), name, seed, [mean - 10.0, mean + 10.0])
+    tuned = "ppo/cartpole/vanilla-tit-tuned"
+    write_run(tmp_path / tuned / "0", tuned, 0, [500.0, 400.0])
+    write_run(tmp_path / tuned / "1", tuned, 1, None)
+    hidden = "ppo/cartpole-no-velocity/mlp"
+    write_run(tmp_path / hidden / "0", hidden, 0, [40.0])
+    return tmp_path
+
+
+def test_numbers(runs):
+    cells, notes = make_table([runs])
+    acrobot, cartpole, hidden = cells
+    assert (acrobot.recipe, acrobot.runs) == ("ppo/acrobot/enhanced-tit", 5)
+    assert acrobot.mean == pytest.approx(-836 / 5)
+    assert acrobot.std == pytest.approx(np.std([-80, -90, -500, -85, -81]))
+    assert acrobot.std_episodes == pytest.approx(10)
+    assert acrobot.iqm == pytest.approx((-81 - 85 - 90) / 3)  # a quarter is cut at both ends
+    assert acrobot.low < acrobot.iqm < acrobot.high
+    assert (acrobot.paper_mean, acrobot.paper_std) == (-81, 17)
+    # The tuned recipe stands beside the paper's value of the plain one.
+    assert (cartpole.paper_mean, cartpole.table) == (500, "online, arrays")
+    assert np.isnan([cartpole.low, cartpole.high, hidden.paper_mean]).all()
+    assert hidden.table == "not in the paper"
+    (note,) = notes
+    assert "vanilla-tit-tuned/1 is left out: it has no evaluation yet" in note
+
+
+def test_scores_count_where_there_are_some(tmp_path):
+    name = "ppo/acrobot/mlp"
+    for seed, best in enumerate([50.0, 60.0]):
+        folder = write_run(tmp_path / str(seed), name, seed, [1.0, 3.0])
+        evaluation = json.loads((folder / "evaluation.json").read_text())
+        evaluation |= {"score": {"best": best, "last": 1.0}, "score_std": 4.0}
+        (folder / "evaluation.json").write_text(json.dumps(evaluation))
+    ((cell,), _) = make_table([tmp_path])
+    assert (cell.mean, cell.std, cell.std_episodes) == (55, 5, 4)
+
+
+def test_offline_results_stand_beside_the_papers(tmp_path):
+    """Best normalised scores, in the paper's order, each network beside its own number."""
+    numbers = {"mlp": (58.8, 12.7), "enhanced-tit": (99.2, 1.7)}
+    for network in numbers:
+        for seed, best in enumerate([70.0, 80.0, 90.0]):
+            name = f"cql/hopper-medium-replay-v0/{network}"
+            folder = write_run(tmp_path / network / str(seed), name, seed, [1000.0, 1200.0])
+            evaluation = json.loads((folder / "evaluation.json").read_text())
+            evaluation |= {"score": {"best": best, "last": 30.0}, "score_std": 3.0}
+            (folder / "evaluation.json").write_text(json.dumps(evaluation))
+    cells, notes = make_table([tmp_path])
+    assert not notes
+    for cell, (network, paper) in zip(cells, numbers.items(), strict=True):
+        assert (cell.table, cell.recipe.rsplit("/")[-1], cell.runs) == ("offline", network, 3)
+        assert (cell.mean, cell.std) == pytest.approx((80, np.std([70, 80, 90])))
+        assert (cell.steps, cell.std_episodes) == (500_000, 3)
+        assert (cell.paper_mean, cell.paper_std) == paper
+    text = to_markdown(cells)
+    assert "### Offline" in text
+    assert "| cql/hopper-medium-replay-v0/enhanced-tit | 3 | 80.0 ± 8.2 | 3.0 |" in text
+    assert text.count("| 99.2 ± 1.7 |") == 1
+
+
+def test_other_data_do_not_stand_beside_the_papers_numbers(tmp_path):
+    name = "dt/hopper-medium-replay-v2/dt"
+    known = {"hopper-medium-replay-v2": True, "data/hopper_medium_replay-v2.hdf5": True}
+    for number, (dataset, expected) in enumerate({**known, "mine.hdf5": False}.items()):
+        folder = tmp_path / str(number)
+        write_run(folder, name, 0, [1000.0, 1200.0], dataset=dataset)
+        ((cell,), _) = make_table([folder])
+        assert (cell.table == "offline") == expected
+        assert (cell.paper_mean == 71.0) == expected
+    write_run(tmp_path / "other", "dt/walker2d-medium-replay-v2/dt", 0, [1.0])
+    cells, _ = make_table([tmp_path / "2", tmp_path / "other"])
+    assert [cell.table for cell in cells] == ["offline", "not in the paper"]
+
+
+def test_every_value_of_the_paper_belongs_to_a_recipe():
+    assert set(paper_results()) <= set(RECIPES)
+    online = {name for name, result in paper_results().items() if name.startswith("ppo/")}
+    assert len(online) == 30 + 29 + 12  # arrays, images, ablation
+    assert len(paper_results()) - len(online) == 12 + 12  # CQL, Decision Transformer
+
+
+def test_command(runs, tmp_path, capsys):
+    out = tmp_path / "tables"
+    main(["table", str(runs / "ppo"), "--out", str(out)])
+    printed = capsys.readouterr()
+    assert "| ppo/acrobot/enhanced-tit | 5 | -167 ± 166 | 10.0 |" in printed.out
+    assert "note: " in printed.err
+    assert (out / "table.md").read_text() in printed.out
+    rows = list(csv.DictReader(io.StringIO((out / "table.csv").read_text())))
+    assert rows[1]["low"] == ""
+    assert float(rows[0]["paper_mean"]) == -81
+    assert (out / "table.png").read_bytes().startswith(b"\x89PNG")
+    main(["table", str(runs / "ppo"), "--format", "csv"])
+    assert capsys.readouterr().out == (out / "table.csv").read_text()
+
+
+def test_markdown_and_csv_hold_the_same_recipes(runs):
+    cells, _ = make_table([runs])
+    for cell in cells:
+        assert cell.recipe in to_markdown(cells)
+        assert cell.recipe in to_csv(cells)
+
+
+def test_other_settings_under_one_name(runs):
+    write_run(runs / "more", "ppo/acrobot/enhanced-tit", 7, [1.0], num_envs=2)
+    with pytest.raises(ValueError, match=r"both called ppo/acrobot/enhanced-tit.*num_envs"):
+        make_table([runs])
+
+
+def test_the_same_seed_twice(runs):
+    write_run(runs / "more", "ppo/acrobot/enhanced-tit", 4, [1.0])
+    with pytest.raises(ValueError, match="with seed 4; name one of them only"):
+        make_table([runs])
+
+
+def test_folders_without_runs(tmp_path, runs):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"empty holds no run folder"):
+        make_table([tmp_path / "empty"])
+    with pytest.raises(ValueError, match=r"no evaluated run in .*has no evaluation yet"):
+        make_table([runs / "ppo/cartpole/vanilla-tit-tuned/1"])

@@ -1,0 +1,29 @@
+"""Small runs of sweeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from recipes.ppo import PPO
+from recipes.recipe import Recipe
+from recipes.run import Run
+from recipes.sweeps.sweep import Job
+from torchrl_tit.networks import MLPConfig
+
+TINY = PPO(
+    name="ppo/cartpole/mlp",
+    env="CartPole-v1",
+    backbone=MLPConfig(hidden_dim=8),
+    total_steps=128,
+    steps_per_batch=64,
+    minibatch_size=32,
+    epochs=1,
+    checkpoint_interval=64,
+    evaluation_episodes=2,
+)
+
+
+def begin(folder: Path, recipe: Recipe) -> Job:
+    """Begins a run as a worker would, so that workers resume it with these small settings."""
+    Run.create(folder, recipe)
+    return Job(recipe, folder)

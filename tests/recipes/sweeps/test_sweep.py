@@ -1,0 +1,113 @@
+"""Sweeps: complete runs stay, killed ones go on, other settings are refused."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from recipes.cli import main
+from recipes.registry import RECIPES
+from recipes.run import Run
+from recipes.sweeps import sweep
+from tests.recipes.sweeps.sweep_runs import TINY, begin
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_patterns_and_seeds_make_the_runs(tmp_path):
+    jobs = sweep.make_jobs(["ppo/*/mlp", "ppo/cartpole/mlp"], [3, 3, 4], tmp_path)
+    fitting = [name for name in RECIPES if name.startswith("ppo/") and name.endswith("/mlp")]
+    assert len(jobs) == 2 * len(fitting)
+    assert {job.recipe.seed for job in jobs} == {3, 4}
+    assert all(job.folder == tmp_path / job.recipe.name / f"seed-{job.recipe.seed}" for job in jobs)
+
+
+@pytest.mark.slow
+def test_sweep_resumes_runs_and_leaves_complete_ones(tmp_path, capsys):
+    jobs = [
+        sweep.Job(replace(TINY, seed=seed), tmp_path / TINY.name / f"seed-{seed}")
+        for seed in range(3)
+    ]
+    for job in jobs:
+        begin(job.folder, job.recipe)
+    with Run.open(jobs[0].folder) as run:  # complete already
+        run.recipe.train(run)
+        run.save_evaluation(run.recipe.evaluate(run))
+        run.plot()
+    before = (jobs[0].folder / "evaluation.json").stat().st_mtime_ns
+    assert [job.is_complete() for job in jobs] == [True, False, False]
+    assert sweep.run_jobs(jobs, workers=2) == []
+    assert all(job.is_complete() for job in jobs)
+    assert (jobs[0].folder / "evaluation.json").stat().st_mtime_ns == before
+    assert not jobs[0].log.exists()
+
+
+@pytest.mark.slow
+def test_failures_are_named(tmp_path):
+    job = sweep.Job(TINY, tmp_path / "seed-0")
+    begin(job.folder, TINY)
+    (job.folder / "checkpoints" / "000000000064").mkdir(parents=True)  # no checkpoint of ours
+    assert sweep.run_jobs([job], workers=1) == [job]
+    assert "error: " in job.log.read_text()
+
+
+def test_a_run_in_use_is_waited_for(tmp_path):
+    free, used = (sweep.Job(replace(TINY, seed=seed), tmp_path / f"{seed}") for seed in range(2))
+    for job in (free, used):
+        begin(job.folder, job.recipe)
+    lock = Run.open(used.folder)
+    lock.__enter__()
+    begun = []
+
+    def start(job):
+        begun.append((job, job.is_in_use()))
+        lock.__exit__()  # the other process ends once the free run has begun
+        return subprocess.Popen([sys.executable, "-c", ""])
+
+    assert sweep.run_jobs([used, free], workers=2, start=start) == []
+    assert begun == [(free, False), (used, False)]
+
+
+def test_other_settings_under_the_same_name_are_refused(tmp_path, capsys):
+    job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], tmp_path)[0]
+    begin(job.folder, TINY)
+    with pytest.raises(SystemExit) as exit_:
+        main(["sweep", "ppo/acrobot/mlp", "ppo/cartpole/mlp", "--out", str(tmp_path)])
+    assert exit_.value.code == 2
+    assert "with other settings" in capsys.readouterr().err
+    assert not (tmp_path / "ppo/acrobot").exists()
+
+
+def test_unknown_names_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"called 'ppo/cartpole/mpl'.*ppo/cartpole/mlp"):
+        sweep.make_jobs(["ppo/cartpole/mpl"], [0], tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_stops_every_worker(tmp_path, number):
+    out = tmp_path / "sweep"
+    job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], out)[0]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "recipes", "sweep", "ppo/cartpole/mlp", "--out", str(out)],
+        cwd=ROOT,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    metrics = job.folder / "metrics.csv"
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=90)
+    assert process.returncode == 130
+    assert "the same command goes on" in errors
+    assert list((job.folder / "checkpoints").iterdir())
+    with Run.open(job.folder):  # nobody is at work there any more
+        pass

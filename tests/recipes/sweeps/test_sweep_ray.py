@@ -1,0 +1,186 @@
+"""Sweeps on a Ray cluster: two machines, which are both this one."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from threading import Thread
+
+import pytest
+
+from recipes.cli import main
+from recipes.metrics import read_metrics
+from recipes.sweeps import sweep_ray
+from recipes.sweeps.sweep import Job, run_jobs
+from recipes.sweeps.sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
+from tests.recipes.sweeps.sweep_runs import TINY, begin
+from torchrl_tit.checkpoint import checkpoint_steps
+
+ROOT = Path(__file__).parents[3]
+LONG = replace(TINY, total_steps=1_000_000, compile="off")
+
+# What `sweep --ray ADDRESS` does, with runs that are there already.
+DRIVER = """
+import sys
+from pathlib import Path
+from recipes.run import Run
+from recipes.sweeps.sweep import Job, run_jobs
+from recipes.sweeps.sweep_ray import RayWorker, connect
+
+connect(sys.argv[1])
+run_jobs([Job(Run.open(Path(f)).recipe, Path(f)) for f in sys.argv[2:]], 9, RayWorker)
+"""
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """The address of a cluster of two machines with a CPU each; this process is connected to it."""
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    folder = tempfile.mkdtemp(prefix="ray-")  # pytest's is too long a name for sockets
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_TMPDIR", folder)
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_worker_niceness", "0")  # not 15: other tests run beside these
+        machines = Cluster(
+            initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
+        )
+        machines.add_node(num_cpus=1)
+        ray.init(machines.address, log_to_driver=False)
+        yield machines.address
+        ray.shutdown()
+        machines.shutdown()
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def meanwhile(act: Callable[[], None]) -> None:
+    """Does something beside the sweep, which is not left alone if that fails."""
+
+    def guarded() -> None:
+        try:
+            act()
+        except BaseException:
+            os.kill(os.getpid(), signal.SIGINT)
+            raise
+
+    Thread(target=guarded, daemon=True).start()
+
+
+def wait_until_trained(job: Job) -> None:
+    metrics = job.folder / "metrics.csv"
+    before = len(metrics.read_text().splitlines()) if metrics.exists() else 1
+    while not (metrics.exists() and len(metrics.read_text().splitlines()) > before):
+        time.sleep(0.05)
+
+
+def actor_of(job: Job) -> int:
+    """The process that started the run's."""
+    table = subprocess.run(["ps", "-ewwo", "ppid,args"], capture_output=True, text=True).stdout
+    [line] = [line for line in table.splitlines() if line.endswith(f"--resume {job.folder}")]
+    return int(line.split()[0])
+
+
+@pytest.mark.slow
+def test_a_sweep_goes_on_after_its_driver_was_killed_and_stops_at_ctrl_c(
+    cluster: str, tmp_path: Path
+) -> None:
+    short = begin(tmp_path / "seed-0", TINY)
+    long = begin(tmp_path / "seed-1", LONG)
+    command = [sys.executable, "-c", DRIVER, cluster, str(short.folder), str(long.folder)]
+    driver = subprocess.Popen(command, cwd=ROOT)
+    while not (short.is_complete() and checkpoint_steps(long.folder / "checkpoints")):
+        assert driver.poll() is None, long.log.read_text()
+        time.sleep(0.05)
+    driver.kill()
+    driver.wait()
+    queued = begin(tmp_path / "seed-2", replace(LONG, threads=2))  # more than a machine has
+    finished = (short.folder / "evaluation.json").stat().st_mtime_ns
+
+    def press_ctrl_c() -> None:
+        wait_until_trained(long)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    meanwhile(press_ctrl_c)
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs([short, queued, long], 9, RayWorker, count_begun)
+    assert (short.folder / "evaluation.json").stat().st_mtime_ns == finished
+    assert not long.is_in_use()
+    steps = [row["step"] for row in read_metrics(long.folder / "metrics.csv")]
+    assert steps == [64 * (i + 1) for i in range(len(steps))]  # none lost, none twice
+    assert checkpoint_steps(long.folder / "checkpoints")[-1] == steps[-1]
+    assert "stopped; go on: " in long.log.read_text()
+    assert queued.log.read_text() == ""
+
+
+@pytest.mark.slow
+def test_runs_that_fail_or_whose_worker_dies_are_named(cluster: str, tmp_path: Path) -> None:
+    killed = begin(tmp_path / "seed-0", LONG)
+    damaged = begin(tmp_path / "seed-1", TINY)
+    (damaged.folder / "checkpoints" / "000000000064").mkdir(parents=True)  # no checkpoint of ours
+
+    def kill() -> None:
+        wait_until_trained(killed)
+        os.kill(actor_of(killed), signal.SIGKILL)
+
+    meanwhile(kill)
+    failed = run_jobs([killed, damaged], 9, RayWorker, count_begun)
+    assert set(failed) == {killed, damaged}
+    assert "error: " in damaged.log.read_text()
+    assert "error: the worker died" in killed.log.read_text()
+    while killed.is_in_use():  # the run's own process saves a checkpoint and stops
+        time.sleep(0.05)
+    last = list(read_metrics(killed.folder / "metrics.csv"))[-1]["step"]
+    assert checkpoint_steps(killed.folder / "checkpoints")[-1] == last
+
+
+def test_runs_that_fit_no_machine_are_named(tmp_path, monkeypatch):
+    ray = pytest.importorskip("ray")
+    machines = [{"CPU": 1.0}, {"CPU": 4.0, "GPU": 1.0}, {"CPU": 2.0}]
+    nodes = [{"Alive": i != 1, "Resources": has} for i, has in enumerate(machines)]
+    monkeypatch.setattr(ray, "nodes", lambda: nodes)
+    monkeypatch.setattr(ray, "cluster_resources", lambda: {"CPU": 3.0})
+    jobs = [
+        Job(replace(TINY, threads=2), tmp_path / "a"),
+        Job(replace(TINY, threads=3), tmp_path / "b"),
+        Job(replace(TINY, device="cuda"), tmp_path / "c"),
+        Job(replace(TINY, device="auto"), tmp_path / "d"),  # the processor, where there is no GPU
+    ]
+    cpus, gpus = find_unmet_needs(jobs)
+    assert "b waits until a machine with 3 CPUs and 0 GPUs" in cpus
+    assert "c waits until a machine with 1 CPUs and 1 GPUs" in gpus
+
+
+def test_without_ray_the_message_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(SystemExit) as exit_:
+        main(["sweep", "ppo/cartpole/mlp", "--out", str(tmp_path / "out"), "--ray", "auto"])
+    assert exit_.value.code == 2
+    assert "pip install 'torchrl-tit[ray]'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("address", "reason"),
+    [
+        ("127.0.0.1:1", "no Ray cluster answered at '127.0.0.1:1'"),
+        ("nowhere", "no connection to Ray at 'nowhere': ValueError: .*nowhere"),
+    ],
+)
+def test_addresses_without_a_cluster_are_refused(monkeypatch, address, reason):
+    pytest.importorskip("ray")
+    monkeypatch.setattr(sweep_ray, "_PATIENCE", 30.0 if address == "nowhere" else 2.0)
+    with pytest.raises(ValueError, match=reason):
+        connect(address)
+
+
+def test_a_machine_that_does_not_see_the_folder_says_so(tmp_path):
+    actor = sweep_ray._actor_class()
+    with pytest.raises(FileNotFoundError, match="must share a file system"):
+        actor("recipes.sweeps.sweep_ray", [], tmp_path, tmp_path / "missing.log")

@@ -1,0 +1,192 @@
+"""Hyperparameter search: spaces as data, pruning, and searches that were killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from recipes.cli import main
+from recipes.ppo import PPO
+from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.registry import get_recipe
+from recipes.sweeps.search_space import load_space, with_values
+from recipes.sweeps.tune import Search, Settings
+from torchrl_tit.networks import MLPConfig
+
+optuna = pytest.importorskip("optuna")
+
+RECIPE = PPO(
+    name="ppo/cartpole/mine",
+    env="CartPole-v1",
+    backbone=MLPConfig(),
+    total_steps=256,
+    steps_per_batch=64,
+    epochs=1,
+    evaluation_episodes=2,
+    checkpoint_interval=64,
+)
+SPACE = {
+    "learning_rate": {"type": "float", "low": 1e-4, "high": 1e-2, "log": True},
+    "epochs": {"type": "int", "low": 1, "high": 2},
+    "backbone.hidden_dim": {"type": "categorical", "choices": [8, 16]},
+}
+
+
+@pytest.fixture
+def files(tmp_path):
+    (tmp_path / "recipe.json").write_text(recipe_to_json(RECIPE))
+    space = {k: v for k, v in SPACE.items() if not k.startswith("backbone")}
+    (tmp_path / "space.json").write_text(json.dumps(space))
+    return tmp_path
+
+
+def words(files, trials):
+    paths = [str(files / "recipe.json"), "--space", str(files / "space.json")]
+    return ["tune", *paths, "--trials", str(trials), "--out", str(files / "out")]
+
+
+@pytest.mark.slow
+def test_a_search_that_was_killed_goes_on(files, capsys):
+    out = files / "out"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "recipes", *words(files, 2)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 120
+    while not (out / "trial-0" / "seed-0" / "recipe.json").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    # Its worker has a session of its own, and holds the folder until it is done.
+    while not (out / "trial-0" / "seed-0" / "learning_curve.png").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    drawn = (out / "trial-0.json").read_text()
+
+    main(words(files, 2))
+    assert (out / "trial-0.json").read_text() == drawn
+    assert sorted(path.name for path in out.glob("trial-*/")) == ["trial-0", "trial-1"]
+    best = recipe_from_json((out / "best.json").read_bytes(), "best.json")
+    means = [
+        json.loads((out / f"trial-{n}/seed-0/evaluation.json").read_text())["mean"] for n in (0, 1)
+    ]
+    winner = recipe_from_json((out / f"trial-{means.index(max(means))}.json").read_bytes(), "")
+    assert best == winner
+    assert isinstance(best, PPO)
+    assert 1e-4 <= best.learning_rate <= 1e-2
+    assert f"best of 2 trials: {max(means):.1f} with learning_rate" in capsys.readouterr().out
+
+    main(words(files, 2))  # complete: nothing is run again
+    assert len(list(out.glob("trial-*/"))) == 2
+    with pytest.raises(SystemExit):
+        main([*words(files, 2), "--seeds", "1"])
+    assert "holds a search with other settings" in capsys.readouterr().err
+
+
+def test_a_trial_below_the_median_is_pruned(tmp_path, monkeypatch):
+    """Earlier trials are told; the new one's metrics are written by hand."""
+    space = load_space(None, RECIPE)
+    search = Search(tmp_path, Settings(RECIPE, space, startup_trials=2, warmup=0.25))
+    for _ in range(2):
+        trial = search.study.ask()
+        for field, values in space.items():
+            values.suggest(trial, field)
+        for step in (64, 128, 192):
+            trial.report(100.0, step)
+        search.study.tell(trial, 100.0)
+        (tmp_path / f"trial-{trial.number}.json").write_text(recipe_to_json(RECIPE))
+
+    stopped = []
+
+    class Process:
+        returncode = None
+
+        def poll(self):
+            return None
+
+        def send_signal(self, number):
+            stopped.append(number)
+
+        def wait(self):
+            pass
+
+    def start(job):
+        job.folder.mkdir(parents=True)
+        rows = "step,time,return_mean\n64,0,10\n"
+        (job.folder / "metrics.csv").write_text(rows)
+        monkeypatch.setattr(time, "sleep", lambda _: write_more(job.folder / "metrics.csv"))
+        return Process()
+
+    def write_more(path: Path):
+        path.write_text("step,time,return_mean\n64,0,10\n128,0,12\n")
+
+    monkeypatch.setattr("recipes.sweeps.tune.start", start)
+    search.run(3, workers=1)
+    assert stopped == [signal.SIGINT]
+    last = search.study.trials[-1]
+    assert last.state == optuna.trial.TrialState.PRUNED
+    assert last.intermediate_values == {128: (10 + 12) / 2}
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ({"learning_rat": {"type": "float", "low": 0, "high": 1}}, "unknown field 'learning_rat'"),
+        (
+            {"backbone.depth": {"type": "int", "low": 0, "high": 1}},
+            "unknown field 'backbone.depth'",
+        ),
+        ({"epochs": {"type": "int", "low": 0, "high": 3}}, "epochs must be at least 1, not 0"),
+        ({"epochs": {"type": "float", "low": 1, "high": 3.5}}, "field 'epochs' is 1.0"),
+        ({"epochs": {"type": "int", "low": 3, "high": 1}}, "low must be below high, not 3 and 1"),
+        ({"gamma": {"type": "float", "low": 0, "high": 1, "log": True}}, "low must be above 0"),
+        ({"gamma": {"type": "categorical", "choices": []}}, "is not a search space"),
+        ({"gamma": {"type": "uniform", "low": 0}}, "is not a search space"),
+        ({"gamma": [1, 2]}, "is not a search space"),
+        ({}, "names no field"),
+    ],
+)
+def test_bad_spaces_are_refused_before_anything_runs(space, message, files, capsys):
+    (files / "space.json").write_text(json.dumps(space))
+    with pytest.raises(SystemExit) as stop:
+        main(words(files, 2))
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not (files / "out").exists()
+
+
+def test_values_that_do_not_go_together_fail_the_trial_only(tmp_path):
+    recipe = get_recipe("ppo/cartpole/enhanced-tit")
+    (tmp_path / "space.json").write_text(
+        json.dumps({"backbone.num_heads_outer": {"type": "categorical", "choices": [1, 3]}})
+    )
+    space = load_space(tmp_path / "space.json", recipe)
+    search = Search(tmp_path / "out", Settings(recipe, space))
+    search.study.enqueue_trial({"backbone.num_heads_outer": 3})  # does not divide the width
+    assert search.run(1, workers=1) == [0]
+    assert "32" in search.study.trials[0].user_attrs["error"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["ppo/acrobot/enhanced-tit", "ppo/pong/vanilla-tit", "ppo/hopper/mlp", "ppo/pong/nature-cnn"],
+)
+def test_every_default_space_fits_its_recipes(name):
+    recipe = get_recipe(name)
+    space = load_space(None, recipe)
+    values = {field: values.examples()[-1] for field, values in space.items()}
+    assert with_values(recipe, values, Path("here")) != recipe
+
+
+def test_other_algorithms_need_a_space():
+    with pytest.raises(ValueError, match="no search space comes with the algorithm dt"):
+        load_space(None, get_recipe("dt/hopper-medium-v2/dt"))
