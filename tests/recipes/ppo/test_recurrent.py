@@ -11,7 +11,7 @@ from torchrl.objectives.value import GAE
 from recipes.ppo import PPO
 from recipes.ppo.agent import Agent
 from recipes.ppo.update import add_advantages, minibatches
-from recipes.results.render import render
+from recipes.results.film import film
 from recipes.run import Run
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.modules import LSTMConfig
@@ -99,8 +99,8 @@ def test_resumed_is_bit_for_bit_the_same_and_evaluated_alike(tmp_path):
         assert RECIPE.evaluate(run)["returns"] == returns
         # One episode after the other remembers no more of them than all side by side.
         rendered = replace(RECIPE, evaluation_seed=RECIPE.evaluation_seed)
-        film = tmp_path / "film.gif"
-        assert render(rendered, run, film, episodes=3) == returns
+        video = tmp_path / "film.gif"
+        assert film(rendered, run, video, episodes=3) == returns
 
 
 @pytest.mark.parametrize(

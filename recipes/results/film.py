@@ -1,10 +1,8 @@
-"""What `render` does on the command line: film a trained agent."""
+"""Films of trained agents."""
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,39 +20,7 @@ from ..run import Run
 _SUFFIXES = (".gif", ".mp4")
 
 
-def add_render_options(parser: argparse.ArgumentParser) -> None:
-    """Adds the options of `render` to the command line.
-
-    Args:
-        parser: What reads the words after `render`; its options then go to :func:`run_render`.
-    """
-    parser.add_argument("run", type=Path, help="run folder")
-    parser.add_argument("--out", type=Path, required=True, help="new file: .gif or .mp4")
-    parser.add_argument("--episodes", type=int, default=1, help="episodes, or whole Atari games")
-    parser.add_argument(
-        "--seed", type=int, help="seed of the first episode; the evaluation's if missing"
-    )
-
-
-def run_render(options: argparse.Namespace) -> None:
-    """Films the agent of a run folder and prints the returns.
-
-    Args:
-        options: What the parser read.
-
-    Raises:
-        FileNotFoundError: If there is no run, or it has no checkpoint.
-        ValueError: If the file's kind, the episodes or the task do not allow it.
-    """
-    run = Run.open(options.run)
-    recipe = run.recipe
-    if options.seed is not None:
-        recipe = replace(recipe, evaluation_seed=options.seed)
-    returns = render(recipe, run, options.out, options.episodes)
-    print(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")
-
-
-def render(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float]:
+def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float]:
     """Films a run's newest agent while it plays as in the evaluation.
 
     Args:
@@ -83,10 +49,10 @@ def render(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[flo
             TemporaryDirectory(prefix=".", dir=video.absolute().parent) as folder,
         ):
             reel = Path(folder, video.name)
-            with _writer(reel, base.render_fps) as film:
+            with _writer(reel, base.render_fps) as pictures:
 
                 def filmed(tensordict: TensorDictBase) -> TensorDictBase:
-                    film.append_data(base.render()[0])
+                    pictures.append_data(base.render()[0])
                     return policy(tensordict)
 
                 returns = evaluate(env, filmed, episodes, seed=recipe.evaluation_seed)

@@ -1,11 +1,15 @@
-"""What `data` does on the command line: look into data sets, and convert them."""
+"""`data`: look into data sets, convert them, and make them."""
 
 from __future__ import annotations
 
 import argparse
+import shlex
+import sys
 from pathlib import Path
+from typing import Annotated
 
 import gymnasium
+import tyro
 from torch import Tensor
 
 from torchrl_tit.datasets import (
@@ -18,19 +22,47 @@ from torchrl_tit.datasets import (
 )
 from torchrl_tit.datasets.sources import HDF5_SUFFIXES
 
+from .words import Parser, parse_fields, program
 
-def add_data_commands(parser: argparse.ArgumentParser) -> None:
-    """Adds `info` and `convert` to the command line.
 
-    Args:
-        parser: What reads the words after `data`; its options then go to :func:`run_data_command`.
-    """
+def data(words: list[str]) -> None:
+    """Looks into data sets, converts them, or makes them."""
+    if words[:1] == ["collect"]:
+        return _collect(words[1:])
+    parser = Parser(f"{program()} data")
+    _add_options(parser)
+    print(_run(parser.parse_args(words)))
+
+
+def _collect(words: list[str]) -> None:
+    from ..collect import Collection, collect  # takes a second that others save
+
+    out = tyro.conf.arg(help="Folder of the data, which the same command goes on with.")
+    parsed = parse_fields(
+        [
+            ("collection", Annotated[Collection, tyro.conf.arg(name="")]),
+            ("out", Annotated[Path, out]),
+        ],
+        words,
+        "data collect",
+        Collection.__doc__,
+    )
+    command = shlex.join([*program().split(), "data", "collect", *words])
+    try:
+        lines = collect(parsed.collection, parsed.out, command)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on", file=sys.stderr)
+        raise
+    print("\n".join(lines))
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
     commands = parser.add_subparsers(
         dest="command", required=True, metavar="info | convert | collect"
     )
     info = commands.add_parser("info", help="what is in a data set")
     convert = commands.add_parser("convert", help="between HDF5 in D4RL's layout and Minari")
-    # Its options are the fields of a dataclass, which recipes/cli.py reads.
+    # Its options are the fields of a dataclass, which parse_fields reads.
     commands.add_parser("collect", add_help=False, help="make data sets of a task, as D4RL did")
     for command in (info, convert):
         command.add_argument("source", help="HDF5 file, Minari folder, D4RL's or Minari's name")
@@ -48,19 +80,7 @@ def add_data_commands(parser: argparse.ArgumentParser) -> None:
     convert.add_argument("target", help="HDF5 file, Minari folder (/PATH-v0 or ./PATH-v0) or name")
 
 
-def run_data_command(options: argparse.Namespace) -> str:
-    """Does what the command line says.
-
-    Args:
-        options: What the parser of :func:`add_data_commands` read.
-
-    Returns:
-        What to print.
-
-    Raises:
-        ValueError: If the data, a name or the task cannot be used.
-        OSError: If something cannot be read, downloaded or written.
-    """
+def _run(options: argparse.Namespace) -> str:
     reading = {
         "task": options.env,
         "max_episode_steps": options.max_episode_steps,
