@@ -36,6 +36,17 @@ def test_file_is_forced_to_disk_before_it_gets_its_name(tmp_path: Path, monkeypa
     assert calls == ["fsync", "replace", "fsync"]  # the file, its name, the folder
 
 
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    target = tmp_path / "missing" / "notes.txt"
+    with pytest.raises(FileNotFoundError, match=r"notes.txt cannot be written: .*missing$"):
+        files.write_text_atomic(target, "new")
+    with (
+        pytest.raises(FileNotFoundError, match=r"notes.txt cannot be written: .*missing$"),
+        files.whole_or_not_at_all(target),
+    ):
+        raise AssertionError("nothing is made")
+
+
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
 def test_failure_leaves_the_old_file_and_nothing_else(

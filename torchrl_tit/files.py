@@ -22,6 +22,7 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
         data: All of its new content.
 
     Raises:
+        FileNotFoundError: There is no such folder.
         OSError: The file could not be written.
 
     Example:
@@ -33,6 +34,7 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
         b'all of it'
     """
     path = Path(path)
+    _check_folder(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
@@ -55,6 +57,7 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
         text: All of its new content; line ends are written as they are.
 
     Raises:
+        FileNotFoundError: There is no such folder.
         OSError: The file could not be written.
 
     Example:
@@ -80,6 +83,7 @@ def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     Raises:
         FileExistsError: There is one already; it stays as it is.
+        FileNotFoundError: There is no such parent folder.
         OSError: It could not be written.
 
     Example:
@@ -94,6 +98,7 @@ def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
         True
     """
     path = Path(path)
+    _check_folder(path)
     hidden = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         if path.exists():
@@ -154,3 +159,9 @@ def fsync_directory(path: str | os.PathLike[str]) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _check_folder(path: Path) -> None:
+    """Names the file and its folder, where the error of the hidden file would name only that."""
+    if not path.absolute().parent.is_dir():
+        raise FileNotFoundError(f"{path} cannot be written: there is no folder {path.parent}")
