@@ -7,7 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import gymnasium
 import imageio.v2 as imageio
 from tensordict import TensorDictBase
 
@@ -35,8 +34,8 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
     Raises:
         FileExistsError: If there is such a file already.
         FileNotFoundError: If there is no checkpoint.
-        ValueError: If the file is of another kind, ``episodes`` is less than 1, or a package that
-            the pictures or the film need is missing.
+        ValueError: If the file is of another kind, ``episodes`` is less than 1, or what the
+            pictures or the film need is missing: a package, or OpenGL for a task of MuJoCo.
     """
     if video.suffix not in _SUFFIXES:
         raise ValueError(f"a film is one of {', '.join(_SUFFIXES)}, not {video.name!r}")
@@ -52,16 +51,24 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
             with _writer(reel, base.render_fps) as pictures:
 
                 def filmed(tensordict: TensorDictBase) -> TensorDictBase:
-                    pictures.append_data(base.render()[0])
+                    pictures.append_data(_picture(base, run))
                     return policy(tensordict)
 
                 returns = evaluate(env, filmed, episodes, seed=recipe.evaluation_seed)
             reel.rename(hidden)
-    except gymnasium.error.DependencyNotInstalled as error:
-        raise ValueError(f"{run.folder} cannot be rendered: {error}") from error
     finally:
         env.close()
     return returns.tolist()
+
+
+def _picture(env: Any, run: Run) -> Any:
+    try:
+        return env.render()[0]
+    except Exception as error:  # each task draws in its own way, and so do its errors differ
+        raise ValueError(
+            f"{run.folder} cannot be rendered: {error}; for MuJoCo without a screen, set the "
+            "environment variable MUJOCO_GL to egl or osmesa"
+        ) from error
 
 
 def _writer(video: Path, fps: int) -> Any:

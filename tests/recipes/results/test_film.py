@@ -115,6 +115,28 @@ def test_bad_input(cartpole, tmp_path, capsys):
     assert "holds no checkpoint" in error(empty.folder, "--out", tmp_path / "other.gif")
 
 
+def test_pictures_that_cannot_be_drawn(cartpole, tmp_path, capsys, monkeypatch):
+    class FatalError(Exception):
+        """As MuJoCo raises it where there is no screen."""
+
+    def fail(self):
+        raise FatalError("OpenGL has not been loaded")
+
+    monkeypatch.setattr("torchrl_tit.envs.GymVectorEnv.render", fail)
+    with pytest.raises(SystemExit):
+        main(["render", str(cartpole.folder), "--out", str(tmp_path / "film.gif")])
+    error = capsys.readouterr().err
+    assert "cannot be rendered: OpenGL has not been loaded; for MuJoCo without a screen" in error
+    assert "MUJOCO_GL to egl" in error
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_missing(cartpole, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["render", str(cartpole.folder), "--out", str(tmp_path / "missing" / "film.gif")])
+    assert "film.gif cannot be written: there is no folder" in capsys.readouterr().err
+
+
 def test_tasks_without_pictures(cartpole):
     env = cartpole.recipe.make_env(1, 0)
     env.reset()
