@@ -39,11 +39,13 @@ class AtariGames(VectorEnv):
         game: The game as ale-py's ROM files are called, such as "ms_pacman".
         num_envs: N, the number of games.
         noop_max: Most frames without action at the start of a game; with 0 there are none.
-        max_num_frames_per_episode: Frames after which a game is cut off, all counted.
+        max_num_frames_per_episode: Frames after which a game is cut off, where an action counts as
+            4; those without action at its start do not count.
         render_mode: ``"rgb_array"`` emulates a second time, for pictures in full size.
 
     Raises:
-        ValueError: If the game is unknown.
+        ValueError: If the game or the render mode is unknown, or a number of games or frames is
+            too small.
 
     Source: "Human-level control through deep reinforcement learning" (Mnih et al., 2015), methods.
 
@@ -79,6 +81,13 @@ class AtariGames(VectorEnv):
             raise ValueError(f"Unknown game {game!r}: ale-py has {roms.get_all_rom_ids()}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be None or 'rgb_array', but is {render_mode!r}.")
+        for name, given, least in (
+            ("num_envs", num_envs, 1),
+            ("noop_max", noop_max, 0),
+            ("max_num_frames_per_episode", max_num_frames_per_episode, 1),
+        ):
+            if given < least:
+                raise ValueError(f"{name} must be at least {least}, but is {given}.")
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._noop_max = noop_max
