@@ -182,7 +182,10 @@ def run_jobs(
                     if code is None:
                         continue
                     del running[job]
-                    if code:
+                    if code and job.is_in_use():
+                        waiting.append(job)  # another process began it a moment before
+                        continue
+                    if code and not job.is_complete():
                         failed.append(job)
                     progress.update()
         except KeyboardInterrupt:

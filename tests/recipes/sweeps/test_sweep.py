@@ -73,6 +73,29 @@ def test_a_run_in_use_is_waited_for(tmp_path):
     assert begun == [(free, False), (used, False)]
 
 
+@pytest.mark.parametrize("completes", [True, False])
+def test_a_run_that_another_sweep_began_first_is_no_failure(completes, tmp_path, monkeypatch):
+    job = begin(tmp_path / "run", TINY)
+    other = Run.open(job.folder)
+    codes = [2, 0]  # the first worker finds the run in use
+
+    def start(job):
+        if len(codes) == 2:
+            other.__enter__()
+        return subprocess.Popen([sys.executable, "-c", f"raise SystemExit({codes.pop(0)})"])
+
+    def at_work(running):
+        if len(codes) == 1 and not running:
+            other.__exit__()
+        return len(running)
+
+    if completes:  # before this sweep sees its own worker end
+        monkeypatch.setattr(sweep.Job, "is_in_use", lambda job: False)
+        monkeypatch.setattr(sweep.Job, "is_complete", lambda job: len(codes) == 1)
+    assert sweep.run_jobs([job], workers=1, start=start, at_work=at_work) == []
+    assert len(codes) == completes
+
+
 def test_other_settings_under_the_same_name_are_refused(tmp_path, capsys):
     job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], tmp_path)[0]
     begin(job.folder, TINY)
