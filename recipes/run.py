@@ -63,9 +63,11 @@ class Run:
     def check_new(folder: Path) -> None:
         """Raises FileExistsError where :meth:`create` would."""
         # recipe.json comes last: without it, what a killed process began here is no run yet.
-        begun = {"versions.json", ".lock"}
         if folder.exists() and (
-            not folder.is_dir() or any(path.name not in begun for path in folder.iterdir())
+            not folder.is_dir()
+            or any(
+                path.name != "versions.json" and path.name[0] != "." for path in folder.iterdir()
+            )
         ):
             raise FileExistsError(
                 f"{folder} exists already: continue it with `train --resume {folder}`, or name "

@@ -57,6 +57,14 @@ def trained(folder: Path, recipe: PPO = SMALL) -> Run:
     return run
 
 
+def test_what_a_kill_leaves_before_the_recipe_is_no_run(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("versions.json", ".lock", ".recipe.json.0a1b2c3d.tmp"):
+        (folder / name).touch()
+    assert Run.create(folder, SMALL).recipe == Run.open(folder).recipe == SMALL
+
+
 def edit(path: Path, **fields: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
