@@ -74,7 +74,7 @@ def tune(words: list[str]) -> None:
     settings = Settings(
         recipe,
         load_space(options.space, recipe),
-        seeds=tuple(options.seeds),
+        seeds=tuple(dict.fromkeys(options.seeds)),
         startup_trials=options.startup_trials,
     )
     search = Search(options.out, settings)

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 Number = float | int
 
+# What a search is of, not what it searches; it has seeds of its own.
+_FIXED = {"algorithm", "name", "seed", "backbone", "backbone.network"}
+
 
 class Categorical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="categorical"):
     """One of several values."""
@@ -126,15 +129,15 @@ def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Reci
         64
     """
     fields = json.loads(recipe_to_json(recipe))
+    names = [*fields, *(f"backbone.{name}" for name in fields["backbone"])]
+    known = dict.fromkeys(name for name in names if name not in _FIXED)
     for name, value in values.items():
-        prefix, _, field = name.rpartition(".")
-        part = fields if not prefix else fields.get(prefix)
-        if not isinstance(part, dict) or field not in part or field in ("algorithm", "network"):
-            known = dict.fromkeys([*fields, *(f"backbone.{key}" for key in fields["backbone"])])
+        if name not in known:
             raise ValueError(
                 f"{source} searches the unknown field {name!r}: {nearest(name, known)}"
             )
-        part[field] = value
+        prefix, _, field = name.rpartition(".")
+        (fields[prefix] if prefix else fields)[field] = value
     return recipe_from_json(json.dumps(fields), source)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import filelock
 import msgspec
 from tqdm import tqdm
 
@@ -41,6 +42,10 @@ class Settings:
     warmup: float = 0.3
     """Share of a trial's first run before which it is not pruned."""
 
+    def __post_init__(self) -> None:
+        for seed in self.seeds:
+            replace(self.recipe, seed=seed)  # raises ValueError where it cannot be one
+
 
 class Search:
     """A search in a folder, which a second process can go on with after the first was killed.
@@ -52,7 +57,8 @@ class Search:
         best.json       the recipe of the best trial, which ``train`` takes
 
     Trials are drawn by Optuna's tree-structured Parzen estimator and stopped early by its median
-    pruner, on returns of training episodes. A trial's value is the mean of its evaluations.
+    pruner, on returns of training episodes. A trial's value is the mean of its evaluations, and its
+    recipe's name that of the recipe that is searched, with ``/trial-N`` behind.
 
     Args:
         folder: the folder.
@@ -101,7 +107,17 @@ class Search:
 
         Raises:
             KeyboardInterrupt: after Ctrl-C, once all workers have saved a checkpoint.
+            RuntimeError: if another process is at work on the search.
         """
+        try:
+            with filelock.FileLock(self.folder / ".lock", timeout=0):
+                return self._run(trials, workers)
+        except filelock.Timeout as error:
+            raise RuntimeError(
+                f"{self.folder} is in use by another process: wait for it, or stop it"
+            ) from error
+
+    def _run(self, trials: int, workers: int) -> list[int]:
         import optuna
         from optuna.trial import TrialState
 
@@ -117,10 +133,11 @@ class Search:
         with raise_on_signals(), progress:
             try:
                 while progress.n < trials:
-                    while len(running) < min(workers, trials - progress.n):
+                    room = min(workers, trials - progress.n)
+                    while len(running) < room:
                         running.append(_Trial(self, self.study.ask()))
                     time.sleep(0.2)
-                    for trial in list(running):
+                    for trial in running[:room]:  # a search that was killed may have left more
                         state = trial.advance()
                         if state is not None:
                             running.remove(trial)
@@ -171,8 +188,11 @@ class _Trial:
             recipe = with_values(search.settings.recipe, values, search.folder / "space.json")
             recipe.check()
         except ValueError as error:  # values that do not go together
-            self.trial.set_user_attr("error", str(error))
+            self.folder.mkdir(exist_ok=True)
+            write_text_atomic(self.folder / "error.log", f"error: {error}\n")
             return
+        if recipe.name:  # which stands for other settings
+            recipe = replace(recipe, name=f"{recipe.name}/trial-{self.number}")
         write_text_atomic(self.file, recipe_to_json(recipe))
         self.jobs = [
             Job(replace(recipe, seed=seed), self.folder / f"seed-{seed}", source=str(self.file))
@@ -199,7 +219,8 @@ class _Trial:
                 for job in self.jobs
             ]
             return self._end(TrialState.COMPLETE, sum(means) / len(means))
-        self.process = start(job)
+        if not job.is_in_use():  # by what a search that was killed left behind
+            self.process = start(job)
         return None
 
     def stop(self) -> None:

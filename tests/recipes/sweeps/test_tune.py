@@ -8,12 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+import filelock
 import pytest
 
 from recipes.cli import main
 from recipes.ppo import PPO
 from recipes.recipe import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
+from recipes.run import Run
 from recipes.sweeps.search_space import load_space, with_values
 from recipes.sweeps.tune import Search, Settings
 from torchrl_tit.networks import MLPConfig
@@ -82,9 +84,12 @@ def test_a_search_that_was_killed_goes_on(files, capsys):
     winner = recipe_from_json((out / f"trial-{means.index(max(means))}.json").read_bytes(), "")
     assert best == winner
     assert isinstance(best, PPO)
+    assert best.name == f"ppo/cartpole/mine/trial-{means.index(max(means))}"
     assert 1e-4 <= best.learning_rate <= 1e-2
     assert f"best of 2 trials: {max(means):.1f} with learning_rate" in capsys.readouterr().out
 
+    main(["table", str(out)])  # where each trial stands under its name
+    assert "| ppo/cartpole/mine/trial-1 | 1 |" in capsys.readouterr().out
     main(words(files, 2))  # complete: nothing is run again
     assert len(list(out.glob("trial-*/"))) == 2
     with pytest.raises(SystemExit):
@@ -145,6 +150,7 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, monkeypatch):
             {"backbone.depth": {"type": "int", "low": 0, "high": 1}},
             "unknown field 'backbone.depth'",
         ),
+        ({"seed": {"type": "int", "low": 0, "high": 1}}, "unknown field 'seed'"),
         ({"epochs": {"type": "int", "low": 0, "high": 3}}, "epochs must be at least 1, not 0"),
         ({"epochs": {"type": "float", "low": 1, "high": 3.5}}, "field 'epochs' is 1.0"),
         ({"epochs": {"type": "int", "low": 3, "high": 1}}, "low must be below high, not 3 and 1"),
@@ -173,7 +179,70 @@ def test_values_that_do_not_go_together_fail_the_trial_only(tmp_path):
     search = Search(tmp_path / "out", Settings(recipe, space))
     search.study.enqueue_trial({"backbone.num_heads_outer": 3})  # does not divide the width
     assert search.run(1, workers=1) == [0]
-    assert "32" in search.study.trials[0].user_attrs["error"]
+    assert "width 32" in (tmp_path / "out/trial-0/error.log").read_text()
+
+
+class FailingWorker:
+    """A worker's process that fails at once."""
+
+    returncode = 2
+
+    def poll(self):
+        return self.returncode
+
+
+def test_a_run_that_a_killed_search_left_at_work_is_waited_for(tmp_path, monkeypatch):
+    search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
+    search.study.ask()
+    events = []
+
+    def sleep(_):
+        events.append("wait")
+        if len(events) == 3:
+            left.__exit__()
+
+    def start(job):
+        events.append(f"start {job.folder.parent.name}")
+        return FailingWorker()
+
+    monkeypatch.setattr("recipes.sweeps.tune.start", start)
+    with Run.create(tmp_path / "trial-0" / "seed-0", RECIPE) as left:
+        monkeypatch.setattr(time, "sleep", sleep)
+        assert search.run(1, workers=1) == [0]
+    assert events == ["wait"] * 3 + ["start trial-0", "wait"]
+
+
+def test_no_more_trials_than_workers_go_on(tmp_path, monkeypatch):
+    search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
+    for _ in range(3):  # at work when the search was killed
+        search.study.ask()
+    begun = []
+
+    def start(job):
+        begun.append(job.folder.parent.name)
+        return FailingWorker()
+
+    monkeypatch.setattr("recipes.sweeps.tune.start", start)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    assert search.run(2, workers=1) == [0, 1]
+    assert begun == ["trial-0", "trial-1"]
+
+
+def test_one_process_at_a_time(tmp_path):
+    search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
+    with (
+        filelock.FileLock(tmp_path / ".lock"),
+        pytest.raises(RuntimeError, match="is in use by another process"),
+    ):
+        search.run(1, workers=1)
+    assert not search.study.trials
+
+
+def test_seeds_that_cannot_be_are_refused_before_anything_runs(files, capsys):
+    with pytest.raises(SystemExit):
+        main([*words(files, 1), "--seeds", "0", "-1"])
+    assert "seed must be at least 0, not -1" in capsys.readouterr().err
+    assert not (files / "out").exists()
 
 
 @pytest.mark.parametrize(
