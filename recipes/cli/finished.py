@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from torchrl_tit.files import write_text_atomic
 
+from ..recipe import Recipe
 from ..results.plot import plot_comparison, plot_table
 from ..results.table import make_table, to_csv, to_markdown
 from ..run import Run
@@ -64,11 +66,20 @@ def compare(words: list[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("comparison.png"), help="PNG to write")
     parser.add_argument("--title", default="", help="title of the picture")
     options = parser.parse_args(words)
-    curves: dict[str, list[Path]] = {}
-    for folder in options.runs:
-        run = Run.open(folder)
-        curves.setdefault(run.recipe.name or str(folder), []).append(folder / "metrics.csv")
-    plot_comparison(curves, options.out, title=options.title, offline=run.recipe.offline)
+    seeds: dict[Recipe, list[Path]] = {}  # runs of the same settings
+    for folder in dict.fromkeys(options.runs):
+        seeds.setdefault(replace(Run.open(folder).recipe, seed=0), []).append(folder)
+    offline = {recipe.offline for recipe in seeds}
+    if len(offline) > 1:
+        fail("environment steps and gradient steps have no axis in common: compare them apart")
+    names = [recipe.name for recipe in seeds]
+    curves = {}
+    for recipe, folders in seeds.items():
+        name = recipe.name
+        if not name or names.count(name) > 1:
+            name = f"{name} {folders[0]}".lstrip()
+        curves[name] = [folder / "metrics.csv" for folder in folders]
+    plot_comparison(curves, options.out, title=options.title, offline=offline.pop())
     print(f"written to {options.out}")
 
 

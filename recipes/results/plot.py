@@ -57,6 +57,9 @@ def plot_comparison(
         title: title of the picture.
         points: steps at which the runs are compared; between batches, returns are interpolated.
         offline: as for :func:`plot_learning_curve`.
+
+    Raises:
+        ValueError: if there is no return to draw.
     """
     figure = _figure(title, offline)
     (axes,) = figure.axes
@@ -73,6 +76,9 @@ def plot_comparison(
         axes.fill_between(
             grid, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.2, linewidth=0
         )
+    if not axes.lines:
+        folders = ", ".join(str(run.parent) for runs in curves.values() for run in runs)
+        raise ValueError(f"there is nothing to draw: no episode has ended in {folders}")
     _write(figure, picture)
 
 
