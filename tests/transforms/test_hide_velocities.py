@@ -92,6 +92,11 @@ def test_can_be_saved():
 def test_bad_input():
     with pytest.raises(ValueError, match=r"'Ant-v5' are velocities, only of CartPole, .*name the"):
         HideVelocities("Ant-v5")
+    env = make_env(  # with one more entry at the front
+        "Hopper-v5", hide_velocities=True, exclude_current_positions_from_observation=False
+    )
+    with pytest.raises(ValueError, match=r"'Hopper-v5' has 11 entries, not 12; name"):
+        env.reset()
     with pytest.raises(ValueError, match=r"hidden is \[1, 1\]"):
         HideEntries([1, 1])
     for hidden in ([4], [0, 1, 2, 3]):

@@ -101,7 +101,8 @@ class HideVelocities(HideEntries):
         in_keys: See :class:`HideEntries`.
 
     Raises:
-        ValueError: If it is not known which entries are velocities in this task; name them to
+        ValueError: If it is not known which entries are velocities in this task, or, when an
+            environment takes the transform, a setting of the task has added entries; name them to
             :class:`HideEntries` instead.
 
     Example:
@@ -120,3 +121,13 @@ class HideVelocities(HideEntries):
                 f"{', '.join(VELOCITIES)}; name the entries to HideEntries."
             )
         super().__init__(VELOCITIES[name], in_keys)
+        self._task = task
+
+    def _seen(self, size: int) -> list[int]:
+        # In every one of these tasks the last entry is a velocity.
+        if size - 1 != self._hidden[-1]:
+            raise ValueError(
+                f"An observation of {self._task!r} has {self._hidden[-1] + 1} entries, not {size}; "
+                "name those that are velocities to HideEntries."
+            )
+        return super()._seen(size)
