@@ -13,7 +13,8 @@ class Interrupt:
     """Turns the first Ctrl-C (or SIGTERM) into a request that the training loop reads.
 
     The loop ends its batch, saves a checkpoint and stops. A second Ctrl-C stops at once; the last
-    checkpoint is still there then.
+    checkpoint is still there then. So does an error of the batch that was to be ended: the same
+    Ctrl-C stops a C++ compiler that is at work for it.
 
     Example:
         >>> with Interrupt() as interrupt:
@@ -28,9 +29,11 @@ class Interrupt:
         self._previous = {s: signal.signal(s, self._handle) for s in _SIGNALS}
         return self
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+        if self.requested and isinstance(error, RuntimeError):
+            raise KeyboardInterrupt from error
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.requested:

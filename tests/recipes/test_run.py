@@ -188,6 +188,16 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_an_error_that_ctrl_c_brings_about_is_a_stop(tmp_path, monkeypatch):
+    def compiler_stopped(*_):
+        os.kill(os.getpid(), signal.SIGINT)
+        raise RuntimeError("C++ compile error")
+
+    monkeypatch.setattr("recipes.ppo.training.add_advantages", compiler_stopped)
+    with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
+        SMALL.train(run)
+
+
 def test_version_changes(tmp_path):
     run = Run.create(tmp_path / "run", SMALL)
     assert run.version_changes() == []
