@@ -16,8 +16,8 @@ def begun(tmp_path, monkeypatch):
     """Begins runs, in each of which an episode has ended."""
     monkeypatch.chdir(tmp_path)
 
-    def begin(folder, name=NAME, **fields):
-        Run.create(tmp_path / folder, replace(get_recipe(name), **fields))
+    def begin(folder, recipe=NAME, **fields):
+        Run.create(tmp_path / folder, replace(get_recipe(recipe), **fields))
         (tmp_path / folder / "metrics.csv").write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
         return folder
 
@@ -50,11 +50,8 @@ def test_other_settings_under_one_name_are_another_curve(begun, drawn):
     assert drawn("a", "b", "c") == {f"{NAME} a": ["a", "c"], f"{NAME} b": ["b"]}
 
 
-def test_runs_without_a_name_are_called_as_their_folder(tmp_path, drawn, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for folder, rate in {"a": 1e-3, "b": 1e-4}.items():
-        recipe = replace(get_recipe(NAME), name="", learning_rate=rate)
-        Run.create(tmp_path / folder, recipe)
+def test_runs_without_a_name_are_called_as_their_folder(begun, drawn):
+    begun("a", name=""), begun("b", name="", learning_rate=1e-3)
     assert drawn("a") == {"a": ["a"]}
     assert drawn("a", "b") == {"a": ["a"], "b": ["b"]}
 
