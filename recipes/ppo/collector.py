@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -67,6 +68,7 @@ def make_collector(
 
 def _make_share(recipe: PPO, index: int, step: int) -> EnvBase:
     """Builds the environments of one process, in it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training process
     torch.set_num_threads(recipe.threads)
     share = recipe.num_envs // recipe.collectors
     seeds = np.random.SeedSequence([recipe.seed, index, step])

@@ -1,6 +1,8 @@
 """Gymnasium tasks and Atari games by name."""
 
 import difflib
+import os
+import signal
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -162,7 +164,7 @@ def _tasks(
     if name not in gymnasium.registry and ":" not in name:
         raise _unknown(name)
     # What the vector environment returns is copied at once, so it need not make copies of its own.
-    make = partial(_task, name, **kwargs)
+    make = partial(_task, os.getpid(), name, **kwargs)
     vectorize = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
     try:
         return vectorize([make] * num_envs, copy=False, autoreset_mode=AutoresetMode.DISABLED)
@@ -170,8 +172,10 @@ def _tasks(
         raise ValueError(f"Task {name!r} cannot be made: {error}") from error
 
 
-def _task(name: str, **kwargs: Any) -> gymnasium.Env:
-    """One copy, in the process that steps it."""
+def _task(home: int, name: str, **kwargs: Any) -> gymnasium.Env:
+    """One copy, in the process that steps it; ``home`` is the process that steps all of them."""
+    if os.getpid() != home:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # which decides what Ctrl-C means
     if "mujoco" in str(gymnasium.spec(name).entry_point):
         show_mujoco_warnings_once()
     # The specs are checked once, in tests; Gymnasium's checker would cost time at every step.

@@ -1,10 +1,15 @@
 """Several collectors in processes of their own."""
 
+import os
+import signal
+import time
 from dataclasses import replace
 
 import pytest
 import torch
+from torch import multiprocessing
 
+from recipes.metrics import Metrics
 from recipes.ppo import PPO
 from recipes.ppo.agent import Agent
 from recipes.ppo.collector import make_collector
@@ -51,6 +56,27 @@ def test_batches_are_those_of_the_policy(async_collection):
     first = RECIPE.make_env(4, RECIPE.seed).reset()["history"][:, -1].tolist()
     assert all(start in first for start in starts[:envs])  # each environment has its own seed
     assert len(set(map(tuple, starts[:envs]))) == envs
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fields", [{}, {"collectors": 1, "vectorization_mode": "async"}])
+def test_a_terminals_ctrl_c_reaches_every_process_and_saves(fields, tmp_path, monkeypatch):
+    log = Metrics.log
+
+    def ctrl_c(metrics, step, **values):
+        log(metrics, step, **values)
+        if step == 64:
+            for process in multiprocessing.active_children():
+                os.kill(process.pid, signal.SIGINT)
+            time.sleep(1)  # in which they would end
+        else:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Metrics, "log", ctrl_c)
+    recipe = replace(RECIPE, checkpoint_interval=10**6, **fields)
+    with Run.create(tmp_path / "run", recipe) as run, pytest.raises(KeyboardInterrupt):
+        recipe.train(run)
+    assert checkpoint_steps(run.checkpoints) == [128]
 
 
 @pytest.mark.slow
