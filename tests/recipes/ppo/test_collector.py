@@ -67,6 +67,7 @@ def test_a_terminals_ctrl_c_reaches_every_process_and_saves(fields, tmp_path, mo
         log(metrics, step, **values)
         if step == 64:
             for process in multiprocessing.active_children():
+                assert process.pid
                 os.kill(process.pid, signal.SIGINT)
             time.sleep(1)  # in which they would end
         else:
