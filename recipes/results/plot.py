@@ -120,7 +120,7 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
             markersize=4,
             label="paper",
         )
-        axes.set_yticks(places, [cell.recipe.rpartition("/")[2] for cell in group])
+        axes.set_yticks(places, [cell.label.rpartition("/")[2] for cell in group])
         axes.set(title=task, ylim=(len(group) - 0.4, -0.6))
         axes.grid(alpha=0.3)
     for axes in panels[len(tasks) :]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..offline.recipe import OfflineRecipe
 from ..recipe import Recipe
+from ..registry import RECIPES
 from ..run import Run
 
 OTHER = "not in the paper"
@@ -59,6 +60,13 @@ class Cell:
     paper_mean: float
     """The paper's value; NaN where it has none. That of a tuned recipe is that of the plain one."""
     paper_std: float
+    changes: str = ""
+    """The fields in which the runs are not as the recipe of that name says."""
+
+    @property
+    def label(self) -> str:
+        """The recipe's name, and what was changed."""
+        return f"{self.recipe} (other {self.changes})" if self.changes else self.recipe
 
 
 def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
@@ -174,7 +182,8 @@ def _cell(name: str, runs: Sequence[tuple[Run, dict]]) -> Cell:
         if replace(run.recipe, seed=0) != replace(first.recipe, seed=0):
             raise ValueError(
                 f"{first.folder} and {run.folder} are both called {name}, but differ in "
-                f"{', '.join(_differences(first.recipe, run.recipe))}: give them other names"
+                f"{', '.join(_differences(first.recipe, run.recipe)) or 'the algorithm'}: give "
+                "them other names"
             )
         if run.recipe.seed in seeds:
             raise ValueError(
@@ -210,6 +219,7 @@ def _cell(name: str, runs: Sequence[tuple[Run, dict]]) -> Cell:
         high=high,
         paper_mean=paper.mean if paper else float("nan"),
         paper_std=paper.std if paper else float("nan"),
+        changes=", ".join(_differences(RECIPES.get(name, first.recipe), first.recipe)),
     )
 
 
@@ -233,8 +243,7 @@ def _plain(name: str) -> str:
 
 def _differences(left: Recipe, right: Recipe) -> list[str]:
     ours, others = asdict(left), asdict(right)
-    names = [k for k in ours | others if k != "seed" and ours.get(k) != others.get(k)]
-    return names or ["algorithm"]
+    return [k for k in ours | others if k != "seed" and ours.get(k) != others.get(k)]
 
 
 def _row(cell: Cell) -> str:
@@ -242,7 +251,7 @@ def _row(cell: Cell) -> str:
     known = cell.paper_mean == cell.paper_mean
     paper = f"{_number(cell.paper_mean)} ± {_number(cell.paper_std)}" if known else ""
     return (
-        f"| {cell.recipe} | {cell.runs} | {_number(cell.mean)} ± {_number(cell.std)} "
+        f"| {cell.label} | {cell.runs} | {_number(cell.mean)} ± {_number(cell.std)} "
         f"| {_number(cell.std_episodes)} | {_number(cell.iqm)}{interval} | {paper} |"
     )
 

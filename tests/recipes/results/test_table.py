@@ -137,6 +137,16 @@ def test_markdown_and_csv_hold_the_same_recipes(runs):
         assert cell.recipe in to_csv(cells)
 
 
+def test_what_was_changed_is_named(tmp_path):
+    write_run(tmp_path / "0", "ppo/cartpole/mlp", 3, [20.0], total_steps=1000, device="auto")
+    write_run(tmp_path / "1", "ppo/cartpole/d2rl", 0, [500.0])
+    cells, _ = make_table([tmp_path])
+    assert [cell.changes for cell in cells] == ["device, total_steps", ""]
+    text = to_markdown(cells)
+    assert "| ppo/cartpole/mlp (other device, total_steps) | 1 | 20.0" in text
+    assert "| ppo/cartpole/d2rl | 1 | 500" in text
+
+
 def test_other_settings_under_one_name(runs):
     write_run(runs / "more", "ppo/acrobot/enhanced-tit", 7, [1.0], num_envs=2)
     with pytest.raises(ValueError, match=r"both called ppo/acrobot/enhanced-tit.*num_envs"):
