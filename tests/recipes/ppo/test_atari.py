@@ -16,7 +16,12 @@ from recipes.registry import RECIPES
 from recipes.run import Run
 from torchrl_tit.networks import EnhancedTITConfig, MLPConfig
 
-GAMES = ["breakout", "mspacman", "pong", "spaceinvaders"]
+GAMES = {
+    "breakout": "ALE/Breakout-v5",
+    "mspacman": "ALE/MsPacman-v5",
+    "pong": "ALE/Pong-v5",
+    "spaceinvaders": "ALE/SpaceInvaders-v5",
+}
 NETWORKS = [
     *("nature-cnn", "resnet", "catformer", "coberl", "vanilla-tit", "enhanced-tit"),
     *("enhanced-tit-wo-dense", "enhanced-tit-wo-inner", "enhanced-tit-wo-outer"),
@@ -24,9 +29,12 @@ NETWORKS = [
 
 
 def test_every_cell_of_the_tables_is_named():
-    for game in GAMES:
-        for network in NETWORKS:
-            recipe = RECIPES[f"ppo/{game}/{network}"]
+    for game, env in GAMES.items():
+        for network in [*NETWORKS, "catformer-tuned", "coberl-tuned"]:
+            recipe = ATARI_RECIPES[f"ppo/{game}/{network}"]
+            other = ATARI_RECIPES[f"ppo/pong/{network}"]
+            assert replace(recipe, env=other.env, name=other.name) == other
+            assert (recipe.env, RECIPES[recipe.name]) == (env, recipe)
             assert recipe == recipe_from_json(recipe_to_json(recipe), "itself")
 
 

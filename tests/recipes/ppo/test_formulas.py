@@ -208,17 +208,6 @@ def test_whole_rollouts_cover_the_steps():
     assert RECIPE.final_step == 100_352  # 49 batches of 2048 cover 100k
 
 
-def test_protocol_settings_of_arrays():
-    expected = {
-        "learning_rate": 3e-4, "steps_per_batch": 2048, "num_envs": 1, "minibatch_size": 64,
-        "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "clip_epsilon": 0.2,
-        "entropy_coeff": 0.0, "critic_coeff": 0.5, "max_grad_norm": 0.5, "adam_eps": 1e-5,
-        "initialization": "orthogonal", "total_steps": 100_000, "evaluation_episodes": 100,
-        "decay_learning_rate": False, "decay_clip_epsilon": False, "history": 1,
-    }  # fmt: skip
-    assert {name: getattr(RECIPE, name) for name in expected} == expected
-
-
 def test_minibatches_show_every_step_once_an_epoch():
     n = 40
     batch = TensorDict(
