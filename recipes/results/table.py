@@ -76,7 +76,8 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         folders: run folders, or folders with run folders somewhere below.
 
     Returns:
-        The cells, in the paper's order, and a note for each run that is left out.
+        The cells, in the paper's order, and a note for each run that is left out, or was
+        evaluated over another number of episodes than its recipe says.
 
     Raises:
         ValueError: if there is no evaluated run, two runs of a name have other settings beside the
@@ -98,6 +99,9 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
                 f"{run.recipe.final_step} steps"
             )
             continue
+        asked = run.recipe.evaluation_episodes
+        if (episodes := evaluation.get("episodes", asked)) != asked:  # `evaluate --episodes`
+            notes.append(f"{run.folder} was evaluated over {episodes} episodes, not {asked}")
         groups.setdefault(run.recipe.name or str(run.folder), []).append((run, evaluation))
     if not groups:
         raise ValueError(

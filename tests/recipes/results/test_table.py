@@ -137,6 +137,17 @@ def test_markdown_and_csv_hold_the_same_recipes(runs):
         assert cell.recipe in to_csv(cells)
 
 
+def test_fewer_episodes_are_named(tmp_path):
+    folder = write_run(tmp_path / "run", "ppo/cartpole/mlp", 0, [20.0, 30.0])
+    evaluation = json.loads((folder / "evaluation.json").read_text())
+    for episodes, notes in {
+        100: [],
+        2: [f"{folder} was evaluated over 2 episodes, not 100"],
+    }.items():
+        (folder / "evaluation.json").write_text(json.dumps(evaluation | {"episodes": episodes}))
+        assert make_table([tmp_path])[1] == notes
+
+
 def test_what_was_changed_is_named(tmp_path):
     write_run(tmp_path / "0", "ppo/cartpole/mlp", 3, [20.0], total_steps=1000, device="auto")
     write_run(tmp_path / "1", "ppo/cartpole/d2rl", 0, [500.0])
