@@ -66,6 +66,8 @@ def test_wrong_settings(
 def test_nothing_left() -> None:
     with pytest.raises(ValueError, match="inner and outer cannot both be off"):
         EnhancedTIT((4,), 2, inner=False, outer=False)
+    with pytest.raises(ValueError, match="that of the outer blocks: switch it off"):
+        EnhancedTIT((4,), 2, outer=False, temporal_position_encoding=True)
 
 
 @BOTH

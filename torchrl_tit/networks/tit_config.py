@@ -143,6 +143,10 @@ class EnhancedTITConfig(TITConfig):
         super().__post_init__()
         if not (self.inner or self.outer):
             raise ValueError("inner and outer cannot both be off: nothing would be left")
+        if self.temporal_position_encoding and not self.outer:
+            raise ValueError(
+                "temporal_position_encoding is that of the outer blocks: switch it off, or outer on"
+            )
 
     def make_paired_outer(self, history: int) -> PairedOuterTransformer:
         """Builds the outer blocks that each stand beside an inner block."""
