@@ -232,6 +232,26 @@ def test_evaluation_counts_whole_games():
     games.close()
 
 
+def test_points_between_two_lives_are_of_the_game():
+    games = AtariGames("breakout", 1)
+    games.reset(seed=0)
+    (emulator,) = games._emulators[0]
+    receive = emulator.recv
+
+    def paying():
+        image, _, *others = receive()
+        return image, np.ones(1), *others
+
+    emulator.recv = paying
+    points, terminated = 0, False
+    while not terminated:
+        _, rewards, (terminated,), _, info = games.step(np.array([LEFT]))
+        points += rewards[0]
+    # No action, fire and action 2 led to the next life.
+    assert info["game_return"] == points + 3
+    games.close()
+
+
 def test_pictures_of_the_games():
     games = AtariGames("breakout", 2, render_mode="rgb_array")
     games.reset(seed=0)
