@@ -53,6 +53,14 @@ def test_protocol_settings(name):
     recipe.check()  # the network fits the game
 
 
+def test_zeros_stand_before_the_first_frame():
+    env = ATARI_RECIPES["ppo/pong/nature-cnn"].make_env(1, seed=0)
+    history = env.reset()["history"]
+    assert not history[:, :-1].any()
+    assert history[:, -1].any()
+    env.close()
+
+
 def test_settings_of_tit():
     backbone = ATARI_RECIPES["ppo/pong/enhanced-tit"].backbone
     expected = {

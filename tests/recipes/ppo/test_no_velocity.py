@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from gymnasium.vector import AsyncVectorEnv
 
 from recipes.ppo.no_velocity import NO_VELOCITY_RECIPES
 from recipes.registry import RECIPES
@@ -38,7 +39,7 @@ def test_all_networks_train_with_the_same_settings():
         assert len(settings) == 1
 
 
-def test_a_run_in_processes_is_the_run_in_one(tmp_path):
+def test_a_run_in_processes_is_the_run_in_one(tmp_path, monkeypatch):
     recipe = replace(
         NO_VELOCITY_RECIPES["ppo/cartpole-no-velocity/mlp-stack-8"],
         num_envs=2,
@@ -48,13 +49,21 @@ def test_a_run_in_processes_is_the_run_in_one(tmp_path):
         epochs=1,
         evaluation_episodes=3,
     )
-    results = []
+    results, made = [], []
+
+    class Processes(AsyncVectorEnv):
+        def __init__(self, *arguments, **options):
+            made.append(recipe.vectorization_mode)
+            super().__init__(*arguments, **options)
+
+    monkeypatch.setattr("torchrl_tit.envs.factory.AsyncVectorEnv", Processes)
     for mode in ("sync", "async"):
         recipe = replace(recipe, vectorization_mode=mode)
         with Run.create(tmp_path / mode, recipe) as run:
             recipe.train(run)
             evaluation = recipe.evaluate(run)
         results.append((load_checkpoint(run.checkpoints)[1]["agent"], evaluation["returns"]))
+    assert made == ["async"]
     (sync, returns), (async_, async_returns) = results
     assert returns == async_returns
     for name, weight in sync.items():
