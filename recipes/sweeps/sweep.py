@@ -182,8 +182,10 @@ def run_jobs(
                     if code is None:
                         continue
                     del running[job]
-                    if code and job.is_in_use():
-                        waiting.append(job)  # another process began it a moment before
+                    # Refused, as another process began it a moment before. Where a worker on Ray
+                    # is lost (1), its run can still be in use, by what it leaves behind.
+                    if code == 2 and job.is_in_use():
+                        waiting.append(job)
                         continue
                     if code and not job.is_complete():
                         failed.append(job)
