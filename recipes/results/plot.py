@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from .table import Cell
+
+# Letters of a name with which two stand side by side below a picture.
+_WIDEST_OF_TWO = 40
 
 
 def plot_learning_curve(
@@ -52,16 +56,20 @@ def plot_comparison(
     """Draws learning curves of several groups of runs: mean over the runs, band of one deviation.
 
     Args:
-        curves: ``metrics.csv`` files of the runs (seeds) of each group, by the group's name.
+        curves: ``metrics.csv`` files of the runs (seeds) of each group, by the group's name; what
+            the names begin with in common, up to a "/", stands in the title alone.
         picture: the PNG file to write.
-        title: title of the picture.
+        title: title of the picture, instead of what the names have in common.
         points: steps at which the runs are compared; between batches, returns are interpolated.
         offline: as for :func:`plot_learning_curve`.
 
     Raises:
         ValueError: if there is no return to draw.
     """
-    figure = _figure(title, offline)
+    levels = zip(*(name.split("/")[:-1] for name in curves), strict=False)
+    shared = takewhile(lambda level: len(curves) > 1 and len(set(level)) == 1, levels)
+    common = "".join(f"{level[0]}/" for level in shared)
+    figure = _figure(title or common.rstrip("/"), offline)
     (axes,) = figure.axes
     for name, runs in curves.items():
         known = [(steps, returns) for steps, returns in map(_curve, runs) if len(steps)]
@@ -72,7 +80,8 @@ def plot_comparison(
         )
         returns = np.stack([np.interp(grid, *run) for run in known])
         mean, deviation = returns.mean(0), returns.std(0)
-        (line,) = axes.plot(grid, mean, linewidth=2, label=f"{name} ({len(known)} runs)")
+        label = f"{name.removeprefix(common)} ({len(known)} runs)"
+        (line,) = axes.plot(grid, mean, linewidth=2, label=label)
         axes.fill_between(
             grid, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.2, linewidth=0
         )
@@ -158,8 +167,9 @@ def _write(figure: Figure, picture: Path) -> None:
     (axes,) = figure.axes
     handles, labels = axes.get_legend_handles_labels()
     if len(handles) > 2:  # they would hide the curves
-        figure.set_figheight(4 + 0.15 * len(handles))
-        figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+        columns = 2 if max(map(len, labels)) <= _WIDEST_OF_TWO else 1
+        figure.set_figheight(4 + 0.3 * len(handles) / columns)
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
     else:
         axes.legend(frameon=False)
     _save(figure, picture)
@@ -167,5 +177,5 @@ def _write(figure: Figure, picture: Path) -> None:
 
 def _save(figure: Figure, picture: Path) -> None:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format="png", bbox_inches="tight")
     write_bytes_atomic(picture, buffer.getvalue())

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 from matplotlib.image import imread
 
 from recipes.results.plot import plot_comparison
@@ -17,3 +18,31 @@ def height(folder: Path, groups: int) -> int:
 
 def test_the_legend_of_many_curves_has_a_place_of_its_own(tmp_path):
     assert height(tmp_path, 1) == height(tmp_path, 2) < height(tmp_path, 3) < height(tmp_path, 9)
+
+
+@pytest.mark.parametrize("length", [5, 39, 45, 90])
+def test_the_legend_is_in_the_picture(length, tmp_path):
+    metrics, picture = tmp_path / "metrics.csv", tmp_path / "curves.png"
+    metrics.write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
+    plot_comparison({f"{i} {'n' * length}": [metrics] for i in range(4)}, picture, title="")
+    shape = imread(picture)[..., :3]
+    assert all(edge.min() == 1 for edge in (shape[:, 0], shape[:, -1], shape[0], shape[-1]))
+
+
+def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, monkeypatch):
+    metrics = tmp_path / "metrics.csv"
+    metrics.write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
+    figures = []
+    monkeypatch.setattr(
+        "recipes.results.plot._write", lambda figure, picture: figures.append(figure)
+    )
+    names = ["ppo/cartpole/mlp", "ppo/cartpole/mlp-stack-8", "ppo/cartpole/lstm"]
+    for title in ("", "mine"):
+        plot_comparison({name: [metrics] for name in names}, tmp_path / "a.png", title=title)
+    plot_comparison({names[0]: [metrics]}, tmp_path / "a.png", title="")
+    drawn = [
+        (axes.get_title(), axes.get_legend_handles_labels()[1])
+        for (axes,) in (figure.axes for figure in figures)
+    ]
+    labels = ["mlp (1 runs)", "mlp-stack-8 (1 runs)", "lstm (1 runs)"]
+    assert drawn == [("ppo/cartpole", labels), ("mine", labels), ("", [f"{names[0]} (1 runs)"])]
