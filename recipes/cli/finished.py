@@ -66,6 +66,8 @@ def compare(words: list[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("comparison.png"), help="PNG to write")
     parser.add_argument("--title", default="", help="title of the picture")
     options = parser.parse_args(words)
+    if options.out.suffix != ".png":
+        fail(f"--out {options.out} must end in .png: what is written is a PNG")
     seeds: dict[Recipe, list[Path]] = {}  # runs of the same settings
     for folder in dict.fromkeys(options.runs):
         seeds.setdefault(replace(Run.open(folder).recipe, seed=0), []).append(folder)

@@ -71,3 +71,10 @@ def test_runs_in_which_no_episode_has_ended(begun, tmp_path, capsys):
         main(["compare", "a", "b"])
     assert "no episode has ended in a, b" in capsys.readouterr().err
     assert not (tmp_path / "comparison.png").exists()
+
+
+def test_a_picture_is_called_what_it_is(begun, capsys):
+    begun("a")
+    with pytest.raises(SystemExit):
+        main(["compare", "a", "--out", "curves.pdf"])
+    assert "--out curves.pdf must end in .png" in capsys.readouterr().err
