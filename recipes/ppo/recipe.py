@@ -145,6 +145,11 @@ class PPO(Recipe):
                 "environments: it must be a multiple of num_envs"
             )
 
+        if not self.critic_coeff > 0:
+            raise ValueError(
+                f"critic_coeff must be above 0, not {self.critic_coeff}: PPO's advantages need a "
+                "critic that learns"
+            )
         if self.contrastive_coeff and not isinstance(self.backbone, CoBERLConfig):
             raise ValueError(
                 "contrastive_coeff is the weight of a loss of coberl alone: set it to 0 for other "
