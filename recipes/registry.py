@@ -40,7 +40,7 @@ def find_recipe(name: str) -> Recipe:
     """Looks a recipe up by name, or reads it from a JSON file such as a run's ``recipe.json``.
 
     Raises:
-        ValueError: if there is none of that name, or the file holds none.
+        ValueError: if there is none of that name, or the file holds none, or it is a folder.
         FileNotFoundError: if there is no such file.
 
     Example:
@@ -48,6 +48,11 @@ def find_recipe(name: str) -> Recipe:
         'ALE/Pong-v5'
     """
     path = Path(name)
+    if path.is_dir():
+        raise ValueError(
+            f"{name} is a folder, not a recipe: name the recipe.json in it, or go on with a run by "
+            f"`train --resume {name}`"
+        )
     if path.suffix == ".json":
         return recipe_from_json(path.read_bytes(), path)
     return get_recipe(name)

@@ -91,6 +91,7 @@ def test_help_explains_every_field(capsys):
         (["train", "NAME", "--backbone.num-heads-inner", "3"], "width 32"),
         (["train", "NAME", "--num-envs", "3"], "multiple of num_envs"),
         (["train", "NAME", "--critic-coeff", "0"], "critic_coeff must be above 0, not 0.0"),
+        (["train", "."], ". is a folder, not a recipe"),
         (["train", "NAME", "--backbone.patch-size", "0"], "patch_size"),
         (["train"], "train needs a recipe's name"),
         (["train", "--resume", "nowhere"], "no run folder"),
