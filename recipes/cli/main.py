@@ -53,7 +53,7 @@ def list_recipes(words: list[str]) -> None:
     parser = Parser(f"{program()} list")
     parser.add_argument("pattern", nargs="?", default="", help="part of a name; * is any text")
     pattern = parser.parse_args(words).pattern
-    names = [name for name in RECIPES if fnmatchcase(name, f"*{pattern}*")]
+    names = [name for name in RECIPES if fnmatchcase(name, f"*{pattern.lower()}*")]
     if not names:
         fail(f"no recipe contains {pattern!r}: `{program()} list` names all of them")
     print("\n".join(names))

@@ -108,6 +108,11 @@ def test_bad_words_are_one_line_and_leave_nothing(words, message, capsys, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
+def test_list_takes_names_as_gymnasium_writes_them(capsys):
+    main(["list", "CartPole/MLP"])
+    assert capsys.readouterr().out == "ppo/cartpole/mlp\n"
+
+
 @pytest.mark.parametrize("option", [["--backbone.embed-dim", "wide"], ["--no-such-field", "1"]])
 def test_wrong_types_and_unknown_options(option, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
