@@ -20,9 +20,13 @@ def test_recipes_can_be_built_and_hide_the_velocities(name):
     network = name.rpartition("/")[2]
     assert recipe.history == (8 if "8" in network else 1)
     backbone = recipe.backbone
-    assert getattr(backbone, "temporal_position_encoding", False) == ("positions" in network)
+    assert getattr(backbone, "temporal_position_encoding", False) == (
+        "positions" in network or "tuned" in network
+    )
     assert getattr(backbone, "outer", True) == ("wo-outer" not in network)
     entries = {"CartPole-v1": 2, "Acrobot-v1": 4, "Hopper-v5": 5}[recipe.env]
+    if "tuned" in network:
+        assert recipe.backbone.patch_size == entries
     env = recipe.make_env(2, seed=0)
     assert env.reset()["history"].shape == (2, recipe.history, entries)
     assert recipe.num_envs == (16 if "acrobot" in name else 8)
