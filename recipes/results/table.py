@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..offline.recipe import OfflineRecipe
-from ..recipe import Recipe
+from ..recipe import Recipe, recipe_to_json
 from ..registry import RECIPES
 from ..run import Run
 
@@ -32,7 +32,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Cell:
-    """All runs of one recipe: one cell of a table.
+    """All runs of the same settings: one cell of a table.
 
     A run's value is the mean return of its evaluation, or its best normalised score where it has
     one (offline recipes).
@@ -61,16 +61,16 @@ class Cell:
     """The paper's value; NaN where it has none. That of a tuned recipe is that of the plain one."""
     paper_std: float
     changes: str = ""
-    """The fields in which the runs are not as the recipe of that name says."""
+    """What the runs have otherwise than the recipe of that name: fields and their values."""
 
     @property
     def label(self) -> str:
         """The recipe's name, and what was changed."""
-        return f"{self.recipe} (other {self.changes})" if self.changes else self.recipe
+        return f"{self.recipe} ({self.changes})" if self.changes else self.recipe
 
 
 def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
-    """Reads run folders and puts the runs of each recipe together.
+    """Reads run folders and puts the runs of the same settings together, whatever their seed.
 
     Args:
         folders: run folders, or folders with run folders somewhere below.
@@ -80,10 +80,9 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         evaluated over another number of episodes than its recipe says.
 
     Raises:
-        ValueError: if there is no evaluated run, two runs of a name have other settings beside the
-            seed, or the same seed.
+        ValueError: if there is no evaluated run, or two of the same settings have the same seed.
     """
-    groups: dict[str, list[tuple[Run, dict]]] = {}
+    groups: dict[Recipe, list[tuple[Run, dict]]] = {}
     notes = []
     for run in _runs(folders):
         try:
@@ -102,17 +101,21 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         asked = run.recipe.evaluation_episodes
         if (episodes := evaluation.get("episodes", asked)) != asked:  # `evaluate --episodes`
             notes.append(f"{run.folder} was evaluated over {episodes} episodes, not {asked}")
-        groups.setdefault(run.recipe.name or str(run.folder), []).append((run, evaluation))
+        groups.setdefault(replace(run.recipe, seed=0), []).append((run, evaluation))
     if not groups:
         raise ValueError(
             f"no evaluated run in {', '.join(map(str, folders))}" + "".join(f"; {n}" for n in notes)
         )
-    cells = [_cell(name, runs) for name, runs in groups.items()]
+    named = dict(RECIPES)  # with names that are not ours, for the first settings found of each
+    cells = [
+        _cell(settings, named.setdefault(settings.name, settings), runs)
+        for settings, runs in groups.items()
+    ]
     order = {name: index for index, name in enumerate(paper_results())}
 
     def rank(cell: Cell) -> tuple[bool, int, str]:
         place = order.get(_plain(cell.recipe), len(order))
-        return cell.table == OTHER, place, cell.recipe
+        return cell.table == OTHER, place, cell.label
 
     cells.sort(key=rank)
     return cells, notes
@@ -176,19 +179,13 @@ def _value(evaluation: dict) -> float:
     return float(evaluation["score"]["best"] if "score" in evaluation else evaluation["mean"])
 
 
-def _cell(name: str, runs: Sequence[tuple[Run, dict]]) -> Cell:
+def _cell(settings: Recipe, named: Recipe, runs: Sequence[tuple[Run, dict]]) -> Cell:
     # Not at the top: SciPy takes a second that only tables should cost.
     from scipy.stats import bootstrap, trim_mean
 
-    first = runs[0][0]
+    name = settings.name or str(runs[0][0].folder)
     seeds: dict[int, Run] = {}
     for run, _ in runs:
-        if replace(run.recipe, seed=0) != replace(first.recipe, seed=0):
-            raise ValueError(
-                f"{first.folder} and {run.folder} are both called {name}, but differ in "
-                f"{', '.join(_differences(first.recipe, run.recipe)) or 'the algorithm'}: give "
-                "them other names"
-            )
         if run.recipe.seed in seeds:
             raise ValueError(
                 f"{seeds[run.recipe.seed].folder} and {run.folder} are the same run: {name} with "
@@ -209,7 +206,7 @@ def _cell(name: str, runs: Sequence[tuple[Run, dict]]) -> Cell:
             (values,), iqm, n_resamples=10_000, method="percentile", rng=0
         ).confidence_interval
         low, high = float(interval.low), float(interval.high)
-    paper = _paper_result(first.recipe)
+    paper = _paper_result(settings)
     return Cell(
         table=paper.table if paper else OTHER,
         recipe=name,
@@ -223,7 +220,7 @@ def _cell(name: str, runs: Sequence[tuple[Run, dict]]) -> Cell:
         high=high,
         paper_mean=paper.mean if paper else float("nan"),
         paper_std=paper.std if paper else float("nan"),
-        changes=", ".join(_differences(RECIPES.get(name, first.recipe), first.recipe)),
+        changes=_changes(named, settings) if settings.name else "",
     )
 
 
@@ -245,9 +242,17 @@ def _plain(name: str) -> str:
     return name if name in paper_results() else name.removesuffix("-tuned")
 
 
-def _differences(left: Recipe, right: Recipe) -> list[str]:
-    ours, others = asdict(left), asdict(right)
-    return [k for k in ours | others if k != "seed" and ours.get(k) != others.get(k)]
+def _changes(named: Recipe, settings: Recipe) -> str:
+    """Fields that settings have otherwise, with their values: "backbone.embed_dim 64"."""
+    before, now = _fields(named), _fields(settings)
+    changed = [k for k in now if k != "seed" and (k not in before or before[k] != now[k])]
+    return ", ".join(f"{field} {now[field]}" for field in changed)
+
+
+def _fields(recipe: Recipe) -> dict[str, object]:
+    fields = json.loads(recipe_to_json(recipe))
+    backbone = fields.pop("backbone")
+    return fields | {f"backbone.{name}": value for name, value in backbone.items()}
 
 
 def _row(cell: Cell) -> str:

@@ -12,10 +12,11 @@ from recipes.cli import main
 from recipes.recipe import recipe_to_json
 from recipes.registry import RECIPES, get_recipe
 from recipes.results.table import make_table, paper_results, to_csv, to_markdown
+from torchrl_tit.networks import MLPConfig
 
 
-def write_run(folder, name, seed, returns, **fields):
-    recipe = replace(get_recipe(name), seed=seed, **fields)
+def write_run(folder, of, seed, returns, **fields):
+    recipe = replace(get_recipe(of), seed=seed, **fields)
     folder.mkdir(parents=True)
     (folder / "recipe.json").write_text(recipe_to_json(recipe))
     if returns is not None:
@@ -149,19 +150,46 @@ def test_fewer_episodes_are_named(tmp_path):
 
 
 def test_what_was_changed_is_named(tmp_path):
-    write_run(tmp_path / "0", "ppo/cartpole/mlp", 3, [20.0], total_steps=1000, device="auto")
+    wide = MLPConfig(hidden_dim=256)
+    write_run(tmp_path / "0", "ppo/cartpole/mlp", 3, [20.0], total_steps=1000, backbone=wide)
     write_run(tmp_path / "1", "ppo/cartpole/d2rl", 0, [500.0])
     cells, _ = make_table([tmp_path])
-    assert [cell.changes for cell in cells] == ["device, total_steps", ""]
+    assert [cell.changes for cell in cells] == ["total_steps 1000, backbone.hidden_dim 256", ""]
     text = to_markdown(cells)
-    assert "| ppo/cartpole/mlp (other device, total_steps) | 1 | 20.0" in text
+    assert "| ppo/cartpole/mlp (total_steps 1000, backbone.hidden_dim 256) | 1 | 20.0" in text
     assert "| ppo/cartpole/d2rl | 1 | 500" in text
 
 
-def test_other_settings_under_one_name(runs):
-    write_run(runs / "more", "ppo/acrobot/enhanced-tit", 7, [1.0], num_envs=2)
-    with pytest.raises(ValueError, match=r"both called ppo/acrobot/enhanced-tit.*num_envs"):
-        make_table([runs])
+def test_other_settings_under_one_name_are_another_cell(tmp_path):
+    for seed in (0, 1):
+        for rate in (3e-4, 1e-3):
+            folder = tmp_path / f"{seed}-{rate}"
+            write_run(folder, "ppo/acrobot/mlp", seed, [rate * 1e4], learning_rate=rate)
+    cells, _ = make_table([tmp_path])
+    found = [(cell.recipe, cell.changes, cell.runs, round(cell.mean, 9)) for cell in cells]
+    assert found == [
+        ("ppo/acrobot/mlp", "", 2, 3),
+        ("ppo/acrobot/mlp", "learning_rate 0.001", 2, 10),
+    ]
+
+
+def test_other_settings_under_a_name_of_ones_own(tmp_path):
+    for number, epochs in enumerate([4, 5]):
+        folder = tmp_path / str(number)
+        write_run(folder, "ppo/acrobot/mlp", 0, [1.0], name="mine", epochs=epochs)
+    cells, _ = make_table([tmp_path])
+    assert [(cell.label, cell.runs) for cell in cells] == [("mine", 1), ("mine (epochs 5)", 1)]
+
+
+def test_runs_without_a_name_are_called_as_their_folder(tmp_path):
+    for number, epochs in enumerate([4, 4, 5]):
+        folder = tmp_path / str(number)
+        write_run(folder, "ppo/acrobot/mlp", number, [1.0], name="", epochs=epochs)
+    cells, _ = make_table([tmp_path])
+    assert [(cell.label, cell.runs) for cell in cells] == [
+        (str(tmp_path / "0"), 2),
+        (str(tmp_path / "2"), 1),
+    ]
 
 
 def test_the_same_seed_twice(runs):
