@@ -6,6 +6,7 @@ import io
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 # Letters of a name with which two stand side by side below a picture.
 _WIDEST_OF_TWO = 40
+# Letters of a line beside a panel.
+_WIDEST_LABEL = 26
 
 
 def plot_learning_curve(
@@ -103,7 +106,12 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
         tasks.setdefault(cell.recipe.rpartition("/")[0], []).append(cell)
     columns = min(3, len(tasks))
     rows = -(-len(tasks) // columns)
-    height = 0.6 + 0.32 * max(map(len, tasks.values()))
+    labels = {
+        task: [_break(cell.label.removeprefix(f"{task}/")) for cell in group]
+        for task, group in tasks.items()
+    }
+    breaks = max(label.count("\n") for group in labels.values() for label in group)
+    height = 0.6 + (0.32 + 0.16 * breaks) * max(map(len, tasks.values()))
     figure = _blank((4.2 * columns, height * rows + 0.6))
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for axes, (task, group) in zip(panels, tasks.items(), strict=False):
@@ -129,7 +137,7 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
             markersize=4,
             label="paper",
         )
-        axes.set_yticks(places, [cell.label.rpartition("/")[2] for cell in group])
+        axes.set_yticks(places, labels[task])
         axes.set(title=task, ylim=(len(group) - 0.4, -0.6))
         axes.grid(alpha=0.3)
     for axes in panels[len(tasks) :]:
@@ -142,6 +150,11 @@ def _curve(metrics: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps and returns of the batches in which an episode ended."""
     rows = [row for row in read_metrics(metrics) if not np.isnan(row["return_mean"])]
     return np.array([row["step"] for row in rows]), np.array([row["return_mean"] for row in rows])
+
+
+def _break(label: str) -> str:
+    """Breaks a label into lines that leave a panel its room."""
+    return "\n".join(wrap(label, _WIDEST_LABEL))
 
 
 def _blank(size: tuple[float, float]) -> Figure:

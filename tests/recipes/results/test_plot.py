@@ -1,11 +1,13 @@
 """Pictures of learning curves."""
 
+from itertools import combinations
 from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
 
-from recipes.results.plot import plot_comparison
+from recipes.results.plot import plot_comparison, plot_table
+from recipes.results.table import Cell
 
 
 def height(folder: Path, groups: int) -> int:
@@ -46,3 +48,27 @@ def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, monkeypat
     ]
     labels = ["mlp (1 runs)", "mlp-stack-8 (1 runs)", "lstm (1 runs)"]
     assert drawn == [("ppo/cartpole", labels), ("mine", labels), ("", [f"{names[0]} (1 runs)"])]
+
+
+def test_what_was_changed_has_room_beside_its_panel(tmp_path, monkeypatch):
+    """Names of cells overlap neither another panel nor each other, and show what was changed."""
+    changes = "env ALE/Pong-v5, num_envs 2, total_steps 128, steps_per_batch 64, epochs 3"
+    cells = [
+        Cell("Online", f"ppo/{task}/enhanced-tit", 1, 1, *[1.0] * 8, changes=text)
+        for task in ("a", "b", "c")
+        for text in ("", changes)
+    ]
+    figures = []
+    monkeypatch.setattr("recipes.results.plot._save", lambda figure, path: figures.append(figure))
+    plot_table(cells, tmp_path / "table.png")
+    (figure,) = figures
+    figure.canvas.draw()
+    boxes = []
+    for axes in figure.axes:
+        labels = axes.get_yticklabels()
+        assert [label.get_text().replace("\n", " ") for label in labels] == [
+            "enhanced-tit",
+            f"enhanced-tit ({changes})",
+        ]
+        boxes += [axes.bbox, *(label.get_window_extent() for label in labels)]
+    assert not any(box.overlaps(other) for box, other in combinations(boxes, 2))
