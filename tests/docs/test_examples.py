@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from docs.examples import dqn, iql, sac
+from docs.examples import dqn, iql, ppo, sac
 
 
 def parameters_of_backbones(loss):
@@ -61,3 +61,15 @@ def test_critics_are_stacked_and_start_as_they_were_built(example, short):
     assert layers
     for layer in layers:  # drawn anew, they would be spread more than twice as far
         assert layer.std().item() == pytest.approx(0.02, rel=0.1)
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.1])
+def test_ppo_trains_the_backbone_before_its_heads(dropout):
+    backbone, loss = ppo.main(steps=512, dropout=dropout)
+    heads = dict(loss.named_parameters())
+    assert not parameters_of_backbones(loss)
+    assert parameters_of_backbones(backbone)
+    for name, parameter in [*backbone.named_parameters(), *heads.items()]:
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any() or "in_proj" in name, name
