@@ -164,6 +164,7 @@ def run_jobs(
     running: dict[Job, Worker] = {}
     failed = []
     done = len(jobs) - len(waiting)
+    shown = ""
     with raise_on_signals(), tqdm(total=len(jobs), initial=done, unit=" runs") as progress:
         try:
             while waiting or running:
@@ -174,8 +175,9 @@ def run_jobs(
                 text = f"{at_work(running.values())} at work"
                 if waiting and len(running) < workers:
                     text += ", others in use by other processes"
-                if text != progress.postfix:
+                if text != shown:
                     progress.set_postfix_str(text)
+                    shown = text
                 time.sleep(0.2)
                 for job in list(running):
                     code = running[job].poll()

@@ -129,11 +129,12 @@ class Search:
             if trial.state == TrialState.RUNNING
         ]
         failed = [t.number for t in ended if t.state == TrialState.FAIL]
-        progress = tqdm(total=trials, initial=len(ended), unit=" trials")
+        done = len(ended)  # a progress bar that is switched off does not count
+        progress = tqdm(total=trials, initial=done, unit=" trials")
         with raise_on_signals(), progress:
             try:
-                while progress.n < trials:
-                    room = min(workers, trials - progress.n)
+                while done < trials:
+                    room = min(workers, trials - done)
                     while len(running) < room:
                         running.append(_Trial(self, self.study.ask()))
                     time.sleep(0.2)
@@ -141,6 +142,7 @@ class Search:
                         state = trial.advance()
                         if state is not None:
                             running.remove(trial)
+                            done += 1
                             progress.update()
                             if state == TrialState.FAIL:
                                 failed.append(trial.number)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -71,6 +72,14 @@ def test_a_run_in_use_is_waited_for(tmp_path):
 
     assert sweep.run_jobs([used, free], workers=2, start=start) == []
     assert begun == [(free, False), (used, False)]
+
+
+def test_without_a_progress_view(tmp_path, monkeypatch):
+    """TQDM_DISABLE=1 switches it off."""
+    monkeypatch.setattr(sweep, "tqdm", partial(sweep.tqdm, disable=True))
+    job = begin(tmp_path / "run", TINY)
+    ends = [sys.executable, "-c", ""]
+    assert sweep.run_jobs([job], workers=1, start=lambda job: subprocess.Popen(ends)) == []
 
 
 @pytest.mark.parametrize("completes", [True, False])

@@ -6,10 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import filelock
 import pytest
+from tqdm import tqdm
 
 from recipes.cli import main
 from recipes.ppo import PPO
@@ -226,6 +228,17 @@ def test_no_more_trials_than_workers_go_on(tmp_path, monkeypatch):
     monkeypatch.setattr(time, "sleep", lambda _: None)
     assert search.run(2, workers=1) == [0, 1]
     assert begun == ["trial-0", "trial-1"]
+
+
+def test_without_a_progress_view(tmp_path, monkeypatch):
+    """TQDM_DISABLE=1 switches it off."""
+    (tmp_path / "space.json").write_text(json.dumps({"epochs": SPACE["epochs"]}))
+    space = load_space(tmp_path / "space.json", RECIPE)
+    naps = iter(range(20))  # a search without an end runs out of them
+    monkeypatch.setattr("recipes.sweeps.tune.tqdm", partial(tqdm, disable=True))
+    monkeypatch.setattr("recipes.sweeps.tune.start", lambda job: FailingWorker())
+    monkeypatch.setattr(time, "sleep", lambda _: next(naps))
+    assert Search(tmp_path / "out", Settings(RECIPE, space)).run(2, workers=1) == [0, 1]
 
 
 def test_one_process_at_a_time(tmp_path):
