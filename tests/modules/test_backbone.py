@@ -34,6 +34,12 @@ def test_nested_keys():
     assert td["agent", "features"].shape == (5, 64)
 
 
+def test_a_key_can_be_a_name():
+    backbone = Backbone(EnhancedTIT((4,), history=2), in_keys="past", out_keys="seen")
+    td = backbone(TensorDict({"past": torch.randn(5, 2, 4)}, [5]))
+    assert td["seen"].shape == (5, 64)
+
+
 @pytest.mark.parametrize("acts", [False, True])
 @torch.no_grad()
 def test_is_called_as_any_tensordict_module(acts):

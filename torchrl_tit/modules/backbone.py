@@ -27,9 +27,9 @@ class Backbone(TensorDictModule):
     Args:
         network: maps a history [..., K, *observation_shape] to features [..., F], or to as many
             tensors as there are ``out_keys`` (policy and value features, say).
-        in_keys: one key, nested or not, under which the history stands (see
-            :class:`~torchrl_tit.transforms.History`).
-        out_keys: one key for each tensor that the network puts out.
+        in_keys: a list with one key, nested or not, under which the history stands (see
+            :class:`~torchrl_tit.transforms.History`), or its name.
+        out_keys: a list with one key for each tensor that the network puts out, or a single name.
         autocast: the type that matrix products are computed in, such as ``torch.bfloat16``; weights
             and features keep theirs. None computes all in the type of the weights.
 
@@ -49,16 +49,19 @@ class Backbone(TensorDictModule):
     def __init__(
         self,
         network: nn.Module,
-        in_keys: Sequence[NestedKey] = ("history",),
-        out_keys: Sequence[NestedKey] = ("features",),
+        in_keys: Sequence[NestedKey] | str = ("history",),
+        out_keys: Sequence[NestedKey] | str = ("features",),
         autocast: torch.dtype | None = None,
     ) -> None:
+        in_keys, out_keys = (
+            [keys] if isinstance(keys, str) else list(keys) for keys in (in_keys, out_keys)
+        )
         if len(in_keys) != 1 or not out_keys:
             raise ValueError(
                 "a backbone reads one history and writes at least one entry of features, not "
-                f"in_keys={list(in_keys)} and out_keys={list(out_keys)}"
+                f"in_keys={in_keys} and out_keys={out_keys}"
             )
-        super().__init__(network, in_keys=list(in_keys), out_keys=list(out_keys))
+        super().__init__(network, in_keys=in_keys, out_keys=out_keys)
         self.autocast = autocast
         self._cache: FrameCache | None = None  # while acting
         # What runs while acting in place of frame encoder and history encoder, if compiled.
