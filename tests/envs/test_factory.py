@@ -70,7 +70,7 @@ def test_a_seeded_reset_is_gymnasiums():
         ("CartPole-v7", "'CartPole-v7'; did you mean one of .*'CartPole-v1'"),
         ("cartpole-v1", "'cartpole-v1'; did you mean one of .*'CartPole-v1'"),
         ("Hoper-v5", "'Hoper-v5'; did you mean one of 'Hopper-v5'"),
-        ("xyzzy", "'xyzzy'; is its package imported"),
+        ("xyzzy", "'xyzzy'; is its package imported, or is it an Atari game, .* 'ALE/Pong-v5'"),
     ],
 )
 def test_unknown_names(name, words):

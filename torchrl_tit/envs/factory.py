@@ -202,7 +202,7 @@ def _unknown(name: str) -> ValueError:
     hint = (
         f"did you mean one of {', '.join(map(repr, nearest))}"
         if nearest
-        else "is its package imported"
+        else "is its package imported, or is it an Atari game, whose name is one as 'ALE/Pong-v5'"
     )
     return ValueError(
         f"Unknown task {name!r}; {hint}? `gymnasium.pprint_registry()` lists all names."
