@@ -177,6 +177,11 @@ def test_actions_are_clipped_on_their_way_only():
     assert isinstance(env.action_spec, Unbounded)
 
 
+def test_a_policy_that_writes_no_action_is_named():
+    with pytest.raises(KeyError, match="action"):
+        make_env("CartPole-v1").rollout(1, lambda tensordict: tensordict, auto_reset=True)
+
+
 def test_actions_have_bounds_where_they_are_not_clipped():
     space = make_env("Pendulum-v1", 3, clip_actions=False).action_spec.space
     assert torch.equal(space.low, torch.full((3, 1), -2.0))

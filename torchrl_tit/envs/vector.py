@@ -139,7 +139,7 @@ class GymVectorEnv(EnvBase):
         stepped = tensordict.get("_step", None)
         if stepped is not None and not stepped.all():
             raise NotImplementedError("GymVectorEnv cannot step only some of its environments.")
-        action = tensordict.get("action").numpy(force=True)
+        action = tensordict["action"].numpy(force=True)
         if self._bounds is not None:
             action = action.clip(*self._bounds)
         observations, rewards, terminated, truncated, info = self._env.step(action)
