@@ -8,8 +8,19 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 import torch
@@ -63,6 +74,14 @@ class Recipe:
             ALGORITHMS[cls.algorithm] = cls
 
     def __post_init__(self) -> None:
+        for name, kind in _field_types(type(self)).items():  # type: ignore[arg-type]
+            if name != "backbone":
+                _checked(name, getattr(self, name), kind)
+            elif not isinstance(self.backbone, kind):
+                raise ValueError(
+                    f"field 'backbone' must be the settings of a network, such as MLPConfig(), not "
+                    f"{self.backbone!r}"
+                )
         check_at_least(self, threads=1, seed=0, evaluation_episodes=1, evaluation_seed=0)
         check_at_most(self, seed=_MAX_SEED, evaluation_seed=_MAX_SEED)
         if self.name and not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", self.name):
@@ -182,15 +201,27 @@ def _take(fields: dict[str, Any], key: str, choices: Mapping[str, T]) -> T:
 
 def _convert(kind: type[T], fields: dict[str, Any], prefix: str = "", **made: Any) -> T:
     """Builds a dataclass from fields, each strictly of its type; ``made`` are built already."""
-    types = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    hints = get_type_hints(kind)
+    types = _field_types(kind)  # type: ignore[arg-type]
     values = dict(made)
     for name, value in fields.items():
         if name not in types:
             raise ValueError(f"unknown field {prefix + name!r}: {nearest(name, types)}")
         if name not in made:
-            try:
-                values[name] = msgspec.convert(value, hints[name])
-            except msgspec.ValidationError as error:
-                raise ValueError(f"field {prefix + name!r} is {value!r}: {error}") from error
+            values[name] = _checked(prefix + name, value, types[name])
     return kind(**values)
+
+
+@cache
+def _field_types(kind: type) -> dict[str, Any]:
+    """The fields of a dataclass with their types."""
+    hints = get_type_hints(kind)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+def _checked(name: str, value: object, kind: Any) -> Any:
+    """Returns a value as its type, or raises ValueError where it is of another."""
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        choices = f", not one of {get_args(kind)}" if get_origin(kind) is Literal else ""
+        raise ValueError(f"field {name!r} is {value!r}{choices}: {error}") from error

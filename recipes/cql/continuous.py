@@ -64,8 +64,6 @@ class CQL(CQLRecipe[CQLAgent]):
             temperature_learning_rate=0,
             action_samples=1,
         )
-        if self.critic not in ("mlp", "backbone"):
-            raise ValueError(f"critic must be 'mlp' or 'backbone', not {self.critic!r}")
         if not self.temperature_init > 0:
             raise ValueError(f"temperature_init must be positive, not {self.temperature_init}")
         if not self.critic_hidden or min(self.critic_hidden) < 1:

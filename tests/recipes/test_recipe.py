@@ -1,0 +1,35 @@
+"""What every recipe has: fields whose values are of their types."""
+
+from dataclasses import replace
+
+import pytest
+
+from recipes.registry import get_recipe
+from torchrl_tit.networks import MLP
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"initialization": "orthogonl"},
+            "field 'initialization' is 'orthogonl', not one of",
+        ),
+        ({"compile": "yes"}, r"field 'compile' is 'yes', not one of \('auto', 'on', 'off'\)"),
+        ({"num_envs": "2"}, "field 'num_envs' is '2': Expected `int`"),
+        ({"epochs": 2.0}, r"field 'epochs' is 2\.0: Expected `int`"),
+        ({"hide_velocities": 1}, "field 'hide_velocities' is 1: Expected `bool`"),
+        (
+            {"backbone": "mlp"},
+            "must be the settings of a network, .* not 'mlp'",
+        ),
+        ({"backbone": MLP((4,))}, "must be the settings of a network"),
+    ],
+)
+def test_values_of_other_types_are_refused_in_python_too(changes, message):
+    with pytest.raises(ValueError, match=message):
+        replace(get_recipe("ppo/cartpole/mlp"), **changes)
+
+
+def test_whole_numbers_are_numbers():
+    assert replace(get_recipe("ppo/cartpole/mlp"), learning_rate=1).learning_rate == 1
