@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
+from recipes.ppo import PPO
 from recipes.registry import get_recipe
-from torchrl_tit.networks import MLP
+from torchrl_tit.networks import MLP, MLPConfig
 
 
 @pytest.mark.parametrize(
@@ -32,4 +33,5 @@ def test_values_of_other_types_are_refused_in_python_too(changes, message):
 
 
 def test_whole_numbers_are_numbers():
-    assert replace(get_recipe("ppo/cartpole/mlp"), learning_rate=1).learning_rate == 1
+    recipe = PPO(env="CartPole-v1", backbone=MLPConfig(), learning_rate=1)
+    assert recipe.learning_rate == 1

@@ -54,7 +54,7 @@ def test_what_was_changed_has_room_beside_its_panel(tmp_path, monkeypatch):
     """Names of cells overlap neither another panel nor each other, and show what was changed."""
     changes = "env ALE/Pong-v5, num_envs 2, total_steps 128, steps_per_batch 64, epochs 3"
     cells = [
-        Cell("Online", f"ppo/{task}/enhanced-tit", 1, 1, *[1.0] * 8, changes=text)
+        Cell("Online", f"ppo/{task}/enhanced-tit", 1, 1, 1, 0, 0, 1, 1, 1, 1, 0, changes=text)
         for task in ("a", "b", "c")
         for text in ("", changes)
     ]
