@@ -14,7 +14,9 @@ def sweep(words: list[str]) -> None:
     """Trains recipes with seeds."""
     parser = Parser(f"{program()} sweep")
     parser.add_argument(
-        "names", nargs="+", help="names of recipes, or patterns such as 'ppo/*/mlp'"
+        "names",
+        nargs="+",
+        help="names of recipes, patterns such as 'ppo/*/mlp', or JSON files that hold a recipe",
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each recipe")
     parser.add_argument(

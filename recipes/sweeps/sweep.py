@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from ..interrupt import raise_on_signals
 from ..recipe import Recipe, nearest
-from ..registry import RECIPES
+from ..registry import RECIPES, find_recipe
 from ..run import Run
 
 PROGRAM = str(__package__).rpartition(".")[0]
@@ -81,33 +81,53 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
     """Lists the runs of a sweep, and checks all of them before any begins.
 
     Args:
-        patterns: names of recipes, or patterns such as ``ppo/*/mlp``.
+        patterns: names of recipes, patterns such as ``ppo/*/mlp``, or JSON files that hold a
+            recipe, such as ``tune``'s ``best.json``.
         seeds: seeds, each of which every recipe is run with.
         out: folder of the sweep; a run's folder is ``out/NAME/seed-SEED``.
 
     Raises:
-        ValueError: if a pattern fits no recipe, a recipe cannot be built, or a folder holds a run
-            with other settings.
+        FileNotFoundError: if there is no such file.
+        ValueError: if a pattern fits no recipe, a file holds none or one without a name, two have
+            one name and other settings, a recipe cannot be built, or a folder holds a run with
+            other settings.
 
     Example:
         >>> jobs = make_jobs(["ppo/cartpole/*-tit"], [0, 1], Path("runs/sweep"))
         >>> [str(job.folder) for job in jobs][:2]
         ['runs/sweep/ppo/cartpole/vanilla-tit/seed-0', 'runs/sweep/ppo/cartpole/vanilla-tit/seed-1']
     """
-    names: dict[str, None] = {}  # in order, each once
+    found: dict[str, tuple[Recipe, str]] = {}  # by name, in order, each once
     for pattern in patterns:
-        fitting = [name for name in RECIPES if fnmatchcase(name, pattern)]
-        if not fitting:
-            raise ValueError(f"no recipe is called {pattern!r}: {nearest(pattern, RECIPES)}")
-        names.update(dict.fromkeys(fitting))
+        for recipe, source in _find(pattern):
+            other, other_source = found.setdefault(recipe.name, (recipe, source))
+            if replace(recipe, seed=0) != replace(other, seed=0):
+                raise ValueError(
+                    f"{source or 'the named recipe'} and {other_source or 'the named recipe'} are "
+                    f"both called {recipe.name!r} and differ: change the field name in the file"
+                )
     jobs = []
-    for name in names:
-        RECIPES[name].check()
+    for recipe, source in found.values():
+        recipe.check()
         for seed in dict.fromkeys(seeds):
-            job = Job(replace(RECIPES[name], seed=seed), out / name / f"seed-{seed}")
+            folder = out / recipe.name / f"seed-{seed}"
+            job = Job(replace(recipe, seed=seed), folder, source)
             job.check()
             jobs.append(job)
     return jobs
+
+
+def _find(pattern: str) -> list[tuple[Recipe, str]]:
+    """The recipes that a pattern fits, or the one in a JSON file, each with its file."""
+    if pattern.endswith(".json"):
+        recipe = find_recipe(pattern)
+        if not recipe.name:
+            raise ValueError(f"the recipe in {pattern} has no name, which its runs' folders take")
+        return [(recipe, pattern)]
+    fitting = [(recipe, "") for name, recipe in RECIPES.items() if fnmatchcase(name, pattern)]
+    if not fitting:
+        raise ValueError(f"no recipe is called {pattern!r}: {nearest(pattern, RECIPES)}")
+    return fitting
 
 
 class Worker(Protocol):

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from recipes.cli import main
+from recipes.recipe import recipe_to_json
 from recipes.registry import RECIPES
 from recipes.run import Run
 from recipes.sweeps import sweep
@@ -26,6 +27,31 @@ def test_patterns_and_seeds_make_the_runs(tmp_path):
     assert len(jobs) == 2 * len(fitting)
     assert {job.recipe.seed for job in jobs} == {3, 4}
     assert all(job.folder == tmp_path / job.recipe.name / f"seed-{job.recipe.seed}" for job in jobs)
+
+
+def test_files_of_recipes_are_swept_beside_named_ones(tmp_path):
+    mine = replace(TINY, name="ppo/cartpole/mine", seed=7)
+    file = tmp_path / "mine.json"
+    file.write_text(recipe_to_json(mine))
+    jobs = sweep.make_jobs([str(file), "ppo/cartpole/mlp", str(file)], [0, 1], tmp_path)
+    assert [job.recipe for job in jobs[:2]] == [replace(mine, seed=0), replace(mine, seed=1)]
+    assert [job.recipe.name for job in jobs[2:]] == ["ppo/cartpole/mlp"] * 2
+    assert jobs[0].folder == tmp_path / "ppo/cartpole/mine/seed-0"
+    assert jobs[1].words()[:4] == ["train", str(file), "--seed", "1"]
+    assert jobs[2].words()[:2] == ["train", "ppo/cartpole/mlp"]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_file_with_the_name_of_another_recipe_is_refused(order, tmp_path):
+    file = tmp_path / "mine.json"
+    file.write_text(recipe_to_json(replace(TINY, name="ppo/cartpole/mlp")))
+    with pytest.raises(ValueError, match="both called 'ppo/cartpole/mlp' and differ"):
+        sweep.make_jobs([str(file), "ppo/cartpole/*"][::order], [0], tmp_path)
+    file.write_text(recipe_to_json(replace(TINY, name="")))
+    with pytest.raises(ValueError, match=r"mine\.json has no name"):
+        sweep.make_jobs([str(file)], [0], tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"yours\.json"):
+        sweep.make_jobs([str(tmp_path / "yours.json")], [0], tmp_path)
 
 
 @pytest.mark.slow
