@@ -280,3 +280,10 @@ def test_bad_input():
             AtariGames("pong", **{name: value})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="runs in threads, side by side"):
         make_env("ALE/Pong-v5", vectorization_mode="async")
+
+
+@pytest.mark.parametrize("name", ["PongNoFrameskip-v4", "Pong-v4"])
+def test_names_without_the_protocol_are_refused(name):
+    gymnasium.register_envs(ale_py)
+    with pytest.raises(ValueError, match=f"{name}.*without the protocol.*'ALE/Pong-v5'"):
+        make_env(name)

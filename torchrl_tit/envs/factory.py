@@ -163,6 +163,11 @@ def _tasks(
     # "module:name" makes Gymnasium import the module, which registers the name.
     if name not in gymnasium.registry and ":" not in name:
         raise _unknown(name)
+    spec = gymnasium.registry.get(name)
+    if spec is not None and str(spec.entry_point).startswith("ale_py"):
+        raise ValueError(
+            f"Task {name!r} is an Atari game without the protocol: name it as in 'ALE/Pong-v5'."
+        )
     # What the vector environment returns is copied at once, so it need not make copies of its own.
     make = partial(_task, os.getpid(), name, **kwargs)
     vectorize = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
