@@ -30,6 +30,7 @@ _VISIBLE = {"cartpole": 2, "acrobot": 4, "hopper": 5}
 def _networks(task: str) -> dict[str, tuple[int, NetworkConfig]]:
     """The networks, each with the history K that it reads."""
     tit = EnhancedTITConfig(**TUNED_TIT[task].get("backbone", {}))
+    tit = replace(tit, patch_size=min(tit.patch_size, _VISIBLE[task]))
     positions = replace(tit, temporal_position_encoding=True)
     return {
         "mlp": (1, MLPConfig()),

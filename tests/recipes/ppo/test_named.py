@@ -73,3 +73,14 @@ def test_settings_of_tit(task, network):
 def test_the_trunks_have_two_tanh_layers_of_64(task, network):
     backbone = RECIPES[f"ppo/{task}/{network}"].backbone
     assert vars(backbone) == {"hidden_dim": 64, "num_layers": 2, "activation": "tanh"}
+
+
+@pytest.mark.parametrize("task", ["ant", "halfcheetah", "hopper", "walker2d"])
+@pytest.mark.parametrize("network", ["vanilla-tit", "enhanced-tit"])
+def test_tuned_locomotion_takes_the_whole_observation_for_one_patch(task, network):
+    recipe = RECIPES[f"ppo/{task}/{network}-tuned"]
+    assert isinstance(recipe, PPO)
+    recipe.check()
+    env = recipe.make_env(1, seed=0)
+    assert isinstance(recipe.backbone, EnhancedTITConfig | VanillaTITConfig)
+    assert recipe.backbone.patch_size == env.observation_spec["history"].shape[-1]

@@ -9,7 +9,7 @@ from recipes.ppo.no_velocity import NO_VELOCITY_RECIPES
 from recipes.registry import RECIPES
 from recipes.run import Run
 from torchrl_tit.checkpoint import load_checkpoint
-from torchrl_tit.networks import MLPConfig
+from torchrl_tit.networks import EnhancedTITConfig, MLPConfig
 
 
 @pytest.mark.parametrize("name", NO_VELOCITY_RECIPES)
@@ -26,7 +26,8 @@ def test_recipes_can_be_built_and_hide_the_velocities(name):
     assert getattr(backbone, "outer", True) == ("wo-outer" not in network)
     entries = {"CartPole-v1": 2, "Acrobot-v1": 4, "Hopper-v5": 5}[recipe.env]
     if "tuned" in network:
-        assert recipe.backbone.patch_size == entries
+        assert isinstance(backbone, EnhancedTITConfig)
+        assert backbone.patch_size == entries
     env = recipe.make_env(2, seed=0)
     assert env.reset()["history"].shape == (2, recipe.history, entries)
     assert recipe.num_envs == (16 if "acrobot" in name else 8)
