@@ -77,7 +77,7 @@ class Recipe:
         for name, kind in _field_types(type(self)).items():  # type: ignore[arg-type]
             if name != "backbone":
                 _checked(name, getattr(self, name), kind)
-            elif not isinstance(self.backbone, kind):
+            elif not isinstance(self.backbone, NetworkConfig):
                 raise ValueError(
                     f"field 'backbone' must be the settings of a network, such as MLPConfig(), not "
                     f"{self.backbone!r}"
