@@ -74,14 +74,14 @@ class Recipe:
             ALGORITHMS[cls.algorithm] = cls
 
     def __post_init__(self) -> None:
+        if not isinstance(self.backbone, NetworkConfig):
+            raise ValueError(
+                f"field 'backbone' must be the settings of a network, such as MLPConfig(), not "
+                f"{self.backbone!r}"
+            )
         for name, kind in _field_types(type(self)).items():  # type: ignore[arg-type]
-            if name != "backbone":
+            if name != "backbone":  # which algorithm takes which network, it says itself
                 _checked(name, getattr(self, name), kind)
-            elif not isinstance(self.backbone, NetworkConfig):
-                raise ValueError(
-                    f"field 'backbone' must be the settings of a network, such as MLPConfig(), not "
-                    f"{self.backbone!r}"
-                )
         check_at_least(self, threads=1, seed=0, evaluation_episodes=1, evaluation_seed=0)
         check_at_most(self, seed=_MAX_SEED, evaluation_seed=_MAX_SEED)
         if self.name and not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", self.name):

@@ -197,7 +197,7 @@ def test_impossible_settings_of_both(tmp_path, make, settings, message):
         ({"actor_learning_rate": -1.0}, "actor_learning_rate must be at least 0"),
         ({"critic_learning_rate": -1.0}, "critic_learning_rate must be at least 0"),
         ({"temperature_learning_rate": -1.0}, "temperature_learning_rate must be at least 0"),
-        ({"critic": "tit"}, "field 'critic' is 'tit', not one of"),
+        ({"critic": "tit"}, r"field 'critic' is 'tit', not one of \('mlp', 'backbone'\)"),
     ],
 )
 def test_impossible_settings(tmp_path, settings, message):
@@ -206,5 +206,6 @@ def test_impossible_settings(tmp_path, settings, message):
 
 
 def test_an_unknown_way_over_critics(tmp_path):
-    with pytest.raises(ValueError, match="field 'over_critics' is 'max', not one of"):
+    message = r"field 'over_critics' is 'max', not one of \('mean', 'sum'\)"
+    with pytest.raises(ValueError, match=message):
         make_cql(tmp_path, over_critics="max").check()
