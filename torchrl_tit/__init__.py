@@ -3,8 +3,31 @@
 Every network here is a frame encoder followed by a history encoder; everything else is TorchRL.
 """
 
-from torchrl_tit.modules import Backbone
-from torchrl_tit.networks import EnhancedTIT, VanillaTIT
-from torchrl_tit.transforms import History
+from __future__ import annotations
 
-__all__ = ["Backbone", "EnhancedTIT", "History", "VanillaTIT"]
+import importlib
+from typing import Any
+
+_HOMES = {
+    "Backbone": "torchrl_tit.modules",
+    "EnhancedTIT": "torchrl_tit.networks",
+    "History": "torchrl_tit.transforms",
+    "HistoryNetwork": "torchrl_tit.networks",
+    "Inner": "torchrl_tit.settings",
+    "Outer": "torchrl_tit.settings",
+    "PairedOuter": "torchrl_tit.settings",
+    "VanillaTIT": "torchrl_tit.networks",
+}
+"""Where the public names live: PyTorch is loaded with the first of them that needs it."""
+
+__all__ = [*_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

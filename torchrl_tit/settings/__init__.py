@@ -1,0 +1,59 @@
+"""Settings: dataclasses of values and checks, which import neither torch nor what they describe.
+
+Listing recipes and printing help need names, defaults and docstrings only, so settings stand apart
+from the modules that they build. Each part names its implementation, which is imported when it is
+built (:meth:`~torchrl_tit.settings.parts.Part.build`).
+"""
+
+from torchrl_tit.settings.frames import (
+    Activation,
+    Flat,
+    FrameSettings,
+    Inner,
+    Linear,
+    NatureCNNFrames,
+    ResNetFrames,
+)
+from torchrl_tit.settings.histories import (
+    D2RL,
+    LSTM,
+    MLP,
+    Catformer,
+    CoBERL,
+    DecisionTransformer,
+    HistorySettings,
+    OFENet,
+    Outer,
+    PairedOuter,
+    StackedCNN,
+    StackedInner,
+)
+from torchrl_tit.settings.networks import NETWORKS, Head, Network
+from torchrl_tit.settings.parts import Part, resolve
+
+__all__ = [
+    "D2RL",
+    "LSTM",
+    "MLP",
+    "NETWORKS",
+    "Activation",
+    "Catformer",
+    "CoBERL",
+    "DecisionTransformer",
+    "Flat",
+    "FrameSettings",
+    "Head",
+    "HistorySettings",
+    "Inner",
+    "Linear",
+    "NatureCNNFrames",
+    "Network",
+    "OFENet",
+    "Outer",
+    "PairedOuter",
+    "Part",
+    "ResNetFrames",
+    "StackedCNN",
+    "StackedInner",
+    "resolve",
+]

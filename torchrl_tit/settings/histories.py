@@ -1,0 +1,231 @@
+"""Settings of history encoders, which turn the tokens of K frames into one feature vector."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from torchrl_tit.settings.checks import check_at_least, check_choice, check_probability
+from torchrl_tit.settings.frames import Activation, PatchTransformerSettings, TransformerSettings
+from torchrl_tit.settings.parts import Part
+
+
+@dataclass(frozen=True, kw_only=True)
+class HistorySettings(Part, kind="history encoder"):
+    """Settings of a history encoder: tokens [..., K, L, D] -> outputs [..., E]."""
+
+    reads_actions: ClassVar[bool] = False
+    """Whether it reads past actions and returns to go beside the tokens."""
+    is_recurrent: ClassVar[bool] = False
+    """Whether it carries a state from step to step where it reads one frame."""
+
+    def check_num_frames(self, num_frames: int) -> None:
+        """Raises ValueError where the encoder cannot read so many frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OuterSettings(TransformerSettings, HistorySettings):
+    """Settings that both outer transformers share."""
+
+    temporal_position_encoding: bool = False
+    """Whether the K frames get a learned position encoding (not in the paper)."""
+
+    def check_num_frames(self, num_frames: int) -> None:
+        """Raises ValueError where there is one frame and a position encoding."""
+        if self.temporal_position_encoding and num_frames == 1:
+            raise ValueError(
+                "temporal_position_encoding tells frames apart, but num_frames is 1: raise it, or "
+                "switch the encoding off"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outer(
+    OuterSettings,
+    name="outer",
+    builds="torchrl_tit.histories.outer:StackedOuterTransformer",
+):
+    """The outer transformer of Vanilla_TIT: stacked causal blocks over one token a frame."""
+
+    num_blocks: int = 2
+    """Number of blocks."""
+    dense: bool = False
+    """Whether to output the concatenated outputs of all blocks, or only that of the last."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(self, num_blocks=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairedOuter(
+    OuterSettings,
+    name="paired-outer",
+    builds="torchrl_tit.histories.outer:PairedOuterTransformer",
+):
+    """The outer blocks of Enhanced_TIT: one for each token of a frame, all outputs concatenated."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackedInner(
+    PatchTransformerSettings,
+    HistorySettings,
+    name="stacked-inner",
+    builds="torchrl_tit.histories.stacked:StackedInnerTransformer",
+):
+    """Inner blocks on K frames that are stacked as channels: the paper's ablation "w/o Outer"."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackedCNN(
+    HistorySettings, name="stacked-cnn", builds="torchrl_tit.histories.stacked:StackedCNN"
+):
+    """A convolutional network on K images that are stacked as channels."""
+
+    torso: Literal["nature-cnn", "resnet"] = "nature-cnn"
+    """The convolutions: those of the deep Q-network, or the residual ones of the baselines."""
+
+    def __post_init__(self) -> None:
+        check_choice(self, "torso", ("nature-cnn", "resnet"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayersSettings:
+    """Settings of fully connected layers, by default those of Stable-Baselines3 for arrays."""
+
+    hidden_dim: int = 64
+    """Width of every layer."""
+    num_layers: int = 2
+    """Number of layers."""
+    activation: Activation = "tanh"
+    """Activation of every layer."""
+
+    def __post_init__(self) -> None:
+        check_at_least(self, hidden_dim=1, num_layers=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MLP(LayersSettings, HistorySettings, name="mlp", builds="torchrl_tit.histories.mlp:MLP"):
+    """Fully connected layers on all entries of all tokens."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OFENet(
+    LayersSettings, HistorySettings, name="ofenet", builds="torchrl_tit.histories.mlp:OFENet"
+):
+    """Fully connected layers that each read the input and the outputs of all layers before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class D2RL(LayersSettings, HistorySettings, name="d2rl", builds="torchrl_tit.histories.mlp:D2RL"):
+    """Fully connected layers that each read the input and the output of the layer before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Catformer(
+    HistorySettings, name="catformer", builds="torchrl_tit.histories.catformer:Catformer"
+):
+    """Catformer: a transformer whose layers are concatenated, by default as in arXiv 2212.14538."""
+
+    num_blocks: int = 2
+    """Number of pairs of an attention layer and an FFN layer."""
+    num_heads: int = 5
+    """Attention heads; must divide ``attention_expansion`` x the width."""
+    attention_expansion: int = 1
+    """Width at which attention works as a multiple of the width (2 in its paper's tuning)."""
+    ffn_expansion: int = 4
+    """Hidden width of an FFN as a multiple of the width."""
+
+    def __post_init__(self) -> None:
+        check_at_least(self, num_blocks=1, num_heads=1, attention_expansion=1, ffn_expansion=1)
+
+    def check_num_frames(self, num_frames: int) -> None:
+        """Raises ValueError where there is one frame."""
+        _check_several_frames(self.name, num_frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoBERL(HistorySettings, name="coberl", builds="torchrl_tit.histories.coberl:CoBERL"):
+    """CoBERL: a gated transformer, a gate and an LSTM, with GTrXL's widths (arXiv 1910.06764)."""
+
+    num_blocks: int = 2
+    """Number of gated transformer blocks."""
+    num_heads: int = 8
+    """Attention heads; must divide the width."""
+    ffn_expansion: int = 4
+    """Hidden width of an FFN as a multiple of the width."""
+    gate_bias: float = 0.0
+    """Start value of the bias of all gates; 2 starts them near the identity, as its paper does."""
+    hidden_dim: int = 512
+    """Size of the LSTM's state, which is the encoder's output."""
+
+    def __post_init__(self) -> None:
+        check_at_least(self, num_blocks=1, num_heads=1, ffn_expansion=1, hidden_dim=1)
+
+    def check_num_frames(self, num_frames: int) -> None:
+        """Raises ValueError where there is one frame."""
+        _check_several_frames(self.name, num_frames)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LSTM(HistorySettings, name="lstm", builds="torchrl_tit.histories.recurrent:LSTM"):
+    """An LSTM. With one frame it carries its state through the episode; with more it reads them."""
+
+    is_recurrent = True
+
+    hidden_dim: int = 64
+    """Size of the LSTM's state, which is the encoder's output."""
+
+    def __post_init__(self) -> None:
+        check_at_least(self, hidden_dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DecisionTransformer(
+    HistorySettings,
+    name="decision-transformer",
+    builds="torchrl_tit.histories.decision_transformer:DecisionTransformer",
+):
+    """Decision Transformer, by default as in arXiv 2106.01345 for MuJoCo.
+
+    It reads returns to go, actions and time steps beside the tokens of the frames.
+    """
+
+    reads_actions = True
+
+    num_blocks: int = 3
+    """Number of GPT-2 blocks."""
+    num_heads: int = 1
+    """Attention heads of a block; must divide the width."""
+    ffn_dim: int | None = None
+    """Hidden width of a block's FFN; four times the width where not given."""
+    activation: Activation = "relu"
+    """Activation in a block's FFN."""
+    dropout: float = 0.1
+    """Dropout on the tokens, on attention weights, and on the outputs of attention and FFN."""
+    max_ep_len: int = 1000
+    """Number of time steps that the timestep embedding knows, from 0."""
+    timestep_embedding: bool = True
+    """Whether tokens get a learned embedding of their time step (Online DT has none)."""
+
+    def __post_init__(self) -> None:
+        check_at_least(self, num_blocks=1, num_heads=1, max_ep_len=1)
+        if self.ffn_dim is not None:
+            check_at_least(self, ffn_dim=1)
+        check_probability(self, "dropout")
+
+    def check_num_frames(self, num_frames: int) -> None:
+        """Raises ValueError where a window is longer than the longest episode."""
+        if num_frames > self.max_ep_len:
+            raise ValueError(
+                f"num_frames {num_frames} is more than max_ep_len {self.max_ep_len}: lower it, or "
+                "raise max_ep_len to the length of the longest episode"
+            )
+
+
+def _check_several_frames(name: str, num_frames: int) -> None:
+    if num_frames < 2:
+        raise ValueError(
+            f"{name} is a transformer over time, but num_frames is {num_frames}: set it to 2 or "
+            "more"
+        )

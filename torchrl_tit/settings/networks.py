@@ -1,0 +1,416 @@
+"""Settings of whole networks: which frame encoder, which history encoder, and what follows them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Literal
+
+from torchrl_tit.settings.checks import check_at_least, check_choice
+from torchrl_tit.settings.frames import (
+    Activation,
+    Flat,
+    FrameSettings,
+    Inner,
+    Linear,
+    ResNetFrames,
+)
+from torchrl_tit.settings.histories import (
+    D2RL,
+    LSTM,
+    MLP,
+    Catformer,
+    CoBERL,
+    DecisionTransformer,
+    HistorySettings,
+    OFENet,
+    Outer,
+    PairedOuter,
+    StackedCNN,
+    StackedInner,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Head:
+    """The layers between the history encoder and the features."""
+
+    features_dim: int | None = 64
+    """Size F of the features; where not given, the history encoder's output is the features."""
+    activation: Activation = "tanh"
+    """Activation after the linear layer."""
+    norm: bool = True
+    """Whether a LayerNorm stands before the linear layer and another one after the activation."""
+
+    def __post_init__(self) -> None:
+        if self.features_dim is not None:
+            check_at_least(self, features_dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network:
+    """A frame encoder followed by a history encoder and a head: any pair that makes sense."""
+
+    frame: FrameSettings
+    """What turns one observation into tokens."""
+    history: HistorySettings
+    """What turns the tokens of the last K frames into one vector."""
+    head: Head = field(default_factory=Head)
+    """What turns that into features."""
+    num_frames: int = 1
+    """Number K of observations that the network reads."""
+    trunks: Literal["shared", "separate"] = "shared"
+    """Whether policy and value share the network, or have one each."""
+    initialization: Literal["normal", "default"] = "default"
+    """How the weights start: normal with a standard deviation of 0.02, as the authors of TIT have
+    it, or as each layer does by itself."""
+
+    def __post_init__(self) -> None:
+        check_at_least(self, num_frames=1)
+        check_choice(self, "trunks", ("shared", "separate"))
+        check_choice(self, "initialization", ("normal", "default"))
+        self.history.check_num_frames(self.num_frames)
+
+    @property
+    def carries_state(self) -> bool:
+        """Whether a state is carried from step to step instead of reading several frames."""
+        return self.history.is_recurrent and self.num_frames == 1
+
+
+def vanilla_tit(
+    num_frames: int = 1,
+    *,
+    patch_size: int | None = 1,
+    embed_dim: int = 32,
+    num_blocks: int = 2,
+    num_heads_inner: int = 1,
+    num_heads_outer: int = 1,
+    ffn_expansion_inner: int = 4,
+    ffn_expansion_outer: int = 4,
+    activation_inner: Activation = "gelu",
+    activation_outer: Activation = "gelu",
+    attention_dropout_inner: float = 0.0,
+    attention_dropout_outer: float = 0.0,
+    ffn_dropout_inner: float = 0.0,
+    ffn_dropout_outer: float = 0.0,
+    position_encoding: bool = True,
+    temporal_position_encoding: bool = False,
+    share_blocks: bool = False,
+    features_dim: int = 64,
+    activation_head: Activation = "tanh",
+) -> Network:
+    """Vanilla_TIT: the inner transformer's last class token, and the outer transformer on it.
+
+    arXiv 2212.14538, section "Vanilla_TIT", figure 1.
+
+    Args:
+        num_frames: number K of observations.
+        patch_size: entries of an array's patch, or pixels along a side of an image's; the whole
+            observation where None.
+        embed_dim: width D of a token.
+        num_blocks: number L of inner blocks and of outer blocks.
+        num_heads_inner: attention heads of an inner block; must divide the width.
+        num_heads_outer: attention heads of an outer block; must divide the width.
+        ffn_expansion_inner: hidden width of an inner block's FFN as a multiple of the width.
+        ffn_expansion_outer: hidden width of an outer block's FFN as a multiple of the width.
+        activation_inner: activation in an inner block's FFN.
+        activation_outer: activation in an outer block's FFN.
+        attention_dropout_inner: dropout on the attention weights of inner blocks.
+        attention_dropout_outer: dropout on the attention weights of outer blocks.
+        ffn_dropout_inner: dropout on the FFN outputs of inner blocks.
+        ffn_dropout_outer: dropout on the FFN outputs of outer blocks.
+        position_encoding: whether patches and class token get a learned position encoding.
+        temporal_position_encoding: whether the K frames get one (not in the paper).
+        share_blocks: whether all inner blocks are one block, and all outer blocks too.
+        features_dim: size of the features.
+        activation_head: activation of the head.
+    """
+    return Network(
+        frame=Inner(
+            patch_size=patch_size,
+            embed_dim=embed_dim,
+            num_blocks=num_blocks,
+            num_heads=num_heads_inner,
+            ffn_expansion=ffn_expansion_inner,
+            activation=activation_inner,
+            attention_dropout=attention_dropout_inner,
+            ffn_dropout=ffn_dropout_inner,
+            position_encoding=position_encoding,
+            share_blocks=share_blocks,
+            every_block=False,
+        ),
+        history=Outer(
+            num_blocks=num_blocks,
+            num_heads=num_heads_outer,
+            ffn_expansion=ffn_expansion_outer,
+            activation=activation_outer,
+            attention_dropout=attention_dropout_outer,
+            ffn_dropout=ffn_dropout_outer,
+            temporal_position_encoding=temporal_position_encoding,
+            share_blocks=share_blocks,
+        ),
+        head=Head(features_dim=features_dim, activation=activation_head),
+        num_frames=num_frames,
+        initialization="normal",
+    )
+
+
+def enhanced_tit(
+    num_frames: int = 1,
+    *,
+    dense: bool = True,
+    inner: bool = True,
+    outer: bool = True,
+    **hyperparameters: Any,
+) -> Network:
+    """Enhanced_TIT: an outer block beside every inner block, all outer outputs concatenated.
+
+    arXiv 2212.14538, section "Enhanced_TIT", figure 2, and its ablations.
+
+    Args:
+        num_frames: number K of observations.
+        dense: off is the paper's "w/o Dense": only the last outer block is read.
+        inner: off is "w/o Inner": outer blocks, each on the one before, on a linear embedding.
+        outer: off is "w/o Outer": frames stacked as channels, and inner blocks only.
+        **hyperparameters: those of :func:`vanilla_tit`.
+
+    Raises:
+        ValueError: if nothing would be left, or a hyperparameter is not possible.
+
+    Example:
+        >>> enhanced_tit(4, inner=False).frame
+        Linear(embed_dim=32, bias=False, activation='none')
+    """
+    if not (inner or outer):
+        raise ValueError("inner and outer cannot both be off: nothing would be left")
+    if hyperparameters.get("temporal_position_encoding") and not outer:
+        raise ValueError(
+            "temporal_position_encoding is that of the outer blocks: switch it off, or outer on"
+        )
+    vanilla = vanilla_tit(num_frames, **hyperparameters)
+    assert isinstance(vanilla.frame, Inner)
+    assert isinstance(vanilla.history, Outer)
+    if not outer:
+        stacked = StackedInner(**{**asdict(vanilla.frame), "every_block": dense})
+        return replace(vanilla, frame=Flat(), history=stacked)
+    if not inner:
+        frame = Linear(embed_dim=vanilla.frame.embed_dim)
+        return replace(vanilla, frame=frame, history=replace(vanilla.history, dense=dense))
+    shared = asdict(vanilla.history)
+    paired = PairedOuter(**{f.name: shared[f.name] for f in fields(PairedOuter)})
+    return replace(vanilla, frame=replace(vanilla.frame, every_block=dense), history=paired)
+
+
+def nature_cnn(num_frames: int = 1, *, features_dim: int = 512) -> Network:
+    """NatureCNN: the frames stacked as channels, three convolutions, one linear layer with relu.
+
+    Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015); the
+    baseline "NatureCNN + MLP" of arXiv 2212.14538.
+    """
+    head = Head(features_dim=features_dim, activation="relu", norm=False)
+    return Network(frame=Flat(), history=StackedCNN(), head=head, num_frames=num_frames)
+
+
+def resnet(num_frames: int = 1, *, features_dim: int = 512) -> Network:
+    """ResNet: the frames stacked as channels, a residual network, one linear layer with relu.
+
+    The baseline "ResNet + MLP" of arXiv 2212.14538.
+    """
+    return replace(
+        nature_cnn(num_frames, features_dim=features_dim), history=StackedCNN(torso="resnet")
+    )
+
+
+def catformer(
+    num_frames: int = 2, *, embed_dim: int = 255, features_dim: int = 512, **hyperparameters: Any
+) -> Network:
+    """Catformer: a residual network on each frame, then Catformer's layers over the frames.
+
+    Davis et al., "Catformer: Designing Stable Transformers via Sensitivity Analysis", ICML 2021, as
+    built for the baseline of arXiv 2212.14538.
+
+    Args:
+        num_frames: number K of observations.
+        embed_dim: width of a token.
+        features_dim: size of the features.
+        **hyperparameters: fields of :class:`Catformer`.
+    """
+    return Network(
+        frame=ResNetFrames(embed_dim=embed_dim),
+        history=Catformer(**hyperparameters),
+        head=Head(features_dim=features_dim, activation="relu"),
+        num_frames=num_frames,
+    )
+
+
+def coberl(
+    num_frames: int = 2, *, embed_dim: int = 256, features_dim: int = 512, **hyperparameters: Any
+) -> Network:
+    """CoBERL: a residual network on each frame, a gated transformer over them, a gate and an LSTM.
+
+    Banino et al., "CoBERL: Contrastive BERT for Reinforcement Learning", arXiv 2107.05431, figure
+    1; a baseline of arXiv 2212.14538.
+
+    Args:
+        num_frames: number K of observations.
+        embed_dim: width of a token.
+        features_dim: size of the LSTM's state, which is the features.
+        **hyperparameters: further fields of :class:`CoBERL`.
+    """
+    return Network(
+        frame=ResNetFrames(embed_dim=embed_dim),
+        history=CoBERL(hidden_dim=features_dim, **hyperparameters),
+        head=Head(features_dim=None),
+        num_frames=num_frames,
+    )
+
+
+def mlp(num_frames: int = 1, **hyperparameters: Any) -> Network:
+    """MLP: two tanh layers of 64 on all entries of K arrays, apart for policy and value.
+
+    The baseline of arXiv 2212.14538 for arrays.
+
+    Args:
+        num_frames: number K of observations.
+        **hyperparameters: fields of :class:`MLP`.
+    """
+    return _separate(num_frames, MLP(**hyperparameters))
+
+
+def ofenet(num_frames: int = 1, **hyperparameters: Any) -> Network:
+    """OFENet: an MLP with dense connections, apart for policy and value.
+
+    Ota et al., "Can Increasing Input Dimensionality Improve Deep Reinforcement Learning?", ICML
+    2020, as built for the baseline of arXiv 2212.14538: without its auxiliary loss.
+
+    Args:
+        num_frames: number K of observations.
+        **hyperparameters: fields of :class:`OFENet`.
+    """
+    return _separate(num_frames, OFENet(**hyperparameters))
+
+
+def d2rl(num_frames: int = 1, **hyperparameters: Any) -> Network:
+    """D2RL: an MLP whose layers are all given the observation, apart for policy and value.
+
+    Sinha et al., "D2RL: Deep Dense Architectures in Reinforcement Learning", arXiv 2010.09163, as
+    built for the baseline of arXiv 2212.14538: the output includes the observation.
+
+    Args:
+        num_frames: number K of observations.
+        **hyperparameters: fields of :class:`D2RL`.
+    """
+    return _separate(num_frames, D2RL(**hyperparameters))
+
+
+def lstm(
+    num_frames: int = 1, *, embed_dim: int = 64, hidden_dim: int = 64, features_dim: int = 64
+) -> Network:
+    """LSTM: a tanh layer on the observation, TorchRL's LSTM, and a head as TIT has it.
+
+    Small observations, of positions say, hardly move the state; the head's LayerNorm makes that
+    readable.
+
+    Args:
+        num_frames: 1, and the state is carried through the episode; more, and it reads those.
+        embed_dim: width of the tanh layer.
+        hidden_dim: size of the state.
+        features_dim: size of the features.
+    """
+    return Network(
+        frame=Linear(embed_dim=embed_dim, bias=True, activation="tanh"),
+        history=LSTM(hidden_dim=hidden_dim),
+        head=Head(features_dim=features_dim),
+        num_frames=num_frames,
+    )
+
+
+def decision_transformer(
+    num_frames: int = 20, *, embed_dim: int = 128, **hyperparameters: Any
+) -> Network:
+    """Decision Transformer: returns to go, states and actions of K steps, states embedded linearly.
+
+    Chen et al., "Decision Transformer: Reinforcement Learning via Sequence Modeling", arXiv
+    2106.01345, section 3.
+
+    Args:
+        num_frames: steps K of a window.
+        embed_dim: width of a token.
+        **hyperparameters: fields of :class:`DecisionTransformer`.
+    """
+    return Network(
+        frame=Linear(embed_dim=embed_dim, bias=True),
+        history=DecisionTransformer(**hyperparameters),
+        head=Head(features_dim=None),
+        num_frames=num_frames,
+    )
+
+
+def dt_tit(
+    num_frames: int = 20,
+    *,
+    embed_dim: int = 128,
+    patch_size: int | None = None,
+    num_blocks_inner: int = 1,
+    num_heads_inner: int = 1,
+    ffn_expansion_inner: int = 1,
+    activation_inner: Activation = "relu",
+    position_encoding: bool = False,
+    **hyperparameters: Any,
+) -> Network:
+    """DT_TIT: Decision Transformer whose states are read by an inner transformer.
+
+    arXiv 2212.14538, section on offline supervised learning.
+
+    Args:
+        num_frames: steps K of a window.
+        embed_dim: width of a token.
+        patch_size: patch of the inner transformer; the whole observation where None.
+        num_blocks_inner: number of inner blocks.
+        num_heads_inner: attention heads of an inner block.
+        ffn_expansion_inner: hidden width of an inner block's FFN as a multiple of the width.
+        activation_inner: activation in an inner block's FFN.
+        position_encoding: whether patches and class token get a learned position encoding.
+        **hyperparameters: fields of :class:`DecisionTransformer`.
+    """
+    inner = Inner(
+        patch_size=patch_size,
+        embed_dim=embed_dim,
+        num_blocks=num_blocks_inner,
+        num_heads=num_heads_inner,
+        ffn_expansion=ffn_expansion_inner,
+        activation=activation_inner,
+        position_encoding=position_encoding,
+        every_block=False,
+    )
+    return replace(
+        decision_transformer(num_frames, embed_dim=embed_dim, **hyperparameters), frame=inner
+    )
+
+
+NETWORKS: dict[str, Callable[..., Network]] = {
+    "enhanced-tit": enhanced_tit,
+    "vanilla-tit": vanilla_tit,
+    "nature-cnn": nature_cnn,
+    "resnet": resnet,
+    "catformer": catformer,
+    "coberl": coberl,
+    "mlp": mlp,
+    "ofenet": ofenet,
+    "d2rl": d2rl,
+    "lstm": lstm,
+    "decision-transformer": decision_transformer,
+    "dt-tit": dt_tit,
+}
+"""The systems of the paper, and LSTM, by name: each is a pair of encoders."""
+
+
+def _separate(num_frames: int, history: HistorySettings) -> Network:
+    """Layers on the entries of K observations, without a head, apart for policy and value."""
+    return Network(
+        frame=Flat(),
+        history=history,
+        head=Head(features_dim=None),
+        num_frames=num_frames,
+        trunks="separate",
+    )
