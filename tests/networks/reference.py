@@ -48,7 +48,7 @@ class ReferenceTIT(nn.Module):
     def __init__(
         self,
         observation_shape: Sequence[int],
-        history: int = 1,
+        num_frames: int = 1,
         *,
         variant: str = "enhanced",
         patch_size: int = 1,
@@ -71,7 +71,7 @@ class ReferenceTIT(nn.Module):
     ) -> None:
         super().__init__()
         self.shape = tuple(observation_shape)
-        self.history = history
+        self.num_frames = num_frames
         self.variant = variant
         self.dense = dense and variant == "enhanced"
         self.inner, self.outer = inner, outer
@@ -91,7 +91,7 @@ class ReferenceTIT(nn.Module):
         else:
             self.embedding = nn.Linear(math.prod(self.shape), embed_dim, bias=False)
         if temporal_position_encoding and outer:
-            self.step_pos_encoding = nn.Parameter(torch.randn(history, 1, embed_dim))
+            self.step_pos_encoding = nn.Parameter(torch.randn(num_frames, 1, embed_dim))
 
         count = 1 if share_blocks else num_blocks
         if variant == "enhanced" and inner and outer:
@@ -112,7 +112,7 @@ class ReferenceTIT(nn.Module):
         self.ln2 = nn.LayerNorm(features_dim)
 
     def _patch_embedding(self, patch: int, width: int) -> tuple[nn.Module, int]:
-        frames = 1 if self.outer else self.history
+        frames = 1 if self.outer else self.num_frames
         if len(self.shape) == 1:
             missing = math.ceil(self.shape[0] / patch) * patch - self.shape[0]
             conv = nn.Conv1d(
@@ -146,7 +146,7 @@ class ReferenceTIT(nn.Module):
     def with_maps(self, history: Tensor) -> tuple[Tensor, list[Tensor], list[Tensor]]:
         """Features, inner attention weights [.., (K,) h, S, S], outer ones [.., h, K, K]."""
         leading = history.shape[: history.ndim - 1 - len(self.shape)]
-        x = history.reshape(-1, self.history, *self.shape)
+        x = history.reshape(-1, self.num_frames, *self.shape)
         if x.dtype == torch.uint8:
             x = x.to(self.ln1.weight.dtype) / 255
         tokens, inner_maps = self._encode_frames(x)  # L x [N, K, D]
@@ -154,7 +154,7 @@ class ReferenceTIT(nn.Module):
         newest = [output[:, -1] for output in outputs]
         y = torch.cat(newest, -1) if self.dense else newest[-1]
         y = self.ln2(self.head(self.ln1(y)))
-        steps = (self.history,) if self.outer else ()
+        steps = (self.num_frames,) if self.outer else ()
         return (
             y.reshape(*leading, -1),
             [m.reshape(*leading, *steps, *m.shape[1:]) for m in inner_maps],
@@ -208,6 +208,7 @@ def matched_parameters(
 
 def _reference_name(name: str, reference: ReferenceTIT) -> str:
     name = name.replace("history_encoder.inner.", "frame_encoder.")
+    name = name.replace("frame_encoders.observation.", "frame_encoder.")
     fixed = {
         "frame_encoder.patch_embedding.weight": "obs_patch_embed.weight",
         "frame_encoder.class_token": "class_token_encoding",

@@ -8,6 +8,8 @@ from torch import nn
 
 from torchrl_tit.networks import NatureCNN
 
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
+
 
 def reference(channels: int, positions: int, features: int) -> nn.Sequential:
     return nn.Sequential(
@@ -24,7 +26,7 @@ def reference(channels: int, positions: int, features: int) -> nn.Sequential:
 
 
 @pytest.mark.parametrize(
-    ("shape", "history", "channels", "positions", "features"),
+    ("shape", "num_frames", "channels", "positions", "features"),
     [
         ((84, 84), 4, 4, 49, 512),
         ((3, 84, 84), 1, 3, 49, 16),
@@ -33,17 +35,19 @@ def reference(channels: int, positions: int, features: int) -> nn.Sequential:
     ],
 )
 def test_equals_the_layers_in_a_row(
-    shape: tuple[int, ...], history: int, channels: int, positions: int, features: int
+    shape: tuple[int, ...], num_frames: int, channels: int, positions: int, features: int
 ) -> None:
     torch.manual_seed(0)
-    network = NatureCNN(shape, history, features_dim=features)
+    network = NatureCNN(shape, num_frames, features_dim=features)
     layers = reference(channels, positions, features)
     for ours, theirs in zip(network.parameters(), layers.parameters(), strict=True):
         theirs.data.copy_(ours)
-    frames = torch.rand(5, history, *shape, requires_grad=True)
+    frames = torch.rand(5, num_frames, *shape, requires_grad=True)
     features_of = network(frames)
     # Oldest frame first, the channels of one frame beside each other.
-    stacked = torch.cat([frames[:, k].reshape(5, -1, *shape[-2:]) for k in range(history)], dim=1)
+    stacked = torch.cat(
+        [frames[:, k].reshape(5, -1, *shape[-2:]) for k in range(num_frames)], dim=1
+    )
     torch.testing.assert_close(features_of, layers(stacked))
     assert features_of.shape == (5, features) == (5, network.features_dim)
     assert (features_of > 0).any()

@@ -17,7 +17,10 @@ from tests.networks.reference import (
     matched_parameters,
     randomize,
 )
+from tests.numerics import assert_near
 from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, VanillaTIT
+
+pytestmark = pytest.mark.numerics
 
 NETWORKS: dict[str, dict[str, Any]] = {
     "vanilla": {"variant": "vanilla"},
@@ -27,7 +30,7 @@ NETWORKS: dict[str, dict[str, Any]] = {
     "without outer": {"outer": False},
 }
 
-# Name: observation shape, history, hyperparameters.
+# Name: observation shape, number of frames K, hyperparameters.
 CASES: dict[str, tuple[tuple[int, ...], int, dict[str, Any]]] = {
     "array, K=1": ((4,), 1, {}),
     "array, K=2": ((4,), 2, {"num_heads_inner": 2, "num_heads_outer": 4}),
@@ -81,16 +84,16 @@ PAIRS = [
 
 
 def make_pair(
-    network: str, shape: tuple[int, ...], history: int, **settings: Any
+    network: str, shape: tuple[int, ...], num_frames: int, **settings: Any
 ) -> tuple[HistoryNetwork, ReferenceTIT]:
     kind = NETWORKS[network]
     settings = {"embed_dim": 16, "features_dim": 12} | settings
-    reference = ReferenceTIT(shape, history, **settings, **kind)
+    reference = ReferenceTIT(shape, num_frames, **settings, **kind)
     ours: HistoryNetwork
     if kind.get("variant") == "vanilla":
-        ours = VanillaTIT(shape, history, **settings)
+        ours = VanillaTIT(shape, num_frames, **settings)
     else:
-        ours = EnhancedTIT(shape, history, **settings, **kind)
+        ours = EnhancedTIT(shape, num_frames, **settings, **kind)
     randomize(ours)
     copy_parameters(ours, reference)
     return ours, reference
@@ -117,29 +120,27 @@ def gradient(parameter: Tensor) -> Tensor:
 
 @pytest.mark.parametrize(("network", "case"), PAIRS)
 def test_outputs_and_gradients(network: str, case: str) -> None:
-    shape, steps, settings = CASES[case]
-    ours, reference = make_pair(network, shape, steps, **settings)
-    history = torch.randn(5, steps, *shape)
+    shape, num_frames, settings = CASES[case]
+    ours, reference = make_pair(network, shape, num_frames, **settings)
+    history = torch.randn(5, num_frames, *shape)
     probe = torch.randn(5, 12)
 
     features, input_gradient = results(ours, history, probe)
     expected, expected_gradient = results(reference, history, probe)
 
-    torch.testing.assert_close(features, expected, rtol=0, atol=1e-5)
-    torch.testing.assert_close(input_gradient, expected_gradient, rtol=0, atol=1e-4)
+    assert_near(features, expected)
+    assert_near(input_gradient, expected_gradient)
     assert input_gradient.abs().max() > 1e-3, "a gradient that is no gradient proves nothing"
     for name, parameter, theirs in matched_parameters(ours, reference):
-        torch.testing.assert_close(
-            gradient(parameter), gradient(theirs), rtol=1e-4, atol=1e-4, msg=prefixed(name)
-        )
+        assert_near(gradient(parameter), gradient(theirs), msg=prefixed(name))
 
 
 @pytest.mark.parametrize(("network", "case"), PAIRS)
 def test_in_double_precision_nothing_but_rounding_is_left(network: str, case: str) -> None:
-    shape, steps, settings = CASES[case]
-    ours, reference = make_pair(network, shape, steps, **settings)
+    shape, num_frames, settings = CASES[case]
+    ours, reference = make_pair(network, shape, num_frames, **settings)
     ours, reference = ours.double(), reference.double()
-    history = torch.randn(2, steps, *shape, dtype=torch.float64)
+    history = torch.randn(2, num_frames, *shape, dtype=torch.float64)
     probe = torch.randn(2, 12, dtype=torch.float64)
 
     features, input_gradient = results(ours, history, probe)
@@ -160,8 +161,8 @@ def test_in_double_precision_nothing_but_rounding_is_left(network: str, case: st
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("case", ["array, K=4", "wide image of three channels"])
 def test_all_parameters_are_matched(network: str, case: str) -> None:
-    shape, steps, settings = CASES[case]
-    ours, reference = make_pair(network, shape, steps, **settings)
+    shape, num_frames, settings = CASES[case]
+    ours, reference = make_pair(network, shape, num_frames, **settings)
     matched = {id(theirs) for _, _, theirs in matched_parameters(ours, reference)}
     unread = {name for name, p in reference.named_parameters() if id(p) not in matched}
     if network == "without dense":
@@ -176,43 +177,41 @@ def test_bytes(network: str, shape: tuple[int, ...], patch_size: int) -> None:
     ours, reference = make_pair(network, shape, 2, patch_size=patch_size)
     history = torch.randint(0, 256, (3, 2, *shape), dtype=torch.uint8)
 
-    torch.testing.assert_close(ours(history), reference(history), rtol=0, atol=1e-5)
-    torch.testing.assert_close(ours(history), ours(history / 255), rtol=0, atol=1e-5)
+    assert_near(ours(history), reference(history))
+    assert_near(ours(history), ours(history / 255))
 
     ours(history).square().sum().backward()
     reference(history).square().sum().backward()
     for name, parameter, theirs in matched_parameters(ours, reference):
-        torch.testing.assert_close(
-            gradient(parameter), gradient(theirs), rtol=1e-4, atol=1e-4, msg=prefixed(name)
-        )
+        assert_near(gradient(parameter), gradient(theirs), msg=prefixed(name))
 
 
 @pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("leading", [(), (3,), (2, 3), (2, 1, 3), (0,), (2, 0)])
 @pytest.mark.parametrize("case", ["array, K=4", "wide image of three channels"])
 def test_leading_dimensions(network: str, leading: tuple[int, ...], case: str) -> None:
-    shape, steps, settings = CASES[case]
-    ours, reference = make_pair(network, shape, steps, **settings)
-    history = torch.randn(*leading, steps, *shape)
+    shape, num_frames, settings = CASES[case]
+    ours, reference = make_pair(network, shape, num_frames, **settings)
+    history = torch.randn(*leading, num_frames, *shape)
     features = ours(history)
     assert features.shape == (*leading, 12)
     if 0 not in leading:
-        torch.testing.assert_close(features, reference(history), rtol=0, atol=1e-5)
+        assert_near(features, reference(history))
     features.sum().backward()  # an empty batch has a gradient too
 
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_memory_layout_does_not_matter(network: str) -> None:
-    shape, steps, settings = CASES["wide image of three channels"]
-    ours, _ = make_pair(network, shape, steps, **settings)
-    history = torch.randn(3, steps, *shape)
+    shape, num_frames, settings = CASES["wide image of three channels"]
+    ours, _ = make_pair(network, shape, num_frames, **settings)
+    history = torch.randn(3, num_frames, *shape)
     expected = ours(history)
     channels_last = history.permute(0, 1, 3, 4, 2).contiguous().permute(0, 1, 4, 2, 3)
     step_last = history.movedim(1, -1).contiguous().movedim(-1, 1)
-    window = torch.randn(3, steps + 3, *shape)[:, 2:-1].copy_(history)
+    window = torch.randn(3, num_frames + 3, *shape)[:, 2:-1].copy_(history)
     for other in (channels_last, step_last, window):
         assert not other.is_contiguous()
-        torch.testing.assert_close(ours(other), expected, rtol=0, atol=1e-5)
+        assert_near(ours(other), expected)
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -221,9 +220,9 @@ def test_memory_layout_does_not_matter(network: str) -> None:
     "case", ["array, K=1", "array, K=4", "three blocks", "shared blocks", "image", "P > D"]
 )
 def test_attention_maps(network: str, leading: tuple[int, ...], case: str) -> None:
-    shape, steps, settings = CASES[case]
-    ours, reference = make_pair(network, shape, steps, **settings)
-    history = torch.randn(*leading, steps, *shape)
+    shape, num_frames, settings = CASES[case]
+    ours, reference = make_pair(network, shape, num_frames, **settings)
+    history = torch.randn(*leading, num_frames, *shape)
     maps = ours.attention_maps(history)
 
     blocks = settings.get("num_blocks", 2)
@@ -240,10 +239,15 @@ def test_attention_maps(network: str, leading: tuple[int, ...], case: str) -> No
     _, inner, outer = reference.with_maps(history)
     outer = outer[-len(maps.outer) :] if maps.outer else []
     for weights, expected in zip(maps.inner + maps.outer, inner + outer, strict=True):
-        torch.testing.assert_close(weights, expected, rtol=0, atol=1e-5)
-        torch.testing.assert_close(weights.sum(-1), torch.ones(weights.shape[:-1]))
+        assert_near(weights, expected)
+        assert_near(weights.sum(-1), torch.ones(weights.shape[:-1]))
     for weights in maps.outer:
-        assert weights.shape == (*leading, settings.get("num_heads_outer", 1), steps, steps)
+        assert weights.shape == (
+            *leading,
+            settings.get("num_heads_outer", 1),
+            num_frames,
+            num_frames,
+        )
         assert not weights.triu(1).any(), "a step sees a later one"
 
 
@@ -254,7 +258,7 @@ def test_usual_pass_computes_no_attention_maps(monkeypatch: pytest.MonkeyPatch) 
         raise AssertionError("attention weights were computed")
 
     for name in ("weights", "_weights"):
-        monkeypatch.setattr(f"torchrl_tit.networks.attention.SelfAttention.{name}", never)
+        monkeypatch.setattr(f"torchrl_tit.layers.attention.SelfAttention.{name}", never)
     tit(torch.randn(2, 3, 8, 8))
     with pytest.raises(AssertionError, match="were computed"):
         tit.attention_maps(torch.randn(2, 3, 8, 8))

@@ -7,26 +7,21 @@ from typing import Any
 import pytest
 import torch
 
-from torchrl_tit.networks import (
-    EnhancedTIT,
-    EnhancedTITConfig,
-    SelfAttention,
-    VanillaTIT,
-    VanillaTITConfig,
-    make_activation,
-)
+from torchrl_tit.layers import SelfAttention
+from torchrl_tit.layers.activations import make_activation
+from torchrl_tit.networks import EnhancedTIT, VanillaTIT
 
 BOTH = pytest.mark.parametrize("kind", [EnhancedTIT, VanillaTIT])
 
 WRONG_SETTINGS: list[tuple[tuple[int, ...], int, dict[str, Any], str]] = [
-    ((4,), 0, {}, r"history .* must be >= 1, not 0"),
-    ((4,), -1, {}, r"history .* must be >= 1, not -1"),
+    ((4,), 0, {}, r"num_frames must be at least 1, not 0"),
+    ((4,), -1, {}, r"num_frames must be at least 1, not -1"),
     ((), 1, {}, r"observation_shape \(\) is not that of an array \(D,\) or an image"),
     ((0,), 1, {}, r"observation_shape \(0,\) is not"),
     ((1, 2, 3, 4), 1, {}, r"observation_shape \(1, 2, 3, 4\) is not"),
     ((4,), 1, {"num_heads_inner": 3}, r"width 32 cannot be split over 3 attention heads: choose"),
     ((4,), 1, {"num_heads_outer": 5}, r"width 32 cannot be split over 5 attention heads: choose"),
-    ((4,), 1, {"num_heads_outer": 0}, r"width 32 cannot be split over 0 attention heads"),
+    ((4,), 1, {"num_heads_outer": 0}, r"num_heads must be at least 1, not 0"),
     ((8, 8), 1, {"patch_size": 9}, r"patch_size 9 is larger than the image of 8 x 8"),
     ((8, 4), 1, {"patch_size": 8}, r"patch_size 8 is larger than the image of 8 x 4"),
     ((9, 8), 1, {"patch_size": 4}, r"4 does not divide the image of 9 x 8 pixels: .* \[1\]"),
@@ -35,13 +30,18 @@ WRONG_SETTINGS: list[tuple[tuple[int, ...], int, dict[str, Any], str]] = [
     ((4,), 1, {"activation_outer": "gelo"}, r"unknown activation 'gelo'.*'gelu'"),
     ((4,), 1, {"activation_head": "Tanh"}, r"unknown activation 'Tanh'.*'tanh'"),
     *(
-        ((4,), 1, {f"{kind}_dropout_{part}": p}, rf"{kind}_dropout_{part} .* \[0, 1\), not {p}")
+        ((4,), 1, {f"{kind}_dropout_{part}": p}, rf"{kind}_dropout .* \[0, 1\), not {p}")
         for kind in ("attention", "ffn")
         for part in ("inner", "outer")
         for p in (-0.1, 1.0, float("nan"))
     ),
     *(
-        ((4,), 1, {name: 0}, rf"{name} must be >= 1, not 0")
+        (
+            (4,),
+            1,
+            {name: 0},
+            rf"{name.removesuffix('_inner').removesuffix('_outer')} must be at least 1, not 0",
+        )
         for name in (
             "patch_size",
             "embed_dim",
@@ -55,12 +55,12 @@ WRONG_SETTINGS: list[tuple[tuple[int, ...], int, dict[str, Any], str]] = [
 
 
 @BOTH
-@pytest.mark.parametrize(("shape", "history", "settings", "message"), WRONG_SETTINGS)
+@pytest.mark.parametrize(("shape", "num_frames", "settings", "message"), WRONG_SETTINGS)
 def test_wrong_settings(
-    kind: type[Any], shape: tuple[int, ...], history: int, settings: dict[str, Any], message: str
+    kind: type[Any], shape: tuple[int, ...], num_frames: int, settings: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
-        kind(shape, history, **settings)
+        kind(shape, num_frames, **settings)
 
 
 def test_nothing_left() -> None:
@@ -72,27 +72,8 @@ def test_nothing_left() -> None:
 
 @BOTH
 def test_unknown_hyperparameter_is_named(kind: type[Any]) -> None:
-    with pytest.raises(TypeError, match=r"TITConfig.* unexpected keyword argument 'embed_dims'"):
+    with pytest.raises(TypeError, match=r"_tit\(\) got an unexpected .* argument 'embed_dims'"):
         kind((4,), embed_dims=64)
-    config = VanillaTITConfig() if kind is VanillaTIT else EnhancedTITConfig()
-    with pytest.raises(TypeError, match=r"TITConfig.* unexpected keyword argument 'embed_dims'"):
-        kind((4,), config=config, embed_dims=64)
-
-
-def test_config_of_the_other_network() -> None:
-    with pytest.raises(TypeError, match="type EnhancedTITConfig: expected VanillaTITConfig"):
-        VanillaTIT((4,), config=EnhancedTITConfig(dense=False))  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="type VanillaTITConfig: expected EnhancedTITConfig"):
-        EnhancedTIT((4,), config=VanillaTITConfig())  # type: ignore[arg-type]
-
-
-def test_hyperparameters_override_those_of_the_config() -> None:
-    config = EnhancedTITConfig(embed_dim=16, features_dim=8)
-    tit = EnhancedTIT((4,), 2, config, features_dim=24)
-    assert tit.config == EnhancedTITConfig(embed_dim=16, features_dim=24)
-    assert config.features_dim == 8
-    with pytest.raises(ValueError, match=r"width 16 cannot be split over 3"):
-        EnhancedTIT((4,), 2, config, num_heads_inner=3)
 
 
 @pytest.mark.parametrize(

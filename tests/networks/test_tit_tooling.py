@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import io
 import pickle
-import shutil
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -15,7 +14,10 @@ from torch import Tensor, nn
 from torch.func import functional_call, stack_module_state
 
 from tests.networks.reference import randomize
+from tests.numerics import assert_near
 from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, VanillaTIT
+
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
 NETWORKS: dict[str, tuple[type[Any], dict[str, Any]]] = {
     "vanilla": (VanillaTIT, {}),
@@ -57,19 +59,21 @@ compiled_cases = pytest.mark.parametrize(
 
 def make(network: str, observation: str, seed: int = 0, **settings: Any) -> HistoryNetwork:
     kind, options = NETWORKS[network]
-    shape, steps, patches = OBSERVATIONS[observation]
+    shape, num_frames, patches = OBSERVATIONS[observation]
     settings = {"embed_dim": 16, "num_heads_inner": 2, "features_dim": 12, **options, **settings}
-    built = kind(shape, steps, **patches, **settings)
+    if num_frames == 1:  # there is nothing to tell apart
+        settings.pop("temporal_position_encoding", None)
+    built = kind(shape, num_frames, **patches, **settings)
     randomize(built, seed)
     assert isinstance(built, HistoryNetwork)
     return built
 
 
 def make_history(observation: str, *leading: int) -> Tensor:
-    shape, steps, _ = OBSERVATIONS[observation]
+    shape, num_frames, _ = OBSERVATIONS[observation]
     if observation == "image":
-        return torch.randint(0, 256, (*leading, steps, *shape), dtype=torch.uint8)
-    return torch.randn(*leading, steps, *shape)
+        return torch.randint(0, 256, (*leading, num_frames, *shape), dtype=torch.uint8)
+    return torch.randn(*leading, num_frames, *shape)
 
 
 def loss_and_gradients(network: Any, module: nn.Module, history: Tensor) -> list[Tensor]:
@@ -96,7 +100,7 @@ def test_compile_in_one_graph_equals_eager(network: str, observation: str, mode:
     expected = loss_and_gradients(module, module, history)
     torch.manual_seed(0)
     actual = loss_and_gradients(compiled, module, history)
-    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
+    assert_near(actual, expected)
 
 
 def test_compile_with_any_batch_size_is_done_once() -> None:
@@ -110,21 +114,8 @@ def test_compile_with_any_batch_size_is_done_once() -> None:
     compiled = torch.compile(module, fullgraph=True, backend=backend, dynamic=True)
     for batch in (7, 4, 9):
         history = make_history("array, K=3", batch)
-        torch.testing.assert_close(compiled(history), module(history))
+        assert_near(compiled(history), module(history))
     assert len(graphs) == 1
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(
-    shutil.which("c++") is None and shutil.which("g++") is None, reason="no C++ compiler"
-)
-def test_inductor_equals_eager() -> None:
-    module = make("enhanced", "array, K=3", num_blocks=1)
-    history = make_history("array, K=3", 4)
-    compiled = torch.compile(module, fullgraph=True)
-    expected = loss_and_gradients(module, module, history)
-    actual = loss_and_gradients(compiled, module, history)
-    torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
 
 
 @compiled_cases
@@ -133,12 +124,12 @@ def test_export_with_a_dynamic_batch(network: str, observation: str) -> None:
     exported = torch.export.export(
         module,
         (make_history(observation, 4),),
-        dynamic_shapes={"history": {0: torch.export.Dim("batch")}},
+        dynamic_shapes={"inputs": ({0: torch.export.Dim("batch")},)},
         strict=network == "enhanced",
     ).module()
     for batch in (1, 4, 7):
         history = make_history(observation, batch)
-        torch.testing.assert_close(exported(history), module(history), rtol=0, atol=1e-5)
+        assert_near(exported(history), module(history))
 
 
 # On CPUs, PyTorch's attention kernel runs once per set of parameters, and says so.
@@ -158,7 +149,7 @@ def test_vmap_over_stacked_parameters(network: str, observation: str) -> None:
 
     features = torch.vmap(call, in_dims=(0, 0, None))(stacked, buffers, history)
     expected = torch.stack([module(history) for module in modules])
-    torch.testing.assert_close(features, expected, rtol=0, atol=1e-5)
+    assert_near(features, expected)
 
     features.square().sum().backward()
     expected.square().sum().backward()
@@ -166,7 +157,7 @@ def test_vmap_over_stacked_parameters(network: str, observation: str) -> None:
         for index, module in enumerate(modules):
             gradient = module.get_parameter(name).grad
             assert parameter.grad is not None
-            torch.testing.assert_close(parameter.grad[index], gradient, rtol=1e-4, atol=1e-4)
+            assert_near(parameter.grad[index], gradient)
 
 
 @vmap_of_attention
@@ -197,8 +188,8 @@ def test_parameters_swapped_by_tensordict(network: str) -> None:
     history = make_history("image", 4)
     own = module(history)
     with TensorDict.from_module(other).data.clone().to_module(module):
-        torch.testing.assert_close(module(history), other(history))
-    torch.testing.assert_close(module(history), own)
+        assert_near(module(history), other(history))
+    assert_near(module(history), own)
 
 
 @every_network
@@ -223,8 +214,9 @@ def test_copies_compute_the_same_and_are_apart(network: str, observation: str) -
 @every_network
 @every_observation
 def test_autocast_to_bfloat16_stays_close(network: str, observation: str) -> None:
-    module = make(network, observation)
+    module = make(network, observation).float()
     history = make_history(observation, 8)
+    history = history.float() if history.is_floating_point() else history
     expected = module(history)
     with torch.autocast("cpu", torch.bfloat16):
         features = module(history)
@@ -235,7 +227,7 @@ def test_autocast_to_bfloat16_stays_close(network: str, observation: str) -> Non
 
 
 @every_network
-@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @every_observation
 def test_whole_network_in_another_float_type(
     network: str, observation: str, dtype: torch.dtype
@@ -246,7 +238,7 @@ def test_whole_network_in_another_float_type(
     features = module.to(dtype)(history.to(dtype) if history.is_floating_point() else history)
     assert features.dtype == dtype
     error = (features.double() - expected).norm() / expected.norm()
-    assert error < (1e-5 if dtype == torch.float64 else 0.1)
+    assert error < (1e-5 if dtype == torch.float32 else 0.1)
 
 
 @every_network

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from torchrl_tit.networks.activations import Activation, make_activation
+from torchrl_tit import settings
+from torchrl_tit.frames.encoder import FrameEncoder
+from torchrl_tit.frames.flat import Flat
+from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, RecurrentEncoder
+from torchrl_tit.layers.activations import make_activation
+from torchrl_tit.layers.initialization import init_normal_
+
+ObservationShape = Sequence[int] | Mapping[str, Sequence[int]]
+"""Shape of an observation, or of each of several by key."""
 
 
 @dataclass(frozen=True)
@@ -26,92 +34,264 @@ class AttentionMaps:
 
 
 class HistoryNetwork(nn.Module):
-    """Maps a history of K observations to features: frame encoder, history encoder, head.
+    """Maps the last K observations to features: frame encoder, history encoder, head.
 
         history  [..., K, *observation_shape]
           frame encoder    -> tokens   [..., K, L, D]   one observation at a time, shared over time
-          history encoder  -> outputs  [..., E]         what happened over the K steps
+          history encoder  -> outputs  [..., E]         what happened over the K frames
           head             -> features [..., F]
 
     Nothing flows from the history encoder back into the frame encoder, so the tokens of a frame
     depend on that frame alone (arXiv 2212.14538, appendix on information flow: "T-S" is 0).
 
+    Several observations (pixels and a state, say) have a frame encoder each, and their tokens stand
+    side by side: ``observation_shape`` is then a mapping, and ``frame`` one too, or settings that
+    all share.
+
     Args:
+        frame: settings of the frame encoder.
+        history: settings of the history encoder.
         observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
-        history: number of observations K >= 1.
-        frame_encoder: [..., *observation_shape] -> [..., L, D]; None where the history encoder
-            reads the observations themselves.
-        history_encoder: [..., K, L, D] -> [..., E].
-        head: [..., E] -> [..., F].
-        features_dim: size F of the features.
+        num_frames: number K >= 1 of observations.
+        head: settings of the head.
+        initialization: "normal" starts the weights as the authors of TIT do
+            (:func:`~torchrl_tit.layers.init_normal_`), "default" as each layer does by itself.
+        action_dim: entries of an action, for history encoders that read actions.
 
     Raises:
-        ValueError: if ``history`` or ``observation_shape`` are not possible, or a history of
-            another shape is given to ``forward``.
+        ValueError: if a setting is not possible, the two encoders do not fit each other, or a
+            history of another shape is given to ``forward``.
         TypeError: if a history of another dtype is given to ``forward``.
+
+    Example:
+        >>> from torchrl_tit.settings import Inner, PairedOuter
+        >>> network = HistoryNetwork(
+        ...     Inner(patch_size=12), PairedOuter(), observation_shape=(84, 84), num_frames=16
+        ... )
+        >>> network(torch.zeros(2, 16, 84, 84, dtype=torch.uint8)).shape
+        torch.Size([2, 64])
     """
 
     def __init__(
         self,
-        observation_shape: Sequence[int],
-        history: int,
+        frame: settings.FrameSettings | Mapping[str, settings.FrameSettings],
+        history: settings.HistorySettings,
         *,
-        frame_encoder: nn.Module | None,
-        history_encoder: nn.Module,
-        head: nn.Module,
-        features_dim: int,
+        observation_shape: ObservationShape,
+        num_frames: int = 1,
+        head: settings.Head | None = None,
+        initialization: str = "default",
+        action_dim: int | None = None,
     ) -> None:
         super().__init__()
-        self.observation_shape = tuple(observation_shape)
-        self.history = history
-        self.features_dim = features_dim
-        self.frame_encoder = frame_encoder
+        if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 1:
+            raise ValueError(
+                f"num_frames is the number K of observations and must be at least 1, not "
+                f"{num_frames!r}"
+            )
+        self.num_frames = num_frames
+        self.frame_encoders = nn.ModuleDict(_build_frames(frame, observation_shape))
+        shape = _history_shape(self.frames, num_frames, action_dim)
+        history_encoder = history.build(shape)
+        assert isinstance(history_encoder, HistoryEncoder)
         self.history_encoder = history_encoder
-        self.head = head
+        self.head, self.features_dim = _make_head(
+            history_encoder.out_features, head or settings.Head()
+        )
+        if initialization == "normal":
+            init_normal_(self)
 
-    def forward(self, history: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor) -> Tensor:
         """Maps histories to features.
 
         Args:
-            history: [..., K, *observation_shape], oldest first; uint8 (divided by 255) or of the
-                network's own float type (taken as it is).
+            *inputs: a history [..., K, *observation_shape] for each observation, the oldest frame
+                first; uint8 (which stands for 0..1) or of the network's own float type (taken as
+                it is). Then what the history encoder reads beside (``history_encoder.context``).
 
         Returns:
             float [..., F].
         """
-        self.check(history)
-        tokens = history if self.frame_encoder is None else self.frame_encoder(history)
-        return self.encode_history(tokens)
+        count = len(self.frame_encoders)
+        return self.encode_history(self.encode_frames(*inputs[:count]), *inputs[count:])
 
-    def encode_history(self, tokens: Tensor) -> Tensor:
-        """Maps the tokens of K observations to features, float [..., K, L, D] -> [..., F]."""
-        return self.head(self.history_encoder(tokens))
+    def encode_frames(self, *histories: Tensor) -> Tensor:
+        """Maps histories to tokens, [..., K, *observation_shape] each -> float [..., K, L, D]."""
+        self.check(*histories)
+        tokens = [encoder(history) for encoder, history in zip(self.frames, histories, strict=True)]
+        return self.join_tokens(tokens)
 
-    def attention_maps(self, history: Tensor) -> AttentionMaps:
+    def join_tokens(self, tokens: Sequence[Tensor]) -> Tensor:
+        """Puts the tokens of several observations side by side, [..., L_i, D] each."""
+        if len(tokens) == 1:
+            return tokens[0]
+        return torch.cat([self.as_floats(x) for x in tokens], dim=-2)
+
+    def encode_history(self, tokens: Tensor, *context: Tensor) -> Tensor:
+        """Maps the tokens of K frames to features, float [..., K, L, D] -> [..., F]."""
+        return self.head(self.history_encoder(self.as_floats(tokens), *context))
+
+    def every_frame(self, *inputs: Tensor) -> Tensor:
+        """Maps histories to features of every frame, from itself and the frames before it.
+
+        Only where ``history_encoder.encodes_every_frame``.
+
+        Args:
+            *inputs: as in ``forward``.
+
+        Returns:
+            float [..., K, F].
+        """
+        count = len(self.frame_encoders)
+        tokens = self.as_floats(self.encode_frames(*inputs[:count]))
+        return self.head(self.history_encoder.every_frame(tokens, *inputs[count:]))
+
+    def step(
+        self, histories: Sequence[Tensor], state: dict[str, Tensor], is_init: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Reads the newest frame and the state before it, where the network carries a state.
+
+        Args:
+            histories: [*B, 1, *observation_shape] each.
+            state: of the history encoder, before the step.
+            is_init: bool [*B, 1], True where an episode begins.
+
+        Returns:
+            Features, float [*B, F], and the state after the step.
+        """
+        assert isinstance(self.history_encoder, RecurrentEncoder)
+        tokens = self.as_floats(self.encode_frames(*histories)).squeeze(-3)  # [*B, L, D]
+        outputs, state = self.history_encoder.step(tokens, state, is_init)
+        return self.head(outputs), state
+
+    def as_floats(self, tokens: Tensor) -> Tensor:
+        """Makes floats of flat frames of bytes, for history encoders that read tokens."""
+        if tokens.dtype == torch.uint8 and not self.history_encoder.reads_frames:
+            return tokens.to(weights_dtype(self)) / 255
+        return tokens
+
+    def attention_maps(self, *histories: Tensor) -> AttentionMaps:
         """Returns the attention weights of every inner and outer block.
 
         A pass of its own: the usual one computes neither these nor what is not read.
 
         Args:
-            history: as in ``forward``.
+            *histories: as in ``forward``.
         """
-        self.check(history)
-        if self.frame_encoder is None:
-            return AttentionMaps(_attention_maps(self.history_encoder, history), [])
-        return AttentionMaps(
-            _attention_maps(self.frame_encoder, history),
-            _attention_maps(self.history_encoder, self.frame_encoder(history)),
-        )
+        tokens = self.as_floats(self.encode_frames(*histories))
+        pairs = zip(self.frames, histories, strict=True)
+        inner = [maps for encoder, history in pairs for maps in encoder.attention_maps(history)]
+        outer = self.history_encoder.attention_maps(tokens)
+        if self.history_encoder.reads_frames:  # its blocks are inner ones
+            return AttentionMaps([*inner, *outer], [])
+        return AttentionMaps(inner, outer)
 
-    def check(self, history: Tensor) -> None:
-        """Raises ValueError or TypeError where a history does not fit this network."""
-        check_history(history, self.history, self.observation_shape, weights_dtype(self))
+    def check(self, *histories: Tensor) -> None:
+        """Raises ValueError or TypeError where histories do not fit this network."""
+        if len(histories) != len(self.frame_encoders):
+            raise ValueError(
+                f"this network reads {len(self.frame_encoders)} histories "
+                f"({', '.join(self.frame_encoders)}), not {len(histories)}"
+            )
+        dtype = weights_dtype(self)
+        for encoder, history in zip(self.frames, histories, strict=True):
+            ndim = len(encoder.observation_shape) + 1
+            num_frames = self.num_frames
+            if self.history_encoder.reads_any_length and history.ndim >= ndim:
+                num_frames = history.shape[-ndim]
+            check_history(history, num_frames, encoder.observation_shape, dtype)
+
+    @property
+    def keeps_frames(self) -> bool:
+        """Whether keeping tokens saves work: frames are encoded, and there are earlier ones."""
+        encodes = not all(isinstance(encoder, Flat) for encoder in self.frames)
+        return encodes and self.num_frames > 1
+
+    @property
+    def carries_state(self) -> bool:
+        """Whether a state is carried from step to step instead of reading several frames."""
+        return self.history_encoder.is_recurrent and self.num_frames == 1
+
+    @property
+    def frames(self) -> list[FrameEncoder]:
+        """The frame encoder of each observation."""
+        return list(self.frame_encoders.values())  # type: ignore[arg-type]
 
 
-def _attention_maps(encoder: nn.Module, x: Tensor) -> list[Tensor]:
-    """Returns an encoder's attention weights: none where it has no attention."""
-    attention_maps = getattr(encoder, "attention_maps", None)
-    return [] if attention_maps is None else attention_maps(x)
+class TwoTrunks(nn.Module):
+    """Two networks of the same observations that share nothing: one for the policy, one for values.
+
+    Args:
+        policy: the policy's network.
+        value: the value's network.
+
+    Example:
+        >>> from torchrl_tit.networks import MLP
+        >>> policy, value = MLP(observation_shape=(4,), num_frames=8)(torch.randn(16, 8, 4))
+        >>> policy.shape, value.shape
+        (torch.Size([16, 64]), torch.Size([16, 64]))
+    """
+
+    def __init__(self, policy: HistoryNetwork, value: HistoryNetwork) -> None:
+        super().__init__()
+        self.policy = policy
+        self.value = value
+        self.features_dim = policy.features_dim
+
+    def forward(self, *histories: Tensor) -> tuple[Tensor, Tensor]:
+        """Maps histories to features for the policy and for the value, float [..., F] each."""
+        return self.policy(*histories), self.value(*histories)
+
+
+def build_network(
+    network: settings.Network,
+    observation_shape: ObservationShape,
+    *,
+    action_dim: int | None = None,
+    trunks: str | None = None,
+) -> HistoryNetwork | TwoTrunks:
+    """Builds the network that settings describe.
+
+    Args:
+        network: the settings.
+        observation_shape: shape of an observation, or of each of several by key.
+        action_dim: entries of an action, for history encoders that read actions.
+        trunks: "shared" builds one network where the settings say two: an actor's, say, whose
+            critics are apart.
+
+    Raises:
+        ValueError: if the two encoders do not fit each other or the observation.
+
+    Example:
+        >>> from torchrl_tit.settings import NETWORKS
+        >>> build_network(NETWORKS["enhanced-tit"](4), (4,))(torch.randn(2, 4, 4)).shape
+        torch.Size([2, 64])
+    """
+    if (trunks or network.trunks) == "separate":
+        policy, value = (build_trunk(network, observation_shape, action_dim) for _ in range(2))
+        return TwoTrunks(policy, value)
+    return build_trunk(network, observation_shape, action_dim)
+
+
+def build_trunk(
+    network: settings.Network, observation_shape: ObservationShape, action_dim: int | None = None
+) -> HistoryNetwork:
+    """Builds one network of the settings, whether policy and value share it or not.
+
+    Args:
+        network: the settings.
+        observation_shape: shape of an observation, or of each of several by key.
+        action_dim: entries of an action, for history encoders that read actions.
+    """
+    return HistoryNetwork(
+        network.frame,
+        network.history,
+        observation_shape=observation_shape,
+        num_frames=network.num_frames,
+        head=network.head,
+        initialization=network.initialization,
+        action_dim=action_dim,
+    )
 
 
 def weights_dtype(network: nn.Module) -> torch.dtype:
@@ -120,27 +300,28 @@ def weights_dtype(network: nn.Module) -> torch.dtype:
     Not that of ``parameters()``, which is empty where TorchRL's losses have put plain tensors
     (target weights, a stack of critics) in their places.
     """
-    weights = (getattr(module, "weight", None) for module in network.modules())
+    names = ("weight", "weight_ih_l0")  # the latter of LSTMs, which may be the only layer
+    weights = (getattr(module, name, None) for module in network.modules() for name in names)
     return next(weight.dtype for weight in weights if isinstance(weight, Tensor))
 
 
 def check_history(
-    history: Tensor, steps: int, observation_shape: tuple[int, ...], dtype: torch.dtype
+    history: Tensor, num_frames: int, observation_shape: tuple[int, ...], dtype: torch.dtype
 ) -> None:
     """Raises ValueError or TypeError where a history does not fit a network.
 
     Args:
         history: what the network is given.
-        steps: number of observations K that it reads.
+        num_frames: number K of observations that it reads.
         observation_shape: shape of one of them.
         dtype: type of the network's weights.
     """
-    expected = (steps, *observation_shape)
+    expected = (num_frames, *observation_shape)
     if tuple(history.shape[-len(expected) :]) != expected:
         raise ValueError(
             f"a history of shape {tuple(history.shape)} does not fit this network: expected "
-            f"[..., {', '.join(map(str, expected))}], which is {steps} observations of "
-            f"shape {observation_shape}, oldest first (torchrl_tit.History stacks them)"
+            f"[..., {', '.join(map(str, expected))}], which is {num_frames} observations of shape "
+            f"{observation_shape}, oldest first (torchrl_tit.History stacks them)"
         )
     device = history.device.type
     # "meta", say, has no autocast to ask about.
@@ -151,37 +332,53 @@ def check_history(
     )
     if not fits and history.dtype != torch.uint8:
         raise TypeError(
-            f"a history of {history.dtype} does not fit this network of {dtype}: give it "
-            "uint8, or convert it first (TorchRL's DoubleToFloat, say)"
+            f"a history of {history.dtype} does not fit this network of {dtype}: give it uint8, or "
+            "convert it first (TorchRL's DoubleToFloat, say)"
         )
 
 
-def check_observation(observation_shape: Sequence[int], history: int) -> None:
-    """Raises ValueError where no network can read such observations or histories."""
-    if history < 1:
-        raise ValueError(f"history is the number of observations K and must be >= 1, not {history}")
-    if len(observation_shape) not in (1, 2, 3) or min(observation_shape) < 1:
+def _build_frames(
+    frame: settings.FrameSettings | Mapping[str, settings.FrameSettings],
+    observation_shape: ObservationShape,
+) -> dict[str, FrameEncoder]:
+    """Builds the frame encoder of each observation; a single one is called "observation"."""
+    shapes = observation_shape
+    if not isinstance(shapes, Mapping):
+        shapes = {"observation": shapes}
+    frames = frame if isinstance(frame, Mapping) else dict.fromkeys(shapes, frame)
+    if frames.keys() != shapes.keys():
         raise ValueError(
-            f"observation_shape {tuple(observation_shape)} is not that of an array (D,) or an "
-            "image (H, W) or (C, H, W)"
+            f"there are frame encoders for {', '.join(frames)}, but observations "
+            f"{', '.join(shapes)}: name one for each"
         )
+    return {key: frames[key].build(shape) for key, shape in shapes.items()}
 
 
-def make_head(in_features: int, features_dim: int, activation: Activation) -> nn.Sequential:
-    """The head after the backbone: LayerNorm, linear, activation, LayerNorm.
-
-    Args:
-        in_features: size E of the history encoder's output.
-        features_dim: size F of the features.
-        activation: activation by name.
-
-    Example:
-        >>> make_head(64, 32, "tanh")(torch.randn(8, 64)).shape
-        torch.Size([8, 32])
-    """
-    return nn.Sequential(
-        nn.LayerNorm(in_features),
-        nn.Linear(in_features, features_dim),
-        make_activation(activation),
-        nn.LayerNorm(features_dim),
+def _history_shape(
+    frames: Sequence[FrameEncoder], num_frames: int, action_dim: int | None
+) -> HistoryShape:
+    """What the history encoder reads, if the tokens of all frame encoders fit side by side."""
+    widths = {encoder.width for encoder in frames}
+    if len(widths) > 1:
+        raise ValueError(
+            f"tokens of the widths {sorted(widths)} cannot stand side by side: give all frame "
+            "encoders the same embed_dim (flat frames are as wide as their observation)"
+        )
+    alone = len(frames) == 1 and isinstance(frames[0], Flat)
+    return HistoryShape(
+        num_frames=num_frames,
+        num_tokens=sum(encoder.num_tokens for encoder in frames),
+        width=widths.pop(),
+        frame_shape=frames[0].observation_shape if alone else None,
+        action_dim=action_dim,
     )
+
+
+def _make_head(in_features: int, head: settings.Head) -> tuple[nn.Module, int]:
+    """Builds the layers after the history encoder; returns them and the size of the features."""
+    if head.features_dim is None:
+        return nn.Identity(), in_features
+    layers = [nn.Linear(in_features, head.features_dim), make_activation(head.activation)]
+    if head.norm:
+        layers = [nn.LayerNorm(in_features), *layers, nn.LayerNorm(head.features_dim)]
+    return nn.Sequential(*layers), head.features_dim

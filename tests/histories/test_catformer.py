@@ -1,0 +1,83 @@
+"""Catformer: what it does beyond equality with the reference in tests/interop."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from tests.networks.reference import randomize
+from tests.numerics import assert_near
+from torchrl_tit import settings
+from torchrl_tit.histories import HistoryShape
+from torchrl_tit.histories.catformer import Catformer as CatformerEncoder
+from torchrl_tit.networks import Catformer
+
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
+
+SMALL: dict[str, Any] = {"embed_dim": 12, "num_heads": 3, "features_dim": 8}
+
+
+def test_defaults_are_the_protocols() -> None:
+    network = Catformer((84, 84), 4)
+    shapes = {name: tuple(p.shape) for name, p in network.named_parameters()}
+    assert shapes["frame_encoders.observation.linear.weight"] == (255, 25_600)
+    assert shapes["history_encoder.positions"] == (1, 4, 255)
+    assert shapes["history_encoder.attentions.1.projection.weight"] == (255, 510)
+    assert shapes["history_encoder.ffns.0.1.weight"] == (1020, 255)
+    assert shapes["history_encoder.ffns.1.1.weight"] == (1020, 765)
+    assert shapes["head.1.weight"] == (512, 255)
+    assert not any(name.startswith("history_encoder.attentions.0.projection") for name in shapes)
+
+
+def test_expansions_widen_what_they_name() -> None:
+    network = Catformer((20, 20), 4, **SMALL, attention_expansion=2, ffn_expansion=3)
+    shapes = {name: tuple(p.shape) for name, p in network.named_parameters()}
+    assert shapes["history_encoder.attentions.0.projection.weight"] == (24, 12)
+    assert shapes["history_encoder.attentions.1.attention.out_proj.weight"] == (12, 24)
+    assert shapes["history_encoder.ffns.1.1.weight"] == (36, 36)
+
+
+@pytest.mark.parametrize("num_blocks", [1, 2, 3])
+def test_steps_are_told_apart_and_maps_are_causal(num_blocks: int) -> None:
+    torch.manual_seed(0)
+    shape = HistoryShape(num_frames=4, num_tokens=1, width=12)
+    encoder = CatformerEncoder(settings.Catformer(num_heads=3, num_blocks=num_blocks), shape)
+    randomize(encoder)
+    tokens = torch.randn(2, 5, 4, 1, 12)
+    features = encoder(tokens)
+    assert features.shape == (2, 5, 12)
+    assert not torch.allclose(encoder(tokens[:, :, [1, 0, 2, 3]]), features, atol=1e-3)
+    maps = encoder.attention_maps(tokens)
+    assert len(maps) == num_blocks
+    for weights in maps:
+        assert weights.shape == (2, 5, 3, 4, 4)
+        assert_near(weights.sum(-1), torch.ones(2, 5, 3, 4))
+        assert torch.equal(weights, weights.tril())
+
+
+def test_attention_maps_of_the_network() -> None:
+    network = Catformer((20, 20), 3, **SMALL)
+    maps = network.attention_maps(torch.rand(2, 3, 20, 20))
+    assert maps.inner == []
+    assert [tuple(weights.shape) for weights in maps.outer] == [(2, 3, 3, 3)] * 2
+
+
+@pytest.mark.parametrize(
+    ("hyperparameters", "message"),
+    [
+        ({"num_heads": 4}, "width 255 cannot be split over 4 attention heads"),
+        ({"attention_expansion": 0}, "attention_expansion must be at least 1, not 0"),
+        ({"ffn_expansion": 0}, "ffn_expansion must be at least 1, not 0"),
+        ({"num_blocks": 0}, "num_blocks must be at least 1, not 0"),
+    ],
+)
+def test_wrong_settings(hyperparameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Catformer((84, 84), 4, **hyperparameters)
+
+
+def test_it_works_over_time() -> None:
+    with pytest.raises(ValueError, match="over time, but num_frames is 1: set it to 2 or more"):
+        Catformer((84, 84), 1)

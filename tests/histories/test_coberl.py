@@ -1,0 +1,108 @@
+"""CoBERL against its parts in a row, and the predictions of its contrastive loss."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.networks.reference import randomize
+from torchrl_tit.histories.coberl import CoBERL as CoBERLEncoder
+from torchrl_tit.layers import GRUGate, init_orthogonal_
+from torchrl_tit.networks import CoBERL, HistoryNetwork, ResNet, masked_predictions
+
+SMALL: dict[str, Any] = {"embed_dim": 12, "num_heads": 3, "features_dim": 8}
+
+
+def encode(network: HistoryNetwork, history: Tensor) -> Tensor:
+    """The tokens of the frames, [B, K, D]."""
+    return network.frames[0](history)[:, :, 0]
+
+
+def test_network_is_transformer_gate_and_lstm() -> None:
+    network = CoBERL((20, 20), 4, **SMALL, num_blocks=2)
+    randomize(network)
+    history = torch.rand(3, 4, 20, 20)
+    encoder = network.history_encoder
+    assert isinstance(encoder, CoBERLEncoder)
+    y = encode(network, history)
+    x = y
+    for block in encoder.blocks:
+        x = block(x, causal=True)
+    lstm = nn.LSTM(12, 8, batch_first=True)
+    lstm.load_state_dict(encoder.lstm.state_dict())
+    states, _ = lstm(encoder.gate(y, x))
+    torch.testing.assert_close(network(history), states[:, -1])
+
+
+def test_gate_bias_starts_near_the_identity_and_survives_initialisation() -> None:
+    network = CoBERL((20, 20), 4, **SMALL, gate_bias=9)
+    init_orthogonal_(network)
+    gates = [module for module in network.modules() if isinstance(module, GRUGate)]
+    assert len(gates) == 5  # two a block, one before the LSTM
+    assert all((gate.bias == 9).all() for gate in gates)
+    tokens = torch.randn(2, 4, 1, 12)
+    x = tokens[:, :, 0]
+    _, through = network.history_encoder.predict_masked(  # type: ignore[operator]
+        tokens, torch.zeros(2, 4, dtype=torch.bool)
+    )
+    torch.testing.assert_close(through, x, rtol=0, atol=0.05)
+    assert all((g.bias == 0).all() for g in CoBERL((20, 20), 4).modules() if isinstance(g, GRUGate))
+
+
+def test_masked_prediction_hides_the_step_and_sees_the_future() -> None:
+    network = CoBERL((20, 20), 4, **SMALL)
+    randomize(network)
+    history = torch.rand(2, 4, 20, 20)
+    mask = torch.tensor([[False, True, False, False], [False, False, False, True]])
+    encodings, predictions = masked_predictions(network, history, mask)
+    assert encodings.shape == predictions.shape == (2, 4, 12)
+    torch.testing.assert_close(encodings, encode(network, history))
+
+    # A masked frame changes no prediction.
+    changed = torch.where(mask[..., None, None], torch.rand_like(history), history)
+    other_encodings, other = masked_predictions(network, changed, mask)
+    torch.testing.assert_close(other, predictions)
+    assert not torch.allclose(other_encodings[mask], encodings[mask])
+    # A later frame does.
+    later = history.clone()
+    later[0, 3] = 1 - later[0, 3]
+    assert (masked_predictions(network, later, mask)[1] - predictions)[0, 1].abs().max() > 1e-3
+    # Leading dimensions are free.
+    one = masked_predictions(network, history[None, 0], mask[None, 0])[1]
+    torch.testing.assert_close(one[0], predictions[0])
+
+
+def test_actor_path_is_causal_and_masks_nothing() -> None:
+    network = CoBERL((20, 20), 4, **SMALL)
+    history = torch.rand(2, 4, 20, 20)
+    network(history).sum().backward()
+    assert network.history_encoder.mask_token.grad is None
+    for weights in network.attention_maps(history).outer:
+        assert weights.shape == (2, 3, 4, 4)
+        assert torch.equal(weights, weights.tril())
+
+
+@pytest.mark.parametrize(
+    ("hyperparameters", "message"),
+    [
+        ({"num_heads": 7}, "width 256 cannot be split over 7 attention heads"),
+        ({"num_blocks": 0}, "num_blocks must be at least 1, not 0"),
+    ],
+)
+def test_wrong_settings(hyperparameters: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        CoBERL((84, 84), 4, **hyperparameters)
+
+
+def test_it_works_over_time() -> None:
+    with pytest.raises(ValueError, match="over time, but num_frames is 1: set it to 2 or more"):
+        CoBERL((84, 84), 1)
+
+
+def test_other_networks_predict_nothing() -> None:
+    network = ResNet((20, 20), 4)
+    with pytest.raises(TypeError, match=r"StackedCNN cannot predict masked frames.*: take coberl"):
+        masked_predictions(network, torch.rand(2, 4, 20, 20), torch.zeros(2, 4, dtype=torch.bool))

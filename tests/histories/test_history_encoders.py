@@ -1,0 +1,83 @@
+"""What history encoders share: one token of several, frames themselves, an LSTM from zero."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import nn
+
+from tests.networks.reference import randomize
+from torchrl_tit import settings
+from torchrl_tit.histories import HistoryEncoder, HistoryShape, OneToken
+from torchrl_tit.settings import HistorySettings
+
+ONE_TOKEN: list[HistorySettings] = [
+    settings.Outer(num_heads=2),
+    settings.Outer(num_heads=2, dense=True, temporal_position_encoding=True),
+    settings.Catformer(num_heads=2),
+    settings.CoBERL(num_heads=2, hidden_dim=5),
+    settings.LSTM(hidden_dim=5),
+]
+
+
+@pytest.mark.parametrize("choices", ONE_TOKEN, ids=repr)
+def test_several_tokens_become_one_by_a_linear_layer(choices: HistorySettings) -> None:
+    several = choices.build(HistoryShape(num_frames=3, num_tokens=2, width=8)).double()
+    one = choices.build(HistoryShape(num_frames=3, num_tokens=1, width=8)).double()
+    randomize(several)
+    weights = several.state_dict()
+    linear = {name: weights.pop(f"one_token.linear.{name}") for name in ("weight", "bias")}
+    one.load_state_dict(weights)
+    tokens = torch.randn(4, 3, 2, 8, dtype=torch.float64)
+    merged = nn.functional.linear(tokens.flatten(-2), linear["weight"], linear["bias"])
+    torch.testing.assert_close(several(tokens), one(merged.unsqueeze(-2)))
+    assert several(tokens).shape == (4, several.out_features)
+    for ours, theirs in zip(
+        several.attention_maps(tokens), one.attention_maps(merged.unsqueeze(-2)), strict=True
+    ):
+        torch.testing.assert_close(ours, theirs)
+
+
+def test_one_token_stays_as_it_is() -> None:
+    module = OneToken(HistoryShape(num_frames=3, num_tokens=1, width=8))
+    assert not list(module.parameters())
+    tokens = torch.randn(4, 3, 1, 8)
+    assert torch.equal(module(tokens), tokens[:, :, 0])
+
+
+def test_masked_predictions_of_several_tokens_compare_the_one_made_of_them() -> None:
+    shape = HistoryShape(num_frames=3, num_tokens=2, width=8)
+    coberl = settings.CoBERL(num_heads=2, hidden_dim=5).build(shape)
+    tokens = torch.randn(4, 3, 2, 8)
+    encodings, predictions = coberl.predict_masked(tokens, torch.rand(4, 3) < 0.5)
+    torch.testing.assert_close(encodings, coberl.one_token(tokens))
+    assert predictions.shape == (4, 3, 8)
+
+
+def test_lstm_reads_several_frames_from_a_state_of_zeros() -> None:
+    encoder = settings.LSTM(hidden_dim=5).build(HistoryShape(num_frames=3, num_tokens=1, width=8))
+    reference = nn.LSTM(8, 5, batch_first=True)
+    reference.load_state_dict(encoder.memory.lstm.state_dict())
+    tokens = torch.randn(2, 4, 3, 1, 8)
+    expected, _ = reference(tokens.reshape(8, 3, 8))
+    torch.testing.assert_close(encoder(tokens), expected[:, -1].reshape(2, 4, 5))
+    for name, parameter in reference.named_parameters():
+        if name.startswith("bias"):
+            assert not parameter.any()
+        else:
+            square = parameter.T @ parameter if name.endswith("hh_l0") else None
+            if square is not None:
+                torch.testing.assert_close(square, torch.eye(5))
+
+
+def test_frames_that_were_encoded_cannot_be_stacked() -> None:
+    tokens = HistoryShape(num_frames=3, num_tokens=1, width=8)
+    for choices in (settings.StackedInner(), settings.StackedCNN()):
+        with pytest.raises(ValueError, match="stacks the frames themselves, not tokens: choose"):
+            choices.build(tokens)
+
+
+def test_an_encoder_without_blocks_has_no_attention_maps() -> None:
+    encoder = settings.MLP().build(HistoryShape(num_frames=3, num_tokens=1, width=8))
+    assert isinstance(encoder, HistoryEncoder)
+    assert encoder.attention_maps(torch.randn(2, 3, 1, 8)) == []

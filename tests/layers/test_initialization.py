@@ -1,0 +1,155 @@
+"""The two initialisations of the experiments."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from torchrl_tit.layers import (
+    ArrayPatchEmbedding,
+    ImagePatchEmbedding,
+    SelfAttention,
+    TransformerBlock,
+    init_normal_,
+    init_orthogonal_,
+)
+from torchrl_tit.networks import EnhancedTIT, VanillaTIT
+
+KINDS = pytest.mark.parametrize("kind", [EnhancedTIT, VanillaTIT])
+SHAPES = pytest.mark.parametrize(("shape", "patch_size"), [((12,), 1), ((24, 24), 12)])
+
+
+def make(kind: type[Any], shape: tuple[int, ...], patch_size: int) -> nn.Module:
+    torch.manual_seed(0)
+    network = kind(shape, 4, patch_size=patch_size, embed_dim=64, temporal_position_encoding=True)
+    assert isinstance(network, nn.Module)
+    return network
+
+
+def assert_normal(weight: Tensor, std: float) -> None:
+    error = 5 * std / math.sqrt(weight.numel())
+    assert abs(weight.mean().item()) < error
+    assert abs(weight.std().item() - std) < error
+    if weight.numel() > 1000:
+        assert weight.abs().max() > 2.5 * std, "truncated"
+
+
+def assert_uniform(weight: Tensor, bound: float) -> None:
+    assert weight.abs().max() <= bound
+    assert abs(weight.std().item() - bound / math.sqrt(3)) < 5 * bound / math.sqrt(weight.numel())
+
+
+def assert_input_projections_as_in_multihead_attention(network: nn.Module) -> None:
+    for attention in network.modules():
+        if isinstance(attention, SelfAttention):
+            rows, columns = attention.in_proj_weight.shape
+            assert_uniform(attention.in_proj_weight, math.sqrt(6 / (rows + columns)))
+            assert not attention.in_proj_bias.any()
+
+
+@KINDS
+@SHAPES
+def test_networks_start_as_the_authors(
+    kind: type[Any], shape: tuple[int, ...], patch_size: int
+) -> None:
+    network = make(kind, shape, patch_size)
+    for module in network.modules():
+        if isinstance(module, nn.Linear):
+            assert_normal(module.weight, 0.02)
+            assert not module.bias.any()
+        if isinstance(module, nn.LayerNorm):
+            assert (module.weight == 1).all()
+            assert not module.bias.any()
+        if isinstance(module, ArrayPatchEmbedding | ImagePatchEmbedding):
+            # PyTorch's default of a convolution: uniform within 1 / sqrt(inputs).
+            assert_uniform(module.weight, 1 / math.sqrt(module.weight[0].numel()))
+    assert_input_projections_as_in_multihead_attention(network)
+    positions = {n: p for n, p in network.named_parameters() if "position" in n or "token" in n}
+    assert len(positions) == 3
+    for parameter in positions.values():
+        assert_normal(parameter, 0.02)
+
+
+def test_normal_covers_embeddings_and_leaves_convolutions() -> None:
+    embedding, conv = nn.Embedding(50, 64), nn.Conv2d(3, 8, 3)
+    before = conv.weight.detach().clone(), conv.bias.detach().clone()  # type: ignore[union-attr]
+    init_normal_(nn.Sequential(embedding, conv), std=0.1)
+    assert_normal(embedding.weight, 0.1)
+    assert torch.equal(conv.weight, before[0])
+    assert torch.equal(conv.bias, before[1])  # type: ignore[arg-type]
+
+
+def assert_orthogonal(weight: Tensor, gain: float) -> None:
+    matrix = weight.flatten(1)
+    if matrix.shape[0] > matrix.shape[1]:
+        matrix = matrix.T
+    expected = gain**2 * torch.eye(len(matrix))
+    torch.testing.assert_close(matrix @ matrix.T, expected, rtol=0, atol=1e-4 * gain**2)
+
+
+@KINDS
+@SHAPES
+@pytest.mark.parametrize("gain", [math.sqrt(2), 0.01])
+def test_orthogonal(kind: type[Any], shape: tuple[int, ...], patch_size: int, gain: float) -> None:
+    network = make(kind, shape, patch_size)
+    for parameter in network.parameters():
+        parameter.data.add_(0.01)  # biases that are 0 already would prove nothing
+    before = {name: p.detach().clone() for name, p in network.named_parameters()}
+    init_orthogonal_(network, gain)
+
+    changed = set()
+    for name, module in network.named_modules():
+        if isinstance(module, nn.Linear):
+            assert_orthogonal(module.weight, gain)
+            assert not module.bias.any()
+            changed |= {f"{name}.weight", f"{name}.bias"}
+        if isinstance(module, ImagePatchEmbedding):
+            assert_orthogonal(module.weight, gain)
+            changed.add(f"{name}.weight")
+    assert any("out_proj" in name for name in changed)
+    # Array patches, input projections, LayerNorms, class token and positions stay.
+    for name, parameter in network.named_parameters():
+        assert torch.equal(parameter, before[name]) == (name not in changed), name
+
+
+def test_orthogonal_covers_convolutions_of_images_only() -> None:
+    image, array = nn.Conv2d(4, 16, 3), nn.Conv1d(4, 16, 3)
+    before = array.weight.detach().clone()
+    init_orthogonal_(nn.Sequential(image, array))
+    assert_orthogonal(image.weight, math.sqrt(2))
+    assert not image.bias.any()  # type: ignore[union-attr]
+    assert torch.equal(array.weight, before)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (ArrayPatchEmbedding(12, 4, 32, channels=3), nn.Conv1d(3, 32, 4, 4, bias=False)),
+        (ImagePatchEmbedding(3, (8, 8), 4, 32), nn.Conv2d(3, 32, 4, 4, bias=False)),
+        (SelfAttention(32, 4), nn.MultiheadAttention(32, 4)),
+    ],
+)
+def test_layers_draw_what_pytorch_draws(ours: Any, theirs: Any) -> None:
+    torch.manual_seed(1)
+    ours.reset_parameters()
+    torch.manual_seed(1)
+    if isinstance(theirs, nn.MultiheadAttention):
+        theirs._reset_parameters()
+        assert torch.equal(ours.in_proj_weight, theirs.in_proj_weight)
+        assert torch.equal(ours.in_proj_bias, theirs.in_proj_bias)
+        assert not ours.out_proj.bias.any()
+        assert ours.out_proj.weight.std() > 0
+    else:
+        theirs.reset_parameters()
+        assert torch.equal(ours.weight, theirs.weight)
+
+
+def test_a_block_starts_with_pytorchs_defaults() -> None:
+    torch.manual_seed(0)
+    block = TransformerBlock(64, num_heads=4)
+    assert_uniform(block.ffn.get_parameter("0.weight"), 1 / math.sqrt(64))
+    assert_uniform(block.attention.out_proj.weight, 1 / math.sqrt(64))

@@ -1,0 +1,48 @@
+"""Convolutional frame encoders: one image to one token."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import Tensor, nn
+
+from torchrl_tit import settings
+from torchrl_tit.frames.encoder import FrameEncoder, check_image_shape
+from torchrl_tit.layers.images import as_images, stacked_shape
+from torchrl_tit.layers.torsos import TORSOS
+
+
+class CNNFrameEncoder(FrameEncoder):
+    """Maps one image to one token: convolutions and a linear layer.
+
+    With the residual network of arXiv 2212.14538, the frame encoder of Catformer and CoBERL.
+
+    Args:
+        settings: which convolutions, and the width of the token.
+        observation_shape: (H, W) or (C, H, W), at least 8 pixels a side (NatureCNN: 36).
+
+    Raises:
+        ValueError: if observations are not images of that size.
+
+    Example:
+        >>> import torch
+        >>> encoder = CNNFrameEncoder(settings.ResNetFrames(embed_dim=255), (84, 84))
+        >>> encoder(torch.zeros(2, 4, 84, 84)).shape
+        torch.Size([2, 4, 1, 255])
+    """
+
+    def __init__(
+        self,
+        settings: settings.ResNetFrames | settings.NatureCNNFrames,
+        observation_shape: Sequence[int],
+    ) -> None:
+        torso = TORSOS[settings.name]
+        shape = check_image_shape(observation_shape, torso.smallest_image)
+        super().__init__(shape, num_tokens=1, width=settings.embed_dim)
+        self.torso = torso(*stacked_shape(shape))
+        self.linear = nn.Linear(self.torso.out_features, settings.embed_dim)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """[..., (C,) H, W], float or uint8 -> float [..., 1, D]."""
+        images, leading = as_images(observation, len(self.observation_shape))
+        return self.linear(self.torso(images)).reshape(*leading, 1, self.width)

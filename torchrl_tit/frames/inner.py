@@ -1,0 +1,136 @@
+"""The inner transformer: the patches of one observation to class tokens."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_tit import settings
+from torchrl_tit.frames.encoder import FrameEncoder, check_observation_shape
+from torchrl_tit.layers.block import TransformerBlock
+from torchrl_tit.layers.patches import make_patch_embedding
+
+
+class InnerTransformer(FrameEncoder):
+    """Reads the patches of one observation (arXiv 2212.14538, section "The Inner Transformer").
+
+    Class token and patch tokens, plus position encodings, go through L blocks. The outputs are
+    the class token: after every block (Enhanced_TIT) or after the last one (Vanilla_TIT). Of the
+    last block nothing else is read, so nothing else is computed.
+
+    Args:
+        settings: patch size, width, blocks and outputs.
+        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
+        num_frames: number of observations that are stacked as channels.
+
+    Raises:
+        ValueError: if the patch does not fit the observation, or the heads not the width.
+
+    Example:
+        >>> inner = InnerTransformer(settings.Inner(patch_size=12, num_heads=4), (84, 84))
+        >>> inner(torch.zeros(8, 84, 84, dtype=torch.uint8)).shape
+        torch.Size([8, 2, 32])
+    """
+
+    def __init__(
+        self,
+        settings: settings.Inner | settings.StackedInner,
+        observation_shape: Sequence[int],
+        *,
+        num_frames: int | None = None,
+    ) -> None:
+        shape = check_observation_shape(observation_shape)
+        super().__init__(
+            shape,
+            num_tokens=settings.num_blocks if settings.every_block else 1,
+            width=settings.embed_dim,
+        )
+        self.num_frames = num_frames
+        self.num_blocks = settings.num_blocks
+        self.every_block = settings.every_block
+        self.patch_embedding = make_patch_embedding(
+            shape, settings.patch_size or shape[-1], settings.embed_dim, num_frames=num_frames or 1
+        )
+        self.class_token = nn.Parameter(torch.empty(1, 1, settings.embed_dim))
+        self.positions = (
+            nn.Parameter(torch.empty(1, 1 + self.patch_embedding.num_patches, settings.embed_dim))
+            if settings.position_encoding
+            else None
+        )
+        self.blocks = nn.ModuleList(
+            TransformerBlock.from_settings(settings, settings.embed_dim)
+            for _ in range(1 if settings.share_blocks else settings.num_blocks)
+        )
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises class token and positions: normal with a standard deviation of 0.02."""
+        nn.init.normal_(self.class_token, std=0.02)
+        if self.positions is not None:
+            nn.init.normal_(self.positions, std=0.02)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Encodes observations.
+
+        Args:
+            observation: [..., *observation_shape], or [..., num_frames, *observation_shape] where
+                frames are stacked as channels; float, or uint8 which is divided by 255.
+
+        Returns:
+            Class tokens, float [..., L, D], or [..., 1, D] of the last block only.
+        """
+        class_token, patches, leading = self._tokens(observation)
+        if self.num_blocks == 1:  # before it, the class token is the same for all observations
+            x = self._block(0).read_first(class_token, patches)  # [N, 1, D]
+            return x.reshape(*leading, 1, x.shape[-1])
+        x = _join(class_token, patches)
+        class_tokens = []
+        for index in range(self.num_blocks):
+            last = index == self.num_blocks - 1
+            x = self._block(index)(x, read="first" if last else "all")
+            if last or self.every_block:
+                class_tokens.append(x[:, 0])
+        return torch.stack(class_tokens, dim=1).reshape(*leading, self.num_tokens, x.shape[-1])
+
+    def attention_maps(self, observation: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each block, L x float [..., heads, S, S].
+
+        S = 1 + patches; position 0 is the class token, the patches follow row by row.
+        """
+        class_token, patches, leading = self._tokens(observation)
+        x = _join(class_token, patches)
+        maps = []
+        for index in range(self.num_blocks):
+            block = self._block(index)
+            weights = block.attention_weights(x)
+            maps.append(weights.reshape(*leading, *weights.shape[1:]))
+            x = block(x)
+        return maps
+
+    def _block(self, index: int) -> TransformerBlock:
+        block = self.blocks[index % len(self.blocks)]
+        assert isinstance(block, TransformerBlock)
+        return block
+
+    def _tokens(self, observation: Tensor) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+        """[..., *observation] -> class token [1, 1, D], patches [N, patches, D], leading shape."""
+        frame_ndim = len(self.observation_shape) + (self.num_frames is not None)
+        leading = observation.shape[: observation.ndim - frame_ndim]
+        shape = observation.shape[observation.ndim - frame_ndim :]
+        # Arrays become [N, channels, D], images [N, channels, H, W]: frames are channels too.
+        space = 1 if len(self.observation_shape) == 1 else 2
+        channels = math.prod(shape[:-space])
+        x = observation.reshape(math.prod(leading), channels, *shape[-space:])
+        patches = self.patch_embedding(x)
+        if self.positions is None:
+            return self.class_token, patches, tuple(leading)
+        class_token = self.class_token + self.positions[:, :1]
+        return class_token, patches + self.positions[:, 1:], tuple(leading)
+
+
+def _join(class_token: Tensor, patches: Tensor) -> Tensor:
+    """[1, 1, D] and [N, patches, D] -> [N, 1 + patches, D]."""
+    return torch.cat([class_token.expand(patches.shape[0], -1, -1), patches], dim=1)

@@ -1,0 +1,5 @@
+"""History encoders: the tokens of K frames to one vector."""
+
+from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken, RecurrentEncoder
+
+__all__ = ["HistoryEncoder", "HistoryShape", "OneToken", "RecurrentEncoder"]

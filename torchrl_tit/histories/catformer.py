@@ -1,0 +1,130 @@
+"""Catformer: a transformer whose layers are concatenated instead of added."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_tit import settings
+from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
+from torchrl_tit.layers.attention import Read, SelfAttention
+
+
+class CatformerAttention(nn.Module):
+    """Attention layer: project the concatenation, LayerNorm, causal self-attention.
+
+    Args:
+        in_dim: width of the concatenation of all earlier layers' outputs.
+        width: width D of the output.
+        settings: heads, and the width at which attention works.
+        project: whether there is a projection; without it ``in_dim`` is the attention's width.
+
+    Raises:
+        ValueError: if the heads do not divide the attention's width.
+    """
+
+    def __init__(
+        self, in_dim: int, width: int, settings: settings.Catformer, *, project: bool
+    ) -> None:
+        super().__init__()
+        attention_dim = settings.attention_expansion * width
+        self.projection = nn.Linear(in_dim, attention_dim) if project else nn.Identity()
+        self.norm = nn.LayerNorm(attention_dim)
+        self.attention = SelfAttention(
+            attention_dim, settings.num_heads, causal=True, out_dim=width
+        )
+
+    def forward(self, x: Tensor, read: Read = "all") -> Tensor:
+        """Float [N, K, in_dim] -> float [N, K or 1, D]."""
+        return self.attention(self.norm(self.projection(x)), read)
+
+    def attention_weights(self, x: Tensor) -> Tensor:
+        """Returns the weights with which this layer attends, float [N, heads, K, K]."""
+        return self.attention.weights(self.norm(self.projection(x)))
+
+
+class Catformer(HistoryEncoder):
+    """Catformer's layers over one token a frame, read at the newest frame.
+
+    Davis et al., "Catformer: Designing Stable Transformers via Sensitivity Analysis", ICML 2021, as
+    built for the baseline of arXiv 2212.14538. Attention and FFN take turns, without residuals:
+    each layer after the first reads the concatenation of the outputs of all layers before it (not
+    of the tokens themselves). The weights start as PyTorch's layers do. Where frames have several
+    tokens, a linear layer makes one of them.
+
+    Args:
+        settings: blocks, heads and expansions.
+        shape: what it reads.
+
+    Raises:
+        ValueError: if the heads do not divide the attention's width.
+
+    Example:
+        >>> shape = HistoryShape(num_frames=4, num_tokens=1, width=32)
+        >>> catformer = Catformer(settings.Catformer(num_heads=4), shape)
+        >>> catformer(torch.randn(8, 4, 1, 32)).shape
+        torch.Size([8, 32])
+    """
+
+    def __init__(self, settings: settings.Catformer, shape: HistoryShape) -> None:
+        super().__init__(shape, out_features=shape.width)
+        width = shape.width
+        self.one_token = OneToken(shape)
+        self.positions = nn.Parameter(torch.empty(1, shape.num_frames, width))
+        self.attentions = nn.ModuleList()
+        self.ffns = nn.ModuleList()
+        for index in range(settings.num_blocks):
+            # The first layer reads the tokens as they are, unless it is to be wider.
+            project = index > 0 or settings.attention_expansion > 1
+            earlier = width * max(2 * index, 1)
+            self.attentions.append(CatformerAttention(earlier, width, settings, project=project))
+            earlier = width * (2 * index + 1)
+            self.ffns.append(
+                nn.Sequential(
+                    nn.LayerNorm(earlier),
+                    nn.Linear(earlier, settings.ffn_expansion * width),
+                    nn.GELU(),
+                    nn.Linear(settings.ffn_expansion * width, width),
+                )
+            )
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises the temporal positions: normal with a standard deviation of 0.02."""
+        nn.init.normal_(self.positions, std=0.02)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens of K frames, float [..., K, L, D] -> float [..., D]."""
+        x, leading = self._steps(tokens)  # [N, K, D]
+        outputs: list[Tensor] = []  # of all layers so far, [N, K, D] each
+        for index, (attention, ffn) in enumerate(zip(self.attentions, self.ffns, strict=True)):
+            x = torch.cat(outputs, dim=-1) if outputs else x
+            if index == len(self.ffns) - 1:  # of the last two layers only the newest frame is read
+                outputs = [output[:, -1:] for output in outputs]
+                outputs.append(attention(x, read="last"))
+            else:
+                outputs.append(attention(x))
+            outputs.append(ffn(torch.cat(outputs, dim=-1)))
+        return outputs[-1].reshape(*leading, self.out_features)
+
+    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each attention layer, float [..., heads, K, K]."""
+        x, leading = self._steps(tokens)
+        outputs: list[Tensor] = []
+        maps = []
+        for attention, ffn in zip(self.attentions, self.ffns, strict=True):
+            x = torch.cat(outputs, dim=-1) if outputs else x
+            assert isinstance(attention, CatformerAttention)
+            weights = attention.attention_weights(x)
+            maps.append(weights.reshape(*leading, *weights.shape[1:]))
+            outputs.append(attention(x))
+            outputs.append(ffn(torch.cat(outputs, dim=-1)))
+        return maps
+
+    def _steps(self, tokens: Tensor) -> tuple[Tensor, tuple[int, ...]]:
+        """[..., K, L, D] -> [N, K, D] with temporal positions, leading shape."""
+        x = self.one_token(tokens)
+        leading = tuple(x.shape[:-2])
+        return x.reshape(math.prod(leading), *x.shape[-2:]) + self.positions, leading

@@ -1,0 +1,105 @@
+"""CoBERL: gated transformer, gate and LSTM, with the predictions of its contrastive loss."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import LSTM
+
+from torchrl_tit import settings
+from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
+from torchrl_tit.layers.gated_block import GatedTransformerBlock, GRUGate
+
+
+class CoBERL(HistoryEncoder):
+    """Gated transformer over one token a frame, a gate that mixes its input in, an LSTM.
+
+    Banino et al., "CoBERL: Contrastive BERT for Reinforcement Learning", arXiv 2107.05431, figure
+    1; a baseline of arXiv 2212.14538. The gate lets the LSTM read the tokens themselves until the
+    transformer is worth reading. The LSTM starts at zero with the history. The weights start as
+    PyTorch's layers do. Where frames have several tokens, a linear layer makes one of them.
+
+    Args:
+        settings: blocks, heads, gates and the size of the LSTM's state.
+        shape: what it reads.
+
+    Raises:
+        ValueError: if the heads do not divide the width.
+
+    Example:
+        >>> shape = HistoryShape(num_frames=4, num_tokens=1, width=32)
+        >>> coberl = CoBERL(settings.CoBERL(hidden_dim=64), shape)
+        >>> coberl(torch.randn(8, 4, 1, 32)).shape
+        torch.Size([8, 64])
+    """
+
+    def __init__(self, settings: settings.CoBERL, shape: HistoryShape) -> None:
+        super().__init__(shape, out_features=settings.hidden_dim)
+        self.one_token = OneToken(shape)
+        self.blocks = nn.ModuleList(
+            GatedTransformerBlock(
+                shape.width,
+                settings.num_heads,
+                shape.num_frames,
+                ffn_expansion=settings.ffn_expansion,
+                gate_bias=settings.gate_bias,
+            )
+            for _ in range(settings.num_blocks)
+        )
+        self.mask_token = nn.Parameter(torch.empty(shape.width))
+        self.gate = GRUGate(shape.width, settings.gate_bias)
+        # TorchRL's LSTM, not PyTorch's: it works under vmap and in a compiled graph.
+        self.lstm = LSTM(shape.width, settings.hidden_dim, batch_first=True)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises the mask token: normal with a standard deviation of 0.02."""
+        nn.init.normal_(self.mask_token, std=0.02)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens of K frames, float [..., K, L, D] -> state of the LSTM, float [..., E]."""
+        x, leading = self._steps(self.one_token(tokens))  # [N, K, D]
+        states, _ = self.lstm(self.gate(x, self._transform(x, causal=True)))  # [N, K, E]
+        return states[:, -1].reshape(*leading, self.out_features)
+
+    def predict_masked(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Predicts every frame's encoding from both sides, with the masked frames hidden.
+
+        What the contrastive loss compares at the masked frames (arXiv 2107.05431, section 2.1): the
+        transformer sees past and future there, and neither gate nor LSTM take part.
+
+        Args:
+            tokens: float [..., K, L, D].
+            mask: bool [..., K], True where a frame is hidden (15% of them in the paper).
+
+        Returns:
+            The encodings of the frames and their predictions, float [..., K, D] each.
+        """
+        encodings = self.one_token(tokens)
+        hidden = torch.where(mask.unsqueeze(-1), self.mask_token.to(encodings.dtype), encodings)
+        x, _ = self._steps(hidden)
+        return encodings, self._transform(x, causal=False).reshape(encodings.shape)
+
+    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each block, float [..., heads, K, K]."""
+        x, leading = self._steps(self.one_token(tokens))
+        maps = []
+        for block in self.blocks:
+            assert isinstance(block, GatedTransformerBlock)
+            weights = block.attention_weights(x)
+            maps.append(weights.reshape(*leading, *weights.shape[1:]))
+            x = block(x, causal=True)
+        return maps
+
+    def _steps(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
+        """[..., K, D] -> [N, K, D], leading shape."""
+        leading = tuple(x.shape[:-2])
+        return x.reshape(math.prod(leading), *x.shape[-2:]), leading
+
+    def _transform(self, x: Tensor, *, causal: bool) -> Tensor:
+        """The gated blocks on [N, K, D]."""
+        for block in self.blocks:
+            x = block(x, causal=causal)
+        return x

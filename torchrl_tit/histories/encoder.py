@@ -1,0 +1,152 @@
+"""The contract of history encoders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class HistoryShape:
+    """What a history encoder is given to read."""
+
+    num_frames: int
+    """Number K of frames."""
+    num_tokens: int
+    """Number L of tokens of a frame."""
+    width: int
+    """Width D of a token."""
+    frame_shape: tuple[int, ...] | None = None
+    """Where a token is the observation itself: the observation's shape."""
+    action_dim: int | None = None
+    """Entries of a continuous action, or number of discrete ones, where the task is known."""
+
+    def require_frames(self, reader: str) -> tuple[int, ...]:
+        """Returns the observation's shape, for history encoders that read the frames themselves.
+
+        Args:
+            reader: name of the history encoder.
+
+        Raises:
+            ValueError: if the tokens are not the frames themselves.
+        """
+        if self.frame_shape is None:
+            raise ValueError(
+                f"{reader} stacks the frames themselves, not tokens: choose flat frames of one "
+                "observation, or another history encoder"
+            )
+        return self.frame_shape
+
+
+class HistoryEncoder(nn.Module):
+    """Turns the tokens of the last K frames into one vector.
+
+    A subclass is built as ``Encoder(settings, shape)``, calls ``super().__init__`` with the size of
+    its output, and implements ``forward``.
+
+    Args:
+        shape: what it reads.
+        out_features: size E of the output.
+
+    Raises:
+        ValueError: if it reads the frames themselves, but is given tokens.
+    """
+
+    reads_frames: ClassVar[bool] = False
+    """Whether it needs the frames themselves (see :class:`~torchrl_tit.frames.flat.Flat`), and
+    takes bytes as they are."""
+    context: ClassVar[tuple[str, ...]] = ()
+    """Names of its inputs besides the tokens, one argument of ``forward`` each."""
+    reads_any_length: ClassVar[bool] = False
+    """Whether it takes histories of any number of frames, not of ``num_frames`` only."""
+    encodes_every_frame: ClassVar[bool] = False
+    """Whether ``every_frame`` is implemented."""
+    is_recurrent: ClassVar[bool] = False
+    """Whether it can carry a state from step to step: a :class:`RecurrentEncoder`."""
+
+    def __init__(self, shape: HistoryShape, *, out_features: int) -> None:
+        super().__init__()
+        if self.reads_frames:
+            shape.require_frames(type(self).__name__)
+        self.shape = shape
+        self.out_features = out_features
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Encodes histories.
+
+        Args:
+            tokens: float [..., K, L, D], the oldest frame first.
+
+        Returns:
+            float [..., E].
+        """
+        raise NotImplementedError
+
+    def every_frame(self, tokens: Tensor) -> Tensor:
+        """Encodes every frame from itself and the frames before it, for losses on whole windows.
+
+        Args:
+            tokens: as in ``forward``.
+
+        Returns:
+            float [..., K, E].
+        """
+        raise NotImplementedError
+
+    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each block, float [..., heads, K, K]; default: none."""
+        return []
+
+
+class RecurrentEncoder(HistoryEncoder):
+    """A history encoder with a state.
+
+    Where it reads one frame (K = 1), :class:`~torchrl_tit.modules.Backbone` carries the state from
+    step to step in the tensordict. Where it reads several, each history starts with a state of
+    zeros.
+    """
+
+    is_recurrent = True
+    state_shapes: dict[str, torch.Size]
+    """Shape of each entry of the state, without batch dimensions."""
+
+    def step(
+        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Reads single steps, or whole sequences within ``torchrl.modules.set_recurrent_mode``.
+
+        Args:
+            tokens: float [*B, L, D]; in recurrent mode the last dimension of B is time.
+            state: the state before each step, [*B, *state_shape] each; of a sequence only that of
+                its first step is read, and of each step where an episode begins.
+            is_init: bool [*B, 1], True where an episode begins.
+
+        Returns:
+            float [*B, E], and the state after each step.
+        """
+        raise NotImplementedError
+
+
+class OneToken(nn.Module):
+    """Makes one token of the L tokens of a frame: nothing to do where L = 1, else a linear layer.
+
+    Args:
+        shape: what the history encoder reads.
+
+    Example:
+        >>> shape = HistoryShape(num_frames=4, num_tokens=2, width=32)
+        >>> OneToken(shape)(torch.rand(8, 4, 2, 32)).shape
+        torch.Size([8, 4, 32])
+    """
+
+    def __init__(self, shape: HistoryShape) -> None:
+        super().__init__()
+        inputs = shape.num_tokens * shape.width
+        self.linear = nn.Linear(inputs, shape.width) if shape.num_tokens > 1 else nn.Identity()
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Float [..., L, D] -> float [..., D]."""
+        return self.linear(tokens.flatten(-2))

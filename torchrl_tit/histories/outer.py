@@ -1,0 +1,152 @@
+"""The outer transformers of TIT: the tokens of K frames to one vector."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_tit import settings
+from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
+from torchrl_tit.layers.block import TransformerBlock
+
+
+class OuterTransformer(HistoryEncoder):
+    """What both outer transformers share: causal blocks over the frames, read at the newest one.
+
+    The paper gives the outer transformer no position encoding: the newest frame then sees the past
+    as a set. Temporal positions are an option that tells the frames apart.
+
+    Args:
+        settings: heads, FFN, dropout and temporal positions.
+        shape: what it reads.
+        num_blocks: number of blocks.
+        out_features: size of the output.
+    """
+
+    def __init__(
+        self,
+        settings: settings.Outer | settings.PairedOuter,
+        shape: HistoryShape,
+        *,
+        num_blocks: int,
+        out_features: int,
+    ) -> None:
+        super().__init__(shape, out_features=out_features)
+        self.num_blocks = num_blocks
+        self.positions = (
+            nn.Parameter(torch.empty(shape.num_frames, 1, shape.width))
+            if settings.temporal_position_encoding
+            else None
+        )
+        self.blocks = nn.ModuleList(
+            TransformerBlock.from_settings(settings, shape.width, causal=True)
+            for _ in range(1 if settings.share_blocks else num_blocks)
+        )
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises temporal positions: normal with a standard deviation of 0.02."""
+        if self.positions is not None:
+            nn.init.normal_(self.positions, std=0.02)
+
+    def _block(self, index: int) -> TransformerBlock:
+        block = self.blocks[index % len(self.blocks)]
+        assert isinstance(block, TransformerBlock)
+        return block
+
+    def _steps(self, tokens: Tensor) -> tuple[Tensor, tuple[int, ...]]:
+        """[..., K, L, D] -> [N, K, L, D] with temporal positions, leading shape."""
+        leading = tuple(tokens.shape[:-3])
+        x = tokens.reshape(math.prod(leading), *tokens.shape[-3:])
+        return x if self.positions is None else x + self.positions, leading
+
+
+class PairedOuterTransformer(OuterTransformer):
+    """The outer blocks of Enhanced_TIT (arXiv 2212.14538, section "Enhanced_TIT").
+
+    Outer block l reads token l of the K frames, the output of inner block l, never the
+    outer block before it. The newest frame's outputs of all blocks are concatenated (the dense
+    connection). Without the dense connection only the last pair matters, so frames have one token.
+
+    Args:
+        settings: heads, FFN, dropout and temporal positions.
+        shape: what it reads.
+
+    Example:
+        >>> shape = HistoryShape(num_frames=4, num_tokens=2, width=32)
+        >>> outer = PairedOuterTransformer(settings.PairedOuter(num_heads=4), shape)
+        >>> outer(torch.randn(8, 4, 2, 32)).shape
+        torch.Size([8, 64])
+    """
+
+    def __init__(self, settings: settings.PairedOuter, shape: HistoryShape) -> None:
+        super().__init__(
+            settings,
+            shape,
+            num_blocks=shape.num_tokens,
+            out_features=shape.num_tokens * shape.width,
+        )
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens of K frames, float [..., K, L, D] -> float [..., L * D]."""
+        x, leading = self._steps(tokens)
+        newest = [self._block(i)(x[:, :, i], read="last") for i in range(self.num_blocks)]
+        return torch.cat(newest, dim=-1).reshape(*leading, self.out_features)
+
+    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each block, L x float [..., heads, K, K]."""
+        x, leading = self._steps(tokens)
+        maps = (self._block(i).attention_weights(x[:, :, i]) for i in range(self.num_blocks))
+        return [weights.reshape(*leading, *weights.shape[1:]) for weights in maps]
+
+
+class StackedOuterTransformer(OuterTransformer):
+    """The outer transformer of Vanilla_TIT (arXiv 2212.14538, section "The Outer Transformer").
+
+    Causal blocks, each on the output of the one before, over one token a frame. The output is that
+    of the last block for the newest frame, or with dense connections (the ablation without inner
+    blocks) those of all blocks. If frames have several tokens, a linear layer makes one of them.
+
+    Args:
+        settings: blocks, heads, FFN, dropout and temporal positions.
+        shape: what it reads.
+
+    Example:
+        >>> shape = HistoryShape(num_frames=4, num_tokens=1, width=32)
+        >>> outer = StackedOuterTransformer(settings.Outer(num_heads=4), shape)
+        >>> outer(torch.randn(8, 4, 1, 32)).shape
+        torch.Size([8, 32])
+    """
+
+    def __init__(self, settings: settings.Outer, shape: HistoryShape) -> None:
+        outputs = settings.num_blocks if settings.dense else 1
+        super().__init__(
+            settings, shape, num_blocks=settings.num_blocks, out_features=outputs * shape.width
+        )
+        self.dense = settings.dense
+        self.one_token = OneToken(shape)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens of K frames, float [..., K, L, D] -> float [..., D] (dense: [..., blocks * D])."""
+        x, leading = self._steps(self.one_token(tokens).unsqueeze(-2))
+        x = x[:, :, 0]
+        newest = []
+        for index in range(self.num_blocks):
+            last = index == self.num_blocks - 1
+            x = self._block(index)(x, read="last" if last else "all")
+            if last or self.dense:
+                newest.append(x[:, -1])
+        return torch.cat(newest, dim=-1).reshape(*leading, self.out_features)
+
+    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each block, L x float [..., heads, K, K]."""
+        x, leading = self._steps(self.one_token(tokens).unsqueeze(-2))
+        x = x[:, :, 0]
+        maps = []
+        for index in range(self.num_blocks):
+            weights = self._block(index).attention_weights(x)
+            maps.append(weights.reshape(*leading, *weights.shape[1:]))
+            x = self._block(index)(x)
+        return maps

@@ -1,0 +1,89 @@
+"""History encoders that stack the frames as channels."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from torchrl_tit import settings
+from torchrl_tit.frames.encoder import check_image_shape
+from torchrl_tit.frames.inner import InnerTransformer
+from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape
+from torchrl_tit.layers.images import as_images, stacked_shape
+from torchrl_tit.layers.torsos import TORSOS
+
+
+class StackedInnerTransformer(HistoryEncoder):
+    """Inner blocks over K frames that are stacked as channels: the ablation "w/o Outer".
+
+    Args:
+        settings: patch size, width, blocks and outputs.
+        shape: what it reads: flat frames.
+
+    Raises:
+        ValueError: if it is given tokens instead, the patch does not fit the observation, or the
+            heads not the width.
+
+    Example:
+        >>> import torch
+        >>> shape = HistoryShape(num_frames=4, num_tokens=1, width=7056, frame_shape=(84, 84))
+        >>> stacked = StackedInnerTransformer(settings.StackedInner(patch_size=12), shape)
+        >>> stacked(torch.zeros(2, 4, 1, 7056, dtype=torch.uint8)).shape
+        torch.Size([2, 64])
+    """
+
+    reads_frames = True
+
+    def __init__(self, settings: settings.StackedInner, shape: HistoryShape) -> None:
+        tokens = settings.num_blocks if settings.every_block else 1
+        super().__init__(shape, out_features=tokens * settings.embed_dim)
+        self.frame_shape = shape.require_frames(type(self).__name__)
+        self.inner = InnerTransformer(settings, self.frame_shape, num_frames=shape.num_frames)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """[..., K, 1, entries], float or uint8 -> class tokens of L blocks, float [..., L * D]."""
+        return self.inner(self._frames(tokens)).flatten(-2)
+
+    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each block, L x float [..., heads, S, S]."""
+        return self.inner.attention_maps(self._frames(tokens))
+
+    def _frames(self, tokens: Tensor) -> Tensor:
+        """[..., K, 1, entries] -> [..., K, *frame_shape]."""
+        return tokens.squeeze(-2).unflatten(-1, self.frame_shape)
+
+
+class StackedCNN(HistoryEncoder):
+    """A convolutional network on K images that are stacked as channels.
+
+    Args:
+        settings: which convolutions.
+        shape: what it reads: flat frames of at least 36 pixels a side (resnet: 8).
+
+    Raises:
+        ValueError: if it is given tokens instead, or frames are not images of that size.
+
+    Example:
+        >>> import torch
+        >>> shape = HistoryShape(num_frames=4, num_tokens=1, width=7056, frame_shape=(84, 84))
+        >>> cnn = StackedCNN(settings.StackedCNN(), shape)
+        >>> cnn(torch.zeros(2, 4, 1, 7056, dtype=torch.uint8)).shape
+        torch.Size([2, 3136])
+    """
+
+    reads_frames = True
+
+    def __init__(self, settings: settings.StackedCNN, shape: HistoryShape) -> None:
+        torso_class = TORSOS[settings.torso]
+        frame_shape = check_image_shape(
+            shape.require_frames(type(self).__name__), torso_class.smallest_image
+        )
+        torso = torso_class(*stacked_shape(frame_shape, shape.num_frames))
+        super().__init__(shape, out_features=torso.out_features)
+        self.torso = torso
+        self.frame_shape = frame_shape
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """[..., K, 1, entries], float or uint8 -> float [..., E]."""
+        frames = tokens.unflatten(-1, self.frame_shape)  # [..., K, 1, (C,) H, W]
+        images, leading = as_images(frames, len(self.frame_shape) + 2)
+        return self.torso(images).reshape(*leading, self.out_features)

@@ -1,0 +1,24 @@
+"""Layers: what frame and history encoders are both built of."""
+
+from torchrl_tit.layers.attention import SelfAttention
+from torchrl_tit.layers.block import TransformerBlock
+from torchrl_tit.layers.dropout import Dropout
+from torchrl_tit.layers.gated_block import GatedTransformerBlock, GRUGate
+from torchrl_tit.layers.gpt2_block import GPT2Block
+from torchrl_tit.layers.initialization import init_normal_, init_orthogonal_
+from torchrl_tit.layers.patches import ArrayPatchEmbedding, ImagePatchEmbedding
+from torchrl_tit.layers.relative_attention import RelativeSelfAttention
+
+__all__ = [
+    "ArrayPatchEmbedding",
+    "Dropout",
+    "GPT2Block",
+    "GRUGate",
+    "GatedTransformerBlock",
+    "ImagePatchEmbedding",
+    "RelativeSelfAttention",
+    "SelfAttention",
+    "TransformerBlock",
+    "init_normal_",
+    "init_orthogonal_",
+]

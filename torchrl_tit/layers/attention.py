@@ -1,0 +1,217 @@
+"""Multi-head self-attention that computes only the positions that are read."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchrl_tit.layers.dropout import Dropout
+
+Read = Literal["all", "first", "last"]
+"""Positions of a sequence that are read: all, the first (class token), the last (newest step)."""
+
+READ_SLICES: dict[Read, slice] = {
+    "all": slice(None),
+    "first": slice(0, 1),
+    "last": slice(-1, None),
+}
+
+
+class SelfAttention(nn.Module):
+    """Multi-head scaled dot-product self-attention (arXiv 2212.14538, section "Inner Transformer").
+
+    Same parameters, names and results as :class:`torch.nn.MultiheadAttention` with
+    ``batch_first=True``, so that state dicts can be exchanged. Different in that queries are
+    computed only for the positions that are read.
+
+    Args:
+        embed_dim: width D of a token.
+        num_heads: number of heads; must divide ``embed_dim``.
+        causal: whether a position sees only itself and earlier ones.
+        dropout: probability of dropping an attention weight while training.
+        out_dim: width of the output; by default that of the input.
+
+    Raises:
+        ValueError: if ``num_heads`` does not divide ``embed_dim``.
+
+    Example:
+        >>> attention = SelfAttention(embed_dim=32, num_heads=4, causal=True)
+        >>> x = torch.randn(8, 5, 32)
+        >>> attention(x).shape, attention(x, read="last").shape
+        (torch.Size([8, 5, 32]), torch.Size([8, 1, 32]))
+    """
+
+    def __init__(
+        self,
+        embed_dim: int,
+        num_heads: int,
+        *,
+        causal: bool = False,
+        dropout: float = 0.0,
+        out_dim: int | None = None,
+    ) -> None:
+        super().__init__()
+        if num_heads < 1 or embed_dim % num_heads:
+            raise ValueError(
+                f"the width {embed_dim} cannot be split over {num_heads} attention heads: "
+                "choose a number of heads that divides embed_dim"
+            )
+        self.num_heads = num_heads
+        self.causal = causal
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * embed_dim, embed_dim))
+        self.in_proj_bias = nn.Parameter(torch.empty(3 * embed_dim))
+        self.out_proj = nn.Linear(embed_dim, out_dim or embed_dim)
+        # A module, not a number: TorchRL's losses look for nn.Dropout to set vmap's randomness.
+        self.dropout = Dropout(dropout)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises as ``nn.MultiheadAttention`` does: Xavier for the input projections."""
+        nn.init.xavier_uniform_(self.in_proj_weight)
+        nn.init.zeros_(self.in_proj_bias)
+        self.out_proj.reset_parameters()
+        nn.init.zeros_(self.out_proj.bias)
+
+    def forward(self, x: Tensor, read: Read | slice = "all", mask: Tensor | None = None) -> Tensor:
+        """Attends over a sequence.
+
+        Args:
+            x: tokens, float [N, S, D].
+            read: which positions to return, by name or as a slice of S.
+            mask: bool [..., S, S], to be broadcast to [N, heads, S, S]: True where a position (row)
+                sees another (column). Each must see one. Instead of the causal mask, if any.
+
+        Returns:
+            float [N, positions read, D].
+        """
+        positions = READ_SLICES[read] if isinstance(read, str) else read
+        # The last position sees everything before it, so for it no mask is needed.
+        causal = self.causal and mask is None and read != "last"
+        if x.shape[1] == 1:
+            mixed = self._attend_itself(x)
+        elif isinstance(read, str) and read != "all" and mask is None and not causal:
+            mixed = self._attend_one(x, positions)
+        else:
+            mixed = self._attend(x, positions, mask, causal)
+        return self.out_proj(mixed)  # [N, positions, out_dim]
+
+    def read_first(self, first: Tensor, rest: Tensor) -> Tensor:
+        """Reads the first position where it is the same in all sequences: it is projected once.
+
+        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")`` of
+        attention that is not causal.
+
+        Args:
+            first: float [1, 1, D].
+            rest: tokens after it, float [N, S - 1, D].
+
+        Returns:
+            float [N, 1, D].
+        """
+        count, width = rest.shape[0], first.shape[-1]
+        # One query for all: instead of all keys, it is projected, q (K x) = (q K) x. The keys' bias
+        # adds the same to all scores of a head, so the softmax does not see it.
+        query = self._project(first, 0, 1).reshape(self.num_heads, 1, -1)
+        keys = self.in_proj_weight[width : 2 * width].unflatten(0, (self.num_heads, -1))
+        probe = (query @ keys).squeeze(1).t() / math.sqrt(keys.shape[1])  # [D, heads]
+        scores = torch.cat([(first @ probe).expand(count, -1, -1), rest @ probe], dim=1)
+        weights = self.dropout(scores.softmax(dim=1)).unsqueeze(-1)  # [N, S, heads, 1]
+        own, other = (
+            self._project(x, 2, 3).unflatten(-1, (self.num_heads, -1)) for x in (first, rest)
+        )  # values, [1, 1, heads, D / heads] and [N, S - 1, heads, D / heads]
+        mixed = weights[:, :1] * own + (weights[:, 1:] * other).sum(dim=1, keepdim=True)
+        return self.out_proj(mixed.flatten(2))
+
+    def weights(self, x: Tensor) -> Tensor:
+        """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1."""
+        query, key, _ = self._heads(x, READ_SLICES["all"])
+        return self._weights(query, key, self._past(x) if self.causal else None)
+
+    def extra_repr(self) -> str:
+        """Names what the parameters' shapes do not show."""
+        return f"num_heads={self.num_heads}, causal={self.causal}"
+
+    def _project(self, x: Tensor, start: int, stop: int) -> Tensor:
+        """Applies the projections from ``start`` to ``stop`` of (query, key, value) at once."""
+        rows = slice(start * x.shape[-1], stop * x.shape[-1])
+        return F.linear(x, self.in_proj_weight[rows], self.in_proj_bias[rows])
+
+    def _attend(self, x: Tensor, positions: slice, mask: Tensor | None, causal: bool) -> Tensor:
+        """What the positions take from all that they see, float [N, positions, D]."""
+        query, key, value = self._heads(x, positions)  # [N, heads, positions or S, D / heads]
+        fused = causal and positions == READ_SLICES["all"] and not self._drops
+        if causal and not fused:
+            mask = self._past(x)
+        if mask is not None:
+            mask = mask[..., positions, :]
+        if self._drops:
+            mixed = self.dropout(self._weights(query, key, mask)) @ value
+        else:
+            mixed = F.scaled_dot_product_attention(query, key, value, mask, is_causal=fused)
+        return mixed.transpose(1, 2).flatten(2)
+
+    def _attend_itself(self, x: Tensor) -> Tensor:
+        """As ``_attend``, for one position: a softmax over one is 1, so only the value is left."""
+        value = self._project(x, 2, 3)  # [N, 1, D]
+        if not self._drops:
+            return value
+        ones = x.new_ones(x.shape[0], 1, self.num_heads, 1)
+        return (self.dropout(ones) * value.unflatten(-1, (self.num_heads, -1))).flatten(2)
+
+    def _attend_one(self, x: Tensor, position: slice) -> Tensor:
+        """As ``_attend``, for one position that sees all others, float [N, 1, D].
+
+        Nobody's key or value is computed, because projections are linear:
+
+            q . (W x_i + b) = (W^T q) . x_i + q . b,  and the softmax ignores what all i share,
+            sum_i a_i (W x_i + b) = W (sum_i a_i x_i) + b,  as the a_i sum to 1.
+
+        So keys' and values' weights are applied once to each head, not to each of the S tokens.
+        """
+        if self._drops:  # weights that were dropped do not sum to 1
+            return self._attend(x, position, None, causal=False)
+        weights = self.in_proj_weight.unflatten(0, (3, self.num_heads, -1))
+        query_weight, key_weight, value_weight = weights.unbind()  # [heads, D / heads, D] each
+        biases = self.in_proj_bias.unflatten(0, (3, self.num_heads, 1, -1))
+        query_bias, _, value_bias = biases.unbind()  # [heads, 1, D / heads] each
+        one = x[:, position].transpose(0, 1).expand(self.num_heads, -1, -1)  # [heads, N, D]
+        query = torch.baddbmm(query_bias, one, query_weight.mT)  # [heads, N, D / heads]
+        scale = query.shape[-1] ** -0.5
+        # The heads stand where positions usually do: all read the same tokens.
+        query = torch.bmm(query, key_weight).transpose(0, 1).unsqueeze(1)  # [N, 1, heads, D]
+        tokens = x.unsqueeze(1)
+        mixed = F.scaled_dot_product_attention(query, tokens, tokens, scale=scale).squeeze(1)
+        value = torch.baddbmm(value_bias, mixed.transpose(0, 1), value_weight.mT)
+        return value.transpose(0, 1).flatten(1).unsqueeze(1)
+
+    @property
+    def _drops(self) -> bool:
+        """Whether attention weights are dropped."""
+        return self.training and self.dropout.p > 0
+
+    def _heads(self, x: Tensor, positions: slice) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries of the positions, keys and values of all, [N, heads, ..., D / heads] each."""
+        if positions == READ_SLICES["all"]:
+            query, key, value = self._project(x, 0, 3).chunk(3, dim=-1)
+        else:
+            query = self._project(x[:, positions], 0, 1)
+            key, value = self._project(x, 1, 3).chunk(2, dim=-1)
+        return self._split(query), self._split(key), self._split(value)
+
+    def _split(self, x: Tensor) -> Tensor:
+        """[N, S, D] -> [N, heads, S, D / heads]."""
+        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+
+    def _past(self, x: Tensor) -> Tensor:
+        """The causal mask: bool [S, S], lower triangular."""
+        return torch.ones(x.shape[1], x.shape[1], dtype=torch.bool, device=x.device).tril()
+
+    def _weights(self, query: Tensor, key: Tensor, mask: Tensor | None) -> Tensor:
+        scores = query @ key.transpose(-2, -1) / math.sqrt(query.shape[-1])
+        if mask is not None:
+            scores = scores.masked_fill(~mask, -math.inf)
+        return scores.softmax(dim=-1)

@@ -1,0 +1,109 @@
+"""The transformer block of which inner and outer transformers are made."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+
+from torchrl_tit.layers.activations import make_activation
+from torchrl_tit.layers.attention import READ_SLICES, Read, SelfAttention
+from torchrl_tit.settings.frames import Activation, TransformerSettings
+
+
+class TransformerBlock(nn.Module):
+    """Pre-LayerNorm transformer block: ``x + MSA(LN(x))``, then ``x + FFN(LN(x))``.
+
+    The paper's FFN equation adds the block's input again (arXiv 2212.14538, eq. of step 5); its
+    released code adds the residual of the attention output, as everyone does, and so do we.
+
+    Args:
+        embed_dim: width D of a token.
+        num_heads: attention heads; must divide ``embed_dim``.
+        ffn_expansion: hidden width of the FFN as a multiple of ``embed_dim``.
+        activation: activation of the FFN by name.
+        attention_dropout: dropout on the attention weights.
+        ffn_dropout: dropout on the output of the FFN.
+        causal: whether a position sees only itself and earlier ones.
+
+    Example:
+        >>> import torch
+        >>> block = TransformerBlock(embed_dim=32, num_heads=4, ffn_expansion=4)
+        >>> block(torch.randn(8, 5, 32), read="first").shape
+        torch.Size([8, 1, 32])
+    """
+
+    def __init__(
+        self,
+        embed_dim: int,
+        num_heads: int,
+        *,
+        ffn_expansion: int = 4,
+        activation: Activation = "gelu",
+        attention_dropout: float = 0.0,
+        ffn_dropout: float = 0.0,
+        causal: bool = False,
+    ) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(embed_dim)
+        self.attention = SelfAttention(
+            embed_dim, num_heads, causal=causal, dropout=attention_dropout
+        )
+        self.norm2 = nn.LayerNorm(embed_dim)
+        self.ffn = nn.Sequential(
+            nn.Linear(embed_dim, ffn_expansion * embed_dim),
+            make_activation(activation),
+            nn.Linear(ffn_expansion * embed_dim, embed_dim),
+            nn.Dropout(ffn_dropout),
+        )
+
+    @classmethod
+    def from_settings(
+        cls, settings: TransformerSettings, embed_dim: int, *, causal: bool = False
+    ) -> TransformerBlock:
+        """Builds a block of an inner or outer transformer.
+
+        Args:
+            settings: heads, FFN and dropout.
+            embed_dim: width D of a token.
+            causal: whether a position sees only itself and earlier ones.
+        """
+        return cls(
+            embed_dim,
+            settings.num_heads,
+            ffn_expansion=settings.ffn_expansion,
+            activation=settings.activation,
+            attention_dropout=settings.attention_dropout,
+            ffn_dropout=settings.ffn_dropout,
+            causal=causal,
+        )
+
+    def forward(self, x: Tensor, read: Read = "all") -> Tensor:
+        """Transforms a sequence.
+
+        Args:
+            x: tokens, float [N, S, D].
+            read: which positions to compute and return: all, the first or the last.
+
+        Returns:
+            float [N, S or 1, D].
+        """
+        x = x[:, READ_SLICES[read]] + self.attention(self.norm1(x), read)
+        return x + self.ffn(self.norm2(x))
+
+    def read_first(self, first: Tensor, rest: Tensor) -> Tensor:
+        """Reads the first token where it is the same in all sequences, as before the first block.
+
+        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")``.
+
+        Args:
+            first: float [1, 1, D].
+            rest: tokens after it, float [N, S - 1, D].
+
+        Returns:
+            float [N, 1, D].
+        """
+        x = first + self.attention.read_first(self.norm1(first), self.norm1(rest))
+        return x + self.ffn(self.norm2(x))
+
+    def attention_weights(self, x: Tensor) -> Tensor:
+        """Returns the weights with which this block attends, float [N, heads, S, S]."""
+        return self.attention.weights(self.norm1(x))

@@ -1,0 +1,101 @@
+"""GTrXL: a transformer whose residuals are gated."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_tit.layers.relative_attention import RelativeSelfAttention
+
+
+class GRUGate(nn.Module):
+    r"""Mixes a stream x with an update y as a gated recurrent unit does.
+
+    .. math::
+
+        r = \sigma(W_r y + U_r x), \quad z = \sigma(W_z y + U_z x - b), \quad
+        h = \tanh(W_h y + U_h (r \odot x)), \quad g = (1 - z) \odot x + z \odot h
+
+    arXiv 1910.06764, section 3.2. With a bias b > 0 the gate starts near the identity x.
+
+    Args:
+        embed_dim: width D of x and y.
+        bias: start value of every entry of b, which is learned.
+
+    Example:
+        >>> gate, x = GRUGate(32, bias=100.0), torch.randn(8, 5, 32)
+        >>> torch.equal(gate(x, torch.randn(8, 5, 32)), x)
+        True
+    """
+
+    def __init__(self, embed_dim: int, bias: float = 0.0) -> None:
+        super().__init__()
+        self.reset_y = nn.Linear(embed_dim, embed_dim, bias=False)
+        self.reset_x = nn.Linear(embed_dim, embed_dim, bias=False)
+        self.update_y = nn.Linear(embed_dim, embed_dim, bias=False)
+        self.update_x = nn.Linear(embed_dim, embed_dim, bias=False)
+        self.candidate_y = nn.Linear(embed_dim, embed_dim, bias=False)
+        self.candidate_x = nn.Linear(embed_dim, embed_dim, bias=False)
+        # Not a linear layer's bias: initialisations that zero those must leave this one.
+        self.bias = nn.Parameter(torch.full((embed_dim,), float(bias)))
+
+    def forward(self, x: Tensor, y: Tensor) -> Tensor:
+        """Stream x and update y, float [..., D] each -> float [..., D]."""
+        reset = torch.sigmoid(self.reset_y(y) + self.reset_x(x))
+        update = torch.sigmoid(self.update_y(y) + self.update_x(x) - self.bias)
+        candidate = torch.tanh(self.candidate_y(y) + self.candidate_x(reset * x))
+        return (1 - update) * x + update * candidate
+
+
+class GatedTransformerBlock(nn.Module):
+    """Block of GTrXL: ``gate(x, relu(attention(LN(x))))``, then ``gate(x, relu(FFN(LN(x))))``.
+
+    arXiv 1910.06764, section 3.2, with the relative attention of Transformer-XL.
+
+    Args:
+        embed_dim: width D of a token.
+        num_heads: attention heads; must divide ``embed_dim``.
+        num_frames: number K of tokens, one for each frame.
+        ffn_expansion: hidden width of the FFN as a multiple of ``embed_dim``.
+        gate_bias: start value of the gates' bias; 2 starts near the identity.
+
+    Example:
+        >>> block = GatedTransformerBlock(32, num_heads=4, num_frames=5)
+        >>> block(torch.randn(8, 5, 32), causal=True).shape
+        torch.Size([8, 5, 32])
+    """
+
+    def __init__(
+        self,
+        embed_dim: int,
+        num_heads: int,
+        num_frames: int,
+        *,
+        ffn_expansion: int = 4,
+        gate_bias: float = 0.0,
+    ) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(embed_dim)
+        self.attention = RelativeSelfAttention(embed_dim, num_heads, num_frames)
+        self.gate1 = GRUGate(embed_dim, gate_bias)
+        self.norm2 = nn.LayerNorm(embed_dim)
+        self.ffn = nn.Sequential(
+            nn.Linear(embed_dim, ffn_expansion * embed_dim),
+            nn.ReLU(),
+            nn.Linear(ffn_expansion * embed_dim, embed_dim),
+        )
+        self.gate2 = GRUGate(embed_dim, gate_bias)
+
+    def forward(self, x: Tensor, *, causal: bool) -> Tensor:
+        """Transforms tokens, float [N, K, D] -> float [N, K, D].
+
+        Args:
+            x: tokens.
+            causal: whether a step sees only itself and earlier ones.
+        """
+        x = self.gate1(x, torch.relu(self.attention(self.norm1(x), causal=causal)))
+        return self.gate2(x, torch.relu(self.ffn(self.norm2(x))))
+
+    def attention_weights(self, x: Tensor) -> Tensor:
+        """Returns the weights of causal attention, float [N, heads, K, K]."""
+        return self.attention.weights(self.norm1(x), causal=True)

@@ -1,0 +1,60 @@
+"""The two initialisations of the paper's experiments."""
+
+from __future__ import annotations
+
+import math
+
+from torch import nn
+
+from torchrl_tit.layers.patches import ImagePatchEmbedding
+
+
+def init_normal_(module: nn.Module, std: float = 0.02) -> None:
+    """Initialises as the authors' networks do: linear and embedding weights normal, biases 0.
+
+    LayerNorms become 1 and 0. Convolutions, patch embeddings and the input projections of
+    attention keep PyTorch's defaults, class tokens and position encodings are set by their owners.
+    (The authors call a truncated normal, whose bounds are absolute and cut nothing at 0.02.)
+
+    Args:
+        module: the network, changed in place.
+        std: standard deviation of the weights.
+
+    Example:
+        >>> network = nn.Linear(64, 64)
+        >>> init_normal_(network)
+        >>> bool(network.bias.abs().max() == 0)
+        True
+    """
+    for child in module.modules():
+        if isinstance(child, nn.Linear | nn.Embedding):
+            nn.init.normal_(child.weight, std=std)
+        if isinstance(child, nn.Linear) and child.bias is not None:
+            nn.init.zeros_(child.bias)
+        if isinstance(child, nn.LayerNorm):
+            child.reset_parameters()
+
+
+def init_orthogonal_(module: nn.Module, gain: float = math.sqrt(2)) -> None:
+    """Initialises as Stable-Baselines3 does, which trained the paper's online networks.
+
+    Every linear layer (output projections of attention included) and 2-d convolution (image patch
+    embeddings included) becomes orthogonal, its bias 0. The array patch embedding, a 1-d
+    convolution there, and the input projections of attention keep what they have.
+
+    Args:
+        module: the network, changed in place.
+        gain: sqrt(2) for feature extractors, 0.01 for action heads, 1 for value heads.
+
+    Example:
+        >>> head = nn.Linear(64, 2)
+        >>> init_orthogonal_(head, gain=0.01)
+        >>> round(head.weight[0].norm().item(), 4)
+        0.01
+    """
+    for child in module.modules():
+        if isinstance(child, nn.Linear | nn.Conv2d | ImagePatchEmbedding):
+            nn.init.orthogonal_(child.weight, gain=gain)
+            bias = getattr(child, "bias", None)
+            if bias is not None:
+                nn.init.zeros_(bias)
