@@ -1,10 +1,11 @@
-"""What the tests of the frame cache share: networks, streams of histories, counted frames."""
+"""What the tests of acting mode share: networks, streams of histories, counted frames."""
 
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 
+from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT, VanillaTIT
 from torchrl_tit.networks import Catformer, CoBERL
 
@@ -13,7 +14,7 @@ IMAGE = (8, 8)
 
 NETWORKS = {
     "enhanced": lambda k: EnhancedTIT((3,), k, **SMALL),
-    "vanilla": lambda k: VanillaTIT((3,), k, temporal_position_encoding=True, **SMALL),
+    "vanilla": lambda k: VanillaTIT((3,), k, temporal_position_encoding=k > 1, **SMALL),
     "without dense": lambda k: EnhancedTIT((3,), k, dense=False, **SMALL),
     "without inner": lambda k: EnhancedTIT((3,), k, inner=False, **SMALL),
     "images": lambda k: EnhancedTIT(IMAGE, k, patch_size=4, **SMALL),
@@ -23,19 +24,19 @@ NETWORKS = {
 
 
 class CountedFrames:
-    """Counts the frames that a network's frame encoder is given."""
+    """Counts the frames that a network's frame encoders encode."""
 
     def __init__(self, network):
         self.count = 0
         self.only_without_gradients = False
-        self.ndim = len(network.observation_shape)
-        network.frame_encoder.register_forward_pre_hook(self)
+        for encoder in network.frames:
+            encoder.register_forward_pre_hook(self)
 
     def __call__(self, encoder, inputs):
         (x,) = inputs
         if self.only_without_gradients and torch.is_grad_enabled():
             return
-        self.count += x.shape[: x.ndim - self.ndim].numel()
+        self.count += x.shape[: x.ndim - len(encoder.observation_shape)].numel()
 
     def take(self):
         count, self.count = self.count, 0
@@ -43,11 +44,12 @@ class CountedFrames:
 
 
 class Streams:
-    """Histories of N environments that go on, or start anew, as History writes them."""
+    """Histories of N environments that continue or start an episode, as History writes them."""
 
-    def __init__(self, n, steps, shape, padding="same", dtype=torch.float32):
-        self.shape, self.padding, self.dtype = shape, padding, dtype
-        self.windows = torch.zeros(n, steps, *shape, dtype=dtype)
+    def __init__(self, n, steps, shape, padding="same", dtype=None):
+        self.shape, self.padding = shape, padding
+        self.dtype = dtype or torch.get_default_dtype()
+        self.windows = torch.zeros(n, steps, *shape, dtype=self.dtype)
         self.step(torch.ones(n, dtype=torch.bool))
 
     def step(self, reset):
@@ -68,9 +70,7 @@ def features(backbone, history):
 
 def assert_exact(backbone, history):
     network = backbone.module
-    torch.testing.assert_close(
-        features(backbone, history), network(history), rtol=0, atol=1e-5, equal_nan=True
-    )
+    assert_near(features(backbone, history), network(history), equal_nan=True)
 
 
 @torch.no_grad()
@@ -79,4 +79,17 @@ def make(name="enhanced", steps=4):
     network = NETWORKS[name](steps).eval()
     for parameter in network.parameters():  # far from 0, so that a wrong token shows
         parameter.add_(0.1 * torch.randn_like(parameter))
-    return Backbone(network), network, network.observation_shape
+    return Backbone(network), network, encoder_of(network).observation_shape
+
+
+def encoder_of(network):
+    """The frame encoder of a network with a single observation."""
+    (encoder,) = network.frames
+    return encoder
+
+
+def cache_of(backbone):
+    """What a backbone in acting mode keeps of its single observation; None if nothing."""
+    (network,) = backbone._acting
+    caches = list(network._caches.values())
+    return caches[0]._kept if caches else None

@@ -1,23 +1,30 @@
-"""The backbone as a TensorDictModule."""
+"""The backbone as a TensorDictModule, with one or several observations, and one or two trunks."""
 
+import copy
 from contextlib import nullcontext
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import set_skip_existing
+from torch import nn
 from torchrl.data import Categorical
 from torchrl.objectives import ClipPPOLoss
 
+from tests.modules.frames import SMALL, CountedFrames
+from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT, VanillaTIT
 from torchrl_tit.modules import make_actor, make_value
-from torchrl_tit.networks import MLP
+from torchrl_tit.networks import MLP, HistoryNetwork, TwoTrunks, build_network
+from torchrl_tit.settings import NETWORKS, Flat, Inner, Linear, Outer, PairedOuter
+
+pytestmark = pytest.mark.numerics
 
 
 @pytest.mark.parametrize("network_class", [EnhancedTIT, VanillaTIT])
 @pytest.mark.parametrize("leading", [(), (3,), (2, 3)])
-def test_writes_what_the_network_puts_out(network_class, leading):
-    network = network_class((4,), history=3)
+def test_writes_the_outputs_of_the_network(network_class, leading):
+    network = network_class((4,), num_frames=3)
     history = torch.randn(*leading, 3, 4)
     td = Backbone(network)(TensorDict({"history": history}, leading))
     assert td["features"].shape == (*leading, 64)
@@ -26,7 +33,7 @@ def test_writes_what_the_network_puts_out(network_class, leading):
 
 def test_nested_keys():
     backbone = Backbone(
-        EnhancedTIT((4,), history=2),
+        EnhancedTIT((4,), num_frames=2),
         in_keys=[("agent", "history")],
         out_keys=[("agent", "features")],
     )
@@ -35,7 +42,7 @@ def test_nested_keys():
 
 
 def test_a_key_can_be_a_name():
-    backbone = Backbone(EnhancedTIT((4,), history=2), in_keys="past", out_keys="seen")
+    backbone = Backbone(EnhancedTIT((4,), num_frames=2), in_keys="past", out_keys="seen")
     td = backbone(TensorDict({"past": torch.randn(5, 2, 4)}, [5]))
     assert td["seen"].shape == (5, 64)
 
@@ -43,18 +50,18 @@ def test_a_key_can_be_a_name():
 @pytest.mark.parametrize("acts", [False, True])
 @torch.no_grad()
 def test_is_called_as_any_tensordict_module(acts):
-    network = EnhancedTIT((4,), history=2)
+    network = EnhancedTIT((4,), num_frames=2)
     backbone = Backbone(network)
     history = torch.randn(5, 2, 4)
     expected = network(history)
     with backbone.acting() if acts else nullcontext():
         td = TensorDict({"history": history}, [5])
         assert backbone(td) is td
-        torch.testing.assert_close(td["features"], expected)
+        assert_near(td["features"], expected)
         other = TensorDict({}, [5])
         assert backbone(td, tensordict_out=other) is other
-        torch.testing.assert_close(other["features"], expected)
-        torch.testing.assert_close(backbone(history), expected)
+        assert_near(other["features"], expected)
+        assert_near(backbone(history), expected)
         td["features"] = torch.zeros(5)
         with set_skip_existing(True):
             assert not backbone(td)["features"].any()
@@ -65,32 +72,129 @@ def test_is_called_as_any_tensordict_module(acts):
 
 
 def test_two_trunks_write_two_keys():
-    backbone = Backbone(MLP((4,), history=1), out_keys=["policy", "value"])
+    backbone = Backbone(MLP((4,), num_frames=1), out_keys=["policy", "value"])
     td = backbone(TensorDict({"history": torch.randn(5, 1, 4)}, [5]))
     assert td["policy"].shape == td["value"].shape == (5, 64)
     assert not torch.equal(td["policy"], td["value"])
 
 
 def test_a_missing_history_says_what_is_there():
-    backbone = Backbone(EnhancedTIT((4,), history=2))
+    backbone = Backbone(EnhancedTIT((4,), num_frames=2))
     with pytest.raises(KeyError, match=r"no history under 'history', only \['observation'\]"):
         backbone(TensorDict({"observation": torch.randn(5, 4)}, [5]))
 
 
-@pytest.mark.parametrize("keys", [{"in_keys": []}, {"in_keys": ["a", "b"]}, {"out_keys": []}])
-def test_wrong_keys(keys):
-    with pytest.raises(ValueError, match="one history"):
-        Backbone(EnhancedTIT((4,)), **keys)
+@pytest.mark.parametrize(
+    ("network", "keys", "message"),
+    [
+        (EnhancedTIT((4,)), {"in_keys": []}, "1 inputs and 1 outputs, but in_keys is \\[\\]"),
+        (EnhancedTIT((4,)), {"in_keys": ["a", "b"]}, "1 inputs and 1 outputs"),
+        (EnhancedTIT((4,)), {"out_keys": []}, "out_keys is \\[\\]: name one key for each"),
+        (EnhancedTIT((4,)), {"out_keys": ["a", "b"]}, "EnhancedTIT has 1 inputs and 1 outputs"),
+        (MLP((4,)), {}, "MLP has 1 inputs and 2 outputs"),
+        (nn.Flatten(), {"in_keys": []}, "Flatten has 1 inputs"),
+        (nn.Flatten(), {"out_keys": []}, "and 1 outputs"),
+    ],
+)
+def test_wrong_numbers_of_keys(network, keys, message):
+    with pytest.raises(ValueError, match=message):
+        Backbone(network, **keys)
+
+
+def test_several_inputs_of_another_module():
+    backbone = Backbone(nn.Bilinear(3, 4, 5), in_keys=["a", "b"])
+    td = TensorDict({"a": torch.randn(6, 3), "b": torch.randn(6, 4)}, [6])
+    assert backbone(td)["features"].shape == (6, 5)
+
+
+SHAPES = {"pixels": (8, 8), "state": (3,)}
+
+
+def make_two_observations(trunks="shared", num_frames=4):
+    """Pixels and a state: two frame encoders, whose tokens are side by side."""
+
+    def make():
+        return HistoryNetwork(
+            {"pixels": Inner(patch_size=4, embed_dim=16), "state": Linear(embed_dim=16)},
+            PairedOuter(),
+            observation_shape=SHAPES,
+            num_frames=num_frames,
+        )
+
+    return make() if trunks == "shared" else TwoTrunks(make(), make())
+
+
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("trunks", ["shared", "separate"])
+@torch.no_grad()
+def test_several_observations_and_trunks_in_acting_mode(trunks):
+    network = make_two_observations(trunks)
+    for parameter in network.parameters():  # far from 0, so that a wrong token shows
+        parameter.add_(0.1 * torch.randn_like(parameter))
+    out_keys = ["features"] if trunks == "shared" else ["policy", "value"]
+    backbone = Backbone(network, ["pixels", ("low", "state")], out_keys)
+    each = [network] if trunks == "shared" else [network.policy, network.value]
+    frames = [CountedFrames(trunk) for trunk in each]
+    pixels = torch.randint(0, 256, (5, 9, 8, 8), dtype=torch.uint8)
+    states = torch.randn(5, 9, 3)
+    with backbone.acting():
+        for start in range(5):
+            window = slice(start, start + 4)
+            if start == 3:  # a change of one observation, in one place
+                states[2, 4] += 1
+            td = TensorDict({"pixels": pixels[:, window], "low": {"state": states[:, window]}}, [5])
+            backbone(td)
+            new = {0: 20 + 20, 3: 5 + 5 + 1}.get(start, 5 + 5)
+            assert [counted.take() for counted in frames] == [new] * len(frames)
+            expected = network(pixels[:, window], states[:, window])
+            expected = (expected,) if trunks == "shared" else expected
+            for key, features in zip(out_keys, expected, strict=True):
+                assert_near(td[key], features)
+            assert td.keys() == {"pixels", "low", *out_keys}
+            for counted in frames:
+                counted.take()
+    with pytest.raises(KeyError, match=r"no history under \('low', 'state'\), only") as error:
+        backbone(td.exclude(("low", "state")))
+    assert "\n" not in str(error.value)
+
+
+def test_bytes_and_floats_of_flat_frames_stand_side_by_side():
+    """Bytes are numbers from 0 to 1 there, as everywhere."""
+    network = HistoryNetwork(
+        {"pixels": Flat(), "state": Flat()},
+        Outer(),
+        observation_shape={"pixels": (2, 4), "state": (8,)},
+        num_frames=3,
+    )
+    pixels = torch.randint(0, 256, (5, 3, 2, 4), dtype=torch.uint8)
+    state = torch.randn(5, 3, 8)
+    assert_near(network(pixels, state), network(pixels / 255, state))
+
+
+@torch.no_grad()
+def test_two_trunks_share_nothing_in_acting_mode():
+    network = build_network(NETWORKS["enhanced-tit"](4, **SMALL), (3,), trunks="shared")
+    assert isinstance(network, HistoryNetwork)
+    other = copy.deepcopy(network)
+    for parameter in other.parameters():
+        parameter.add_(0.1)
+    backbone = Backbone(TwoTrunks(network, other), out_keys=["policy", "value"])
+    stream = torch.randn(5, 8, 3)
+    with backbone.acting():
+        for start in range(4):
+            td = backbone(TensorDict({"history": stream[:, start : start + 4]}, [5]))
+            assert_near(td["policy"], network(stream[:, start : start + 4]))
+            assert_near(td["value"], other(stream[:, start : start + 4]))
 
 
 def test_wrong_shape_names_what_fits():
-    backbone = Backbone(EnhancedTIT((4,), history=2))
+    backbone = Backbone(EnhancedTIT((4,), num_frames=2))
     with pytest.raises(ValueError, match=r"expected \[\.\.\., 2, 4\]"):
         backbone(TensorDict({"history": torch.randn(5, 3, 4)}, [5]))
 
 
-def test_gradients_of_a_loss_on_heads_reach_the_backbone():
-    network = EnhancedTIT((4,), history=2)
+def test_gradients_of_a_loss_on_heads_reach_the_whole_backbone():
+    network = EnhancedTIT((4,), num_frames=2)
     backbone = Backbone(network)
     actor, critic = make_actor(64, Categorical(2)), make_value(64)
     loss = ClipPPOLoss(actor, critic)
@@ -113,9 +217,9 @@ def test_gradients_of_a_loss_on_heads_reach_the_backbone():
 
 
 @pytest.mark.parametrize("acts", [False, True])
-def test_autocast_computes_in_bfloat16_and_hands_over_float32(acts):
+def test_autocast_computes_in_bfloat16_and_writes_float32(acts):
     torch.manual_seed(0)
-    network = EnhancedTIT((4,), history=3)
+    network = EnhancedTIT((4,), num_frames=3)
     backbone = Backbone(network, autocast=torch.bfloat16)
     seen = []
     network.get_submodule("head.1").register_forward_hook(
@@ -135,6 +239,6 @@ def test_autocast_computes_in_bfloat16_and_hands_over_float32(acts):
 
 
 def test_autocast_of_two_trunks():
-    backbone = Backbone(MLP((4,), history=1), out_keys=["a", "b"], autocast=torch.bfloat16)
+    backbone = Backbone(MLP((4,), num_frames=1), out_keys=["a", "b"], autocast=torch.bfloat16)
     td = backbone(TensorDict({"history": torch.randn(5, 1, 4)}, [5]))
     assert td["a"].dtype == td["b"].dtype == torch.float32

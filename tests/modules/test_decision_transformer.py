@@ -1,4 +1,4 @@
-"""Decision Transformer as TensorDictModules: training, acting, and what is kept while acting."""
+"""Decision Transformer as TensorDictModules: training, acting, and the frames kept meanwhile."""
 
 from __future__ import annotations
 
@@ -13,20 +13,41 @@ from torchrl.envs import Compose, GymEnv, TargetReturn, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.networks.reference import randomize
+from tests.numerics import assert_near
 from tests.transforms.streams import StreamEnv
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.modules import SequenceBackbone, acting, make_dt_actor, make_dt_predictor
-from torchrl_tit.networks import DecisionTransformer
+from torchrl_tit.modules import (
+    Backbone,
+    DTHead,
+    acting,
+    make_dt_actor,
+    make_dt_backbone,
+    make_dt_predictor,
+)
+from torchrl_tit.networks import DTTIT, DecisionTransformer, EnhancedTIT
 from torchrl_tit.transforms import SequenceHistory
 
-SMALL: dict[str, Any] = {"embed_dim": 16, "num_heads": 2, "num_blocks": 2, "context": 5}
+pytestmark = pytest.mark.numerics
+
+SMALL: dict[str, Any] = {"embed_dim": 16, "num_heads": 2, "num_blocks": 2, "num_frames": 5}
+NAMES = ("observation", "action", "return_to_go", "timestep", "mask")
 
 
-def make_network(shape=(11,), actions=3, seed=0, **settings):
-    network = DecisionTransformer(shape, actions, **{**SMALL, **settings}).eval()
+def make_network(
+    shape=(11,), actions=3, seed=0, *, space="continuous", kind=DecisionTransformer, **settings
+):
+    """A network and its head."""
+    network = kind(shape, action_dim=actions, **{**SMALL, **settings}).eval()
     randomize(network, seed)
-    return network
+    head = DTHead(network.features_dim, actions, space)
+    randomize(head, seed)
+    return network, head
+
+
+def predict(network, head, sequence):
+    """The newest step's action."""
+    return head(network(*(sequence[name] for name in NAMES)))
 
 
 def make_batch(shape=(11,), actions=3, *, kind="continuous", batch=4, steps=5):
@@ -58,23 +79,23 @@ def make_batch(shape=(11,), actions=3, *, kind="continuous", batch=4, steps=5):
     )
 
 
-def make_environment(task="Hopper-v5", num_envs=3, context=5, **settings):
-    history = SequenceHistory(context)
+def make_environment(task="Hopper-v5", num_envs=3, num_frames=5, **settings):
+    history = SequenceHistory(num_frames)
     env = make_env(task, num_envs, seed=0, **settings)
     return TransformedEnv(env, Compose(TargetReturn(3600.0), history))
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete", "one-hot"])
 @pytest.mark.parametrize("shape", [(11,), (3, 8, 8)])
-@pytest.mark.parametrize("encoder", ["linear", "inner_transformer"])
-def test_acts_as_it_predicts(kind, shape, encoder):
+@pytest.mark.parametrize("network_class", [DecisionTransformer, DTTIT])
+def test_acts_as_it_predicts(kind, shape, network_class):
     space = "continuous" if kind == "continuous" else "discrete"
-    patch = {"patch_size": 4} if len(shape) > 1 and encoder != "linear" else {}
-    network = make_network(shape, action_space=space, state_encoder=encoder, **patch)
+    patch = {"patch_size": 4} if len(shape) > 1 and network_class is DTTIT else {}
+    network, head = make_network(shape, space=space, kind=network_class, **patch)
     batch = make_batch(shape, kind=kind)
-    predicted = make_dt_predictor(network)(batch.clone())["action"]
+    predicted = make_dt_predictor(network, head)(batch.clone())["action"]
     assert predicted.shape == (4, 5, 3)
-    actor = make_dt_actor(network, one_hot=kind == "one-hot")
+    actor = make_dt_actor(network, head, one_hot=kind == "one-hot")
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         action = actor(TensorDict({"sequence": batch.clone()}, [4]))["action"]
     expected = predicted[:, -1]
@@ -85,38 +106,38 @@ def test_acts_as_it_predicts(kind, shape, encoder):
         assert torch.equal(action.int().argmax(-1), expected.argmax(-1))
         assert (action.sum(-1) == 1).all()
     else:
-        torch.testing.assert_close(action, expected)
+        torch.testing.assert_close(action, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_indices_and_one_hot_vectors_are_the_same_actions():
-    network = make_network(action_space="discrete")
+    network, head = make_network(space="discrete")
     indices = make_batch(kind="discrete")
     vectors = indices.clone()
     vectors["action"] = torch.nn.functional.one_hot(indices["action"].clamp(min=0), 3)
-    outputs = [make_dt_predictor(network)(batch)["action"] for batch in (indices, vectors)]
+    outputs = [make_dt_predictor(network, head)(batch)["action"] for batch in (indices, vectors)]
     torch.testing.assert_close(outputs[0][indices["mask"]], outputs[1][indices["mask"]])
 
 
 def test_a_gaussian_policy_draws_or_takes_the_mean():
-    network = make_network(action_space="gaussian")
-    actor, td = make_dt_actor(network), TensorDict({"sequence": make_batch()}, [4])
+    network, head = make_network(space="gaussian")
+    actor, td = make_dt_actor(network, head), TensorDict({"sequence": make_batch()}, [4])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         mean = actor(td.clone())
-    torch.testing.assert_close(mean["action"], mean["loc"].tanh())
+    assert_near(mean["action"], mean["loc"].tanh())
     with set_exploration_type(ExplorationType.RANDOM):
         drawn = [actor(td.clone())["action"] for _ in range(2)]
     assert not torch.equal(*drawn)
     assert all(x.abs().max() < 1 for x in drawn)
-    every_step = make_dt_actor(network, group=None, newest=False)
+    every_step = make_dt_actor(network, head, group=None, every_frame=True)
     assert every_step.get_dist(make_batch()).batch_shape == (4, 5)
 
 
-@pytest.mark.parametrize("encoder", ["linear", "inner_transformer"])
-def test_acting_keeps_tokens_and_changes_nothing(encoder):
-    network = make_network(state_encoder=encoder)
-    actor = make_dt_actor(network)
+@pytest.mark.parametrize("network_class", [DecisionTransformer, DTTIT])
+def test_acting_keeps_tokens_and_changes_nothing(network_class):
+    network, head = make_network(kind=network_class)
+    actor = make_dt_actor(network, head)
     frames = []
-    network.state_encoder.register_forward_pre_hook(
+    network.frames[0].register_forward_pre_hook(
         lambda module, inputs: frames.append(inputs[0].shape[:-1].numel())
     )
     env = make_environment(max_episode_steps=7)
@@ -129,43 +150,47 @@ def test_acting_keeps_tokens_and_changes_nothing(encoder):
             started = (td["sequence", "timestep"][:, -1] == 0).sum()
             if step:  # one observation each, and the padding of those that began anew
                 assert sum(frames) <= len(td) + started
-            expected = network(*(td["sequence", n] for n in NAMES))[:, -1]
+            expected = predict(network, head, td["sequence"])
             torch.testing.assert_close(action, expected, rtol=0, atol=1e-5)
             resets += int(started)
             _, td = env.step_and_maybe_reset(td.set("action", torch.rand(3, 3) * 2 - 1))
-            if step == 20:  # weights change: nothing that was kept is of use
+            if step == 20:  # weights change: what was kept is of no use
                 randomize(network, seed=1)
     assert resets > 6
 
 
-NAMES = ("observation", "action", "return_to_go", "timestep", "mask")
-
-
 def test_what_is_kept_is_no_part_of_states_and_copies():
-    actor = make_dt_actor(make_network())
-    batch = TensorDict({"sequence": make_batch()}, [4])
+    network, head = make_network()
+    actor = make_dt_actor(network, head)
+    batch, encoded = make_batch(steps=7), []
+    windows = [batch.apply(lambda x, k=k: x[:, k : k + 5]) for k in range(3)]
+    network.frames[0].register_forward_pre_hook(
+        lambda module, inputs: encoded.append(inputs[0].shape[:-1].numel())
+    )
 
-    def kept():
-        (backbone,) = (m for m in actor.modules() if isinstance(m, SequenceBackbone))
-        return backbone._cache and backbone._cache._kept
+    def frames_encoded(policy, window):
+        encoded.clear()
+        policy(TensorDict({"sequence": window}, [4]))
+        return sum(encoded)
 
     with torch.no_grad(), acting(actor):
-        actor(batch.clone())
-        assert kept()
+        assert frames_encoded(actor, windows[0]) == 4 * 5
+        assert frames_encoded(actor, windows[1]) == 4
         assert not any("cache" in name for name in actor.state_dict())
-        assert not kept()
+        assert frames_encoded(actor, windows[2]) == 4 * 5
         copied = copy.deepcopy(actor)
-    torch.testing.assert_close(copied(batch.clone())["action"], actor(batch.clone())["action"])
-    assert not kept()
+        assert frames_encoded(copied, windows[2]) == 4 * 5
+    actions = [one(TensorDict({"sequence": windows[0]}, [4]))["action"] for one in (copied, actor)]
+    torch.testing.assert_close(*actions, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("task", ["Hopper-v5", "CartPole-v1"])
 def test_works_in_a_collector(task):
     shape, actions = ((11,), 3) if task == "Hopper-v5" else ((4,), 2)
     space = "continuous" if task == "Hopper-v5" else "discrete"
-    network = make_network(shape, actions, action_space=space)
+    network, head = make_network(shape, actions, space=space)
     env = make_environment(task, max_episode_steps=6)
-    actor = make_dt_actor(network)
+    actor = make_dt_actor(network, head)
     collector = Collector(
         env,
         actor,
@@ -176,26 +201,19 @@ def test_works_in_a_collector(task):
     )
     with acting(actor):
         for batch in collector:
-            sequence = batch["sequence"]
-            predicted = network(*(as_network_input(sequence[n], n, space, actions) for n in NAMES))
-            expected = predicted[..., -1, :]
+            expected = predict(network, head, batch["sequence"])
             if space == "discrete":
                 assert torch.equal(batch["action"], expected.argmax(-1))
             else:
-                torch.testing.assert_close(batch["action"], expected, rtol=0, atol=1e-5)
+                assert_near(batch["action"], expected)
     collector.shutdown()
-
-
-def as_network_input(entry, name, space, actions):
-    one_hot = name == "action" and space == "discrete"
-    return torch.nn.functional.one_hot(entry, actions) if one_hot else entry
 
 
 def test_one_hot_environment_without_a_batch():
     env = TransformedEnv(
-        GymEnv("CartPole-v1"), Compose(TargetReturn(500.0), SequenceHistory(context=5))
+        GymEnv("CartPole-v1"), Compose(TargetReturn(500.0), SequenceHistory(num_frames=5))
     )
-    actor = make_dt_actor(make_network((4,), 2, action_space="discrete"), one_hot=True)
+    actor = make_dt_actor(*make_network((4,), 2, space="discrete"), one_hot=True)
     steps = env.rollout(10, actor)
     assert (steps["action"].sum(-1) == 1).all()
 
@@ -207,7 +225,7 @@ def test_images_and_integers_of_a_stream():
 
 
 def test_evaluation_side_by_side_equals_one_after_another():
-    actor = make_dt_actor(make_network())
+    actor = make_dt_actor(*make_network())
 
     def make(num_envs):
         return make_environment(num_envs=num_envs, max_episode_steps=25)
@@ -232,20 +250,53 @@ def test_evaluation_side_by_side_equals_one_after_another():
             "continuous",
             r"float32 are continuous, but .* discrete: set action_space='co",
         ),
-        ("gaussian", "one-hot", r"int64 are discrete, but this network's are gaussian"),
+        ("gaussian", "one-hot", r"int64 are discrete, but this head's are gaussian"),
     ],
 )
 def test_actions_of_the_other_kind_are_refused(space, kind, message):
-    backbone = SequenceBackbone(make_network(action_space=space))
-    with pytest.raises(TypeError, match=message):
-        backbone(make_batch(kind=kind))
+    network, head = make_network(space=space)
+    batch = make_batch(kind=kind)
+    for module in (
+        make_dt_actor(network, head, group=None),
+        make_dt_actor(network, head, group=None, every_frame=True),
+        *([make_dt_predictor(network, head)] if space != "gaussian" else []),
+    ):
+        with pytest.raises(TypeError, match=message):
+            module(batch.clone())
 
 
 def test_a_missing_entry_is_named():
-    with pytest.raises(KeyError, match=r"no sequence under .*'observation'.*add SequenceHistory"):
-        make_dt_actor(make_network())(TensorDict({"observation": torch.zeros(2, 11)}, [2]))
+    with pytest.raises(KeyError, match=r"no history under .*'observation'.*SequenceHistory for De"):
+        make_dt_actor(*make_network())(TensorDict({"observation": torch.zeros(2, 11)}, [2]))
 
 
 def test_a_prediction_is_no_distribution():
-    with pytest.raises(ValueError, match=r"gaussian, .*make_dt_actor.* on TorchRL's OnlineDTLoss"):
-        make_dt_predictor(make_network(action_space="gaussian"))
+    with pytest.raises(ValueError, match=r"gaussian: .*make_dt_actor.*with TorchRL's OnlineDTLoss"):
+        make_dt_predictor(*make_network(space="gaussian"))
+
+
+def test_the_features_of_every_frame_are_not_kept():
+    network, _ = make_network()
+    backbone = make_dt_backbone(network, every_frame=True)
+    batch = make_batch()
+    with torch.no_grad(), backbone.acting():
+        features = backbone(batch)["features"]
+    assert features.shape == (4, 5, 16)
+    assert not backbone.keeps_frames
+    assert torch.equal(features, network.every_frame(*(batch[name] for name in NAMES)))
+
+
+def test_features_of_every_frame_are_asked_of_those_that_have_them():
+    network = EnhancedTIT(observation_shape=(4,), num_frames=8)
+    with pytest.raises(ValueError, match="PairedOuterTransformer encodes the newest frame only"):
+        Backbone(network, every_frame=True)
+
+
+def test_autocast_of_every_frame():
+    network, _ = make_network()
+    batch = make_batch()
+    names = list(NAMES)
+    plain = Backbone(network, names, every_frame=True)(batch.clone())["features"]
+    cast = Backbone(network, names, autocast=torch.bfloat16, every_frame=True)(batch)["features"]
+    assert cast.dtype == torch.float32
+    assert 1e-5 < (cast - plain).norm() / plain.norm() < 0.05

@@ -1,4 +1,4 @@
-"""The frame cache gives the features of the full encode, whatever it is handed."""
+"""Acting mode gives the features of the full pass, whatever the input."""
 
 import copy
 import io
@@ -16,12 +16,17 @@ from tests.modules.frames import (
     CountedFrames,
     Streams,
     assert_exact,
+    cache_of,
+    encoder_of,
     features,
     make,
 )
+from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.modules import FrameCache, acting
-from torchrl_tit.networks import MLP, NatureCNN
+from torchrl_tit.networks import MLP, NatureCNN, TwoTrunks
+
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
 
 @pytest.fixture(autouse=True)
@@ -32,10 +37,10 @@ def without_gradients():
 
 @pytest.mark.parametrize("padding", ["same", "constant"])
 @pytest.mark.parametrize("name", NETWORKS)
-def test_features_are_those_of_the_full_encode_whatever_comes(name, padding):
+def test_features_are_those_of_the_full_pass_whatever_comes(name, padding):
     backbone, network, shape = make(name)
     random.seed(0)
-    dtype = torch.uint8 if len(shape) > 1 else torch.float32
+    dtype = torch.uint8 if len(shape) > 1 else None
     streams = Streams(5, 4, shape, padding, dtype)
     evaluation = Streams(3, 4, shape, padding, dtype)
     with backbone.acting():
@@ -43,14 +48,14 @@ def test_features_are_those_of_the_full_encode_whatever_comes(name, padding):
             match random.randrange(8):
                 case 0:  # evaluation in between
                     assert_exact(backbone, evaluation.step(torch.rand(3) < 0.2))
-                case 1:  # environments in another order
+                case 1:  # the environments in another order
                     streams.windows = streams.windows[torch.randperm(5)]
-                case 2:  # the same once more
+                case 2:  # the same input again
                     assert_exact(backbone, streams.windows)
                 case 3:  # other observations in the middle of the history
                     streams.windows[1, 2] = streams.windows[0, 3]
                 case 4:
-                    next(iter(network.frame_encoder.parameters())).mul_(1.01)
+                    next(encoder_of(network).parameters()).mul_(1.01)
                 case _:
                     pass
             assert_exact(backbone, streams.step(torch.rand(5) < 0.2))
@@ -62,25 +67,25 @@ def test_a_wrong_token_would_show():
     with backbone.acting():
         features(backbone, streams.windows)
         history = streams.step(torch.zeros(5, dtype=torch.bool))
-        backbone._cache._kept.tokens.entries[0, 1] *= -1
-        assert not torch.allclose(features(backbone, history), network(history), rtol=0, atol=1e-4)
+        cache_of(backbone).tokens.entries[0, 1] *= -1
+        assert not torch.allclose(features(backbone, history), network(history), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["enhanced", "images"])
 def test_only_new_frames_are_encoded(name):
     backbone, network, shape = make(name, steps=6)
     frames = CountedFrames(network)
-    dtype = torch.uint8 if len(shape) > 1 else torch.float32
+    dtype = torch.uint8 if len(shape) > 1 else None
     nobody, one = torch.zeros(4, dtype=torch.bool), torch.tensor([False, True, False, False])
 
     streams = Streams(4, 6, shape, "same", dtype)
     with backbone.acting():
         features(backbone, streams.windows)
-        assert frames.take() == 4  # an episode's first history is one frame six times
+        assert frames.take() == 4  # the first history of an episode is one frame six times
         for reset in (nobody, nobody, one, nobody, ~nobody, nobody):
             features(backbone, streams.step(reset))
             assert frames.take() == 4
-        features(backbone, torch.randn(4, 6, *shape).to(dtype))
+        features(backbone, torch.randn(4, 6, *shape).to(streams.dtype))
         assert frames.take() == 24
 
     streams = Streams(4, 6, shape, "constant", dtype)
@@ -111,7 +116,7 @@ def test_leading_shapes():
                 history = stream[..., start : start + 4, :]
                 td = backbone(TensorDict({"history": history}, leading))
                 assert frames.take() == numel * (4 if start == 0 else 1)
-                torch.testing.assert_close(td["features"], network(history), rtol=0, atol=1e-5)
+                assert_near(td["features"], network(history))
                 frames.take()
 
 
@@ -134,29 +139,29 @@ def test_nested_keys():
             history = stream[:, start : start + 4]
             td = backbone(TensorDict({"agent": {"history": history}}, [5]))
             assert frames.take() == (20 if start == 0 else 5)
-            torch.testing.assert_close(td["agent", "features"], network(history), rtol=0, atol=1e-5)
+            assert_near(td["agent", "features"], network(history))
             frames.take()
 
 
 @pytest.mark.parametrize(
-    "network",
+    ("make_network", "shape"),
     [
-        EnhancedTIT((3,), 1, **SMALL),
-        EnhancedTIT((3,), 4, outer=False, **SMALL),
-        MLP((3,), 4),
-        NatureCNN((36, 36), 4),
-        nn.Flatten(-2),
+        (lambda: EnhancedTIT((3,), 1, **SMALL), (1, 3)),
+        (lambda: EnhancedTIT((3,), 4, outer=False, **SMALL), (4, 3)),
+        (lambda: MLP((3,), 4), (4, 3)),
+        (lambda: NatureCNN((36, 36), 4), (4, 36, 36)),
+        (lambda: nn.Flatten(-2), (4, 3)),
     ],
-    ids=["K=1", "without outer", "MLP", "NatureCNN", "another's"],
+    ids=["K=1", "without outer", "MLP", "NatureCNN", "other module"],
 )
-def test_networks_with_nothing_to_keep_pass_through(network):
-    shape, steps = getattr(network, "observation_shape", (3,)), getattr(network, "history", 4)
-    names = ["policy", "value"] if isinstance(network, MLP) else ["features"]
+def test_networks_with_nothing_to_keep_pass_through(make_network, shape):
+    network = make_network()
+    names = ["policy", "value"] if isinstance(network, TwoTrunks) else ["features"]
     backbone = Backbone(network, out_keys=names)
-    history = torch.rand(5, steps, *shape)
+    history = torch.rand(5, *shape)
     expected = backbone(TensorDict({"history": history}, [5]))
     with backbone.acting():
-        assert backbone._cache is None
+        assert backbone._acting is None
         td = backbone(TensorDict({"history": history}, [5]))
     assert all(torch.equal(td[name], expected[name]) for name in names)
 
@@ -177,11 +182,20 @@ def test_frames_are_the_same_if_their_bytes_are(value):
         assert frames.take() > 2
 
 
+class WithDoubles(nn.Module):
+    def __init__(self, encoder):
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, x):
+        return self.encoder(x.double())
+
+
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 7, 8])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_one_changed_byte_is_seen_at_any_size_and_offset(size, dtype):
     encoder = nn.Linear(size, 4)
-    cache = FrameCache(lambda_module(encoder, dtype), observation_ndim=1)
+    cache = FrameCache(WithDoubles(encoder), observation_ndim=1)
     memory = torch.randint(0, 255, (1 + 3 * 5 * size,)).to(dtype)
     for offset in (0, 1):
         stream = memory[offset : offset + 3 * 5 * size].view(3, 5, size)
@@ -189,31 +203,19 @@ def test_one_changed_byte_is_seen_at_any_size_and_offset(size, dtype):
         for index in range(size):
             changed = stream[:, 1:].clone()
             changed[1, 1, index] += 1
-            expected = encoder(changed.float())
-            torch.testing.assert_close(cache(changed), expected, rtol=0, atol=1e-4)
+            expected = encoder(changed.double())
+            assert_near(cache(changed), expected)
             cache(stream[:, :4])
 
 
-def lambda_module(encoder, dtype):
-    class AsFloat(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.encoder = encoder
-
-        def forward(self, x):
-            return self.encoder(x.float())
-
-    return AsFloat()
-
-
-def test_histories_that_their_owner_writes_into():
+def test_histories_that_are_written_in_place():
     backbone, _, shape = make()
     history = torch.randn(5, 4, *shape)
     with backbone.acting():
         for _ in range(4):
             assert_exact(backbone, history)
             history[:, :-1] = history[:, 1:].clone()
-            history[:, 0] += 1  # a frame that was never seen
+            history[:, 0] += 1  # a frame that is new
             history[:, -1] = torch.randn(5, *shape)
 
 
@@ -230,12 +232,12 @@ def test_only_one_batch_is_kept_and_it_goes_at_the_end():
     with backbone.acting():
         for n in (7, 3):
             features(backbone, torch.randn(n, 4, *shape))
-        kept = backbone._cache._kept
+        kept = cache_of(backbone)
         words, tokens = kept.words.entries, kept.tokens.entries
         assert tokens.shape == (3, 3, 2, 16)
-        assert words.untyped_storage().nbytes() == 2 * (3 * 3 * 3 * 4)  # with room for as many
-        assert tokens.untyped_storage().nbytes() == 2 * (3 * 3 * 2 * 16 * 4)
-    assert backbone._cache is None
+        assert words.untyped_storage().nbytes() == 2 * (3 * 3 * 3 * 8)  # with room for as many
+        assert tokens.untyped_storage().nbytes() == 2 * (3 * 3 * 2 * 16 * 8)
+    assert backbone._acting is None
 
 
 def test_acting_within_acting_leaves_what_the_outer_one_kept():
@@ -275,14 +277,14 @@ def test_copies_act_with_nothing_kept(copied):
     with backbone.acting():
         features(backbone, stream[:, :4])
         twin = copied(backbone)
-        assert twin._cache._kept is None
+        assert cache_of(twin) is None
         frames, original = CountedFrames(twin.module), CountedFrames(network)
         assert_exact(twin, stream[:, 1:5])
-        assert frames.take() == 20 + 20  # both the backbone and the network encode all
-        next(twin.module.frame_encoder.parameters()).add_(1)
+        assert frames.take() == 20 + 20  # the backbone and the network encode all of them
+        next(encoder_of(twin.module).parameters()).add_(1)
         assert_exact(twin, stream[:, 2:6])
         assert original.take() == 0
-    assert copied(backbone)._cache is None
+    assert copied(backbone)._acting is None
 
 
 def test_a_state_dict_is_the_networks_and_empties_the_cache():
@@ -301,7 +303,7 @@ def test_a_state_dict_is_the_networks_and_empties_the_cache():
         assert frames.take() == 20
 
 
-def test_a_run_that_goes_on_gives_the_bits_of_one_that_is_resumed():
+def test_a_run_that_continues_gives_the_bits_of_one_that_is_resumed():
     backbone, _, shape = make(steps=16)
     stream = torch.randn(5, 40, *shape)
 
@@ -311,19 +313,19 @@ def test_a_run_that_goes_on_gives_the_bits_of_one_that_is_resumed():
     with backbone.acting():
         act(backbone, 0, 8)
         state = backbone.state_dict()
-        going_on = act(backbone, 8, 16)
+        continued = act(backbone, 8, 16)
     resumed = make(steps=16)[0]
     resumed.load_state_dict(state)
     with resumed.acting():
-        assert all(map(torch.equal, going_on, act(resumed, 8, 16)))
+        assert all(map(torch.equal, continued, act(resumed, 8, 16)))
 
 
 def test_acting_finds_every_backbone_of_a_policy():
     first, second = make()[0], make("vanilla")[0]
     policy = nn.ModuleList([first, nn.Sequential(second), nn.Linear(1, 1)])
     with acting(policy):
-        assert first._cache is not None
-        assert second._cache is not None
-    assert first._cache is second._cache is None
+        assert first._acting is not None
+        assert second._acting is not None
+    assert first._acting is second._acting is None
     with acting(lambda td: td):
         pass

@@ -1,4 +1,4 @@
-"""Every way in which a frame encoder's weights can change is noticed by the frame cache."""
+"""Acting mode notices every way in which a frame encoder's weights can change."""
 
 import shutil
 from functools import partial
@@ -12,9 +12,13 @@ from torchrl.collectors import Collector, MultiSyncCollector
 from torchrl.data import Categorical, Unbounded
 from torchrl.objectives import DQNLoss, SoftUpdate
 
-from tests.modules.frames import CountedFrames, features, make
+from tests.modules.frames import CountedFrames, assert_exact, encoder_of, features, make
+from tests.numerics import assert_near
 from torchrl_tit.envs import make_env
+from torchrl_tit.frames import FrameEncoder
 from torchrl_tit.modules import acting, make_actor, while_acting
+
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
 
 def step_of(optimizer_class, compiled=False, **options):
@@ -30,31 +34,31 @@ def step_of(optimizer_class, compiled=False, **options):
 
 
 def write_into_data(network):
-    network.frame_encoder.class_token.data += 1
+    encoder_of(network).class_token.data += 1
 
 
 def write_one_bit_into_data(network):
-    weight = network.frame_encoder.blocks[1].ffn[2].bias.data
-    weight[3] = torch.nextafter(weight[3], torch.tensor(9.0))
+    weight = encoder_of(network).blocks[1].ffn[2].bias.data
+    weight[3] = torch.nextafter(weight[3], torch.tensor(9.0, dtype=weight.dtype))
 
 
 def write_into_a_numpy_view(network):
-    network.frame_encoder.class_token.detach().numpy()[:] += 1
+    encoder_of(network).class_token.detach().numpy()[:] += 1
 
 
 def set_data(network):
-    token = network.frame_encoder.class_token
+    token = encoder_of(network).class_token
     token.data = token.data + 1
 
 
 def transpose_in_place(network):
-    weight = network.frame_encoder.blocks[0].attention.out_proj.weight
+    weight = encoder_of(network).blocks[0].attention.out_proj.weight
     weight.data = weight.data.t()  # the same memory, read in another order
 
 
 def copy_into(network):
     with torch.no_grad():
-        network.frame_encoder.class_token.copy_(torch.ones(16))
+        encoder_of(network).class_token.copy_(torch.ones(16))
 
 
 def load_state_dict(network):
@@ -86,21 +90,21 @@ def write_from_another_process(network):
 
 
 def replace_parameter(network):
-    network.frame_encoder.class_token = nn.Parameter(torch.ones(1, 1, 16))
+    encoder_of(network).class_token = nn.Parameter(torch.ones(1, 1, 16))
 
 
 def replace_module(network):
-    network.frame_encoder.blocks[0] = make()[1].frame_encoder.blocks[1]
+    encoder_of(network).blocks[0] = encoder_of(make()[1]).blocks[1]
 
 
 def add_parameter(network):
-    block = network.frame_encoder.blocks[0]
+    block = encoder_of(network).blocks[0]
     nn.utils.parametrizations.weight_norm(block.ffn[0])
     block.ffn[0].parametrizations.weight.original0.data += 1
 
 
 def write_into_buffer(network):
-    network.frame_encoder.norm.running_mean += 1
+    encoder_of(network).norm.running_mean += 1
 
 
 CHANGES = {
@@ -123,13 +127,13 @@ CHANGES = {
     "a new parameter": replace_parameter,
     "a new module": replace_module,
     "a parametrization": add_parameter,
-    "initialisation": lambda network: nn.init.normal_(network.frame_encoder.class_token),
-    "double and back": lambda network: network.half().float(),
+    "initialisation": lambda network: nn.init.normal_(encoder_of(network).class_token),
+    "double and back": lambda network: network.half().double(),
 }
 
 
 def assert_noticed(change, network, backbone, shape):
-    """Acts, changes the weights, acts on: all features are those of the network as it is then."""
+    """Acts, changes the weights and acts again: features are always those of the network."""
     frames = CountedFrames(network)
     stream = torch.randn(5, 8, *shape)
     with backbone.acting():
@@ -141,9 +145,7 @@ def assert_noticed(change, network, backbone, shape):
             acted = features_without_gradient(backbone, stream[:, start : start + 4])
             assert frames.take() == (20 if start in (0, 2) else 5)
             with torch.no_grad():
-                torch.testing.assert_close(
-                    acted, network(stream[:, start : start + 4]), rtol=0, atol=1e-5
-                )
+                assert_near(acted, network(stream[:, start : start + 4]))
 
 
 @torch.no_grad()
@@ -155,6 +157,19 @@ def features_without_gradient(backbone, history):
 def test_changed_weights_are_noticed(change):
     backbone, network, shape = make()
     assert_noticed(change, network, backbone, shape)
+
+
+def test_a_new_frame_encoder_is_noticed():
+    backbone, network, shape = make()
+    stream = torch.randn(5, 8, *shape)
+    with backbone.acting(), torch.no_grad():
+        assert_exact(backbone, stream[:, :4])
+        network.frame_encoders["observation"] = encoder_of(make()[1])
+        encoder_of(network).class_token += 1
+        assert_exact(backbone, stream[:, 1:5])
+        frames = CountedFrames(network)
+        features(backbone, stream[:, 2:6])
+        assert frames.take() == 5
 
 
 @pytest.mark.slow
@@ -182,21 +197,23 @@ def test_buffers_are_weights_too():
     backbone, network, shape = make("images")
     norm = nn.BatchNorm1d(2).eval()  # over [N, L = 2, D]
 
-    class Normed(nn.Module):
+    class Normed(FrameEncoder):
         def __init__(self, encoder):
-            super().__init__()
+            super().__init__(
+                encoder.observation_shape, num_tokens=encoder.num_tokens, width=encoder.width
+            )
             self.encoder, self.norm = encoder, norm
 
         def forward(self, x):
             tokens = self.encoder(x)
             return self.norm(tokens.flatten(0, -3)).view(tokens.shape)
 
-    network.frame_encoder = Normed(network.frame_encoder)
+    network.frame_encoders["observation"] = Normed(encoder_of(network))
     assert_noticed(write_into_buffer, network, backbone, shape)
 
 
 @pytest.mark.parametrize("part", ["history_encoder", "head"])
-def test_what_follows_the_frame_encoder_is_not_kept(part):
+def test_nothing_after_the_frame_encoder_is_kept(part):
     backbone, network, shape = make()
     frames = CountedFrames(network)
     stream = torch.randn(5, 8, *shape)
@@ -207,7 +224,7 @@ def test_what_follows_the_frame_encoder_is_not_kept(part):
             acted = features_without_gradient(backbone, stream[:, start : start + 4])
             assert frames.take() == (5 if start else 20)
             full = network(stream[:, start : start + 4])
-            torch.testing.assert_close(acted, full, rtol=0, atol=1e-5)
+            assert_near(acted, full)
             full.square().sum().backward()
             optimizer.step()
 
@@ -221,7 +238,7 @@ def test_weights_in_bfloat16():
     with backbone.acting():
         for start in range(4):
             if start == 2:
-                network.frame_encoder.class_token += 0.1
+                encoder_of(network).class_token += 0.1
             frames.take()
             acted = features(backbone, stream[:, start : start + 4])
             assert frames.take() == (20 if start in (0, 2) else 5)
@@ -239,16 +256,14 @@ def test_updates_at_every_step():
     with backbone.acting():
         for start in range(8):
             history = stream[:, start : start + 4]
-            torch.testing.assert_close(
-                features(backbone, history), network(history), rtol=0, atol=1e-5
-            )
+            assert_near(features(backbone, history), network(history))
             optimizer.step()
 
 
 @pytest.mark.parametrize("preserve", [True, False])
 @torch.no_grad()
 def test_other_weights_that_are_swapped_in_and_out(preserve):
-    """What losses do with target weights: as parameters, or as plain tensors in their places."""
+    """As losses do with target weights: as parameters, or as plain tensors in their places."""
     backbone, network, shape = make()
     own = TensorDict.from_module(network)
     others = [own.data.apply(lambda x, i=i: x + 0.1 * i) for i in (1, 2)]
@@ -259,7 +274,7 @@ def test_other_weights_that_are_swapped_in_and_out(preserve):
             weights = others[start % 3 - 1] if start % 3 else own
             with weights.to_module(network, preserve_module_state=preserve):
                 acted, full = features(backbone, history), network(history)
-            torch.testing.assert_close(acted, full, rtol=0, atol=1e-5)
+            assert_near(acted, full)
 
 
 def test_target_weights_of_a_loss_and_their_soft_update():
@@ -280,25 +295,26 @@ def test_target_weights_of_a_loss_and_their_soft_update():
             for weights in (loss.value_network_params, loss.target_value_network_params):
                 with weights.to_module(value_network):
                     acted, full = features(backbone, history), network(history)
-                    torch.testing.assert_close(acted, full, rtol=0, atol=1e-5)
+                    assert_near(acted, full)
 
 
 def make_policy():
     """A policy for Pendulum, whose observations have three entries."""
     backbone, network, _ = make()
     action = Unbounded((1,))
-    return TensorDictSequential(backbone, make_actor(8, action)).eval(), network
+    policy = TensorDictSequential(backbone, make_actor(8, action))
+    return policy.float().eval(), network  # environments write float32
 
 
 def assert_exact_batch(batch, network):
     with torch.no_grad():
         full = network(batch["history"])
-    torch.testing.assert_close(batch["features"], full, rtol=1e-4, atol=1e-5)
+    assert_near(batch["features"], full)
 
 
 def test_weights_sent_to_a_collector_are_noticed():
     policy, network = make_policy()
-    env = make_env("Pendulum-v1", 2, seed=0, history=4)
+    env = make_env("Pendulum-v1", 2, seed=0, num_frames=4)
     collector = Collector(env, policy, frames_per_batch=24, total_frames=96)
     frames = CountedFrames(network)
     weights = TensorDict.from_module(policy).data.clone()
@@ -312,15 +328,15 @@ def test_weights_sent_to_a_collector_are_noticed():
     collector.shutdown()
 
 
-def test_a_collector_acts_only_while_it_makes_a_batch():
+def test_a_policy_acts_only_while_a_batch_is_collected():
     policy, network = make_policy()
-    env = make_env("Pendulum-v1", 2, seed=0, history=4)
+    env = make_env("Pendulum-v1", 2, seed=0, num_frames=4)
     collector = Collector(env, policy, frames_per_batch=24, total_frames=96)
     frames = CountedFrames(network)
     batches = 0
     for batch in while_acting(policy, collector):
         assert frames.take() <= 2 * 12 + 2 * 3
-        assert policy[0]._cache is None
+        assert policy[0]._acting is None
         assert_exact_batch(batch, network)
         frames.take()
         batches += 1
@@ -331,9 +347,9 @@ def test_a_collector_acts_only_while_it_makes_a_batch():
 @pytest.mark.slow
 def test_weights_sent_to_another_process_are_noticed():
     policy, network = make_policy()
-    with acting(policy):  # so the worker's copy acts
+    with acting(policy):  # so that the worker's copy acts
         collector = MultiSyncCollector(
-            [partial(make_env, "Pendulum-v1", 2, seed=0, history=4)],
+            [partial(make_env, "Pendulum-v1", 2, seed=0, num_frames=4)],
             policy,
             frames_per_batch=24,
             total_frames=72,

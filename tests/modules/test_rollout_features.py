@@ -1,4 +1,4 @@
-"""Features of a rollout are those of the plain way, and each frame is encoded once."""
+"""Features of a rollout are those of the backbone itself, and each frame is encoded once."""
 
 import pytest
 import torch
@@ -6,10 +6,14 @@ from tensordict import TensorDict
 from torchrl.objectives.value import GAE
 
 from tests.modules.frames import NETWORKS, CountedFrames, make
-from torchrl_tit import Backbone
+from tests.numerics import assert_near
+from torchrl_tit import Backbone, HistoryNetwork, VanillaTIT
 from torchrl_tit.envs import make_env
 from torchrl_tit.modules import add_rollout_features, make_value
-from torchrl_tit.networks import MLP, NatureCNN
+from torchrl_tit.networks import MLP, NatureCNN, TwoTrunks
+from torchrl_tit.settings import LSTM, Flat, Inner, Outer
+
+pytestmark = pytest.mark.numerics
 
 
 @pytest.fixture(autouse=True)
@@ -46,15 +50,15 @@ def make_rollout(shape, padding="same", n=3, time=40, k=4, cuts=0.1):
 
 @pytest.mark.parametrize("padding", ["same", "constant"])
 @pytest.mark.parametrize("name", NETWORKS)
-def test_features_are_those_of_the_plain_way(name, padding):
+def test_features_are_those_of_the_backbone(name, padding):
     backbone, network, shape = make(name)
     rollout, frames = make_rollout(shape, padding)
     plain, plain_next = network(rollout["history"]), network(rollout["next", "history"])
     counted = CountedFrames(network)
     assert add_rollout_features(rollout, backbone, chunk_size=50) is rollout
     assert counted.take() == frames
-    torch.testing.assert_close(rollout["features"], plain, rtol=0, atol=1e-5)
-    torch.testing.assert_close(rollout["next", "features"], plain_next, rtol=0, atol=1e-5)
+    assert_near(rollout["features"], plain)
+    assert_near(rollout["next", "features"], plain_next)
 
 
 @pytest.mark.parametrize("k", [1, 2, 3, 9, 16])
@@ -64,10 +68,8 @@ def test_histories_of_any_length(k):
     counted = CountedFrames(network)
     add_rollout_features(rollout, backbone)
     assert counted.take() == frames
-    torch.testing.assert_close(rollout["features"], network(rollout["history"]), rtol=0, atol=1e-5)
-    torch.testing.assert_close(
-        rollout["next", "features"], network(rollout["next", "history"]), rtol=0, atol=1e-5
-    )
+    assert_near(rollout["features"], network(rollout["history"]))
+    assert_near(rollout["next", "features"], network(rollout["next", "history"]))
 
 
 def test_steps_that_do_not_follow_each_other():
@@ -76,8 +78,8 @@ def test_steps_that_do_not_follow_each_other():
     rollout = rollout[:, torch.randperm(40)]
     plain, plain_next = network(rollout["history"]), network(rollout["next", "history"])
     add_rollout_features(rollout, backbone)
-    torch.testing.assert_close(rollout["features"], plain, rtol=0, atol=1e-5)
-    torch.testing.assert_close(rollout["next", "features"], plain_next, rtol=0, atol=1e-5)
+    assert_near(rollout["features"], plain)
+    assert_near(rollout["next", "features"], plain_next)
 
 
 def test_batch_shapes_and_nested_keys_with_their_own_dimensions():
@@ -96,9 +98,7 @@ def test_batch_shapes_and_nested_keys_with_their_own_dimensions():
     for td in (one, many):
         add_rollout_features(td, backbone)
         for part in (td, td["next"]):
-            torch.testing.assert_close(
-                part["agents", "features"], network(part["agents", "history"]), rtol=0, atol=1e-5
-            )
+            assert_near(part["agents", "features"], network(part["agents", "history"]))
 
 
 @pytest.mark.parametrize("network_class", [MLP, NatureCNN])
@@ -107,7 +107,6 @@ def test_networks_without_a_frame_encoder(network_class):
     network = network_class(shape, 4)
     keys = ["policy", "value"] if network_class is MLP else ["features"]
     rollout, _ = make_rollout(shape, time=10)
-    rollout["history"], rollout["next", "history"]
     backbone = Backbone(network, out_keys=keys)
     if network_class is MLP:
         rollout = rollout.apply(lambda x: x / 255 if x.is_floating_point() else x)
@@ -115,13 +114,62 @@ def test_networks_without_a_frame_encoder(network_class):
     for part in (rollout, rollout["next"]):
         plain = backbone(part.select("history").clone())
         for key in keys:
-            torch.testing.assert_close(part[key], plain[key], rtol=0, atol=1e-5)
+            assert_near(part[key], plain[key])
+
+
+def make_pixels_and_state(k=4):
+    """A network of images and arrays."""
+    torch.manual_seed(0)
+    return HistoryNetwork(
+        {"pixels": Inner(patch_size=4, embed_dim=16), "state": Inner(embed_dim=16)},
+        Outer(num_blocks=1),
+        observation_shape={"pixels": (8, 8), "state": (3,)},
+        num_frames=k,
+    ).eval()
+
+
+def test_several_observations_and_two_trunks():
+    rollout, count = make_rollout((8, 8))
+    for part in (rollout, rollout["next"]):
+        part["pixels"] = part["history"]
+        part["state"] = part.pop("history")[..., 0, :3].to(torch.get_default_dtype())
+    network = TwoTrunks(make_pixels_and_state(), make_pixels_and_state())
+    for parameter in network.value.parameters():
+        parameter.add_(0.1 * torch.randn_like(parameter))
+    backbone = Backbone(network, ["pixels", "state"], ["policy", "value"])
+    plain = rollout.clone()
+    for part in (plain, plain["next"]):
+        backbone(part)
+    counted = [CountedFrames(trunk) for trunk in (network.policy, network.value)]
+    add_rollout_features(rollout, backbone, chunk_size=50)
+    for counter in counted:
+        assert counter.take() == 2 * count
+    for key in ("policy", "value"):
+        assert_near(rollout[key], plain[key])
+        assert_near(rollout["next", key], plain["next", key])
+    assert not torch.allclose(rollout["policy"], rollout["value"])
+
+
+def test_a_module_that_is_no_history_network():
+    backbone = Backbone(torch.nn.Flatten(-2))
+    rollout, _ = make_rollout((3,))
+    add_rollout_features(rollout, backbone)
+    assert torch.equal(rollout["features"], rollout["history"].flatten(-2))
+    assert torch.equal(rollout["next", "features"], rollout["next", "history"].flatten(-2))
+
+
+def test_a_network_with_a_state_is_refused():
+    network = HistoryNetwork(Flat(), LSTM(), observation_shape=(3,))
+    backbone = Backbone(network, out_keys=["features"])
+    rollout, _ = make_rollout((3,), k=1)
+    with pytest.raises(ValueError, match="call the backbone on the rollout instead"):
+        add_rollout_features(rollout, backbone)
 
 
 def test_advantages_of_a_real_rollout():
     backbone, _, _ = make_cartpole()
     critic = make_value(8)
-    env = make_env("CartPole-v1", 3, history=4, seed=0)
+    env = make_env("CartPole-v1", 3, num_frames=4, seed=0)
     rollout = env.rollout(60, break_when_any_done=False)
     assert rollout["next", "done"].any()
     plain = rollout.clone()
@@ -131,14 +179,10 @@ def test_advantages_of_a_real_rollout():
     for td in (rollout, rollout["next"]):
         critic(td)
     gae = GAE(gamma=0.99, lmbda=0.95, value_network=None)
-    torch.testing.assert_close(
-        gae(rollout)["advantage"], gae(plain)["advantage"], rtol=0, atol=1e-4
-    )
+    assert_near(gae(rollout)["advantage"], gae(plain)["advantage"])
 
 
 def make_cartpole():
-    from torchrl_tit import VanillaTIT
-
     torch.manual_seed(0)
     network = VanillaTIT((4,), 4, embed_dim=16, num_blocks=1, features_dim=8)
     return Backbone(network), network, (4,)

@@ -1,27 +1,29 @@
-"""TensorDictModules: keys in, keys out."""
+"""TensorDictModules: backbones around networks, and heads on their features."""
 
 from torchrl_tit.modules.acting import acting, while_acting
 from torchrl_tit.modules.backbone import Backbone
-from torchrl_tit.modules.decision_transformer import make_dt_actor, make_dt_predictor
+from torchrl_tit.modules.decision_transformer import (
+    DTHead,
+    make_dt_actor,
+    make_dt_backbone,
+    make_dt_predictor,
+)
 from torchrl_tit.modules.frame_cache import FrameCache
 from torchrl_tit.modules.heads import make_actor, make_value
-from torchrl_tit.modules.lstm_backbone import LSTMBackbone, LSTMConfig
 from torchrl_tit.modules.many_actions import ManyActions
 from torchrl_tit.modules.rollout_features import add_rollout_features
-from torchrl_tit.modules.sequence_backbone import SequenceBackbone
 from torchrl_tit.modules.squashed_actor import make_squashed_actor
 
 __all__ = [
     "Backbone",
+    "DTHead",
     "FrameCache",
-    "LSTMBackbone",
-    "LSTMConfig",
     "ManyActions",
-    "SequenceBackbone",
     "acting",
     "add_rollout_features",
     "make_actor",
     "make_dt_actor",
+    "make_dt_backbone",
     "make_dt_predictor",
     "make_squashed_actor",
     "make_value",

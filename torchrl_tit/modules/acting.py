@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
-from typing import Any, TypeVar
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from torch import nn
 
-from torchrl_tit.modules.backbone import Backbone
-from torchrl_tit.modules.sequence_backbone import SequenceBackbone
-
 T = TypeVar("T")
+
+
+@runtime_checkable
+class HasActingMode(Protocol):
+    """A module that can reuse what it computed a step ago, such as a backbone."""
+
+    def acting(self) -> AbstractContextManager[None]:
+        """The context within which it does."""
 
 
 @contextmanager
@@ -19,34 +24,35 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
     """Puts every backbone of a policy into acting mode: only the newest frames are encoded.
 
     Args:
-        policy: a module with any number of backbones in it; other functions are left as they are.
+        policy: a module that contains any number of backbones, or of other modules with a method
+            ``acting`` (see :meth:`Backbone.acting`). Nothing happens to any other function.
 
     Example:
         >>> from tensordict.nn import TensorDictSequential
         >>> from torchrl.data import Categorical
-        >>> from torchrl_tit import EnhancedTIT
+        >>> from torchrl_tit import Backbone, EnhancedTIT
         >>> from torchrl_tit.envs import make_env
         >>> from torchrl_tit.modules import make_actor
-        >>> backbone = Backbone(EnhancedTIT(observation_shape=(4,), history=8))
+        >>> backbone = Backbone(EnhancedTIT(observation_shape=(4,), num_frames=8))
         >>> policy = TensorDictSequential(backbone, make_actor(64, Categorical(2)))
         >>> with acting(policy):
-        ...     steps = make_env("CartPole-v1", 2, history=8).rollout(10, policy)
+        ...     steps = make_env("CartPole-v1", 2, num_frames=8).rollout(10, policy)
     """
     with ExitStack() as stack:
         for module in policy.modules() if isinstance(policy, nn.Module) else ():
-            if isinstance(module, Backbone | SequenceBackbone):
+            if isinstance(module, HasActingMode):
                 stack.enter_context(module.acting())
         yield
 
 
 def while_acting(policy: Callable[..., Any], batches: Iterable[T]) -> Iterator[T]:
-    """Iterates over a collector with its policy in acting mode only while a batch is made.
+    """Iterates over a collector, with its policy in acting mode only while it collects.
 
-    Between two batches, where the policy is trained and saved, nothing is kept.
+    Between two batches, when the policy is trained and saved, no tokens are kept.
 
     Args:
-        policy: the collector's policy, or a module that holds its backbones.
-        batches: the collector, or anything else that acts when it is asked for its next item.
+        policy: the collector's policy, or a module that contains its backbones.
+        batches: the collector, or any other iterable that acts when its next item is requested.
 
     Yields:
         The batches.

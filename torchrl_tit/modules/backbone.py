@@ -10,37 +10,66 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, skip_existing
 from torch import Tensor, nn
+from torchrl.data import Unbounded
+from torchrl.envs import Compose, InitTracker, TensorDictPrimer
 
-from torchrl_tit.modules.frame_cache import Encode, FrameCache
-from torchrl_tit.networks import HistoryNetwork
+from torchrl_tit.histories.encoder import RecurrentEncoder
+from torchrl_tit.modules.acting_network import ActingNetwork
+from torchrl_tit.networks import HistoryNetwork, TwoTrunks
 
 
 class Backbone(TensorDictModule):
-    """Reads a history and writes features, for any TorchRL head, loss or collector.
+    """Reads histories and writes features, for any TorchRL head, loss or collector.
 
-    Put it in front of the heads, once: heads read the features, so the network runs once a step
-    while collecting and once a minibatch in the update, however many heads and losses there are.
+    Put one backbone in front of all heads. They read its features, so the network runs once a step
+    in collection and once a minibatch in training, however many heads and losses there are.
 
-    While acting, each step's history holds K - 1 frames of the step before. Within :meth:`acting`
-    only the newest is encoded, where the network has a frame encoder; the features are the same.
+    The histories of consecutive steps share K - 1 frames. Within :meth:`acting`, only the newest
+    frame is encoded at each step, and the features are the same.
+
+    A recurrent network (an LSTM with one frame) reads its state from the tensordict, and writes the
+    next state beside the features:
+
+    ==========================================  ==================  ================================
+    key                                         shape               what it is
+    ==========================================  ==================  ================================
+    ``history``                                 [..., 1, *obs]      read: the newest observation
+    ``recurrent_state_h``, ``..._c``            [..., 1, H]         read: the state before it
+    ``is_init``                                 [..., 1]            read: bool, first step of an
+                                                                    episode
+    ``features``                                [..., F]            written
+    ``("next", "recurrent_state_h")``, ...      [..., 1, H]         written: the state after it
+    ==========================================  ==================  ================================
+
+    The transforms of :meth:`make_transforms` supply the state and ``is_init``. By default the
+    backbone reads single steps. Within ``torchrl.modules.set_recurrent_mode(True)`` it reads
+    sequences: the last batch dimension is time, and the state is read at the first step of each
+    sequence only. With two trunks, the keys of the states begin with ``policy_`` and ``value_``.
 
     Args:
-        network: maps a history [..., K, *observation_shape] to features [..., F], or to as many
-            tensors as there are ``out_keys`` (policy and value features, say).
-        in_keys: a list with one key, nested or not, under which the history stands (see
-            :class:`~torchrl_tit.transforms.History`), or its name.
-        out_keys: a list with one key for each tensor that the network puts out, or a single name.
-        autocast: the type that matrix products are computed in, such as ``torch.bfloat16``; weights
-            and features keep theirs. None computes all in the type of the weights.
+        network: a :class:`~torchrl_tit.networks.HistoryNetwork`, which maps histories to features
+            [..., F]; a :class:`~torchrl_tit.networks.TwoTrunks` of two such networks; or any other
+            module that maps one tensor for each of ``in_keys`` to one for each of ``out_keys``.
+        in_keys: keys, nested or not, of the history of each observation (see
+            :class:`~torchrl_tit.transforms.History`), in the order of the network, then of the
+            history encoder's further inputs. A single key can be given as a string.
+        out_keys: keys of the features: one, or one for the policy and one for the value. A single
+            key can be given as a string.
+        autocast: dtype of matrix products, such as ``torch.bfloat16``; weights and features keep
+            their dtype. None disables autocast.
+        every_frame: write the features of all K frames, [..., K, F], for losses on whole windows,
+            instead of those of the newest one. Two backbones, one to train and one to act, can
+            share a network.
 
     Raises:
-        ValueError: if there is not exactly one ``in_key``, or no ``out_key``.
-        KeyError: in ``forward``, if there is no history under the key.
+        ValueError: if the number of keys is not that of the network's inputs and outputs, or
+            ``every_frame`` is set for a history encoder that encodes the newest frame only.
+        KeyError: in ``forward``, if the tensordict lacks one of the entries.
 
     Example:
         >>> from tensordict import TensorDict
         >>> from torchrl_tit import Backbone, EnhancedTIT
-        >>> tit = EnhancedTIT(observation_shape=(4,), history=8, features_dim=32)
+        >>> tit = EnhancedTIT(observation_shape=(4,), num_frames=8, features_dim=32)
         >>> backbone = Backbone(tit, in_keys=["history"], out_keys=["features"])
         >>> backbone(TensorDict({"history": torch.randn(5, 8, 4)}, [5]))["features"].shape
         torch.Size([5, 32])
@@ -52,135 +81,248 @@ class Backbone(TensorDictModule):
         in_keys: Sequence[NestedKey] | str = ("history",),
         out_keys: Sequence[NestedKey] | str = ("features",),
         autocast: torch.dtype | None = None,
+        every_frame: bool = False,
     ) -> None:
         in_keys, out_keys = (
             [keys] if isinstance(keys, str) else list(keys) for keys in (in_keys, out_keys)
         )
-        if len(in_keys) != 1 or not out_keys:
-            raise ValueError(
-                "a backbone reads one history and writes at least one entry of features, not "
-                f"in_keys={in_keys} and out_keys={out_keys}"
-            )
-        super().__init__(network, in_keys=in_keys, out_keys=out_keys)
+        trunks = trunks_of(network)
+        _check_keys(network, trunks, in_keys, out_keys)
+        if every_frame:
+            _check_every_frame(network)
+        state_shapes = {
+            prefix + key: shape
+            for prefix, trunk in trunks.items()
+            for key, shape in _state_shapes(trunk).items()
+        }
+        super().__init__(
+            network,
+            in_keys=[*in_keys, *state_shapes, *(["is_init"] if state_shapes else [])],
+            out_keys=[*out_keys, *(("next", key) for key in state_shapes)],
+        )
+        self.history_keys = in_keys
+        """Keys of the histories, and of the history encoder's further inputs."""
+        self.features_keys = out_keys
+        """Keys of the features: one, or the policy's and the value's."""
+        self.state_shapes = state_shapes
+        """Shape of each entry of the recurrent state without batch dimensions, by key."""
         self.autocast = autocast
-        self._cache: FrameCache | None = None  # while acting
-        # What runs while acting in place of frame encoder and history encoder, if compiled.
-        self._compiled: tuple[Encode, Encode] | None = None
+        self.every_frame = every_frame
+        self._acting: list[ActingNetwork] | None = None  # one for each trunk, in acting mode
+        self._compiled: list[ActingNetwork] | None = None  # what acting mode starts with
 
     def forward(
         self, tensordict: TensorDictBase, *args: object, **kwargs: object
     ) -> TensorDictBase:
-        """Writes the features of the history into the tensordict and returns it."""
-        (key,) = self.in_keys
-        if isinstance(tensordict, TensorDictBase) and tensordict.get(key, None) is None:
-            raise KeyError(
-                f"there is no history under {key!r}, only {sorted(map(str, tensordict.keys(True)))}"
-                ": add torchrl_tit.History to the environment, or name the key in in_keys"
-            )
-        special = args or kwargs or skip_existing() or not isinstance(tensordict, TensorDictBase)
-        if self._cache is None or special or torch.compiler.is_compiling():
+        """Writes the features of the histories into the tensordict and returns it."""
+        is_tensordict = isinstance(tensordict, TensorDictBase)
+        if is_tensordict:
+            self._check_entries(tensordict)
+        special = args or kwargs or skip_existing() or not is_tensordict
+        if self._acting is None or special or torch.compiler.is_compiling():
             return super().forward(tensordict, *args, **kwargs)
-        # The same without the 0.1 ms that TensorDictModule takes, which count in a step of acting.
-        (out_key,) = self.out_keys_source
-        return tensordict.set(out_key, self._call_module([tensordict.get(key)]))
+        # Skips the 0.1 ms overhead of TensorDictModule, which matters at each step of acting.
+        outputs = self._call_module([tensordict.get(key) for key in self.in_keys])
+        outputs = (outputs,) if isinstance(outputs, Tensor) else outputs
+        for key, output in zip(self.out_keys_source, outputs, strict=True):
+            tensordict.set(key, output)
+        return tensordict
+
+    @property
+    def features_dim(self) -> int:
+        """Size F of the features."""
+        return self.module.features_dim
+
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether the network carries a state from step to step."""
+        return bool(self.state_shapes)
+
+    @property
+    def keeps_frames(self) -> bool:
+        """Whether acting mode saves anything: histories of several frames that are encoded."""
+        if self.every_frame:
+            return False
+        return any(trunk.keeps_frames for trunk in trunks_of(self.module).values())
+
+    def make_transforms(self) -> Compose:
+        """Builds the transforms by which an environment carries the recurrent state.
+
+        Returns:
+            TorchRL's `InitTracker`, which marks the first step of each episode, and
+            `TensorDictPrimer`, which starts it with a state of zeros. Empty if the network is not
+            recurrent.
+        """
+        if not self.is_recurrent:
+            return Compose()
+        specs = {key: Unbounded(shape=shape) for key, shape in self.state_shapes.items()}
+        return Compose(InitTracker(), TensorDictPrimer(specs, expand_specs=True))
 
     @contextmanager
     def acting(self) -> Iterator[None]:
-        """Keeps the tokens of the frames just seen, to encode only the newest of each step.
+        """Keeps the tokens of the last frames, so that only the newest is encoded at each step.
 
-        For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses.
-        Whatever it is given, the features are those of the network (see
-        :class:`~torchrl_tit.modules.FrameCache`): another batch, a reset or changed weights cost
-        time only. Does nothing for networks that have no frame encoder or see one frame.
+        For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses. The
+        features are those of the network, whatever the input (see
+        :class:`~torchrl_tit.modules.FrameCache`): another batch, a reset or changed weights only
+        take time. Has no effect on networks that encode no frames or read a single one.
 
-        What is kept (copies of one batch of histories, of its tokens, and of the frame encoder's
-        weights) goes at the end, and when a state dict is taken: a run then goes on as one that is
-        resumed from there does. Within another ``acting``, it starts with nothing, and the outer
-        one goes on with what it kept. A copy made within, a collector's in another process say,
-        acts for good, and starts with nothing.
+        The cache (copies of one batch of histories, of its tokens, and of the frame encoder's
+        weights) is discarded at the end, and whenever a state dict is taken: a run then continues
+        exactly like one that is resumed from that state. A nested ``acting`` starts with an empty
+        cache and leaves that of the outer one alone. A copy made within, for a collector in another
+        process for example, always acts, and starts with an empty cache.
 
         Example:
             >>> from tensordict import TensorDict
             >>> from torchrl_tit import EnhancedTIT
-            >>> backbone = Backbone(EnhancedTIT(observation_shape=(4,), history=8))
+            >>> backbone = Backbone(EnhancedTIT(observation_shape=(4,), num_frames=8))
             >>> frames = torch.randn(5, 20, 4)
             >>> with backbone.acting(), torch.no_grad():
             ...     for step in range(12):
             ...         td = backbone(TensorDict({"history": frames[:, step : step + 8]}, [5]))
         """
-        outer, self._cache = self._cache, self._make_cache()
+        outer, self._acting = self._acting, self._make_acting()
         try:
             yield
         finally:
-            self._cache = outer
+            self._acting = outer
 
     def compile_parts(self, **options: Any) -> None:
-        """Compiles what runs while acting: encoding the newest frames, and all that follows it.
+        """Compiles what acting mode runs: encoding the newest frames, and all that follows.
 
-        What is kept and compared is decided between the two, so compile no policy around them: a
-        compiled one keeps nothing. Copies of the backbone are not compiled.
+        Which tokens can be reused is decided between the two, in plain Python. Do not compile the
+        whole policy instead: a compiled backbone keeps no tokens. Copies of the backbone are not
+        compiled.
 
         Args:
             **options: of ``torch.compile``.
         """
-        network = self.module
         if self.keeps_frames:
-            self._compiled = (
-                torch.compile(network.frame_encoder, **options),
-                torch.compile(network.encode_history, **options),
-            )
+            self._compiled = [ActingNetwork(trunk) for trunk in trunks_of(self.module).values()]
+            for network in self._compiled:
+                network.compile(**options)
 
     def clear_cache(self) -> None:
-        """Forgets what was kept while acting."""
-        if self._cache is not None:
-            self._cache.clear()
+        """Discards the tokens that acting mode keeps."""
+        for network in self._acting or ():
+            network.clear()
 
     def state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """As of any module. Forgets what was kept while acting, which is no part of it."""
+        """Returns the network's state dict, and discards the tokens that acting mode keeps."""
         self.clear_cache()
         return super().state_dict(*args, **kwargs)
 
-    @property
-    def keeps_frames(self) -> bool:
-        """Whether acting mode spares anything: there are a frame encoder and earlier frames."""
-        network = self.module
-        return (
-            isinstance(network, HistoryNetwork)
-            and network.frame_encoder is not None
-            and network.history > 1
-        )
-
-    def _make_cache(self) -> FrameCache | None:
-        network = self.module
-        if not self.keeps_frames:
-            return None
-        encode_newest = self._compiled[0] if self._compiled else None
-        return FrameCache(network.frame_encoder, len(network.observation_shape), encode_newest)
-
-    def _call_module(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
-        """Where TensorDictModule calls the network."""
-        if self.autocast is None:
-            return self._encode(tensors, **kwargs)
-        with self.computing(tensors[0].device):
-            features = self._encode(tensors, **kwargs)
-        # Heads and losses need all digits.
-        if isinstance(features, Tensor):
-            return features.float()
-        return tuple(feature.float() for feature in features)
-
     def computing(self, device: torch.device) -> AbstractContextManager[object]:
-        """The context in which matrix products are computed in the type of ``autocast``."""
+        """Returns the context in which matrix products have the dtype ``autocast``."""
         if self.autocast is None:
             return nullcontext()
         return torch.autocast(device.type, self.autocast)
 
+    def _make_acting(self) -> list[ActingNetwork] | None:
+        if not self.keeps_frames:
+            return None
+        if self._compiled is not None:
+            return [network.fresh() for network in self._compiled]
+        return [ActingNetwork(trunk) for trunk in trunks_of(self.module).values()]
+
+    def _call_module(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
+        """Calls the network; overrides the method of TensorDictModule that does."""
+        if self.autocast is None:
+            return self._encode(tensors, **kwargs)
+        with self.computing(tensors[0].device):
+            outputs = self._encode(tensors, **kwargs)
+        # Heads and losses need full precision.
+        if isinstance(outputs, Tensor):
+            return outputs.float()
+        return tuple(output.float() for output in outputs)
+
     def _encode(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
-        if torch.compiler.is_compiling() or self._cache is None:
+        if self.every_frame:
+            return self.module.every_frame(*tensors)
+        if self.is_recurrent:
+            return self._step(tensors)
+        if torch.compiler.is_compiling() or self._acting is None:
             return super()._call_module(tensors, **kwargs)
-        (history,) = tensors
-        self.module.check(history)
-        encode_history = self._compiled[1] if self._compiled else self.module.encode_history
-        return encode_history(self._cache(history))
+        outputs = tuple(network(*tensors) for network in self._acting)
+        return outputs[0] if len(outputs) == 1 else outputs
+
+    def _step(self, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Histories, state and is_init -> features and the next state."""
+        count = len(self.history_keys)
+        histories, is_init = tensors[:count], tensors[-1]
+        before = dict(zip(self.state_shapes, tensors[count:-1], strict=True))
+        features: list[Tensor] = []
+        after: dict[str, Tensor] = {}
+        for prefix, trunk in trunks_of(self.module).items():
+            own = {key: before[prefix + key] for key in _state_shapes(trunk)}
+            outputs, own = trunk.step(histories, own, is_init)
+            features.append(outputs)
+            after |= {prefix + key: value for key, value in own.items()}
+        return (*features, *(after[key] for key in self.state_shapes))
+
+    def _check_entries(self, tensordict: TensorDictBase) -> None:
+        for key in self.in_keys:
+            if tensordict.get(key, None) is None:
+                hint = (
+                    "add torchrl_tit.History to the environment (SequenceHistory for Decision "
+                    "Transformer), or name the key in in_keys"
+                )
+                if key not in self.history_keys:
+                    hint = "add backbone.make_transforms() to the environment, which supplies it"
+                raise KeyError(
+                    f"there is no {'history' if key in self.history_keys else 'entry'} under "
+                    f"{key!r}, only {sorted(map(str, tensordict.keys(True)))}: {hint}"
+                )
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_compiled": None}  # they are the original's
+        return {**super().__getstate__(), "_compiled": None}  # compiled code cannot be copied
+
+
+def trunks_of(network: nn.Module) -> dict[str, HistoryNetwork]:
+    """Returns the trunks of a network by the prefix of their state's keys; none of other modules.
+
+    Example:
+        >>> from torchrl_tit.networks import MLP
+        >>> list(trunks_of(MLP((4,))))
+        ['policy_', 'value_']
+    """
+    if isinstance(network, TwoTrunks):
+        return {"policy_": network.policy, "value_": network.value}
+    return {"": network} if isinstance(network, HistoryNetwork) else {}
+
+
+def _state_shapes(network: HistoryNetwork) -> dict[str, torch.Size]:
+    """Shapes of the state that a network carries from step to step."""
+    encoder = network.history_encoder
+    if network.carries_state and isinstance(encoder, RecurrentEncoder):
+        return encoder.state_shapes
+    return {}
+
+
+def _check_every_frame(network: nn.Module) -> None:
+    """Raises ValueError if the network cannot encode every frame of a window."""
+    encoder = network.history_encoder if isinstance(network, HistoryNetwork) else network
+    if not getattr(encoder, "encodes_every_frame", False):
+        raise ValueError(
+            f"every_frame=True, but {type(encoder).__name__} encodes the newest frame only: leave "
+            "it out, or use a decision-transformer"
+        )
+
+
+def _check_keys(
+    network: nn.Module,
+    trunks: dict[str, HistoryNetwork],
+    in_keys: Sequence[NestedKey],
+    out_keys: Sequence[NestedKey],
+) -> None:
+    """Raises ValueError if the number of keys is not that of the network's inputs and outputs."""
+    reads, writes = max(1, len(in_keys)), max(1, len(out_keys))
+    for trunk in trunks.values():
+        reads = len(trunk.frames) + len(trunk.history_encoder.context)
+        writes = len(trunks)
+    if len(in_keys) != reads or len(out_keys) != writes:
+        raise ValueError(
+            f"{type(network).__name__} has {reads} inputs and {writes} outputs, but in_keys is "
+            f"{list(in_keys)} and out_keys is {list(out_keys)}: name one key for each"
+        )

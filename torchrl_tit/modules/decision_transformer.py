@@ -1,6 +1,8 @@
-"""Decision Transformer's policy, and what its losses train."""
+"""Decision Transformer's head, its policy, and the module that its losses train."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 from tensordict import NestedKey
 from tensordict.nn import (
@@ -9,78 +11,172 @@ from tensordict.nn import (
     TensorDictModule,
     TensorDictSequential,
 )
-from torch import distributions
+from tensordict.utils import unravel_key
+from torch import Tensor, distributions, nn
 from torchrl.modules import OneHotCategorical, TanhNormal
 
-from torchrl_tit.modules.sequence_backbone import SequenceBackbone
-from torchrl_tit.networks import DecisionTransformer
+from torchrl_tit.layers.gaussian_head import GaussianHead
+from torchrl_tit.modules.backbone import Backbone
+from torchrl_tit.networks import HistoryNetwork
+
+ActionSpace = Literal["continuous", "gaussian", "discrete"]
+
+_ACTION_SPACES = ("continuous", "gaussian", "discrete")
 
 
-def make_dt_predictor(network: DecisionTransformer) -> TensorDictSequential:
-    """Builds what Decision Transformer's loss trains: the prediction of every step's action.
+class DTHead(nn.Module):
+    """Maps Decision Transformer's features to actions, or to the parameters of a distribution.
 
     Args:
-        network: the network.
-
-    Returns:
-        A module that reads a batch of :class:`~torchrl_tit.datasets.SequenceStorage` and writes
-        over its "action" the predicted ones, float [..., K, A]: actions within -1..1, or logits of
-        discrete ones. TorchRL's `DTLoss` takes it, and
-        :class:`~torchrl_tit.objectives.MaskedDTLoss`.
+        features_dim: size F of the features.
+        action_dim: entries A of a continuous action, or number A of discrete actions.
+        action_space: "continuous" actions are predicted within -1..1 by a tanh; "gaussian" ones
+            are drawn from a Gaussian that a tanh squashes, as in Online DT; "discrete" ones have
+            logits.
 
     Raises:
-        ValueError: if the network predicts distributions (``action_space="gaussian"``).
+        ValueError: if there is no such ``action_space``.
+        TypeError: in ``forward``, if the network read actions of another kind.
 
     Example:
         >>> import torch
-        >>> from torchrl.objectives import DTLoss
-        >>> loss = DTLoss(make_dt_predictor(DecisionTransformer((11,), 3)))
-        >>> loss.loss_mask_key = "mask"  # or padding counts
+        >>> DTHead(128, 3)(torch.randn(8, 20, 128)).shape
+        torch.Size([8, 20, 3])
     """
-    if network.config.action_space == "gaussian":
+
+    def __init__(
+        self, features_dim: int, action_dim: int, action_space: ActionSpace = "continuous"
+    ) -> None:
+        super().__init__()
+        if action_space not in _ACTION_SPACES:
+            raise ValueError(
+                f"unknown action_space {action_space!r}: choose one of {_ACTION_SPACES}"
+            )
+        self.action_space = action_space
+        self.layers: nn.Module
+        if action_space == "gaussian":
+            self.layers = GaussianHead(features_dim, action_dim)
+        else:
+            squash = nn.Tanh() if action_space == "continuous" else nn.Identity()
+            self.layers = nn.Sequential(nn.Linear(features_dim, action_dim), squash)
+
+    def forward(
+        self, features: Tensor, action: Tensor | None = None
+    ) -> Tensor | tuple[Tensor, Tensor]:
+        """Maps features to actions.
+
+        Args:
+            features: float [..., F].
+            action: the actions that the network read, to check that they are of this head's kind;
+                not checked where not given.
+
+        Returns:
+            float [..., A]: actions, or logits; of a Gaussian, its mean and standard deviation.
+        """
+        if action is not None:
+            discrete = not action.is_floating_point()
+            if discrete != (self.action_space == "discrete"):
+                given = "discrete" if discrete else "continuous"
+                raise TypeError(
+                    f"actions of {action.dtype} are {given}, but this head's are "
+                    f"{self.action_space}: set action_space={given!r}, or use other data"
+                )
+        return self.layers(features)
+
+
+def make_dt_backbone(
+    network: HistoryNetwork, *, group: NestedKey | None = None, every_frame: bool = False
+) -> Backbone:
+    """Builds the backbone that reads the entries of a window and writes "features".
+
+    Args:
+        network: a Decision Transformer of one observation.
+        group: the key under which "observation", "action", "return_to_go", "timestep" and "mask"
+            are, as of :class:`~torchrl_tit.transforms.SequenceHistory`; None for the top level, as
+            in batches of :class:`~torchrl_tit.datasets.SequenceStorage`.
+        every_frame: write the features of all steps, [..., K, F], not of the newest one, [..., F].
+
+    Example:
+        >>> from torchrl_tit.networks import DecisionTransformer
+        >>> make_dt_backbone(DecisionTransformer((11,), action_dim=3), group="sequence").in_keys[:2]
+        [('sequence', 'observation'), ('sequence', 'action')]
+    """
+    names = ["observation", *network.history_encoder.context]
+    in_keys = [name if group is None else unravel_key((group, name)) for name in names]
+    return Backbone(network, in_keys, every_frame=every_frame)
+
+
+def make_dt_predictor(network: HistoryNetwork, head: DTHead) -> TensorDictSequential:
+    """Builds the module that Decision Transformer's loss trains: it predicts every step's action.
+
+    Args:
+        network: a Decision Transformer.
+        head: its head.
+
+    Returns:
+        A module that reads a batch of :class:`~torchrl_tit.datasets.SequenceStorage` and replaces
+        its "action" with the predicted ones, float [..., K, A]: actions within -1..1, or logits of
+        discrete ones. For TorchRL's `DTLoss` and
+        :class:`~torchrl_tit.objectives.MaskedDTLoss`.
+
+    Raises:
+        ValueError: if the head predicts distributions (``action_space="gaussian"``).
+
+    Example:
+        >>> from torchrl.objectives import DTLoss
+        >>> from torchrl_tit.networks import DecisionTransformer
+        >>> network = DecisionTransformer((11,), action_dim=3)
+        >>> loss = DTLoss(make_dt_predictor(network, DTHead(network.features_dim, 3)))
+        >>> loss.loss_mask_key = "mask"  # otherwise padding counts
+    """
+    if head.action_space == "gaussian":
         raise ValueError(
-            "this network's actions are gaussian, which have no error, but a likelihood: train "
-            "make_dt_actor(network, group=None, newest=False) on TorchRL's OnlineDTLoss, or set "
-            "action_space='continuous'"
+            "this head's actions are gaussian: they have a likelihood, not an error. Train "
+            "make_dt_actor(network, head, group=None, every_frame=True) with TorchRL's "
+            "OnlineDTLoss, or set action_space='continuous'"
         )
+    backbone = make_dt_backbone(network, every_frame=True)
     return TensorDictSequential(
-        SequenceBackbone(network), TensorDictModule(network.action_head, ["features"], ["action"])
+        backbone, TensorDictModule(head, ["features", "action"], ["action"])
     )
 
 
 def make_dt_actor(
-    network: DecisionTransformer,
+    network: HistoryNetwork,
+    head: DTHead,
     *,
     group: NestedKey | None = "sequence",
     action_key: NestedKey = "action",
     one_hot: bool = False,
-    newest: bool = True,
+    every_frame: bool = False,
 ) -> TensorDictSequential:
-    """Builds Decision Transformer's policy: histories in, the newest step's action out.
+    """Builds Decision Transformer's policy: it reads a window and writes the newest step's action.
 
     Args:
-        network: the network, as it is trained: weights are shared, not copied.
+        network: a Decision Transformer; its weights are shared with other modules, not copied.
+        head: its head.
         group: the key under which :class:`~torchrl_tit.transforms.SequenceHistory` writes.
         action_key: where the action goes.
-        one_hot: whether discrete actions are one-hot, as the environment's spec says.
-        newest: whether only the newest step's action is asked for; for losses on distributions,
-            such as TorchRL's `OnlineDTLoss`, that of every step is, with ``group=None``.
+        one_hot: whether the environment's discrete actions are one-hot.
+        every_frame: write the actions of all steps, for losses on distributions such as TorchRL's
+            `OnlineDTLoss`; usually with ``group=None``.
 
     Returns:
-        A policy for any TorchRL collector. It writes continuous actions, float [..., A], as they
-        are predicted; those of a network with ``action_space="gaussian"`` and discrete ones, int64
-        [...] or one-hot [..., A], are the most likely ones, or drawn, as TorchRL's exploration type
-        says. With ``newest=False``, all shapes are [..., K, A] or [..., K].
+        A policy for any TorchRL collector. A continuous head's actions, float [..., A], are written
+        as predicted; gaussian ones and discrete ones, int64 [...] or one-hot [..., A], are the most
+        likely ones or drawn, as TorchRL's exploration type says. With ``every_frame``, shapes are
+        [..., K, A] or [..., K].
 
     Example:
         >>> from torchrl.collectors import Collector
         >>> from torchrl.envs import Compose, TargetReturn, TransformedEnv
         >>> from torchrl_tit.envs import make_env
+        >>> from torchrl_tit.networks import DecisionTransformer
         >>> from torchrl_tit.transforms import SequenceHistory
-        >>> network = DecisionTransformer((4,), 2, action_space="discrete", context=5)
-        >>> transforms = Compose(TargetReturn(500.0), SequenceHistory(context=5))
+        >>> network = DecisionTransformer((4,), action_dim=2, num_frames=5)
+        >>> policy = make_dt_actor(network, DTHead(network.features_dim, 2, "discrete"))
+        >>> transforms = Compose(TargetReturn(500.0), SequenceHistory(num_frames=5))
         >>> env = TransformedEnv(make_env("CartPole-v1", 8), transforms)
-        >>> policy = make_dt_actor(network)
         >>> collector = Collector(
         ...     env,
         ...     policy,
@@ -92,20 +188,19 @@ def make_dt_actor(
         [torch.Size([8, 10])]
         >>> collector.shutdown()
     """
-    backbone = SequenceBackbone(network, group=group, newest=newest)
-    if network.config.action_space == "continuous":
-        return TensorDictSequential(
-            backbone, TensorDictModule(network.action_head, ["features"], [action_key])
-        )
+    backbone = make_dt_backbone(network, group=group, every_frame=every_frame)
+    head_keys = ["features", backbone.in_keys[1]]  # the latter to check the kind of actions
+    if head.action_space == "continuous":
+        return TensorDictSequential(backbone, TensorDictModule(head, head_keys, [action_key]))
     distribution: type[distributions.Distribution]
-    if network.config.action_space == "gaussian":
+    if head.action_space == "gaussian":
         parameters, distribution = ["loc", "scale"], TanhNormal
     else:
         parameters = ["logits"]
         distribution = OneHotCategorical if one_hot else distributions.Categorical
     return ProbabilisticTensorDictSequential(
         backbone,
-        TensorDictModule(network.action_head, ["features"], parameters),
+        TensorDictModule(head, head_keys, parameters),
         ProbabilisticTensorDictModule(
             in_keys=parameters, out_keys=[action_key], distribution_class=distribution
         ),

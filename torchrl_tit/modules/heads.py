@@ -1,4 +1,4 @@
-"""Actor and value heads: one linear layer on the features, as TorchRL modules."""
+"""Policy and value heads: one linear layer on the features, as TorchRL modules."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl.modules import (
     ValueOperator,
 )
 
-from torchrl_tit.networks import init_orthogonal_
+from torchrl_tit.layers import init_orthogonal_
 
 
 def make_actor(
@@ -23,19 +23,19 @@ def make_actor(
     in_key: NestedKey = "features",
     action_key: NestedKey = "action",
 ) -> ProbabilisticActor:
-    """Builds the policy head that fits an action space.
+    """Builds the policy head for an action space.
 
-    Discrete actions get a categorical distribution over the logits; continuous ones a diagonal
-    Gaussian with a state-independent log standard deviation that starts at 0, not squashed or
-    clipped (clip on the way to the environment). The layer starts orthogonal with gain 0.01, as in
+    Discrete actions have a categorical distribution. Continuous ones have a diagonal Gaussian whose
+    log standard deviation is a parameter that starts at 0; they are neither squashed nor clipped,
+    so the environment should clip them. The weights start orthogonal with gain 0.01, as in
     Stable-Baselines3, which trained the paper's agents.
 
     Args:
         features_dim: size of the features.
         action_spec: spec of one action without batch dimensions: ``Categorical``, ``OneHot`` or a
             one-dimensional float spec.
-        in_key: where the features [..., F] stand.
-        action_key: where to write the action: int64 [...], bool [..., n], or float [..., n].
+        in_key: key of the features [..., F].
+        action_key: key of the action: int64 [...], bool [..., n], or float [..., n].
 
     Returns:
         A :class:`~torchrl.modules.ProbabilisticActor` that writes the action and its
@@ -43,7 +43,7 @@ def make_actor(
         action under ``ExplorationType.DETERMINISTIC``.
 
     Raises:
-        ValueError: if the action space is neither.
+        ValueError: for any other action space.
 
     Example:
         >>> import torch
@@ -73,7 +73,7 @@ def make_actor(
             "spec, or a float spec of one dimension, without batch dimensions"
         )
     init_orthogonal_(network, gain=0.01)
-    # Checks of logits and samples at every step cost a third of the head's time.
+    # Validating logits and samples takes a third of the head's time at each step.
     checks = {} if distribution is OneHotCategorical else {"validate_args": False}
     return ProbabilisticActor(
         TensorDictModule(network, in_keys=[in_key], out_keys=parameters),
@@ -91,7 +91,7 @@ def make_value(features_dim: int, *, in_key: NestedKey = "features") -> ValueOpe
 
     Args:
         features_dim: size of the features.
-        in_key: where the features [..., F] stand.
+        in_key: key of the features [..., F].
 
     Returns:
         A :class:`~torchrl.modules.ValueOperator` that writes ``"state_value"``, float [..., 1].

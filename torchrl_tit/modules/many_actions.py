@@ -1,4 +1,4 @@
-"""Values of several actions in one state."""
+"""A Q network that evaluates several actions in each state."""
 
 from __future__ import annotations
 
@@ -7,18 +7,19 @@ from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 
 
 class ManyActions(TensorDictModuleBase):
-    """Lets a Q network value several actions in every state.
+    """Makes a Q network evaluate several actions in each state.
 
-    Of a sequence of modules, those before the first that reads the action (a backbone, say) run
-    once a state; what they wrote is then repeated for each action.
+    In a sequence of modules, those before the first one that reads the action (a backbone, for
+    example) run once a state, and their outputs are expanded over the actions. TorchRL's losses
+    repeat the state instead, and run the whole network once an action.
 
     Args:
-        qvalue_network: Reads state entries [*batch, ...] and an action [*batch, A], and writes
-            a value [*batch, 1].
-        action_key: Where the action stands.
+        qvalue_network: reads entries of the state [*batch, ...] and an action [*batch, A], and
+            writes a value [*batch, 1].
+        action_key: key of the action.
 
     Raises:
-        ValueError: If the network does not read the action.
+        ValueError: if the network does not read the action.
 
     Example:
         >>> import torch
@@ -46,7 +47,7 @@ class ManyActions(TensorDictModuleBase):
         self.out_keys = list(qvalue_network.out_keys)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the values; [*batch, A] -> [*batch, 1], or [*batch, m, A] -> [*batch, m, 1]."""
+        """Writes the values: [*batch, A] -> [*batch, 1], or [*batch, m, A] -> [*batch, m, 1]."""
         action = tensordict.get(self.action_key)
         network = self.qvalue_network
         if action.ndim == tensordict.ndim + 1:
@@ -57,8 +58,8 @@ class ManyActions(TensorDictModuleBase):
         for module in modules[:first]:
             states = module(states)
         shape = (*tensordict.shape, action.shape[-2])
-        # One batch dimension: products of more are views of products of one, and writing into
-        # a view (a ReLU in place) would cost autograd a copy.
+        # One batch dimension: linear layers return views of flat products for several, and autograd
+        # copies a view that is written in place, as by an in-place ReLU.
         each = states.unsqueeze(-1).expand(shape).reshape(-1)
         each.set(self.action_key, action.flatten(0, -2))
         for module in modules[first:]:

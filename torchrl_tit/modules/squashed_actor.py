@@ -1,4 +1,4 @@
-"""The policy head of offline RL and SAC: a Gaussian squashed into the bounds of the actions."""
+"""The policy head of CQL and SAC: a Gaussian that is squashed into the action bounds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from torchrl_tit.networks import ClampedGaussianHead
+from torchrl_tit.layers.gaussian_head import ClampedGaussianHead
 
 
 def make_squashed_actor(
@@ -19,15 +19,15 @@ def make_squashed_actor(
 ) -> ProbabilisticActor:
     """Builds a tanh-squashed Gaussian policy head on features.
 
-    Two linear layers give the mean and the logarithm of the standard deviation, clamped to -20..2;
-    tanh and the bounds squash what is drawn (Haarnoja et al., "Soft Actor-Critic", arXiv
-    1801.01290, appendix C). The deterministic action is the squashed mean.
+    Two linear layers compute the mean and the logarithm of the standard deviation, clamped to
+    -20..2. Samples are squashed by tanh and scaled to the bounds (Haarnoja et al., "Soft
+    Actor-Critic", arXiv 1801.01290, appendix C). The deterministic action is the squashed mean.
 
     Args:
         features_dim: size of the features.
         action_spec: a ``Bounded`` spec of one action, without batch dimensions.
-        in_key: where the features [..., F] stand.
-        action_key: where to write the action, float [..., A].
+        in_key: key of the features [..., F].
+        action_key: key of the action, float [..., A].
 
     Returns:
         A :class:`~torchrl.modules.ProbabilisticActor` that follows TorchRL's exploration type.

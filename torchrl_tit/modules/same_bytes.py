@@ -1,4 +1,4 @@
-"""Comparing frames exactly and cheaply: as bytes, eight at a time."""
+"""Compares frames exactly and quickly: as bytes, eight at a time."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ _WORDS = (torch.int64, torch.int32, torch.int16, torch.uint8)
 
 
 def as_words(frames: Tensor) -> Tensor:
-    """Views the bytes of frames as integers, as wide as fit.
+    """Views the bytes of frames as the widest integers that fit.
 
-    Two frames have the same words if and only if they have the same bytes, so NaN equals itself and
-    0.0 differs from -0.0. Images compare several times as fast as their bytes one by one.
+    Two frames are equal as integers if and only if they have the same bytes: NaN equals itself, and
+    0.0 differs from -0.0. Comparing images is several times as fast as byte by byte.
 
     Args:
-        frames: [..., entries] of any dtype; copied only if they are not contiguous.
+        frames: [..., entries] of any dtype; copied only if not contiguous or not aligned.
 
     Returns:
         int64 [..., entries * itemsize / 8], or narrower integers where 8 does not divide.
@@ -35,13 +35,13 @@ def as_words(frames: Tensor) -> Tensor:
 
 
 def all_same(tensor: Tensor, other: Tensor) -> bool:
-    """Tells whether two tensors of the same shape and type have the same values.
+    """Returns whether two tensors of the same shape and dtype have the same values.
 
-    On a CPU it asks NumPy, which compares strided arrays several times as fast as ``torch.equal``.
+    On a CPU, NumPy compares strided arrays several times as fast as ``torch.equal``.
 
     Args:
-        tensor: of any shape and type that NumPy has.
-        other: of the same.
+        tensor: of any shape, and a dtype that NumPy has too.
+        other: of the same shape and dtype.
 
     Example:
         >>> all_same(torch.arange(3), torch.arange(3))
@@ -53,5 +53,5 @@ def all_same(tensor: Tensor, other: Tensor) -> bool:
 
 
 def same_frames(words: Tensor, others: Tensor) -> Tensor:
-    """Tells which of two times as many frames have the same bytes: [..., words] -> bool [...]."""
+    """Compares frames pair by pair: int [..., words] each -> bool [...]."""
     return (words == others).all(-1)
