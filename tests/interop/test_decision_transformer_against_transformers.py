@@ -18,7 +18,9 @@ from tests.interop.test_official_decision_transformer import make_inputs
 from tests.networks.reference import randomize
 from tests.networks.reference_decision_transformer import ReferenceDT
 from torchrl_tit.interop import from_official
-from torchrl_tit.networks import DecisionTransformer
+from torchrl_tit.interop.decision_transformer import ActionPredictor
+
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
 logging.getLogger("transformers").setLevel(logging.ERROR)
 
@@ -93,19 +95,22 @@ def test_outputs_and_gradients_are_equal(kind: str, settings: dict[str, Any], st
         "activation": settings.get("activation", "relu"),
         "context": steps,
     }
-    network = from_official(config, reference.official_state_dict()).eval()
-    assert isinstance(network, DecisionTransformer)
-    assert len(network.blocks) == settings.get("layers", 1)
+    network = from_official(config, reference.official_state_dict()).double().eval()
+    reference.double()
+    assert isinstance(network, ActionPredictor)
+    blocks = network.network.history_encoder.get_submodule("blocks")
+    assert isinstance(blocks, nn.ModuleList)
+    assert len(blocks) == settings.get("layers", 1)
     states, *others, mask = make_inputs(4, steps, 11, 3, 50)
     valid = mask.bool()
     results = []
     for module in (network, reference):
         given = states.clone().requires_grad_()
         actions = module(given, *others, mask)[valid]
-        probe = torch.randn(actions.shape, generator=torch.Generator().manual_seed(0))
+        probe = torch.randn(actions.shape, generator=torch.Generator().manual_seed(0)).double()
         (actions * probe).sum().backward()
         results.append((actions.detach(), given.grad))
     (ours, our_gradient), (theirs, their_gradient) = results
     assert theirs.std() > 0.1
-    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-5)
-    torch.testing.assert_close(our_gradient, their_gradient, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(ours, theirs, rtol=0, atol=1e-9)
+    torch.testing.assert_close(our_gradient, their_gradient, rtol=1e-9, atol=1e-9)

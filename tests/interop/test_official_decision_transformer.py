@@ -12,19 +12,25 @@ from tests.networks.reference import randomize
 from tests.networks.reference_decision_transformer import ReferenceDT
 from torchrl_tit.interop import from_official
 
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
+
 KINDS = pytest.mark.parametrize("kind", ["dt", "dt_tit"])
 
 
 def make_inputs(batch: int, steps: int, state: int, action: int, limit: int) -> list[Tensor]:
-    """States, actions, returns, time steps and mask, with left padding in all rows but one."""
+    """States, actions, returns, time steps and mask, with left padding in all rows but one.
+
+    In double precision, so that what must be equal is equal on any processor.
+    """
     generator = torch.Generator().manual_seed(1)
     mask = torch.ones(batch, steps, dtype=torch.int64)
     for row in range(1, batch):
         mask[row, : min(row, steps - 1)] = 0
     return [
-        torch.randn(batch, steps, state, generator=generator),
-        torch.randn(batch, steps, action, generator=generator),
-        torch.randn(batch, steps, 1, generator=generator),
+        *(
+            torch.randn(batch, steps, size, generator=generator, dtype=torch.float64)
+            for size in (state, action, 1)
+        ),
         torch.randint(0, limit, (batch, steps), generator=generator),
         mask,
     ]
@@ -58,18 +64,16 @@ def test_equals_the_reference(kind: str, settings: dict[str, Any], steps: int) -
     }
     derived = {"state_dim", "act_dim", "embed_dim", "n_layer", "n_inner", "context", "max_ep_len"}
     short = {name: value for name, value in config.items() if name not in derived}
+    prefixed = {f"model.{name}": value for name, value in reference.state_dict().items()}
+    networks = from_official(config, reference.state_dict()), from_official(short, prefixed)
     inputs = make_inputs(4, steps, 11, 3, config["max_ep_len"])
-    expected = reference(*inputs)
+    expected = reference.double()(*inputs)
     valid = inputs[-1].bool()
     assert expected[valid].std() > 0.1
-    prefixed = {f"model.{name}": value for name, value in reference.state_dict().items()}
-    for network in (
-        from_official(config, reference.state_dict()).eval(),
-        from_official(short, prefixed).eval(),
-    ):
-        actions = network(*inputs)
+    for network in networks:
+        actions = network.double().eval()(*inputs)
         assert actions.isfinite().all()
-        torch.testing.assert_close(actions[valid], expected[valid], rtol=0, atol=1e-5)
+        torch.testing.assert_close(actions[valid], expected[valid], rtol=0, atol=1e-9)
 
 
 @KINDS
@@ -79,30 +83,31 @@ def test_a_missing_attention_bias_is_said(kind: str) -> None:
     params = {n: p for n, p in reference.state_dict().items() if not n.endswith("attn.bias")}
     names = [f"transformer.h.{layer}.attn.c_attn.bias" for layer in range(2)]
     with pytest.warns(UserWarning, match=", ".join(names)) as warnings:
-        network = from_official({"kind": kind}, params).eval()
+        network = from_official({"kind": kind}, params).double().eval()
     assert warnings[0].filename == __file__
     for name in names:
         torch.nn.init.zeros_(reference.get_parameter(name))
     inputs = make_inputs(1, 5, 11, 3, 50)
-    torch.testing.assert_close(network(*inputs), reference(*inputs), rtol=0, atol=1e-5)
+    expected = reference.double()(*inputs)
+    torch.testing.assert_close(network(*inputs), expected, rtol=0, atol=1e-9)
 
 
 @KINDS
 def test_what_does_not_fit_is_named(kind: str) -> None:
     params = ReferenceDT(11, 3, tit=kind == "dt_tit").state_dict()
     for entry, name in {
-        "act_dim": "action_head.0.weight",
+        "act_dim": "head.layers.0.weight",
         "n_inner": "ffn.0.weight",
         "max_ep_len": "timestep_embedding.weight",
         "embed_dim": "embedding_norm.weight",
     }.items():
         with pytest.raises(ValueError, match=rf"{name} has shape"):
             from_official({"kind": kind, entry: 24}, params)
-    with pytest.raises(ValueError, match=r"missing blocks\.1\."):
+    with pytest.raises(ValueError, match=r"missing network\.history_encoder\.blocks\.1\."):
         from_official({"kind": kind, "n_layer": 2}, params)
     with pytest.raises(ValueError, match="unknown activation 'softplus'"):
         from_official({"kind": kind, "activation": "softplus"}, params)
-    with pytest.raises(ValueError, match="context of 60 steps is longer than max_ep_len 50"):
+    with pytest.raises(ValueError, match="num_frames 60 is more than max_ep_len 50"):
         from_official({"kind": kind, "context": 60}, params)
     with pytest.raises(ValueError, match=r"there is no parameter"):
         from_official({"kind": kind}, {})

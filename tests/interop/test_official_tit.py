@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 from tests.networks.reference import ReferenceTIT, randomize
+from tests.numerics import assert_near
 from torchrl_tit.interop import from_official
+
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
 BASE: dict[str, Any] = {
     "patch_size": 1,
@@ -68,8 +71,8 @@ def make(variant: str, case: str, **changes: Any) -> tuple[dict[str, Any], Refer
     settings = {name: value for name, value in settings.items() if "dropout" not in name}
     if variant == "vanilla":
         settings["share_blocks"] = False  # the authors' Vanilla_TIT ignores the setting
-    history, observation_shape = (1, shape) if array else (shape[0], shape[1:])
-    reference = ReferenceTIT(observation_shape, history, variant=variant, **settings)
+    num_frames, observation_shape = (1, shape) if array else (shape[0], shape[1:])
+    reference = ReferenceTIT(observation_shape, num_frames, variant=variant, **settings)
     randomize(reference)
     return config, reference.eval()
 
@@ -82,11 +85,11 @@ def assert_same(network: torch.nn.Module, reference: ReferenceTIT, shape: Any) -
     x = torch.randn(3, *shape, requires_grad=True)
     twin = x.detach().clone().requires_grad_()
     features, expected = network.eval()(x), reference(twin[:, None] if len(shape) == 1 else twin)
-    torch.testing.assert_close(features, expected, rtol=0, atol=1e-5)
+    assert_near(features, expected)
     probe = torch.randn_like(features)
     (features * probe).sum().backward()
     (expected * probe).sum().backward()
-    torch.testing.assert_close(x.grad, twin.grad, rtol=0, atol=1e-4)
+    assert_near(x.grad, twin.grad)
 
 
 @both_variants
@@ -106,9 +109,9 @@ def test_bytes_are_divided_and_floats_are_not(variant: str) -> None:
     network = from_official(config, parameters(reference)).eval()
     image = torch.randint(0, 256, (3, 4, 12, 12), dtype=torch.uint8)
     expected = reference(image / 255)
-    torch.testing.assert_close(network(image), expected, rtol=0, atol=1e-5)
-    torch.testing.assert_close(network(image / 255), expected, rtol=0, atol=1e-5)
-    torch.testing.assert_close(network(image.float()), reference(image.float()), atol=1e-4, rtol=0)
+    assert_near(network(image), expected)
+    assert_near(network(image / 255), expected)
+    assert_near(network(image.double()), reference(image.double()))
 
 
 @both_variants
@@ -161,7 +164,7 @@ def test_missing_left_over_and_misshaped_parameters(variant: str) -> None:
     assert "missing head.3.bias" in error(**{"ln2.bias": None})
     assert "no parameter 'class_token_encoding'" in error(class_token_encoding=None)
     message = error(**{f"{block}.ln1.bias": torch.zeros(16)})
-    assert "left over frame_encoder.blocks.7.norm1.bias" in message
+    assert "left over frame_encoders.observation.blocks.7.norm1.bias" in message
     assert "unknown parameter 'log_std'" in error(log_std=torch.zeros(2))
     message = error(**{"head.0.weight": torch.zeros(12, 17)})
     assert "head.1.weight has shape (12, 17) instead of (12, " in message
@@ -185,7 +188,9 @@ def test_config_that_does_not_fit_the_parameters(variant: str, setting: str) -> 
 def test_shared_and_separate_blocks_at_once() -> None:
     config, shared = make("enhanced", "array", share_blocks=True)
     _, separate = make("enhanced", "array")
-    with pytest.raises(ValueError, match=r"2 parameters for frame_encoder\.blocks\.0\.norm1\.bias"):
+    with pytest.raises(
+        ValueError, match=r"2 parameters for frame_encoders\.observation\.blocks\.0\.norm1\.bias"
+    ):
         from_official(config, parameters(shared) | parameters(separate))
 
 

@@ -37,7 +37,7 @@ def _from_official(
         num_layers=num_layers,
     )
     renaming = [
-        (rf"linear{index + 1}_{trunk}\.0\.(.*)", rf"{trunk}.layers.{index}.\1")
+        (rf"linear{index + 1}_{trunk}\.0\.(.*)", rf"{trunk}.history_encoder.layers.{index}.\1")
         for index in range(num_layers)
         for trunk in ("policy", "value")
     ]

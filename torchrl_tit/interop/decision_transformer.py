@@ -11,31 +11,81 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_tit.interop.weights import count_layers, load_renamed, size_of, strip_prefix
-from torchrl_tit.networks import DecisionTransformer, DecisionTransformerConfig
+from torchrl_tit.modules import DTHead
+from torchrl_tit.networks import DTTIT, DecisionTransformer, HistoryNetwork
 
+
+class ActionPredictor(nn.Module):
+    """Decision Transformer and its head, called as the authors' network is.
+
+    Args:
+        network: predicts features.
+        head: makes actions of them.
+    """
+
+    def __init__(self, network: HistoryNetwork, head: DTHead) -> None:
+        super().__init__()
+        self.network = network
+        self.head = head
+
+    def forward(
+        self,
+        states: Tensor,
+        actions: Tensor,
+        returns_to_go: Tensor,
+        timesteps: Tensor,
+        attention_mask: Tensor | None = None,
+    ) -> Tensor:
+        """Predicts the action of every step from what came before it.
+
+        Args:
+            states: float [..., K, S].
+            actions: float [..., K, A].
+            returns_to_go: float [..., K, 1].
+            timesteps: int64 [..., K].
+            attention_mask: [..., K], 0 or False at padding.
+
+        Returns:
+            float [..., K, A].
+        """
+        inputs = [states, actions, returns_to_go, timesteps]
+        if attention_mask is not None:
+            inputs.append(attention_mask)
+        features = self.network.every_frame(*inputs)
+        return self.head(features)
+
+
+_HISTORY = "network.history_encoder"
+_FRAME = "network.frame_encoders.observation"
 _RENAMING = [
-    (r"embed_return\.(.*)", r"return_embedding.\1"),
-    (r"embed_action\.(.*)", r"action_embedding.\1"),
-    (r"embed_timestep\.(.*)", r"timestep_embedding.\1"),
-    (r"embed_ln\.(.*)", r"embedding_norm.\1"),
-    (r"transformer\.h\.(\d+)\.ln_(\d)\.(.*)", r"blocks.\1.norm\2.\3"),
-    (r"transformer\.h\.(\d+)\.attn\.c_attn\.(.*)", r"blocks.\1.attention.in_proj_\2"),
-    (r"transformer\.h\.(\d+)\.attn\.c_proj\.(.*)", r"blocks.\1.attention.out_proj.\2"),
-    (r"transformer\.h\.(\d+)\.mlp\.c_fc\.(.*)", r"blocks.\1.ffn.0.\2"),
-    (r"transformer\.h\.(\d+)\.mlp\.c_proj\.(.*)", r"blocks.\1.ffn.2.\2"),
-    (r"transformer\.ln_f\.(.*)", r"norm.\1"),
-    (r"predict_action\.0\.(.*)", r"action_head.0.\1"),
+    (r"embed_return\.(.*)", rf"{_HISTORY}.return_embedding.\1"),
+    (r"embed_action\.(.*)", rf"{_HISTORY}.action_embedding.\1"),
+    (r"embed_timestep\.(.*)", rf"{_HISTORY}.timestep_embedding.\1"),
+    (r"embed_ln\.(.*)", rf"{_HISTORY}.embedding_norm.\1"),
+    (r"transformer\.h\.(\d+)\.ln_(\d)\.(.*)", rf"{_HISTORY}.blocks.\1.norm\2.\3"),
+    (
+        r"transformer\.h\.(\d+)\.attn\.c_attn\.(.*)",
+        rf"{_HISTORY}.blocks.\1.attention.in_proj_\2",
+    ),
+    (
+        r"transformer\.h\.(\d+)\.attn\.c_proj\.(.*)",
+        rf"{_HISTORY}.blocks.\1.attention.out_proj.\2",
+    ),
+    (r"transformer\.h\.(\d+)\.mlp\.c_fc\.(.*)", rf"{_HISTORY}.blocks.\1.ffn.0.\2"),
+    (r"transformer\.h\.(\d+)\.mlp\.c_proj\.(.*)", rf"{_HISTORY}.blocks.\1.ffn.2.\2"),
+    (r"transformer\.ln_f\.(.*)", rf"{_HISTORY}.norm.\1"),
+    (r"predict_action\.0\.(.*)", r"head.layers.0.\1"),
 ]
-_LINEAR = [(r"embed_state\.(.*)", r"state_encoder.linear.\1")]
+_LINEAR = [(r"embed_state\.(.*)", rf"{_FRAME}.linear.\1")]
 _INNER = [
-    (r"obs_patch_embed\.weight", "state_encoder.patch_embedding.weight"),
-    (r"class_token_encoding", "state_encoder.class_token"),
-    (r"obs_patch_pos_encoding", "state_encoder.positions"),
-    (r"inner_blocks\.(\d+)\.ln(\d)\.(.*)", r"state_encoder.blocks.\1.norm\2.\3"),
-    (r"inner_blocks\.(\d+)\.(.*)", r"state_encoder.blocks.\1.\2"),
+    (r"obs_patch_embed\.weight", f"{_FRAME}.patch_embedding.weight"),
+    (r"class_token_encoding", f"{_FRAME}.class_token"),
+    (r"obs_patch_pos_encoding", f"{_FRAME}.positions"),
+    (r"inner_blocks\.(\d+)\.ln(\d)\.(.*)", rf"{_FRAME}.blocks.\1.norm\2.\3"),
+    (r"inner_blocks\.(\d+)\.(.*)", rf"{_FRAME}.blocks.\1.\2"),
 ]
-# What the authors' network holds and does not use: predictions of states and returns that are not
-# trained, token and position embeddings of GPT-2, and causal masks.
+# Weights of the authors' network that it does not use: predictions of states and returns that are
+# not trained, token and position embeddings of GPT-2, and causal masks.
 _UNUSED = re.compile(
     r"predict_(state|return)\..*|transformer\.w[tp]e\..*|.*\.attn\.(masked_)?bias|.*mask.*"
 )
@@ -48,7 +98,7 @@ def dt_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) ->
     """Builds Decision Transformer; see :func:`~torchrl_tit.interop.from_official`."""
     params = _prepare(params)
     size = config.get("state_dim", size_of(params, "embed_state.weight", axis=1))
-    return _build(config, params, size, {"state_encoder": "linear"}, _LINEAR)
+    return _build(DecisionTransformer, config, params, size, {}, _LINEAR)
 
 
 def dt_tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
@@ -57,7 +107,6 @@ def dt_tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]
     width = size_of(params, "obs_patch_embed.weight")
     patch_size = size_of(params, "obs_patch_embed.weight", axis=-1)
     hyperparameters = {
-        "state_encoder": "inner_transformer",
         "patch_size": patch_size,
         "num_blocks_inner": count_layers(params, r"inner_blocks\.(\d+)\..*"),
         "num_heads_inner": config.get("num_heads_inner", 1),
@@ -65,33 +114,36 @@ def dt_tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]
         "activation_inner": _activation(config.get("activation_inner", "relu")),
         "position_encoding": "obs_patch_pos_encoding" in params,
     }
-    return _build(config, params, config.get("state_dim", patch_size), hyperparameters, _INNER)
+    size = config.get("state_dim", patch_size)
+    return _build(DTTIT, config, params, size, hyperparameters, _INNER)
 
 
 def _build(
+    network_class: type[DecisionTransformer] | type[DTTIT],
     config: Mapping[str, Any],
     params: Mapping[str, Tensor],
     state_dim: int,
     hyperparameters: Mapping[str, Any],
     renaming: list[tuple[str, str]],
-) -> DecisionTransformer:
+) -> ActionPredictor:
     embed_dim = config.get("embed_dim", size_of(params, "embed_ln.weight"))
     max_ep_len = config.get("max_ep_len", size_of(params, "embed_timestep.weight"))
-    context = config.get("context", min(DecisionTransformerConfig.context, max_ep_len))
-    network = DecisionTransformer(
+    action_dim = config.get("act_dim", size_of(params, "predict_action.0.weight"))
+    network = network_class(
         (state_dim,),
-        config.get("act_dim", size_of(params, "predict_action.0.weight")),
+        action_dim=action_dim,
+        num_frames=config.get("context", min(20, max_ep_len)),
         embed_dim=embed_dim,
         num_blocks=config.get("n_layer", count_layers(params, r"transformer\.h\.(\d+)\..*")),
         num_heads=config.get("n_head", 1),
         ffn_dim=config.get("n_inner", size_of(params, "transformer.h.0.mlp.c_fc.bias")),
         activation=_activation(config.get("activation", "relu")),
         max_ep_len=max_ep_len,
-        context=context,
         **hyperparameters,
     )
-    load_renamed(network, params, [*_RENAMING, *renaming])
-    return network
+    predictor = ActionPredictor(network, DTHead(embed_dim, action_dim))
+    load_renamed(predictor, params, [*_RENAMING, *renaming])
+    return predictor
 
 
 def _prepare(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -106,8 +158,9 @@ def _prepare(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
     ]
     if missing:
         warnings.warn(
-            f"the parameters have no {', '.join(missing)}: zeros are taken instead, which is right "
-            'only for untrained weights. Perhaps a filter for causal masks ("attn.bias") took them',
+            f"the parameters have no {', '.join(missing)}: zeros are used instead, which is right "
+            'only for untrained weights. A filter for causal masks ("attn.bias") may have removed '
+            "them",
             stacklevel=4,
         )
     for name in missing:

@@ -7,6 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from torchrl_tit import settings
 from torchrl_tit.interop.weights import (
     Renaming,
     count_layers,
@@ -14,7 +15,7 @@ from torchrl_tit.interop.weights import (
     size_of,
     strip_prefix,
 )
-from torchrl_tit.networks import Catformer, ResNet
+from torchrl_tit.networks import HistoryNetwork, ResNet
 
 
 def _rename_torso(torso: str) -> Renaming:
@@ -27,9 +28,9 @@ def _rename_torso(torso: str) -> Renaming:
 def resnet_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
     """Builds ResNet; see :func:`~torchrl_tit.interop.from_official`."""
     params = strip_prefix(params, "resnet.0.weight")
-    history, *shape = config["observation_shape"]
+    num_frames, *shape = config["observation_shape"]
     features_dim = config.get("features_dim", size_of(params, "linear.0.weight"))
-    network = ResNet(shape, history, features_dim=features_dim)
+    network = ResNet(shape, num_frames, features_dim=features_dim)
     renaming = [*_rename_torso("history_encoder.torso"), (r"linear\.0\.(.*)", r"head.0.\1")]
     load_renamed(network, params, renaming)
     return network
@@ -44,16 +45,19 @@ def catformer_from_official(config: Mapping[str, Any], params: Mapping[str, Tens
     embed_dim = config.get("embed_dim", size_of(params, "catformer.obs_embedding.weight"))
     hidden_dim = size_of(params, "catformer.layer1_ffn_layer.ffn.0.weight")
     attention_dim = size_of(params, "catformer.layer0_attention_layer.attention.out_proj.weight", 1)
-    history, *shape = config["observation_shape"]
-    network = Catformer(
-        shape,
-        history,
-        embed_dim=embed_dim,
-        num_blocks=num_blocks,
-        num_heads=config.get("num_heads", 5),
-        attention_expansion=attention_dim // embed_dim,
-        ffn_expansion=hidden_dim // embed_dim,
-        features_dim=config.get("features_dim", size_of(params, "head.0.weight")),
+    num_frames, *shape = config["observation_shape"]
+    features_dim = config.get("features_dim", size_of(params, "head.0.weight"))
+    network = HistoryNetwork(
+        settings.ResNetFrames(embed_dim=embed_dim),
+        settings.Catformer(
+            num_blocks=num_blocks,
+            num_heads=config.get("num_heads", 5),
+            attention_expansion=attention_dim // embed_dim,
+            ffn_expansion=hidden_dim // embed_dim,
+        ),
+        observation_shape=shape,
+        num_frames=num_frames,  # the authors' may read one frame, which our recipes refuse
+        head=settings.Head(features_dim=features_dim, activation="relu"),
     )
     layers = []
     for index in range(num_blocks):
@@ -70,8 +74,8 @@ def catformer_from_official(config: Mapping[str, Any], params: Mapping[str, Tens
             (rf"{ffn}\.ffn\.2\.(.*)", rf"history_encoder.ffns.{index}.3.\1"),
         ]
     renaming = [
-        *_rename_torso("frame_encoder.torso"),
-        (r"catformer\.obs_embedding\.(.*)", r"frame_encoder.linear.\1"),
+        *_rename_torso("frame_encoders.observation.torso"),
+        (r"catformer\.obs_embedding\.(.*)", r"frame_encoders.observation.linear.\1"),
         (r"catformer\.obs_pos_encoding", "history_encoder.positions"),
         *layers,
         (r"ln1\.(.*)", r"head.0.\1"),

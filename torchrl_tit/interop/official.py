@@ -36,13 +36,13 @@ def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Modul
               ``features_dim``, ``embed_dim``, ``num_heads_inner``, ``num_heads_outer``,
               ``activation_inner``, ``activation_outer``, ``activation_head``,
               ``ffn_expansion_inner``, ``ffn_expansion_outer``, ``position_encoding``, and dropout
-              probabilities where there are any (``attention_dropout_inner``, ...); whether blocks
-              are shared is told by the parameters;
+              probabilities where there are any (``attention_dropout_inner``, ...); the
+              parameters show whether blocks are shared;
             - ``"resnet"`` and ``"catformer"``, with ``observation_shape`` (K, H, W), and for
-              Catformer ``num_heads`` where there are not 5;
+              Catformer ``num_heads`` if not 5;
             - ``"ofenet"`` and ``"d2rl"``;
-            - ``"dt"`` and ``"dt_tit"``, with ``n_head`` (and ``num_heads_inner``) where there is
-              not one head, ``activation`` where it is not relu, and ``context``.
+            - ``"dt"`` and ``"dt_tit"``, with ``n_head`` (and ``num_heads_inner``) if not 1,
+              ``activation`` if not relu, and ``context``, the number K of steps.
 
             Sizes that the parameters tell (``features_dim``, ``hidden_dim``, ``embed_dim``,
             ``n_layer``, ``n_inner``, ``max_ep_len``, ...) can be left out where the kind is not
@@ -53,9 +53,9 @@ def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Modul
     Returns:
         A module that takes what the authors' takes: arrays [B, D] without a history axis, images
         [B, K, H, W]; floats are taken as they are (the authors divide images by 255 before the
-        network), only uint8 is divided by 255. ``"ofenet"`` and ``"d2rl"`` put out features for
+        network), only uint8 is divided by 255. ``"ofenet"`` and ``"d2rl"`` return features for
         policy and value. The ``"dt"`` kinds are called with states, actions, returns_to_go,
-        timesteps and attention_mask, and put out the actions.
+        timesteps and attention_mask, and return the actions.
 
     Raises:
         ValueError: if the kind is not known, an entry is missing, or parameters are missing, left

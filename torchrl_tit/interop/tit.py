@@ -8,7 +8,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from torchrl_tit.interop.weights import load_renamed, strip_prefix
-from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig, VanillaTIT, VanillaTITConfig
+from torchrl_tit.networks import EnhancedTIT, VanillaTIT
 
 _REQUIRED = (
     "patch_size",
@@ -32,15 +32,15 @@ _OPTIONAL = (
 )
 
 _RENAMING = [
-    (r"obs_patch_embed\.weight", "frame_encoder.patch_embedding.weight"),
-    (r"class_token_encoding", "frame_encoder.class_token"),
-    (r"obs_patch_pos_encoding", "frame_encoder.positions"),
+    (r"obs_patch_embed\.weight", "frame_encoders.observation.patch_embedding.weight"),
+    (r"class_token_encoding", "frame_encoders.observation.class_token"),
+    (r"obs_patch_pos_encoding", "frame_encoders.observation.positions"),
     # Enhanced_TIT keeps pairs of blocks (one pair where they are shared), Vanilla_TIT two lists.
-    (r"blocks\.(\d+)\.inner_Transformer_block\.(.*)", r"frame_encoder.blocks.\1.\2"),
+    (r"blocks\.(\d+)\.inner_Transformer_block\.(.*)", r"frame_encoders.observation.blocks.\1.\2"),
     (r"blocks\.(\d+)\.outer_Transformer_block\.(.*)", r"history_encoder.blocks.\1.\2"),
-    (r"block\.inner_Transformer_block\.(.*)", r"frame_encoder.blocks.0.\1"),
+    (r"block\.inner_Transformer_block\.(.*)", r"frame_encoders.observation.blocks.0.\1"),
     (r"block\.outer_Transformer_block\.(.*)", r"history_encoder.blocks.0.\1"),
-    (r"inner_blocks\.(\d+)\.(.*)", r"frame_encoder.blocks.\1.\2"),
+    (r"inner_blocks\.(\d+)\.(.*)", r"frame_encoders.observation.blocks.\1.\2"),
     (r"outer_blocks\.(\d+)\.(.*)", r"history_encoder.blocks.\1.\2"),
     (r"ln1\.(.*)", r"head.0.\1"),
     (r"head\.0\.(.*)", r"head.1.\1"),
@@ -50,21 +50,19 @@ _RENAMING = [
 
 def tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
     """Builds Vanilla_TIT or Enhanced_TIT; see :func:`~torchrl_tit.interop.from_official`."""
-    config_class = _choose(config, "variant", vanilla=VanillaTITConfig, enhanced=EnhancedTITConfig)
+    network_class = _choose(config, "variant", vanilla=VanillaTIT, enhanced=EnhancedTIT)
     hyperparameters = {name: config[name] for name in _REQUIRED}
     hyperparameters |= {name: config[name] for name in _OPTIONAL if name in config}
     params = strip_prefix(params, "class_token_encoding")
     # The authors share blocks in Enhanced_TIT only: their Vanilla_TIT ignores the setting.
-    shared = any(name.startswith("block.") for name in params)
-    hyperparameters["share_blocks"] = shared
+    hyperparameters["share_blocks"] = any(name.startswith("block.") for name in params)
     # The authors' causal masks are parameters too; ours are not.
     params = {n.replace(".ln", ".norm"): p for n, p in params.items() if "attention_mask" not in n}
 
     array = _choose(config, "observation", array=True, image=False)
     shape = tuple(config["observation_shape"])
-    history, shape = (1, shape) if array else (shape[0], shape[1:])
-    network_class = VanillaTIT if config["variant"] == "vanilla" else EnhancedTIT
-    network = network_class(shape, history, config_class(**hyperparameters))
+    num_frames, shape = (1, shape) if array else (shape[0], shape[1:])
+    network = network_class(shape, num_frames, **hyperparameters)
     load_renamed(network, params, _RENAMING)
     # The authors' arrays have no history axis.
     return nn.Sequential(nn.Unflatten(-1, (1, *shape)), network) if array else network
