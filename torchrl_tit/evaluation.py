@@ -1,4 +1,4 @@
-"""Returns of a policy over whole episodes, as the paper measures them."""
+"""Returns of a policy over whole episodes, as measured in the paper."""
 
 import random
 from collections.abc import Callable, Iterator
@@ -24,31 +24,30 @@ def evaluate(
     shrink: bool = False,
     deterministic: bool = True,
 ) -> Tensor:
-    """Plays whole episodes with a policy that learns nothing from them.
+    """Plays whole episodes with a policy, without training it.
 
-    Episode i starts from the seed ``seed + i``, in an environment of its own, so the same policy
-    gets the same returns whatever the number of environments. As many episodes as there are
-    environments run side by side, until the last of them ends: which episodes count does not depend
-    on how long they take. In Atari (:class:`~torchrl_tit.envs.AtariEnv`) an episode is a whole
-    game with all of its points, however many lives it takes. Training goes on afterwards as if
-    nothing had been evaluated: the policy gets its training mode back, and the global random
-    generators of PyTorch, NumPy and Python their states.
+    Episode i is seeded with ``seed + i``, so the returns do not depend on the number of
+    environments. Episodes run side by side, one in each environment, until the last one ends: long
+    episodes count as much as short ones. For Atari (:class:`~torchrl_tit.envs.AtariEnv`) an episode
+    is a whole game with all of its points and lives. Evaluation does not affect training: it
+    restores the policy's training mode and the states of the global random generators of PyTorch,
+    NumPy and Python.
 
     Args:
         env: An environment of any batch size, whose `reset` takes a seed as those of
-            :func:`~torchrl_tit.envs.make_env` and TorchRL's `GymWrapper` do, and which pays the
-            task's own rewards, not clipped ones. Its episodes are cut off by a reset. Or a function
-            that makes one from the number of environments; it is called with ``episodes``, and what
-            it made is closed at the end.
-        policy: Writes the action into the tensordict it is given. It acts in evaluation mode.
+            :func:`~torchrl_tit.envs.make_env` and TorchRL's `GymWrapper` do, and whose rewards are
+            the task's own, not clipped. It is reset, which ends its current episodes. Or a function
+            that makes an environment, given the number of copies: it is called with ``episodes``,
+            and the environment is closed at the end.
+        policy: Writes the action into the tensordict. It acts in evaluation mode.
         episodes: Number of episodes.
         seed: Seed of the first episode.
-        reward_key: Where the reward stands in "next".
-        shrink: Whether the policy is asked only about the environments whose episode still counts,
-            which saves time where episodes differ in length. It must take batches of any size, and
-            keep no state of its own from step to step.
-        deterministic: Whether the distribution's deterministic action is taken (argmax, or the
-            mean), instead of one that is drawn.
+        reward_key: Key of the reward in "next".
+        shrink: Whether the policy is called only for environments whose first episode is still
+            running, which saves time if episodes differ in length. The policy must accept batches
+            of any size and keep no state from step to step.
+        deterministic: Whether to take the distribution's deterministic action (its mode or mean)
+            instead of a sample.
 
     Returns:
         The undiscounted return of each episode; float64 [episodes], on the environment's device.
@@ -87,7 +86,7 @@ def _play_all(
     reward_key: NestedKey,
     shrink: bool,
 ) -> Tensor:
-    """The return of each episode; as many run at once as there are environments; [episodes]."""
+    """Returns the return of each episode, [episodes]; one runs in each environment at a time."""
     starts = range(seed, seed + episodes, env.batch_size.numel())
     returns = [_play(env, policy, start, reward_key, shrink) for start in starts]
     return torch.cat(returns)[:episodes]
@@ -100,7 +99,7 @@ def _play(
     reward_key: NestedKey,
     shrink: bool,
 ) -> Tensor:
-    """The return of one episode in each of the environments; float64 [N]."""
+    """Returns the return of one episode in each environment, float64 [N]."""
     tensordict = env.reset(seed=seed)
     returns = torch.zeros(env.batch_size.numel(), dtype=torch.float64, device=env.device)
     playing = torch.ones_like(returns, dtype=torch.bool)
@@ -108,7 +107,7 @@ def _play(
         acted = _act(policy, tensordict, playing) if shrink else policy(tensordict)
         step, tensordict = env.step_and_maybe_reset(acted)
         outcome = step["next"]
-        # An environment whose episode has ended plays on, but nothing of that counts.
+        # An environment whose episode has ended starts another one, which does not count.
         game_over = outcome.get("game_over", None)
         if game_over is None:
             returns += outcome[reward_key].flatten() * playing
@@ -122,7 +121,7 @@ def _play(
 def _act(
     policy: Callable[[TensorDictBase], TensorDictBase], tensordict: TensorDictBase, playing: Tensor
 ) -> TensorDictBase:
-    """Asks the policy about some environments; the others go on as copies of one of these."""
+    """Calls the policy for the environments still playing; the others get a copy of an action."""
     if playing.all():
         return policy(tensordict)
     rows = playing.nonzero().squeeze(-1)
@@ -133,14 +132,14 @@ def _act(
 
 
 def finished_returns(batch: TensorDictBase) -> Tensor:
-    """Picks the returns of the episodes, or of the whole Atari games, that ended in a batch.
+    """Returns the returns of the episodes, or of the whole Atari games, that ended in a batch.
 
     Args:
-        batch: Steps of :func:`~torchrl_tit.envs.make_env`'s environments, as a collector hands them
-            over; any shape.
+        batch: Steps of environments of :func:`~torchrl_tit.envs.make_env`, as a collector returns
+            them; any shape.
 
     Returns:
-        The undiscounted return of each, in the task's own rewards; [episodes].
+        The undiscounted return of each episode, in the task's own rewards; [episodes].
 
     Example:
         >>> from torchrl_tit.envs import make_env
@@ -159,7 +158,7 @@ def finished_returns(batch: TensorDictBase) -> Tensor:
 def _acting(
     policy: Callable[[TensorDictBase], TensorDictBase], seed: int, deterministic: bool
 ) -> Iterator[None]:
-    """Actions without gradients, and everything as it was before at the end."""
+    """Acts without gradients, and restores all modes and random generators at the end."""
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     modules = list(policy.modules()) if isinstance(policy, nn.Module) else []
     modes = [module.training for module in modules]
@@ -172,7 +171,7 @@ def _acting(
             set_exploration_type(exploration),
             acting(policy),  # encodes the newest frames only
         ):
-            # A policy that draws numbers draws the same ones each time.
+            # A policy that samples actions samples the same ones each time.
             torch.manual_seed(seed)
             if isinstance(policy, nn.Module):
                 policy.eval()

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic writes: files that are complete or not there."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 
 
 def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file so that a reader sees the old content or all of the new, never a part.
+    """Write a file atomically: readers see the old content or the new, never a part of it.
 
-    The bytes go to a hidden file beside the target, are forced to the disk, and take the target's
-    name in one rename. Where anything fails (a full disk, say) the hidden file is removed and what
-    was at `path` is still there.
+    The bytes go to a hidden file next to the target, are flushed to the disk, and take the target's
+    name in one rename. If anything fails (a full disk, say), the hidden file is removed and the old
+    content stays at `path`.
 
     Args:
         path: The file to write; its folder must exist.
@@ -50,11 +50,11 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
-    """Write a UTF-8 text file whole or not at all, see :func:`write_bytes_atomic`.
+    """Write a UTF-8 text file atomically, see :func:`write_bytes_atomic`.
 
     Args:
         path: The file to write; its folder must exist.
-        text: All of its new content; line ends are written as they are.
+        text: All of its new content; line endings are kept.
 
     Raises:
         FileNotFoundError: There is no such folder.
@@ -73,16 +73,16 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
 
 @contextlib.contextmanager
 def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Let something be made under a hidden name, which takes its own name once it is whole.
+    """Make a file or folder under a hidden name, and rename it when it is complete.
 
     Args:
-        path: The file or folder to make, where none is yet; its parent folder must exist.
+        path: The file or folder to make, which must not exist yet; its parent folder must exist.
 
     Yields:
-        The hidden name beside it, to make the file or folder under.
+        The hidden name next to it, under which to make the file or folder.
 
     Raises:
-        FileExistsError: There is one already; it stays as it is.
+        FileExistsError: It exists already; it is left unchanged.
         FileNotFoundError: There is no such parent folder.
         OSError: It could not be written.
 
@@ -106,7 +106,7 @@ def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
         yield hidden
         for made in [hidden, *hidden.rglob("*")]:
             (fsync_directory if made.is_dir() else fsync_file)(made)
-        if path.exists():  # made by someone else in the meantime
+        if path.exists():  # another process made it in the meantime
             raise FileExistsError(f"{path} exists already; choose another name or delete it.")
         os.replace(hidden, path)
     except BaseException:  # Ctrl-C as well must leave nothing behind
@@ -118,7 +118,7 @@ def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def fsync_file(path: str | os.PathLike[str]) -> None:
-    """Force a file's content to the disk.
+    """Flush a file's content to the disk.
 
     Args:
         path: An existing file.
@@ -131,7 +131,7 @@ def fsync_file(path: str | os.PathLike[str]) -> None:
         >>> with tempfile.NamedTemporaryFile() as file:
         ...     fsync_file(file.name)
     """
-    # Windows only lets a file be flushed that is open for writing.
+    # Windows only flushes files that are open for writing.
     descriptor = os.open(path, os.O_RDWR)
     try:
         os.fsync(descriptor)
@@ -140,7 +140,7 @@ def fsync_file(path: str | os.PathLike[str]) -> None:
 
 
 def fsync_directory(path: str | os.PathLike[str]) -> None:
-    """Force a folder's list of names to the disk, so that a rename outlives a power cut.
+    """Flush a folder's list of names to the disk, so that a rename survives a power failure.
 
     Args:
         path: An existing folder.
@@ -162,6 +162,6 @@ def fsync_directory(path: str | os.PathLike[str]) -> None:
 
 
 def _check_folder(path: Path) -> None:
-    """Names the file and its folder, where the error of the hidden file would name only that."""
+    """Raise an error that names the file and its folder, not the hidden file."""
     if not path.absolute().parent.is_dir():
         raise FileNotFoundError(f"{path} cannot be written: there is no folder {path.parent}")

@@ -56,15 +56,15 @@ def assert_same_frames(history, frames):
     [("Breakout", 3, 350), ("MsPacman", 2, 700), ("Pong", 1, 1100), ("SpaceInvaders", 2, 700)],
 )
 def test_equals_stable_baselines3(task, num_envs, steps):
-    env = make_env(f"ALE/{task}-v5", num_envs, history=4, padding="constant")
-    assert isinstance(env, AtariEnv)
-    assert isinstance(env._env, AtariGames)
+    env = make_env(f"ALE/{task}-v5", num_envs, num_frames=4, padding="constant")
+    assert isinstance(env.base_env, AtariEnv)
+    assert isinstance(env.base_env._env, AtariGames)
     wrapped = [Wrapped(task, seed) for seed in range(num_envs)]
     root, begins = env.reset(seed=0), torch.ones(num_envs, 1, dtype=torch.bool)
     torch.manual_seed(0)
     for _ in range(steps):
         for i in begins.flatten().nonzero().flatten():
-            wrapped[i].begin(int(env._env._noops[i]))
+            wrapped[i].begin(int(env.base_env._env._noops[i]))
         for i in range(num_envs):
             assert_same_frames(root["history"][i], wrapped[i].frames)
         step, root = env.step_and_maybe_reset(env.rand_action(root))
@@ -84,7 +84,7 @@ def test_equals_stable_baselines3(task, num_envs, steps):
 @pytest.fixture(scope="module")
 def breakout():
     """Two games of Breakout. With the paddle kept left a life is lost in 23 steps, always."""
-    env = make_env("ALE/Breakout-v5", 2, history=2)
+    env = make_env("ALE/Breakout-v5", 2, num_frames=2)
     yield env
     env.close()
 
@@ -115,7 +115,7 @@ def test_five_lives_are_a_game(breakout):
         rewards = steps["reward"][i, :first_game].sum()
         assert steps["game_return"][i, first_game - 1] == rewards
     assert steps["game_return"].max() > 0
-    # The return goes on over lost lives and begins again with each game; an episode's with both.
+    # A game's return continues after a lost life and starts anew with a game; an episode's always.
     lost = steps["done"] & ~steps["game_over"]
     assert torch.equal(roots["game_return"][lost], steps["game_return"][lost])
     assert not roots["game_return"][steps["game_over"]].any()
@@ -153,7 +153,7 @@ def test_a_seed_of_32_bits(breakout):
 
 def test_only_a_full_reset_begins_new_games(breakout):
     play(breakout, 22, LEFT)
-    lives = breakout._env._lives
+    lives = breakout.base_env._env._lives
     root = breakout.rand_action(play(breakout, 22, LEFT)[-1][1])
     assert breakout.step(root)["next", "terminated"].all()
     assert lives.tolist() == [4, 4]
@@ -164,7 +164,7 @@ def test_only_a_full_reset_begins_new_games(breakout):
 
 
 def test_contract():
-    env = make_env("ALE/Breakout-v5", 2, seed=0, history=3)
+    env = make_env("ALE/Breakout-v5", 2, seed=0, num_frames=3)
     check_env_specs(env)
     assert env.observation_spec["history"].shape == (2, 3, 84, 84)
     assert env.reset()["history"].dtype is torch.uint8
@@ -264,7 +264,7 @@ def test_pictures_of_the_games():
         small = torch.nn.functional.interpolate(grey[None, None], (84, 84), mode="area")[0, 0]
         assert np.corrcoef(small.flatten(), image[0].flatten())[0, 1] > 0.95
     games.close()
-    with pytest.raises(ValueError, match='render_mode="rgb_array" only'):
+    with pytest.raises(ValueError, match='only with render_mode="rgb_array"'):
         AtariGames("pong").render()
 
 
@@ -283,7 +283,7 @@ def test_bad_input():
 
 
 @pytest.mark.parametrize("name", ["PongNoFrameskip-v4", "Pong-v4"])
-def test_names_without_the_protocol_are_refused(name):
+def test_names_without_the_preprocessing_are_refused(name):
     gymnasium.register_envs(ale_py)
-    with pytest.raises(ValueError, match=f"{name}.*without the protocol.*'ALE/Pong-v5'"):
+    with pytest.raises(ValueError, match=f"{name}.*without the preprocessing.*'ALE/Pong-v5'"):
         make_env(name)

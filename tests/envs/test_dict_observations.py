@@ -61,9 +61,14 @@ def test_histories_of_each_key(env):
 
 def test_backbones_read_their_own_key(env):
     camera = EnhancedTIT(
-        observation_shape=(6, 8), history=4, patch_size=2, embed_dim=8, num_blocks=1, features_dim=5
+        observation_shape=(6, 8),
+        num_frames=4,
+        patch_size=2,
+        embed_dim=8,
+        num_blocks=1,
+        features_dim=5,
     )
-    joints = EnhancedTIT(observation_shape=(3,), history=2, embed_dim=8, features_dim=7)
+    joints = EnhancedTIT(observation_shape=(3,), num_frames=2, embed_dim=8, features_dim=7)
     policy = TensorDictSequential(
         Backbone(camera, in_keys=[SEEN], out_keys=["seen"]),
         Backbone(joints, in_keys=[FELT], out_keys=["felt"]),

@@ -19,7 +19,7 @@ from torchrl_tit.envs import make_env
     ],
 )
 def test_tasks(name, observation, action):
-    env = make_env(name, 2, history=3)
+    env = make_env(name, 2, num_frames=3)
     rollout = env.rollout(4)
     assert env.batch_size == (2,)
     assert rollout["observation"].shape == (2, 4, *observation)
@@ -84,8 +84,8 @@ def test_no_copies():
 
 
 def test_processes():
-    env = make_env("Pendulum-v1", 2, seed=0, history=3, vectorization_mode="async")
-    expected = make_env("Pendulum-v1", 2, seed=0, history=3)
+    env = make_env("Pendulum-v1", 2, seed=0, num_frames=3, vectorization_mode="async")
+    expected = make_env("Pendulum-v1", 2, seed=0, num_frames=3)
     assert torch.equal(env.reset()["history"], expected.reset()["history"])
     env.close()
 

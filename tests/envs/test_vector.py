@@ -1,4 +1,4 @@
-"""GymVectorEnv does what TorchRL's wrapper and transforms do, and keeps TorchRL's contract."""
+"""GymVectorEnv does what TorchRL's wrapper does, and keeps TorchRL's contract."""
 
 import gymnasium
 import numpy as np
@@ -9,12 +9,15 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict, assert_close
 from torchrl.collectors import Collector
 from torchrl.data import Unbounded
-from torchrl.envs import EnvBase, StepCounter, TransformedEnv
+from torchrl.envs import EnvBase, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.envs.reference import ImageTask, wrapped
 from tests.transforms.streams import assert_histories
 from torchrl_tit.envs import GymVectorEnv, make_env
+from torchrl_tit.transforms import History
+
+gymnasium.register("Image-v0", lambda **kwargs: ImageTask(**kwargs))
 
 WRITTEN = (
     "observation",
@@ -43,7 +46,7 @@ def actions(env, seed=0):
 
 
 def play(env, steps, step=None, extra=None):
-    """The steps one after the other: what each wrote, and what came next."""
+    """Returns each step and what came next."""
     step = step or env.step_and_maybe_reset
     root, chosen, written = env.reset(), actions(env), []
     for _ in range(steps):
@@ -64,7 +67,13 @@ def play(env, steps, step=None, extra=None):
 def test_equals_gym_wrapper_and_transforms(name, limit, num_envs, num_frames, padding):
     settings = {"max_episode_steps": limit}
     ours = make_env(
-        name, num_envs, seed=3, history=num_frames, padding=padding, clip_actions=False, **settings
+        name,
+        num_envs,
+        seed=3,
+        num_frames=num_frames,
+        padding=padding,
+        clip_actions=False,
+        **settings,
     )
     theirs = wrapped(name, num_envs, 3, num_frames, padding, **settings)
     ended = 0
@@ -83,12 +92,13 @@ def test_equals_gym_wrapper_and_transforms(name, limit, num_envs, num_frames, pa
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
 def test_specs_tell_the_truth(name, top, num_frames):
     for clip in (True, False):
-        check_env_specs(top(make_env(name, 2, history=num_frames, clip_actions=clip)))
-    check_env_specs(top(make_env(name, 1, history=num_frames, device="cpu")))
+        check_env_specs(top(make_env(name, 2, num_frames=num_frames, clip_actions=clip)))
+    check_env_specs(top(make_env(name, 1, num_frames=num_frames, device="cpu")))
 
 
-def test_short_cut_equals_the_general_way():
-    short, general = (make_env("CartPole-v1", 3, seed=0, history=3) for _ in range(2))
+@pytest.mark.parametrize("top", [lambda env: env, lambda env: env.append_transform(StepCounter())])
+def test_short_cut_equals_the_general_way(top):
+    short, general = (top(make_env("CartPole-v1", 3, seed=0, num_frames=3)) for _ in range(2))
     extra = torch.arange(3)
     for (step, root), (expected_step, expected_root) in zip(
         play(short, 60, extra=extra),
@@ -102,6 +112,28 @@ def test_short_cut_equals_the_general_way():
         assert root.get("extra") is not None
 
 
+class Third(Transform):
+    """Sends a third of the policy's action to the task."""
+
+    def __init__(self):
+        super().__init__(in_keys_inv=["action"], out_keys_inv=["action"])
+
+    def _inv_apply_transform(self, action):
+        return action / 3
+
+
+def test_transforms_with_an_inverse():
+    env = make_env("Pendulum-v1", 2, seed=0, clip_actions=False).append_transform(Third())
+    expected = make_env("Pendulum-v1", 2, seed=0, clip_actions=False)
+    root, expected_root = env.reset(), expected.reset()
+    for _ in range(5):
+        action = torch.rand(2, 1)
+        step, root = env.step_and_maybe_reset(root.set("action", 3 * action))
+        other, expected_root = expected.step_and_maybe_reset(expected_root.set("action", action))
+        assert torch.equal(step["action"], 3 * action)
+        torch.testing.assert_close(step["next", "observation"], other["next", "observation"])
+
+
 def test_keeps_what_the_policy_wrote_under_next():
     env = make_env("CartPole-v1", 2, seed=0)
     root = env.rand_action(env.reset())
@@ -113,25 +145,55 @@ def test_keeps_what_the_policy_wrote_under_next():
 
 @pytest.mark.parametrize("num_frames", [1, 3])
 def test_a_partial_reset_keeps_the_others(num_frames):
-    env = make_env("CartPole-v1", 3, seed=0, history=num_frames)
+    env = make_env("CartPole-v1", 3, seed=0, num_frames=num_frames)
     before = play(env, 5)[-1][1]
     request = before.clone().set("_reset", torch.tensor([[False], [True], [False]]))
-    after = env._reset(request)
-    for key in WRITTEN[:3]:
+    after = env.reset(request)
+    for key in ("observation", "history", "episode_reward"):
         assert torch.equal(after[key][[0, 2]], before[key][[0, 2]])
         assert not torch.equal(after[key][1], before[key][1])
 
 
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("num_frames", [1, 2, 8])
+@pytest.mark.parametrize(
+    ("name", "hide"), [("CartPole-v1", False), ("CartPole-v1", True), ("Image-v0", False)]
+)
+def test_histories_come_from_the_transform_alone(name, hide, num_frames, padding):
+    env = make_env(name, 3, seed=0, num_frames=num_frames, padding=padding, hide_velocities=hide)
+    written = {"observation", "reward", "terminated", "truncated", "done"}
+    assert isinstance(env.base_env, GymVectorEnv)
+    assert set(env.base_env.rollout(2)["next"].keys()) == written
+    assert sum(isinstance(transform, History) for transform in env.transform) == 1
+    torch.manual_seed(0)
+    assert_histories(env, num_frames, padding)
+    check_env_specs(env)
+    keys = {*written, "action", "history", "episode_reward"} - {"reward"}
+    assert set(env.rand_action(env.reset()).keys()) == keys
+
+
+@pytest.mark.parametrize("name", ["CartPole-v1", "Image-v0"])
+def test_returns_of_each_episode(name):
+    env = make_env(name, 3, seed=0)
+    returns = torch.zeros(3, 1)
+    for step, root in play(env, 60):
+        assert torch.equal(step["episode_reward"], returns)
+        returns = returns + step["next", "reward"]
+        assert torch.equal(step["next", "episode_reward"], returns)
+        returns = returns * ~step["next", "done"]
+        assert torch.equal(root["episode_reward"], returns)
+
+
 def test_transforms_on_top_see_the_same():
-    bare = make_env("CartPole-v1", 3, seed=0, history=3)
-    topped = TransformedEnv(make_env("CartPole-v1", 3, seed=0, history=3), StepCounter())
+    bare = make_env("CartPole-v1", 3, seed=0, num_frames=3)
+    topped = TransformedEnv(make_env("CartPole-v1", 3, seed=0, num_frames=3), StepCounter())
+    assert isinstance(topped.base_env, TransformedEnv)
     for (_, root), (_, expected) in zip(play(bare, 60), play(topped, 60), strict=True):
         assert_close(root.select(*WRITTEN[:3], "done"), expected.select(*WRITTEN[:3], "done"), 0, 0)
-    assert topped.base_env is topped.base_env.base_env
 
 
 def test_collector_cuts_whole_rollouts():
-    env = make_env("CartPole-v1", 2, seed=0, history=2)
+    env = make_env("CartPole-v1", 2, seed=0, num_frames=2)
     collector = Collector(
         env, frames_per_batch=80, total_frames=160, track_traj_ids=False, policy=env.rand_action
     )
@@ -145,17 +207,15 @@ def test_collector_cuts_whole_rollouts():
     assert not rollout["episode_reward"][:, 1:][~going].any()
 
 
-@pytest.mark.parametrize("padding", ["same", "constant"])
-def test_images_stay_uint8(padding):
-    env = vector(history=3, padding=padding)
+def test_images_stay_uint8():
+    env = vector()
     check_env_specs(env)
-    assert env.reset()["history"].dtype is torch.uint8
-    assert env.observation_spec["history"].shape == (3, 3, 2, 4, 5)
-    assert_histories(env, 3, padding)
+    assert env.reset()["observation"].dtype is torch.uint8
+    assert env.observation_spec["observation"].shape == (3, 2, 4, 5)
 
 
 def test_what_was_written_is_never_written_again():
-    env = make_env("CartPole-v1", 2, seed=0, history=3)
+    env = make_env("CartPole-v1", 2, seed=0, num_frames=3)
     root, kept = env.reset(), []
     for _ in range(30):
         step, root = env.step_and_maybe_reset(env.rand_action(root))
@@ -203,23 +263,22 @@ def test_a_fall_terminates_and_does_not_truncate():
     assert not last["truncated"].any()
 
 
-def test_state_dict_holds_history_and_return():
-    env = make_env("CartPole-v1", 2, seed=0, history=3)
-    play(env, 5)
-    other = make_env("CartPole-v1", 2, seed=1, history=3)
+def test_state_dict_holds_the_histories():
+    env = make_env("CartPole-v1", 2, seed=0, num_frames=3)
+    last = play(env, 5)[-1][1]
+    other = make_env("CartPole-v1", 2, seed=1, num_frames=3)
     other.load_state_dict(env.state_dict())
-    assert torch.equal(other.get_buffer("_history"), env.get_buffer("_history"))
-    assert torch.equal(other.get_buffer("_return"), env.get_buffer("_return"))
-    assert env.get_buffer("_return").any()
+    (saved,) = other.state_dict().values()
+    assert torch.equal(saved, last["history"])
 
 
 def test_refuses_what_it_cannot_do():
     with pytest.raises(ValueError, match=r"autoreset_mode=AutoresetMode.DISABLED, not .*SAME_STEP"):
         vector(mode=AutoresetMode.SAME_STEP)
     with pytest.raises(ValueError, match="num_frames must be at least 1, but is 0"):
-        vector(history=0)
+        make_env("CartPole-v1", num_frames=0)
     with pytest.raises(ValueError, match="padding must be one of"):
-        vector(padding="zeros")
+        make_env("CartPole-v1", padding="zeros")  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="Observations must be a Box, but are Discrete"):
         vector(lambda: gymnasium.make("FrozenLake-v1"))
 
@@ -240,7 +299,7 @@ def test_refuses_what_it_cannot_do():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu():
     ours, expected = (
-        make_env("Pendulum-v1", 3, seed=0, history=3, max_episode_steps=9, device=device)
+        make_env("Pendulum-v1", 3, seed=0, num_frames=3, max_episode_steps=9, device=device)
         for device in ("cuda", None)
     )
     check_env_specs(ours)

@@ -1,4 +1,4 @@
-"""Environments whose observations say where they come from, and what a history of them must be."""
+"""Environments with random observations, and the histories that they must have."""
 
 from collections import deque
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 
 
 class StreamEnv(EnvBase):
-    """Random observations, and episodes of random length in each of its environments."""
+    """Random observations, and episodes of random length in each copy."""
 
     def __init__(self, batch_size=(), shape=(3,), dtype=torch.float32, group=None, seed=0):
         super().__init__(batch_size=torch.Size(batch_size))
@@ -42,7 +42,7 @@ class StreamEnv(EnvBase):
 
 
 class ReferenceHistory:
-    """The last K observations of one environment, kept in the plainest way."""
+    """The last K observations of one environment, in a deque."""
 
     def __init__(self, num_frames: int, padding: str):
         self.frames: deque[torch.Tensor] = deque(maxlen=num_frames)
@@ -66,7 +66,7 @@ def assert_histories(
     observation: NestedKey = "observation",
     history: NestedKey = "history",
 ) -> None:
-    """Plays the environment [N] and compares every history it writes; fails if too little ended."""
+    """Plays the environment [N] and compares every history; fails if no episode ends on its own."""
     references = [ReferenceHistory(num_frames, padding) for _ in range(env.batch_size.numel())]
     root = env.reset()
     started: Iterable[bool] = [True] * len(references)
@@ -74,7 +74,7 @@ def assert_histories(
     for _ in range(steps):
         for i, (reference, fresh) in enumerate(zip(references, started, strict=True)):
             seen = root[observation][i]
-            # A history that goes on was checked as "next" of the step before.
+            # Within an episode, the history was checked as "next" of the step before.
             expected = reference.start(seen) if fresh else torch.stack(list(reference.frames))
             torch.testing.assert_close(root[history][i], expected, rtol=0, atol=0)
         step, root = env.step_and_maybe_reset(env.rand_action(root))

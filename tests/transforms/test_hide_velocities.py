@@ -44,7 +44,7 @@ def test_these_are_the_velocities(name):
 )
 def test_history_and_observation_are_those_of_the_whole_task_less_the_velocities(name, left):
     whole, hidden = (
-        make_env(name, 3, seed=0, history=4, hide_velocities=hide, max_episode_steps=13)
+        make_env(name, 3, seed=0, num_frames=4, hide_velocities=hide, max_episode_steps=13)
         for hide in (False, True)
     )
     check_env_specs(hidden)
@@ -80,7 +80,7 @@ def test_nested_keys_and_tensordicts():
 
 def test_can_be_saved():
     first, second = (
-        make_env("CartPole-v1", 2, seed=seed, history=3, hide_velocities=True) for seed in (0, 1)
+        make_env("CartPole-v1", 2, seed=seed, num_frames=3, hide_velocities=True) for seed in (0, 1)
     )
     assert can_save_env(first)
     root = first.rand_action(first.rollout(4)[:, -1]["next"])
@@ -90,13 +90,14 @@ def test_can_be_saved():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match=r"'Ant-v5' are velocities, only of CartPole, .*name the"):
+    with pytest.raises(
+        ValueError, match=r"'Ant-v5' are velocities, only of CartPole, .*use HideEntries"
+    ):
         HideVelocities("Ant-v5")
-    env = make_env(  # with one more entry at the front
-        "Hopper-v5", hide_velocities=True, exclude_current_positions_from_observation=False
-    )
-    with pytest.raises(ValueError, match=r"'Hopper-v5' has 11 entries, not 12; name"):
-        env.reset()
+    with pytest.raises(ValueError, match=r"'Hopper-v5' has 11 entries, not 12; use HideEntries"):
+        make_env(  # with one more entry at the front
+            "Hopper-v5", hide_velocities=True, exclude_current_positions_from_observation=False
+        )
     with pytest.raises(ValueError, match=r"hidden is \[1, 1\]"):
         HideEntries([1, 1])
     for hidden in ([4], [0, 1, 2, 3]):

@@ -2,10 +2,21 @@
 
 import pytest
 import torch
-from torchrl.envs import Compose, GymEnv, RewardSum, SerialEnv, TransformedEnv
+from tensordict import assert_close
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    GymEnv,
+    RewardSum,
+    SerialEnv,
+    TransformedEnv,
+    UnsqueezeTransform,
+)
 from torchrl.envs.utils import check_env_specs
 
 from tests.transforms.streams import StreamEnv, assert_histories
+from torchrl_tit.envs import make_env
 from torchrl_tit.transforms import History
 
 
@@ -70,9 +81,106 @@ def test_specs_tell_the_truth(num_frames):
 
 
 def test_one_frame_is_stored_nowhere():
-    history = History(1)
-    assert len(history) == 1
-    assert not list(history.buffers())
+    env = TransformedEnv(StreamEnv([2]), History(1))
+    env.rollout(3)
+    assert not env.state_dict()
+
+
+def test_is_torchrls_cat_frames_in_one_step():
+    """The same as CatFrames after UnsqueezeTransform, entry by entry and buffer by buffer."""
+    ours = TransformedEnv(StreamEnv([3]), History(4))
+    theirs = TransformedEnv(
+        StreamEnv([3]),
+        Compose(
+            UnsqueezeTransform(-2, in_keys=["observation"], out_keys=["history"]),
+            CatFrames(4, -2, in_keys=["history"]),
+        ),
+    )
+    assert isinstance(ours.transform, CatFrames)
+    rollouts = []
+    for env in (ours, theirs):
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(40, break_when_any_done=False))
+    assert_close(*rollouts, rtol=0, atol=0)
+    (buffer,), (expected,) = ours.state_dict().values(), theirs.state_dict().values()
+    assert torch.equal(buffer, expected)
+
+
+def test_a_new_environment_takes_the_state():
+    env, other = (TransformedEnv(StreamEnv([3], seed=seed), History(4)) for seed in (0, 1))
+    env.rollout(9, break_when_any_done=False)
+    (saved,) = env.state_dict().values()
+    assert saved.any()
+    other.load_state_dict(env.state_dict())
+    assert torch.equal(*[each.state_dict()["_cat_buffers_observation"] for each in (env, other)])
+
+
+def test_what_was_written_is_never_written_again():
+    env = TransformedEnv(StreamEnv([2]), History(3))
+    root, kept = env.reset(), []
+    for _ in range(30):
+        step, root = env.step_and_maybe_reset(env.rand_action(root))
+        kept.append((step, step.clone()))
+    for written, copy in kept:
+        assert_close(written, copy, rtol=0, atol=0)
+
+
+def test_moves_to_an_environment_of_another_size():
+    history = History(3)
+    TransformedEnv(StreamEnv([2]), history).rollout(4)
+    history.reset_parent()
+    assert_histories(TransformedEnv(StreamEnv([5]), history), 3, "same")
+
+
+def test_transforms_can_be_added_in_the_middle_of_an_episode():
+    env = TransformedEnv(StreamEnv([2]), History(3))
+    root = env.reset()
+    first = root["observation"]
+    env.append_transform(RewardSum())
+    step = env.step(env.rand_action(root.set("episode_reward", torch.zeros(2, 1))))["next"]
+    assert torch.equal(step["history"], torch.stack([first, first, step["observation"]], 1))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_moves_to_a_gpu():
+    env = TransformedEnv(make_env("CartPole-v1", 2, device="cuda").base_env, History(3))
+    assert env.reset()["history"].is_cuda
+    assert_histories(env, 3, "same")
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("num_frames", [1, 3])
+def test_stored_trajectories_get_the_same_histories(num_frames, padding):
+    env = TransformedEnv(StreamEnv([4]), History(num_frames, padding=padding))
+    rollout = env.rollout(30, break_when_any_done=False).refine_names(None, "time")
+    assert rollout["next", "done"].any()
+    stored = rollout.exclude("history")
+    again = History(num_frames, padding=padding)(stored)
+    assert torch.equal(again["history"], rollout["history"])
+
+
+def test_a_replay_buffer_makes_histories_of_observations_stored_once():
+    history = History(4)
+    env = TransformedEnv(StreamEnv([]), history)
+    rollout = env.rollout(50, break_when_any_done=False)
+    transform, sampler = history.make_rb_transform_and_sampler(
+        batch_size=64, traj_key=None, end_key=("next", "done"), strict_length=True
+    )
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(50), sampler=sampler, transform=transform, batch_size=64
+    )
+    buffer.extend(rollout.clone())
+    assert "history" not in buffer.storage[:].keys()  # noqa: SIM118 (a tensordict)
+    sample = buffer.sample()
+    whole = 0
+    for step in sample:
+        (t,) = (rollout["observation"] == step["observation"]).all(-1).nonzero().flatten()
+        begun = t - 3 < 0 or rollout["next", "done"][t - 3 : t].any()
+        if not begun:  # slices know nothing of what came before them
+            whole += 1
+            assert torch.equal(step["history"], rollout["history"][t])
+            assert torch.equal(step["next", "history"], rollout["next", "history"][t])
+    assert whole > 0
 
 
 def test_takes_one_key_as_a_name():
@@ -89,7 +197,7 @@ def test_takes_one_key_as_a_name():
         ({"num_frames": 2, "padding": "zeros"}, ValueError, "'same', 'constant', but is 'zeros'"),
         ({"num_frames": 2, "in_keys": ["a", "b"]}, ValueError, r"in_keys=\['a', 'b'\]"),
         ({"num_frames": 2, "in_keys": [], "out_keys": []}, ValueError, "at least one"),
-        ({"num_frames": 2, "out_keys": ["observation"]}, ValueError, "key of its own"),
+        ({"num_frames": 2, "out_keys": ["observation"]}, ValueError, "needs a key of its own"),
     ],
 )
 def test_wrong_arguments(arguments, error, words):

@@ -10,12 +10,12 @@ from torchrl_tit.envs import make_env
 from torchrl_tit.transforms import SequenceHistory
 
 
-def add_history(env, context, target=100.0, scale=10.0):
-    history = SequenceHistory(context, return_scale=scale)
+def add_history(env, num_frames, target=100.0, scale=10.0):
+    history = SequenceHistory(num_frames, return_scale=scale)
     return TransformedEnv(env, Compose(TargetReturn(target), history))
 
 
-def reference(steps, context, target, scale):
+def reference(steps, num_frames, target, scale):
     """The sequences of one environment's steps [T], one step after the other."""
     episode: list[tuple] = []
     sequences = []
@@ -24,9 +24,9 @@ def reference(steps, context, target, scale):
         actions = [action for _, action, _, _ in episode]
         rows = [(o, a, g) for (o, _, g, _), a in zip(episode, actions, strict=True)]
         rows.append((step["observation"], torch.zeros_like(step["action"]), to_go / scale))
-        first = max(0, len(rows) - context)
+        first = max(0, len(rows) - num_frames)
         rows = rows[first:]
-        missing = context - len(rows)
+        missing = num_frames - len(rows)
         observations = [torch.zeros_like(rows[0][0])] * missing + [o for o, _, _ in rows]
         taken = [torch.zeros_like(rows[0][1])] * missing + [a for _, a, _ in rows]
         sequences.append(
@@ -45,15 +45,15 @@ def reference(steps, context, target, scale):
     return sequences
 
 
-@pytest.mark.parametrize("context", [1, 2, 5])
+@pytest.mark.parametrize("num_frames", [1, 2, 5])
 @pytest.mark.parametrize("task", ["CartPole-v1", "Hopper-v5"])
-def test_equals_the_plain_reference(task, context):
-    env = add_history(make_env(task, 3, seed=0), context)
+def test_equals_the_plain_reference(task, num_frames):
+    env = add_history(make_env(task, 3, seed=0), num_frames)
     torch.manual_seed(0)
     steps = env.rollout(60, break_when_any_done=False)
     assert (steps["next", "done"].sum(1) > 1).all()  # environments are reset one by one
     for one in steps.unbind(0):
-        for t, expected in enumerate(reference(one, context, 100.0, 10.0)):
+        for t, expected in enumerate(reference(one, num_frames, 100.0, 10.0)):
             for name, value in expected.items():
                 actual = one["sequence", name][t]
                 actual = actual.squeeze(-1) if name == "return_to_go" else actual
@@ -91,8 +91,8 @@ def test_specs_say_what_is_written(make):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"context": 0}, "context must be at least 1, but is 0"),
-        ({"return_scale": -1.0}, "return_scale must be positive, but is -1.0"),
+        ({"num_frames": 0}, "num_frames must be at least 1, not 0"),
+        ({"return_scale": -1.0}, "return_scale must be positive, not -1.0"),
     ],
 )
 def test_wrong_settings(settings, message):
@@ -105,11 +105,15 @@ def test_wrong_settings(settings, message):
 def test_a_target_is_needed(ask, late):
     transforms = [SequenceHistory(3), TargetReturn(1.0)] if late else [SequenceHistory(3)]
     env = TransformedEnv(make_env("CartPole-v1"), Compose(*transforms))
-    with pytest.raises(KeyError, match=r"no 'target_return'.*put TorchRL's TargetReturn before it"):
+    with pytest.raises(
+        KeyError, match=r"no 'target_return'.*put TorchRL's TargetReturn before Seq"
+    ):
         env.observation_spec if ask == "observation_spec" else env.reset()
 
 
 def test_an_action_of_another_shape_is_refused():
     env = add_history(GymEnv("CartPole-v1"), 3)  # which takes one-hot actions
-    with pytest.raises(ValueError, match=r"action of shape \[\], but .* has \[2\].*one-hot"):
+    with pytest.raises(
+        ValueError, match=r"action of shape \[\], but the environment takes \[2\].*one-hot"
+    ):
         env.rollout(3, lambda td: td.set("action", torch.tensor(1)))

@@ -9,12 +9,14 @@ from torchrl_tit.envs.factory import (
     make_games,
     time_limit,
 )
+from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
 
 __all__ = [
     "AtariEnv",
     "AtariGames",
     "GymVectorEnv",
+    "TransformedVectorEnv",
     "VectorizationMode",
     "is_atari",
     "make_env",

@@ -11,40 +11,39 @@ from torchrl_tit.envs.vector import GymVectorEnv
 
 
 class AtariEnv(GymVectorEnv):
-    """N copies of an Atari game, with history and returns, as one TorchRL environment.
+    """N copies of an Atari game as one TorchRL environment.
 
-    Beyond the entries of :class:`~torchrl_tit.envs.GymVectorEnv`, of which ``observation`` is uint8
-    [N, 84, 84], it writes
+    In addition to the entries of :class:`~torchrl_tit.envs.GymVectorEnv`, of which ``observation``
+    is uint8 [N, 84, 84], it writes
 
     ======================  ==================  ===================================================
     key                     shape               what it is
     ======================  ==================  ===================================================
-    ``game_over``           [N, 1]              bool, the game has ended, not only a life
+    ``game_over``           [N, 1]              bool, the game ended, not only a life
     ``game_return``         [N, 1]              float32, all points of the game so far
     ======================  ==================  ===================================================
 
-    An episode is one life: its end is a termination, and the next one goes on with the same game,
-    see :class:`~torchrl_tit.envs.AtariGames`. ``game_return`` also counts points that fall between
-    two lives, so it can be more than the sum of the episodes' rewards. Rewards are the game's own:
-    for training, let TorchRL's `SignTransform` clip them. A reset that does not say which copies
-    (no ``_reset`` entry) begins new games in all of them.
+    An episode is one life: losing it is a termination, and the next episode continues the same
+    game, see :class:`~torchrl_tit.envs.AtariGames`. ``game_return`` includes points scored between
+    two lives, so it can be more than the sum of the episodes' rewards. Rewards are the game's own
+    points; for training, clip them with TorchRL's `SignTransform`. A reset without a ``_reset``
+    entry starts new games in all copies.
 
     Args:
         games: The games.
-        **kwargs: ``history``, ``padding`` and ``device`` of
-            :class:`~torchrl_tit.envs.GymVectorEnv`.
+        device: Device of the tensors; by default they stay on the CPU and the device is None.
 
     Example:
-        >>> env = AtariEnv(AtariGames("pong", num_envs=2), history=4)
-        >>> env.reset(seed=0)["history"].shape
-        torch.Size([2, 4, 84, 84])
+        >>> env = AtariEnv(AtariGames("pong", num_envs=2))
+        >>> env.reset(seed=0)["observation"].shape
+        torch.Size([2, 84, 84])
         >>> env.rollout(3)["next", "game_over"].any().item()
         False
         >>> env.close()
     """
 
-    def __init__(self, games: AtariGames, **kwargs: Any) -> None:
-        super().__init__(games, **kwargs)
+    def __init__(self, games: AtariGames, *, device: torch.device | str | None = None) -> None:
+        super().__init__(games, device=device)
         shape = (games.num_envs, 1)
         spec = self.observation_spec
         spec["game_over"] = Categorical(2, shape=shape, dtype=torch.bool, device=self.device)

@@ -1,4 +1,4 @@
-"""Atari games by the protocol of the deep Q-network, played side by side in C++."""
+"""Atari games with the preprocessing of the deep Q-network, emulated side by side in C++."""
 
 import secrets
 from collections.abc import Sequence
@@ -18,30 +18,30 @@ _GREY = np.array([0.299, 0.587, 0.114], np.float32)  # of red, green and blue (I
 
 
 class AtariGames(VectorEnv):
-    """N copies of an Atari game as a Gymnasium vector environment that does not reset by itself.
+    """N copies of an Atari game as a Gymnasium vector environment without automatic resets.
 
-    The protocol is that of Stable-Baselines3's `AtariWrapper`: an action holds for 4 frames, of the
-    last two the brighter pixels count, and the 84 x 84 picture is made by area interpolation. A new
-    game begins with 1 to 30 frames without action. Losing a life ends the episode, but not the
-    game: 4 frames later the next episode goes on with it. Where the game has a fire button, it is
-    pressed for 4 frames at the start of each game and after each lost life, and action 2 follows
-    for 4 frames. Actions are never repeated at random. Rewards are the game's own points.
+    The preprocessing is that of Stable-Baselines3's `AtariWrapper`: an action is repeated for 4
+    frames, the pixelwise maximum of the last two is taken, and the image is scaled to 84 x 84 by
+    area interpolation. A new game starts with 1 to 30 no-op frames. Losing a life ends the episode,
+    but not the game: the next episode continues it 4 frames later. If the game has a fire button,
+    it is pressed for 4 frames at the start of each game and after each lost life, followed by
+    action 2 for 4 frames. Actions are not sticky. Rewards are the game's own points.
 
-    ale-py's `AtariVectorEnv` emulates and scales in threads of its own, one instance a game, since
-    one instance cannot step only those of its games that have lost a life. Its own settings for
-    this end the game at a lost life or never press fire. The scaled colours become grey here, as
-    grey of the brightest colours is not the brightest grey; what remains between this and
-    `AtariWrapper`, which takes grey before it scales, is one grey level of rounding.
+    ale-py's `AtariVectorEnv` emulates and scales in its own threads. There is one instance per
+    game, since an instance cannot step only some of its games (those that lost a life), and its own
+    settings for lost lives either end the game or never press fire. The scaled colours are
+    converted to grey here, since the grey of the maximum of colours is not the maximum of greys.
+    `AtariWrapper` converts before it scales; the difference is one grey level of rounding.
 
-    Reset with a seed and given the same actions, the games repeat exactly.
+    Games that are reset with the same seed and given the same actions repeat exactly.
 
     Args:
-        game: The game as ale-py's ROM files are called, such as "ms_pacman".
+        game: The name of ale-py's ROM file, such as "ms_pacman".
         num_envs: N, the number of games.
-        noop_max: Most frames without action at the start of a game; with 0 there are none.
-        max_num_frames_per_episode: Frames after which a game is cut off, where an action counts as
-            4; those without action at its start do not count.
-        render_mode: ``"rgb_array"`` emulates a second time, for pictures in full size.
+        noop_max: Maximal number of no-op frames at the start of a game; 0 for none.
+        max_num_frames_per_episode: Number of frames (4 for each action) after which a game is
+            truncated, not counting the no-op frames at its start.
+        render_mode: ``"rgb_array"`` emulates each game a second time, for images in full size.
 
     Raises:
         ValueError: If the game or the render mode is unknown, or a number of games or frames is
@@ -75,7 +75,7 @@ class AtariGames(VectorEnv):
         max_num_frames_per_episode: int = MAX_NUM_FRAMES,
         render_mode: str | None = None,
     ) -> None:
-        from ale_py import roms  # an extra, which few need
+        from ale_py import roms  # an optional extra
 
         if game not in roms.get_all_rom_ids():
             raise ValueError(f"Unknown game {game!r}: ale-py has {roms.get_all_rom_ids()}.")
@@ -91,7 +91,7 @@ class AtariGames(VectorEnv):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._noop_max = noop_max
-        # The second emulators, for rendering, do whatever the first do.
+        # The second emulators, for rendering, repeat what the first do.
         self._emulators: list[list[Any]] = [
             [
                 _emulator(game, height, width, noop_max, max_num_frames_per_episode)
@@ -111,9 +111,9 @@ class AtariGames(VectorEnv):
         self._images = np.zeros((num_envs, _SIZE, _SIZE), np.uint8)
         self._screens = np.zeros((num_envs, _HEIGHT, _WIDTH, 3), np.uint8)
         self._lives = np.zeros(num_envs, int)
-        self._over = np.ones(num_envs, bool)  # a game that has not begun is over
+        self._over = np.ones(num_envs, bool)  # also before the first game
         self._truncated = np.zeros(num_envs, bool)
-        self._goes_on = np.zeros(num_envs, bool)  # in the next life, whose episode may begin
+        self._has_next_life = np.zeros(num_envs, bool)  # a life is lost, and the game is not over
         self._returns = np.zeros(num_envs)
         self._noops = np.zeros(num_envs, int)
 
@@ -123,12 +123,12 @@ class AtariGames(VectorEnv):
         seed: int | Sequence[int] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begins episodes, with a new game or, where only some copies are named, the next life.
+        """Starts episodes, each with a new game or with the next life.
 
         Args:
-            seed: Copy i is seeded with ``seed + i``, or with its own number.
-            options: ``"reset_mask"``, bool [N], says which copies begin. Without it, or with a
-                seed, all that begin do so with a new game.
+            seed: Copy i is seeded with ``seed + i``, or with entry i of a sequence.
+            options: ``"reset_mask"``, bool [N], selects the copies to reset: those that lost a life
+                continue their game. Without a mask, or with a seed, all start new games.
 
         Returns:
             The observations, uint8 [N, 84, 84], and a dictionary: see :meth:`step`.
@@ -139,37 +139,37 @@ class AtariGames(VectorEnv):
             seed = secrets.randbelow(2**30)
         if isinstance(seed, int):
             seed = range(seed, seed + self.num_envs)
-        new = asked if mask is None or seed is not None else asked & ~self._goes_on
+        new = asked if mask is None or seed is not None else asked & ~self._has_next_life
         self._begin(new.nonzero()[0], seed)
-        self._goes_on &= ~asked
+        self._has_next_life &= ~asked
         return self._images.copy(), self._info()
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Plays 4 frames of every game, and where a life is lost what leads to the next.
+        """Plays 4 frames of every game, and the frames between two lives where one is lost.
 
         Args:
             actions: int [N].
 
         Returns:
             The observations, uint8 [N, 84, 84]; the points, float64 [N]; whether a life or the game
-            is lost and whether the game is cut off, bool [N]; and a dictionary of arrays [N]:
-            ``game_over`` (bool, lost or cut off), ``game_return`` (float64, all points of the game
-            so far), ``lives``, and ``noops`` (int, the frames without action at its start).
+            is lost, bool [N]; whether the game is truncated, bool [N]; and a dictionary of arrays
+            [N]: ``game_over`` (bool, lost or truncated), ``game_return`` (float64, all points of
+            the game so far), ``lives`` (int), and ``noops`` (int, the no-op frames at its start).
         """
         everyone = np.arange(self.num_envs)
         lives = self._lives.copy()
         rewards = self._play(everyone, actions)
         images, truncated = self._images.copy(), self._truncated.copy()
-        # Some games show no life for a while before they end.
+        # Some games report 0 lives for a while before they end.
         lost = (self._lives < lives) & (self._lives > 0)
         terminated = (self._over & ~truncated) | lost
         going = (lost & ~self._over).nonzero()[0]
         for action in [_NOOP, *self._opening]:
             going = going[~self._over[going]]
             self._play(going, np.full(len(going), action))
-        self._goes_on = lost & ~self._over
+        self._has_next_life = lost & ~self._over
         return images, rewards, terminated, truncated, self._info()
 
     def render(self) -> tuple[np.ndarray, ...]:
@@ -179,20 +179,20 @@ class AtariGames(VectorEnv):
             ValueError: If the games were made without ``render_mode="rgb_array"``.
         """
         if self.render_mode is None:
-            raise ValueError('The games are rendered where render_mode="rgb_array" only.')
+            raise ValueError('Games are rendered only with render_mode="rgb_array".')
         return tuple(self._screens.copy())
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Ends the emulators and their threads."""
+        """Stops the emulators and their threads."""
         self._emulators = []
 
     def _begin(self, games: np.ndarray, seeds: Sequence[int] | None) -> None:
-        """Begins new games."""
+        """Starts new games."""
         self._seeded = True
         for i in games:
             outcomes = self._restart(i, None if seeds is None else seeds[i])
             while self._noop_max and not outcomes[0][1]["episode_frame_number"][0]:
-                outcomes = self._restart(i)  # ale-py draws the number of no-ops from 0 on
+                outcomes = self._restart(i)  # ale-py may draw 0 no-op frames
             self._look(i, [outcome[0] for outcome in outcomes])
             self._noops[i] = outcomes[0][1]["episode_frame_number"][0]
             self._lives[i] = outcomes[0][1]["lives"][0]
@@ -203,7 +203,7 @@ class AtariGames(VectorEnv):
 
     def _restart(self, i: int, seed: int | None = None) -> list[tuple[np.ndarray, dict[str, Any]]]:
         if seed is not None:
-            seed %= 2**31  # more than ale-py takes
+            seed %= 2**31  # ale-py takes no larger seeds
         return [emulator.reset(seed=seed) for emulator in self._emulators[i]]
 
     def _play(self, games: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -211,7 +211,7 @@ class AtariGames(VectorEnv):
         rewards = np.zeros(len(games))
         for i, action in zip(games, actions, strict=True):
             for emulator in self._emulators[i]:
-                emulator.send(np.array([action], int))  # returns at once; threads do the work
+                emulator.send(np.array([action], int))  # returns at once; a thread emulates
         for k, i in enumerate(games):
             outcomes = [emulator.recv() for emulator in self._emulators[i]]
             self._look(i, [outcome[0] for outcome in outcomes])
@@ -222,7 +222,7 @@ class AtariGames(VectorEnv):
         return rewards
 
     def _look(self, i: int, pictures: Sequence[np.ndarray]) -> None:
-        """Takes over what an emulator shows: of each size [1, 1, height, width, 3]."""
+        """Stores the images of a game's emulators, [1, 1, height, width, 3] each."""
         self._images[i] = (pictures[0][0, 0] @ _GREY).round()
         if self.render_mode:
             self._screens[i] = pictures[1][0, 0]
@@ -237,7 +237,7 @@ class AtariGames(VectorEnv):
 
 
 def _emulator(game: str, height: int, width: int, noop_max: int, max_frames: int) -> Any:
-    from ale_py.vector_env import AtariVectorEnv
+    from ale_py.vector_env import AtariVectorEnv  # an optional extra
 
     return AtariVectorEnv(
         game,
@@ -248,7 +248,7 @@ def _emulator(game: str, height: int, width: int, noop_max: int, max_frames: int
         grayscale=False,
         stack_num=1,
         frameskip=FRAME_SKIP,
-        noop_max=noop_max + 1,  # it draws one less at most
+        noop_max=noop_max + 1,  # exclusive in ale-py
         max_num_frames_per_episode=max_frames,
         repeat_action_probability=0.0,
         reward_clipping=False,

@@ -9,14 +9,15 @@ from typing import Any, Literal, get_args
 import gymnasium
 import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from torchrl_tit.envs.atari import AtariEnv
 from torchrl_tit.envs.atari_games import FRAME_SKIP, MAX_NUM_FRAMES, AtariGames
 from torchrl_tit.envs.mujoco_warnings import show_mujoco_warnings_once
+from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.transforms.hide_velocities import HideVelocities
-from torchrl_tit.transforms.history import Padding
+from torchrl_tit.transforms.history import History, Padding
 
 VectorizationMode = Literal["sync", "async"]
 
@@ -26,46 +27,65 @@ def make_env(
     num_envs: int = 1,
     *,
     seed: int | None = None,
-    history: int = 1,
+    num_frames: int = 1,
     padding: Padding = "same",
-    clip_actions: bool = True,
     hide_velocities: bool = False,
+    clip_actions: bool = True,
     vectorization_mode: VectorizationMode = "sync",
     device: torch.device | str | None = None,
     **kwargs: Any,
-) -> EnvBase:
-    """Makes copies of a Gymnasium task or an Atari game.
+) -> TransformedEnv:
+    """Makes copies of a Gymnasium task or an Atari game, with histories of their observations.
+
+    The environment itself (``.base_env``) writes observations only. Transforms write the rest:
+    :class:`~torchrl_tit.transforms.HideVelocities` if asked for, TorchRL's `RewardSum`, and
+    :class:`~torchrl_tit.transforms.History`. Add further ones with ``append_transform``.
+
+    ======================  ==================  ===================================================
+    key                     shape               what it is
+    ======================  ==================  ===================================================
+    ``observation``         [N, *obs]           float32, or the task's own integers (images: uint8)
+    ``history``             [N, K, *obs]        the last K observations, the newest last
+    ``episode_reward``      [N, 1]              float32, the undiscounted return so far
+    ``action``              [N] or [N, A]       int64 for discrete actions, else float32
+    ``reward``              [N, 1]              float32
+    ``terminated``          [N, 1]              bool, the task ended the episode
+    ``truncated``           [N, 1]              bool, the time limit ended the episode
+    ``done``                [N, 1]              bool, either
+    ======================  ==================  ===================================================
 
     Args:
         name: A name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". Names that
-            begin with "ALE/", such as "ALE/Pong-v5", are Atari games under the protocol that stands
-            in :class:`~torchrl_tit.envs.AtariGames`; they need ale-py, the extra "atari".
+            begin with "ALE/", such as "ALE/Pong-v5", are Atari games with the preprocessing of
+            :class:`~torchrl_tit.envs.AtariGames`; they need ale-py, the extra "atari".
         num_envs: N, the number of copies; the batch size is [N], for N = 1 too.
         seed: Copy i is seeded with ``seed + i``; without one, each differs from run to run.
-        history: K, the number of observations in a history.
-        padding: How histories begin: see :class:`~torchrl_tit.envs.GymVectorEnv`.
-        clip_actions: Whether continuous actions are clipped on their way to the task: see there.
-        hide_velocities: Whether observation and history are left without the velocities: see
+        num_frames: K, the number of observations in a history.
+        padding: What fills a history before an episode's first step: see
+            :class:`~torchrl_tit.transforms.History`.
+        hide_velocities: Whether observations and histories lack the velocities: see
             :class:`~torchrl_tit.transforms.HideVelocities`.
+        clip_actions: Whether continuous actions are clipped on their way to the task: see
+            :class:`~torchrl_tit.envs.GymVectorEnv`.
         vectorization_mode: ``"sync"`` steps the copies one after the other in this process,
-            ``"async"`` side by side in a process each, with the same numbers; this pays for slow
+            ``"async"`` side by side in a process each, with the same numbers, which pays for slow
             tasks. Atari games always run side by side, in threads.
-        device: Where the tensors go; by default they stay on the CPU without a stated device.
+        device: Device of the tensors; by default they stay on the CPU and the device is None.
         **kwargs: Passed to `gymnasium.make`, as ``max_episode_steps=200``, or to
             :class:`~torchrl_tit.envs.AtariGames`.
 
     Returns:
-        The environment, whose keys and shapes stand in :class:`~torchrl_tit.envs.GymVectorEnv` and,
-        for Atari games, :class:`~torchrl_tit.envs.AtariEnv`.
+        The environment. Atari games have further keys: see
+        :class:`~torchrl_tit.envs.AtariEnv`.
 
     Raises:
-        ValueError: If the name is unknown or a package that the task needs is missing,
-            ``num_envs`` is less than 1, history or padding are wrong, the mode is unknown or of no
-            use, or it is not known which observations are velocities.
+        ValueError: If the name or the mode is unknown, a package that the task needs is missing,
+            ``num_envs``, ``num_frames`` or the padding is not possible, Atari games are to run in
+            processes, or it is not known which observations are velocities.
         TypeError: If the task's observations or actions are of a kind that is not supported.
 
     Example:
-        >>> env = make_env("CartPole-v1", num_envs=8, seed=0, history=4)
+        >>> env = make_env("CartPole-v1", num_envs=8, seed=0, num_frames=4)
         >>> env.reset()["history"].shape
         torch.Size([8, 4, 4])
         >>> make_env("CartPole-v2")
@@ -79,37 +99,35 @@ def make_env(
         raise ValueError(
             f"vectorization_mode must be 'sync' or 'async', but is {vectorization_mode!r}."
         )
-    env: EnvBase
+    env: GymVectorEnv
     if is_atari(name):
         if vectorization_mode == "async":
             raise ValueError(
                 f"{name} runs in threads, side by side; leave vectorization_mode at 'sync'."
             )
-        games = make_games(name, num_envs, **kwargs)
-        env = AtariEnv(games, history=history, padding=padding, device=device)
+        env = AtariEnv(make_games(name, num_envs, **kwargs), device=device)
     else:
-        env = GymVectorEnv(
-            _tasks(name, num_envs, vectorization_mode, **kwargs),
-            history=history,
-            padding=padding,
-            clip_actions=clip_actions,
-            device=device,
-        )
+        tasks = _tasks(name, num_envs, vectorization_mode, **kwargs)
+        env = GymVectorEnv(tasks, clip_actions=clip_actions, device=device)
     if seed is not None:
         env.set_seed(seed)
-    if hide_velocities:
-        env = TransformedEnv(env, HideVelocities(name, in_keys=["observation", "history"]))
-    return env
+    observation_ndim = env.observation_spec["observation"].ndim - 1
+    transform = Compose(
+        *([HideVelocities(name)] if hide_velocities else []),
+        RewardSum(),
+        History(num_frames, observation_ndim=observation_ndim, padding=padding),
+    )
+    return TransformedVectorEnv(env, transform)
 
 
 def is_atari(name: str) -> bool:
-    """Says whether a name is that of an Atari game: all of these begin with "ALE/".
+    """Tells whether a name is that of an Atari game, which all begin with "ALE/".
 
     Args:
         name: A name that Gymnasium may have registered.
 
     Returns:
-        Whether it is.
+        Whether it is an Atari game.
 
     Example:
         >>> is_atari("ALE/Pong-v5"), is_atari("Hopper-v5")
@@ -119,13 +137,13 @@ def is_atari(name: str) -> bool:
 
 
 def time_limit(name: str) -> int | None:
-    """Says after how many steps the episodes of a task are cut off.
+    """Returns the number of steps after which the episodes of a task are truncated.
 
     Args:
         name: A name as :func:`make_env` takes it.
 
     Returns:
-        The number of steps, or None where the task goes on until it ends by itself.
+        The number of steps, or None for a task without a time limit.
 
     Example:
         >>> time_limit("Hopper-v5"), time_limit("ALE/Pong-v5")
@@ -137,7 +155,7 @@ def time_limit(name: str) -> int | None:
 
 
 def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
-    """Makes copies of an Atari game as :func:`make_env` plays it, by Gymnasium's name.
+    """Makes copies of an Atari game by Gymnasium's name, as :func:`make_env` does.
 
     Args:
         name: A name such as "ALE/Pong-v5".
@@ -166,9 +184,10 @@ def _tasks(
     spec = gymnasium.registry.get(name)
     if spec is not None and str(spec.entry_point).startswith("ale_py"):
         raise ValueError(
-            f"Task {name!r} is an Atari game without the protocol: name it as in 'ALE/Pong-v5'."
+            f"Task {name!r} is an Atari game without the preprocessing; name it as in "
+            "'ALE/Pong-v5'."
         )
-    # What the vector environment returns is copied at once, so it need not make copies of its own.
+    # GymVectorEnv copies what the vector environment returns, which need not copy it before.
     make = partial(_task, os.getpid(), name, **kwargs)
     vectorize = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
     try:
@@ -178,19 +197,19 @@ def _tasks(
 
 
 def _task(home: int, name: str, **kwargs: Any) -> gymnasium.Env:
-    """One copy, in the process that steps it; ``home`` is the process that steps all of them."""
+    """Makes one copy, in the process that steps it; ``home`` is the main process."""
     if os.getpid() != home:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # which decides what Ctrl-C means
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C
     if "mujoco" in str(gymnasium.spec(name).entry_point):
         show_mujoco_warnings_once()
-    # The specs are checked once, in tests; Gymnasium's checker would cost time at every step.
+    # Gymnasium's checker costs time in each step; the tests check the specs instead.
     return gymnasium.make(name, disable_env_checker=True, **kwargs)
 
 
 def _rom(name: str) -> str:
     """The name of an Atari game's ROM file."""
     try:
-        import ale_py
+        import ale_py  # an optional extra
     except ImportError as error:
         raise ValueError(
             f"Task {name!r} needs ale-py: pip install 'torchrl-tit[atari]'."

