@@ -1,4 +1,4 @@
-"""Data that several tests read, rolled once."""
+"""Data that several tests share."""
 
 import pytest
 
@@ -12,5 +12,5 @@ def rolled() -> Transitions:
 
 @pytest.fixture
 def arrays(rolled: Transitions) -> Transitions:
-    """The rolled transitions, to be changed at will."""
+    """A copy of the transitions, which a test may change."""
     return {name: array.copy() for name, array in rolled.items()}

@@ -1,4 +1,4 @@
-"""Transitions of Gymnasium tasks in D4RL's layout, and files made of them."""
+"""Transitions of Gymnasium tasks in D4RL's layout, and files of them."""
 
 from pathlib import Path
 
@@ -13,9 +13,9 @@ Transitions = dict[str, NDArray]
 def roll(
     steps: int = 300, max_episode_steps: int = 15, seed: int = 0, task: str = "Hopper-v5"
 ) -> Transitions:
-    """Random actions: some episodes fall (terminal), some meet the time limit.
+    """Random actions: some episodes terminate, some reach the time limit.
 
-    Ends with an episode's end.
+    The last transition ends an episode.
     """
     env = gymnasium.make(task, max_episode_steps=max_episode_steps)
     env.action_space.seed(seed)
@@ -41,7 +41,7 @@ NAMES = ("observations", "actions", "rewards", "terminals", "timeouts", "next_ob
 
 
 def write(path: Path, arrays: Transitions, **attributes: str) -> Path:
-    """An HDF5 file with these arrays."""
+    """Writes the arrays to an HDF5 file."""
     with h5py.File(path, "w") as file:
         file.attrs.update(attributes)
         for name, array in arrays.items():

@@ -1,4 +1,4 @@
-"""D4RL's files come whole, once, and are held against their checksum."""
+"""D4RL's files are downloaded once, atomically, and verified by checksum."""
 
 import threading
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ NAME = "hopper-medium-replay-v0"
 
 
 class Server(SimpleHTTPRequestHandler):
-    """Serves a folder; lies about the length of what is named "short"."""
+    """Serves a folder; states a wrong length for files named "short"."""
 
     requests: ClassVar[list[str]] = []
 
@@ -74,7 +74,7 @@ def test_cache_is_the_users(site: str, tmp_path: Path, monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("file", "error", "message"),
     [
-        ("short.hdf5", OSError, "bytes came|cannot be downloaded"),
+        ("short.hdf5", OSError, "received only|cannot be downloaded"),
         ("page.hdf5", DatasetError, "is not a whole HDF5 file"),
         ("missing.hdf5", OSError, "cannot be downloaded: HTTP Error 404"),
     ],

@@ -1,4 +1,4 @@
-"""HDF5 files: every field is read as it stands there, and bad files are refused by name and row."""
+"""HDF5 files: fields are read exactly, and errors name the file, field and row."""
 
 import re
 from pathlib import Path
@@ -36,7 +36,7 @@ def assert_same_fields(episodes: Episodes, arrays: Transitions) -> None:
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 500, 2**24])
-def test_every_field_is_the_files(
+def test_every_field_is_that_of_the_file(
     tmp_path: Path, rolled: Transitions, monkeypatch: pytest.MonkeyPatch, chunk_bytes: int
 ) -> None:
     monkeypatch.setattr(episodes_module, "CHUNK_BYTES", chunk_bytes)
@@ -55,7 +55,7 @@ def test_every_field_is_the_files(
     )
 
 
-def test_samples_are_the_files_rows(tmp_path: Path, rolled: Transitions) -> None:
+def test_samples_are_rows_of_the_file(tmp_path: Path, rolled: Transitions) -> None:
     storage = HistoryStorage(read_hdf5(write(tmp_path / "a.hdf5", rolled)))
 
     sample = storage[:]
@@ -88,7 +88,7 @@ def test_floats_become_float32_and_integers_stay(tmp_path: Path, arrays: Transit
     assert rows["terminated"].dtype == torch.bool
 
 
-def test_trailing_unfinished_episode_is_kept_apart(tmp_path: Path, arrays: Transitions) -> None:
+def test_a_trailing_unfinished_episode_is_separate(tmp_path: Path, arrays: Transitions) -> None:
     start, stop = spans(arrays)[-1]
     cut = {name: array[: stop - 1] for name, array in arrays.items()}
     assert stop - 1 > start
@@ -180,22 +180,25 @@ def _break(arrays: Transitions, case: str) -> None:
             r"field 'rewards', row 7: is 1e\+300, but all values must be finite as fl",
         ),
         ("next nan", "field 'next_observations', row 9: is nan"),
-        ("bounds", r"field 'actions', row 10: is 1.0\d*, but the task's actions go from -1.0"),
+        (
+            "bounds",
+            r"field 'actions', row 10: is 1.0\d*, but the task's actions range from -1.0",
+        ),
         ("flag", "field 'terminals', row 0: is 3.0, but must be 0 or 1"),
         ("no end", "no episode ends in its"),
         ("shape", r"field 'rewards': one row has the shape \[3\]"),
         ("scalars", "field 'observations': one row is one number"),
-        ("dtype", r"field 'actions': holds \|S5, but must hold numbers"),
+        ("dtype", r"field 'actions': has the dtype \|S5, but must have a numeric one"),
         (
             "other task",
             r"field 'actions': one row has the shape \[2\], but in Hopper-v5",
         ),
         ("next shape", r"field 'next_observations': one row has the shape \[3\]"),
-        ("goes on", "field 'next_observations', row 3: is not the observation of the row after"),
+        ("goes on", "field 'next_observations', row 3: is not the observation of the next row"),
         ("empty", "field 'observations': has no rows"),
     ],
 )
-def test_bad_data_are_refused_by_file_field_and_row(
+def test_errors_name_file_field_and_row(
     tmp_path: Path, arrays: Transitions, case: str, message: str
 ) -> None:
     _break(arrays, case)
@@ -254,9 +257,11 @@ def test_other_files(tmp_path: Path) -> None:
         load_episodes(tmp_path / "a.hdf5")
     with pytest.raises(FileNotFoundError, match=r"b\.hdf5"):
         load_episodes(tmp_path / "b.hdf5")
-    with pytest.raises(ValueError, match="'hopper' is no data set"):
+    with pytest.raises(ValueError, match="'hopper' is not a data set"):
         load_episodes("hopper")
-    with pytest.raises(ValueError, match=r"no data set: did you mean hopper-medium-v.*Minari has"):
+    with pytest.raises(
+        ValueError, match=r"not a data set: did you mean hopper-medium-v.*Minari has"
+    ):
         load_episodes("hopper-medium-v9")
     with h5py.File(tmp_path / "c.hdf5", "w") as file:
         file["observations/state"] = [1.0]

@@ -1,4 +1,4 @@
-"""Windows cut out of stored episodes: what History gives in the environment itself."""
+"""Windows gathered from stored episodes equal those of History in the environment."""
 
 from typing import Any
 
@@ -22,7 +22,7 @@ from torchrl_tit.transforms import History
 
 
 def store(stream: TensorDictBase) -> Episodes:
-    """A stream of an environment as episodes; its observations without histories."""
+    """Stores a rollout of an environment as episodes, without histories."""
     following = stream["next"]
     ended = following["done"][:, 0]
     terminals = following["terminated"][:, 0]
@@ -67,8 +67,8 @@ def test_windows_of_images_are_those_of_catframes(padding: Any) -> None:
         torch.testing.assert_close(sample[key], stream[key], rtol=0, atol=0)
 
 
-def test_original_handling(arrays: Transitions) -> None:
-    arrays["terminals"][arrays["timeouts"].argmax()] = True  # both at once is a terminal
+def test_settings_of_d3rlpy_1(arrays: Transitions) -> None:
+    arrays["terminals"][arrays["timeouts"].argmax()] = True  # both at once count as terminal
     episodes = episodes_from_arrays(**arrays)
 
     sample = HistoryStorage(episodes, 3, time_limits="drop", terminal_observations="zero")[:]
@@ -82,7 +82,7 @@ def test_original_handling(arrays: Transitions) -> None:
     )
     torch.testing.assert_close(sample["next", "history"][:, -1], sample["next", "observation"])
     torch.testing.assert_close(sample["next", "history"][:, :-1], sample["history"][:, 1:])
-    # The data themselves are as they were.
+    # The data themselves have not changed.
     torch.testing.assert_close(
         HistoryStorage(episodes)[:]["next", "observation"].numpy(), arrays["next_observations"]
     )
@@ -137,13 +137,13 @@ def test_drawing_is_uniform_with_replacement(arrays: Transitions) -> None:
     assert ((counts - expected).abs() < 5 * expected**0.5).all()
 
 
-def test_a_loaded_buffer_goes_on_with_the_same_batches(rolled: Transitions) -> None:
+def test_a_loaded_buffer_continues_with_the_same_batches(rolled: Transitions) -> None:
     def make(seed: int) -> Any:
         return make_replay_buffer(HistoryStorage(episodes_from_arrays(**rolled), 2), 16, seed=seed)
 
     buffer, other = make(0), make(1)
     buffer.sample()
-    torch.manual_seed(3)  # the global generator has no part in it
+    torch.manual_seed(3)  # the global generator has no influence
     assert not (buffer.sample() == other.sample())["history"].all()
     other.load_state_dict(buffer.state_dict())
     for _ in range(3):
@@ -156,7 +156,7 @@ def test_a_state_of_other_data_is_refused(rolled: Transitions) -> None:
     episodes = episodes_from_arrays(**rolled)
     state = make_replay_buffer(HistoryStorage(episodes), 2).state_dict()
     other = make_replay_buffer(HistoryStorage(episodes, time_limits="drop"), 2)
-    with pytest.raises(ValueError, match="The state was saved over"):
+    with pytest.raises(ValueError, match="The state was saved with"):
         other.load_state_dict(state)
 
 
@@ -195,7 +195,7 @@ def test_nothing_to_draw(arrays: Transitions) -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-def test_windows_cut_on_a_gpu(rolled: Transitions) -> None:
+def test_windows_gathered_on_a_gpu(rolled: Transitions) -> None:
     episodes = episodes_from_arrays(**rolled)
     here = HistoryStorage(episodes, 4, terminal_observations="zero")
     there = HistoryStorage(episodes.to("cuda"), 4, terminal_observations="zero")

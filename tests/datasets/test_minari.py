@@ -33,7 +33,7 @@ def _minaris_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def make_with_minari(arrays: Transitions, name: str = "walk/random-v0") -> minari.MinariDataset:
-    """A data set that Minari itself makes."""
+    """A data set that Minari itself writes."""
     buffers = []
     for start, stop in spans(arrays):
         observations = [*arrays["observations"][start:stop], arrays["next_observations"][stop - 1]]
@@ -55,7 +55,7 @@ def make_with_minari(arrays: Transitions, name: str = "walk/random-v0") -> minar
         )
 
 
-def test_every_field_is_minaris(rolled: Transitions) -> None:
+def test_every_field_is_that_of_minari(rolled: Transitions) -> None:
     make_with_minari(rolled)
 
     episodes = load_episodes("walk/random-v0", task="Hopper-v5")
@@ -113,7 +113,7 @@ def test_hdf5_to_minari_and_back_is_lossless(rolled: Transitions, tmp_path: Path
             np.testing.assert_array_equal(before[name][:], after[name][:], err_msg=name)
 
 
-def test_what_a_set_says_about_itself_survives(tmp_path: Path) -> None:
+def test_metadata_survive(tmp_path: Path) -> None:
     episode = EpisodeBuffer(
         seed=3,
         options={"low": 1},
@@ -189,7 +189,7 @@ def test_an_episode_without_a_flag_is_unfinished(rolled: Transitions) -> None:
         ("actions", None, None, "episode 1: cannot be read"),
     ],
 )
-def test_bad_data_are_refused_by_episode_field_and_row(
+def test_errors_name_episode_field_and_row(
     rolled: Transitions, field: str, row: int | slice | None, value: float | None, message: str
 ) -> None:
     dataset = make_with_minari(rolled)
@@ -223,7 +223,11 @@ def test_damaged_sets(rolled: Transitions, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("field", "values", "message"),
     [
-        ("actions", lambda x: x.astype(int), "episode 1: field 'actions': holds float32, but in e"),
+        (
+            "actions",
+            lambda x: x.astype(int),
+            "episode 1: field 'actions': has the dtype float32",
+        ),
         ("rewards", lambda x: x + 1e300, "episode 0: field 'rewards', row 0: is 1e.300, but all"),
     ],
 )
@@ -264,7 +268,7 @@ def test_targets_that_cannot_be_written(rolled: Transitions, tmp_path: Path) -> 
     write_minari(episodes, tmp_path / "a-v0")
     with pytest.raises(FileExistsError, match="exists already"):
         write_minari(episodes, tmp_path / "a-v0")
-    with pytest.raises(ValueError, match="'unnumbered' is no name for a Minari data set"):
+    with pytest.raises(ValueError, match="'unnumbered' is not a valid name"):
         write_minari(episodes, tmp_path / "unnumbered")
     with pytest.raises(ValueError, match="'Hoper-v5' cannot be made"):
         write_minari(episodes, tmp_path / "b-v0", "Hoper-v5")

@@ -1,4 +1,4 @@
-"""Episodes picked and put together keep every row."""
+"""Selected and joined episodes keep every row."""
 
 import torch
 

@@ -17,16 +17,16 @@ from torchrl_tit.datasets import (
 
 
 def reference(
-    arrays: Transitions, start: int, stop: int, step: int, context: int, scale: float
+    arrays: Transitions, start: int, stop: int, step: int, num_frames: int, scale: float
 ) -> dict[str, np.ndarray]:
     """Steps of one episode from one on, one after the other, padded on the left."""
-    length = min(context, stop - start - step)
+    length = min(num_frames, stop - start - step)
     rows: dict[str, list] = {
-        "observation": [np.zeros(11)] * (context - length),
-        "action": [np.full(3, -10.0)] * (context - length),
-        "return_to_go": [np.zeros(1)] * (context - length),
-        "timestep": [0] * (context - length),
-        "mask": [False] * (context - length),
+        "observation": [np.zeros(11)] * (num_frames - length),
+        "action": [np.full(3, -10.0)] * (num_frames - length),
+        "return_to_go": [np.zeros(1)] * (num_frames - length),
+        "timestep": [0] * (num_frames - length),
+        "mask": [False] * (num_frames - length),
     }
     for t in range(step, step + length):
         rows["observation"].append(arrays["observations"][start + t])
@@ -38,19 +38,19 @@ def reference(
     return {name: np.array(values) for name, values in rows.items()}
 
 
-@pytest.mark.parametrize("context", [1, 5, 20])
+@pytest.mark.parametrize("num_frames", [1, 5, 20])
 @pytest.mark.parametrize("with_next", [True, False])
-def test_every_item(arrays: Transitions, context: int, with_next: bool) -> None:
+def test_every_item(arrays: Transitions, num_frames: int, with_next: bool) -> None:
     if not with_next:  # whose final observations are unknown, which no sequence needs
         del arrays["next_observations"]
-    storage = SequenceStorage(episodes_from_arrays(**arrays), context, return_scale=10.0)
+    storage = SequenceStorage(episodes_from_arrays(**arrays), num_frames, return_scale=10.0)
 
     items = storage[:]
 
     index = 0
     for start, stop in spans(arrays):
         for step in range(stop - start):
-            expected = reference(arrays, start, stop, step, context, 10.0)
+            expected = reference(arrays, start, stop, step, num_frames, 10.0)
             for name, values in expected.items():
                 np.testing.assert_allclose(
                     items[name][index].numpy(), values, rtol=1e-6, atol=1e-6, err_msg=name
@@ -101,7 +101,7 @@ def test_episodes_are_drawn_by_length_and_starts_uniformly(arrays: Transitions) 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"context": 0}, "context must be at least 1, but is 0"),
+        ({"num_frames": 0}, "num_frames must be at least 1, not 0"),
         ({"return_scale": 0.0}, "return_scale must be positive"),
         ({"mean": torch.zeros(11)}, "mean and std go together"),
     ],

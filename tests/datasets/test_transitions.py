@@ -1,4 +1,4 @@
-"""The rules for data that lack a field."""
+"""How missing fields are replaced."""
 
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ def test_without_timeouts_an_episode_ends_where_the_next_observation_is_another(
     episodes = episodes_from_arrays(**arrays)
 
     steps = episodes.step_rows
-    # After the last row there is nothing to tell a time limit from the data's end.
+    # After the last row, a time limit cannot be told from the end of the data.
     expected = timeouts & (np.arange(len(timeouts)) < len(timeouts) - 1)
     np.testing.assert_array_equal(episodes.rows["truncated"][steps, 0].numpy(), expected)
     np.testing.assert_array_equal(
@@ -68,10 +68,10 @@ def test_without_next_observations_those_of_time_limits_are_never_drawn(
     expected = np.where(arrays["terminals"][:, None], 0, following)[drawn]
     np.testing.assert_array_equal(sample["observation"].numpy(), arrays["observations"][drawn])
     np.testing.assert_array_equal(sample["next", "observation"].numpy(), expected)
-    # Their rewards count all the same.
+    # Their rewards still count.
     returns = [arrays["rewards"][a:b].sum(dtype=np.float64) for a, b in spans(arrays)]
     np.testing.assert_allclose(episodes.returns.numpy(), returns)
-    with pytest.raises(DatasetError, match=r"episode \d+ was cut off in an observation"):
+    with pytest.raises(DatasetError, match=r"episode \d+ was truncated and its final observation"):
         write_hdf5(episodes, "never-written.hdf5")
 
 
@@ -100,7 +100,7 @@ def test_images_and_discrete_actions_stay_integers() -> None:
     assert sample["next", "reward"].dtype == torch.float32
 
 
-def test_a_choice_in_a_column_of_its_own(tmp_path: Path) -> None:
+def test_discrete_actions_in_a_column_of_their_own(tmp_path: Path) -> None:
     rolled = roll(task="CartPole-v1", max_episode_steps=20)
     column = {**rolled, "actions": rolled["actions"][:, None]}
     task = task_spaces("CartPole-v1")
@@ -147,8 +147,8 @@ def test_wrong_settings(arrays: Transitions, settings: dict[str, Any], message: 
 
 def test_bounds_are_those_of_the_entry_that_is_wrong() -> None:
     space = Box(np.array([-1.0, 0.0], np.float32), np.ones(2, np.float32))
-    message = "row 6: is -0.5, but the task's actions go from 0.0 to 1.0 there"
+    message = "row 6: is -0.5, but the task's actions range from 0.0 to 1.0"
     with pytest.raises(DatasetError, match=message):
         check_actions("a.hdf5", np.array([[-0.5, 0.5], [0.5, -0.5]]), space, first_row=5)
-    with pytest.raises(DatasetError, match="row 1: is 3, but the task's actions go from 0 to 2"):
+    with pytest.raises(DatasetError, match="row 1: is 3, but the task's actions range from 0 to 2"):
         check_actions("a.hdf5", np.array([[2], [3]]), Discrete(3))

@@ -1,4 +1,4 @@
-"""Data sets for offline RL: D4RL, Minari, HDF5 files and arrays into TorchRL replay buffers."""
+"""Data sets for offline RL: from D4RL, Minari, HDF5 files and arrays to TorchRL replay buffers."""
 
 from torchrl_tit.datasets.d4rl import download_d4rl
 from torchrl_tit.datasets.episodes import Episodes
@@ -7,7 +7,6 @@ from torchrl_tit.datasets.hdf5 import read_hdf5, write_hdf5
 from torchrl_tit.datasets.histories import HistoryStorage
 from torchrl_tit.datasets.minari import read_minari
 from torchrl_tit.datasets.minari_writer import write_minari
-from torchrl_tit.datasets.parts import TransitionParts
 from torchrl_tit.datasets.replay_buffer import make_replay_buffer
 from torchrl_tit.datasets.scores import (
     REFERENCE_RETURNS,
@@ -20,6 +19,7 @@ from torchrl_tit.datasets.sequences import SequenceStorage
 from torchrl_tit.datasets.sources import load_episodes
 from torchrl_tit.datasets.storage import EpisodeStorage
 from torchrl_tit.datasets.tasks import TaskSpaces, task_spaces
+from torchrl_tit.datasets.transition_parts import TransitionParts
 from torchrl_tit.datasets.transitions import episodes_from_arrays
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""What data must be before they are trained on."""
+"""Checks of values before training."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_tit.datasets.errors import DatasetError
 
 FLAGS = ("terminals", "timeouts", "terminations", "truncations")  # D4RL's names and Minari's
 
-# Actions of a squashed policy stand at the bounds, and rounding puts some a little beyond.
+# Actions of a squashed policy lie at the bounds, and rounding puts some slightly beyond.
 _ACTION_TOLERANCE = 1e-5
 
 
@@ -24,17 +24,17 @@ def check_finite(
     first_row: int = 0,
     kept_as: torch.dtype = torch.float64,
 ) -> None:
-    """Checks that there is no NaN and no infinity, and will be none.
+    """Checks that there is no NaN and no infinity, even after conversion.
 
     Args:
         source: What the data came from, for messages.
         field: Name of the field.
         values: Some rows of it.
         first_row: The number of the first of them.
-        kept_as: The dtype that they are turned into, which may hold smaller numbers only.
+        kept_as: The dtype that they are converted to, whose range may be smaller.
 
     Raises:
-        DatasetError: If there is one; names the first row that has one.
+        DatasetError: If there is one; the message names the first such row.
 
     Example:
         >>> check_finite("a.hdf5", "rewards", np.array([0.0, np.nan]), first_row=100)
@@ -61,11 +61,11 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
     Args:
         source: What the data came from, for messages.
         values: Some rows of the actions.
-        space: A `Box` or `Discrete` action space; others are not looked into.
+        space: A `Box` or `Discrete` action space; others are not checked.
         first_row: The number of the first of the rows.
 
     Raises:
-        DatasetError: If one lies outside; names the first.
+        DatasetError: If one lies outside; the message names the first.
 
     Example:
         >>> check_actions("a.hdf5", np.array([[1.5]]), Box(-1.0, 1.0, (1,)))
@@ -87,33 +87,33 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
         value, lowest, highest = (x[np.asarray(wrong[row])].flat[0] for x in entries)
         raise DatasetError(
             source,
-            f"is {value}, but the task's actions go from {lowest} to {highest} there.",
+            f"is {value}, but the task's actions range from {lowest} to {highest} here.",
             "actions",
             first_row + row,
         )
 
 
 def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | None) -> torch.dtype:
-    """Says what dtype a field is kept in.
+    """Returns the dtype in which a field is kept.
 
     Args:
         source: What the data came from, for messages.
         field: Name of the field.
-        dtype: The dtype it has there.
-        floats: What floats are turned into; None keeps theirs.
+        dtype: The dtype it has in the source.
+        floats: The dtype for floats; None keeps that of the source.
 
     Returns:
         The dtype: bool for flags, floating for rewards, uint8 or int64 for other integers.
 
     Raises:
-        DatasetError: If it holds no numbers.
+        DatasetError: If its values are not numbers.
 
     Example:
         >>> kept_dtype("a.hdf5", "rewards", np.dtype("float64"), torch.float32)
         torch.float32
     """
     if dtype.kind not in "biuf":
-        raise DatasetError(source, f"holds {dtype}, but must hold numbers.", field)
+        raise DatasetError(source, f"has the dtype {dtype}, but must have a numeric one.", field)
     if field in FLAGS:
         return torch.bool
     if dtype.kind == "f":
@@ -124,13 +124,13 @@ def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | N
 
 
 def plain_tensor(values: NDArray) -> Tensor:
-    """Turns an array of any layout into a tensor.
+    """Converts an array of any layout into a tensor.
 
     Args:
         values: The array, in any byte order and memory layout.
 
     Returns:
-        A tensor of its shape, dtype and values.
+        A tensor of the same shape, dtype and values.
 
     Example:
         >>> plain_tensor(np.array([1.0, 2.0], dtype=">f8"))

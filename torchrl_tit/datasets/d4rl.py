@@ -1,4 +1,4 @@
-"""D4RL's data sets, downloaded once."""
+"""Downloads D4RL's data sets."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _TIMEOUT = 60  # seconds without an answer
 
 
 def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) -> Path:
-    """Downloads one of D4RL's data sets, unless it was downloaded before.
+    """Downloads one of D4RL's data sets, unless it has been downloaded before.
 
-    A file is there whole or not at all. D4RL publishes no checksums, so a download must have the
-    length that the server states and be a whole HDF5 file; its own checksum is kept beside it, and
-    later uses hold the file against that.
+    Files are written atomically. D4RL publishes no checksums, so a download must have the length
+    that the server states and be a whole HDF5 file. Its checksum is stored beside it, and verified
+    whenever the file is used again.
 
     Args:
         name: D4RL's name, such as "hopper-medium-replay-v0" or "hopper-medium-v2".
-        cache_dir: The folder for such files; by default "torchrl-tit/d4rl" in the user's folder for
-            caches (``$XDG_CACHE_HOME``, or ``~/.cache``).
+        cache_dir: Folder for the files; by default "torchrl-tit/d4rl" in the user's cache folder
+            (``$XDG_CACHE_HOME``, or ``~/.cache``).
 
     Returns:
         The file.
@@ -40,17 +40,17 @@ def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) ->
         OSError: If it cannot be downloaded or written.
         DatasetError: If the file is damaged.
 
-    Source: D4RL (arXiv 2004.07219); the addresses are those that TorchRL knows.
+    Source: D4RL (arXiv 2004.07219); the URLs are those of TorchRL.
 
     Example:
         >>> download_d4rl("hopper-medium")
         Traceback (most recent call last):
         ...
-        ValueError: D4RL has no data set 'hopper-medium'; a name is that of a task, kind and ...
+        ValueError: D4RL has no data set 'hopper-medium'; names consist of task, kind and ve...
     """
     if name not in D4RL_DATASETS:
         raise ValueError(
-            f"D4RL has no data set {name!r}; a name is that of a task, kind and version, as in "
+            f"D4RL has no data set {name!r}; names consist of task, kind and version, as in "
             f"'hopper-medium-replay-v0'."
         )
     folder = _cache_folder() if cache_dir is None else Path(cache_dir)
@@ -59,10 +59,10 @@ def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) ->
     record = folder / f"{name}.json"
     if not path.exists():
         record.unlink(missing_ok=True)
-        # Who finds that another process was faster uses what that one downloaded.
+        # If another process was faster, its download is used.
         with contextlib.suppress(FileExistsError), whole_or_not_at_all(path) as hidden:
             _download(D4RL_DATASETS[name], hidden)
-    if not record.exists():  # a kill may have come between the two
+    if not record.exists():  # the process may have been killed between the two
         write_text_atomic(record, json.dumps(_facts(path)))
     if json.loads(record.read_text(encoding="utf-8")) != _facts(path):
         raise DatasetError(
@@ -85,7 +85,7 @@ def _download(url: str, path: Path) -> None:
     except (URLError, OSError) as error:
         raise OSError(f"{url} cannot be downloaded: {error}") from error
     if expected is not None and path.stat().st_size != int(expected):
-        raise OSError(f"{url}: only {path.stat().st_size} of {expected} bytes came; try again.")
+        raise OSError(f"{url}: received only {path.stat().st_size} of {expected} bytes; try again.")
     try:
         h5py.File(path, "r").close()
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Whole episodes, one after the other, with the observation that each ends in."""
+"""Episodes, stored one after the other, each with its final observation."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from torch import Tensor
 
 from torchrl_tit.datasets.errors import DatasetError
 
-CHUNK_BYTES = 4 * 2**20  # what is read, checked and converted at a time
+CHUNK_BYTES = 4 * 2**20  # read, checked and converted at a time
 
 
 @dataclass(frozen=True, eq=False)
 class Episodes:
     """A data set as a flat stream of rows: an episode of T steps is T + 1 rows.
 
-    Row t of an episode is its step t: the observation, the action taken there, and the reward and
-    the flags that followed. Its last row is the observation in which it ended, and zeros beside it.
-    So every observation is stored once, and the next observation of a row is that of the row after.
+    Row t of an episode is its step t: the observation, the action taken, and the reward and flags
+    that followed. Its last row is the final observation, with zeros in the other fields. So each
+    observation is stored once, and the next observation of a row is that of the following row.
 
     Args:
         rows: [R] with "observation" [R, *obs], "action" [R, *action], and "reward", "terminated"
             and "truncated" [R, 1].
-        lengths: Steps of each episode; int64 [E], all at least 1.
-        final_known: Whether the observation that an episode ended in is known (it is zeros
-            otherwise); bool [E].
-        source: What the data came from, for messages.
-        attributes: What the source says about itself, as text and numbers.
+        lengths: Number of steps of each episode; int64 [E], all at least 1.
+        final_known: Whether the final observation of each episode is known (it is zeros otherwise);
+            bool [E].
+        source: Name of the source, for messages.
+        attributes: The source's metadata, as strings and numbers.
         left_out: Names of the source's fields that were not read.
 
     Example:
@@ -57,7 +57,7 @@ class Episodes:
 
     @property
     def num_transitions(self) -> int:
-        """Steps of all episodes together."""
+        """Number of steps of all episodes."""
         return int(self.lengths.sum())
 
     @property
@@ -72,7 +72,7 @@ class Episodes:
 
     @property
     def step_rows(self) -> Tensor:
-        """Row of each step, in order: all but the observations that episodes ended in; [N]."""
+        """Row of each step, in order: all rows but those of final observations; int64 [N]."""
         shifts = torch.arange(len(self.lengths), device=self.lengths.device)
         steps = torch.arange(self.num_transitions, device=self.lengths.device)
         return steps + shifts.repeat_interleave(self.lengths)
@@ -84,7 +84,7 @@ class Episodes:
 
     @property
     def truncated(self) -> Tensor:
-        """Whether each episode was cut off, by a time limit, say; bool [E]."""
+        """Whether each episode was truncated, by a time limit for example; bool [E]."""
         return self.rows["truncated"][self.last_rows].squeeze(-1)
 
     @property
@@ -95,17 +95,17 @@ class Episodes:
 
     @property
     def finished(self) -> Tensor:
-        """Whether each episode has an end, with which the data need not break off; bool [E]."""
+        """Whether each episode was terminated or truncated; bool [E]."""
         return self.terminated | self.truncated
 
     def to(self, device: torch.device | str) -> Episodes:
-        """Copies the data to a device, where windows are then cut.
+        """Copies the data to a device, where windows are then gathered.
 
         Args:
-            device: The device, as "cuda".
+            device: The device, such as "cuda".
 
         Returns:
-            The same episodes there.
+            The same episodes on the device.
         """
         return replace(
             self,
@@ -115,7 +115,7 @@ class Episodes:
         )
 
     def observation_statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the observations in finished episodes' steps.
+        """Computes the mean and standard deviation of the observations of finished episodes.
 
         Returns:
             Mean and population standard deviation + 1e-6; float32 [*obs] each.
@@ -128,9 +128,9 @@ class Episodes:
         return mean.float(), (squares / count).sqrt().float() + 1e-6
 
     def _observations(self) -> Iterator[Tensor]:
-        """The observations in finished episodes' steps, in chunks."""
+        """The observations at the steps of finished episodes, in chunks."""
         chosen = self.finished.repeat_interleave(self.lengths + 1)  # [R]
-        chosen[self.last_rows + 1] = False  # an episode's final observation is no step's
+        chosen[self.last_rows + 1] = False  # final observations are not steps
         observations = self.rows["observation"]
         size = rows_per_chunk(observations[0].numel() * 8)  # as float64
         for start in range(0, len(observations), size):
@@ -138,13 +138,13 @@ class Episodes:
 
 
 def check_final_observations(episodes: Episodes) -> None:
-    """Checks that the episodes can be written with the observation that each ended in.
+    """Checks that the episodes can be written with their final observations.
 
     Args:
         episodes: The data.
 
     Raises:
-        DatasetError: If one was cut off in an observation that the source does not hold.
+        DatasetError: If the final observation of a truncated episode is unknown.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -153,25 +153,22 @@ def check_final_observations(episodes: Episodes) -> None:
         >>> check_final_observations(episodes)
         Traceback (most recent call last):
         ...
-        torchrl_tit.datasets.errors.DatasetError: the data: episode 0 was cut off in an obs...
+        torchrl_tit.datasets.errors.DatasetError: the data: episode 0 was truncated and its...
     """
     unknown = ~episodes.final_known & ~episodes.terminated
     if unknown.any():
         raise DatasetError(
             episodes.source,
-            f"episode {int(unknown.int().argmax())} was cut off in an observation that is not "
-            f"there, for want of 'next_observations', so it cannot be written without loss.",
+            f"episode {int(unknown.int().argmax())} was truncated and its final observation is "
+            f"unknown, because there are no 'next_observations': it cannot be written.",
         )
 
 
 def rows_per_chunk(bytes_per_row: int) -> int:
-    """How many rows to handle at a time.
+    """Returns the number of rows to process at a time, at least 1.
 
     Args:
         bytes_per_row: Size of one row.
-
-    Returns:
-        Their number, at least 1.
 
     Example:
         >>> rows_per_chunk(1024)

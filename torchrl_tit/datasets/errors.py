@@ -1,14 +1,14 @@
-"""What is raised about data that cannot be used."""
+"""The error about data that cannot be used."""
 
 
 class DatasetError(ValueError):
-    """A data set is damaged, incomplete, or not of the task; says which file, field and row.
+    """A data set is damaged, incomplete, or of another task; names the file, field and row.
 
     Args:
-        source: The file, or what else the data came from.
+        source: The file, or another description of the source.
         problem: What is wrong, what was expected and what to do.
-        field: Name of the field, where it lies in one.
-        row: Index of the row, where it lies in one.
+        field: Name of the field, if the problem is in one.
+        row: Index of the row, if the problem is in one.
 
     Example:
         >>> print(DatasetError("a.hdf5", "is nan, but must be finite.", "rewards", 3))

@@ -17,14 +17,14 @@ from torchrl_tit.files import whole_or_not_at_all
 
 
 def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
-    """Reads a file with one row a transition, in chunks: it may be larger than the memory.
+    """Reads a file with one row per transition, in chunks: it may be larger than the memory.
 
     Args:
         path: The file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
-            "terminals" [N], and where it has them "timeouts" [N] and "next_observations" [N, *obs].
+            "terminals" [N], and optionally "timeouts" [N] and "next_observations" [N, *obs].
             Other fields are not read.
         **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
-            where the rules for what is missing stand too.
+            which describes how missing fields are replaced.
 
     Returns:
         The episodes.
@@ -46,7 +46,7 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"There is no data file {path} in {Path.cwd()}: name another, or make it first."
+            f"There is no data file {path} in {Path.cwd()}: check the path, or create it first."
         )
     try:
         file = h5py.File(path, "r")
@@ -59,18 +59,18 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
 
 
 def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
-    """Writes episodes as one row a transition, in chunks.
+    """Writes episodes with one row per transition, in chunks.
 
-    Every field has the dtype it has in memory, and every next observation must be known.
+    Fields keep their dtypes. Every next observation must be known.
 
     Args:
         episodes: The data. Only the last episode may be unfinished.
-        path: The file to write, whole or not at all; there may be none yet.
+        path: The file, which must not exist yet; it is written atomically.
 
     Raises:
-        FileExistsError: If there is one already.
-        ValueError: If an episode before the last is unfinished, or the observation in which one was
-            cut off is unknown: the file could not say so.
+        FileExistsError: If the file exists already.
+        ValueError: If an episode before the last is unfinished, or the final observation of a
+            truncated one is unknown: the layout cannot represent these.
         OSError: If the file cannot be written.
 
     Example:
@@ -87,7 +87,7 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
         number = int((~episodes.finished).int().argmax())
         raise ValueError(
             f"{episodes.source}: episode {number} is neither terminated nor truncated, which the "
-            f"layout of D4RL's files cannot say of any but the last."
+            f"layout of D4RL's files cannot represent for any episode but the last."
         )
     check_final_observations(episodes)
     steps = episodes.step_rows
@@ -116,18 +116,18 @@ def _write(file: h5py.File, name: str, values: Tensor, rows: Tensor) -> None:
 
 
 def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """All arrays of the file, by their full names."""
+    """All arrays of the file by their full names."""
     found: dict[str, h5py.Dataset] = {}
 
-    def note(name: str, item: Any) -> None:
+    def add(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
             found[name] = item
 
-    file.visititems(note)
+    file.visititems(add)
     return found
 
 
 def _attributes(file: h5py.File) -> dict[str, Any]:
-    """What the file says about itself, as plain text, numbers and lists of them."""
+    """The attributes of the file, as strings, numbers and lists of them."""
     values = {name: np.asarray(value) for name, value in file.attrs.items()}
     return {name: value.tolist() for name, value in values.items() if value.dtype.kind in "OUSbiuf"}

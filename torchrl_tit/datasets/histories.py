@@ -1,8 +1,8 @@
-"""Transitions with the last K observations, cut out of episodes when they are drawn."""
+"""Transitions with histories, gathered from episodes when they are drawn."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDict
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.storage import EpisodeStorage
-from torchrl_tit.transforms.history import Padding, check_history
+from torchrl_tit.transforms.history import Padding
 
 TimeLimits = Literal["keep", "drop"]
 TerminalObservations = Literal["keep", "zero"]
@@ -18,28 +18,28 @@ Unfinished = Literal["keep", "drop"]
 
 
 class HistoryStorage(EpisodeStorage):
-    """Transitions whose observation and next observation come as histories.
+    """Transitions with the histories of the observation and of the next observation.
 
     An item has "observation" [*obs], "history" [K, *obs], "action" (int64 if it is discrete), and
     under "next" "observation", "history", "reward" [1], "terminated" [1], "truncated" [1] and
-    "done" [1]: what an environment with :class:`~torchrl_tit.transforms.History` gives on the same
-    stream. A history never reaches into another episode.
+    "done" [1], like the steps of an environment with :class:`~torchrl_tit.transforms.History`. A
+    history never contains observations of another episode.
 
     Args:
         episodes: The data.
-        num_frames: K, the number of observations in a history, at least 1.
-        padding: What stands for the steps before an episode's first: ``"same"`` repeats the first
+        num_frames: Number K of observations in a history, at least 1.
+        padding: The frames before the first step of an episode: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
-        time_limits: ``"drop"`` leaves out the last transition of an episode that a time limit cut
-            off, as d3rlpy 1 did. Without a known next observation it is left out in any case.
-        terminal_observations: ``"zero"`` puts zeros for the observation of a terminal state, as
-            d3rlpy 1 did. Where it is unknown, it is zeros in any case.
-        unfinished: Whether an episode without an end, with which the data break off, is left out.
-            Where it is kept, no flag marks its end.
+        time_limits: ``"drop"`` leaves out the last transition of truncated episodes, as d3rlpy 1
+            does. It is always left out if the next observation is unknown.
+        terminal_observations: ``"zero"`` replaces the observations of terminal states with zeros,
+            as d3rlpy 1 does. They are always zeros if unknown.
+        unfinished: ``"drop"`` leaves out an episode that is neither terminated nor truncated
+            because the data end there. If it is kept, no flag marks its end.
 
     Raises:
         TypeError: If ``num_frames`` is not an integer.
-        ValueError: If it is less than 1, or another setting is none of the above.
+        ValueError: If it is less than 1, or another setting is not one of the above.
         DatasetError: If no transition is left.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
@@ -64,10 +64,15 @@ class HistoryStorage(EpisodeStorage):
         terminal_observations: TerminalObservations = "keep",
         unfinished: Unfinished = "drop",
     ) -> None:
-        check_history(num_frames, padding)
-        _check_choice("time_limits", time_limits, ("keep", "drop"))
-        _check_choice("terminal_observations", terminal_observations, ("keep", "zero"))
-        _check_choice("unfinished", unfinished, ("keep", "drop"))
+        if isinstance(num_frames, bool) or not isinstance(num_frames, int):
+            raise TypeError(f"num_frames must be an integer, but is {num_frames!r}.")
+        if num_frames < 1:
+            raise ValueError(f"num_frames must be at least 1, but is {num_frames}.")
+        _check_choice("padding", padding, get_args(Padding))
+        _check_choice("time_limits", time_limits, get_args(TimeLimits))
+        zero_or_keep = get_args(TerminalObservations)
+        _check_choice("terminal_observations", terminal_observations, zero_or_keep)
+        _check_choice("unfinished", unfinished, get_args(Unfinished))
         left_out = ~episodes.final_known
         if time_limits == "drop":
             left_out = left_out | episodes.truncated
@@ -78,7 +83,7 @@ class HistoryStorage(EpisodeStorage):
         self._num_frames = num_frames
         self._constant = padding == "constant" and num_frames > 1
         self._zero_terminals = terminal_observations == "zero"
-        # One window holds both histories: K steps up to this one, and the next one.
+        # One window contains both histories: K steps up to this one, and the next one.
         self._steps = torch.arange(1 - num_frames, 2, device=self.device)
 
     def _cut(self, row: Tensor, episode: Tensor) -> TensorDict:
@@ -91,13 +96,13 @@ class HistoryStorage(EpisodeStorage):
             window.masked_fill_(_expand(rows < first, ndim), 0)
         action = self._take("action", row)
         if not action.is_floating_point():
-            action = action.long()  # losses take it for an index
+            action = action.long()  # losses use it as an index
         if self._zero_terminals:
             window.select(time, -1).masked_fill_(_expand(terminated, ndim - 1), 0)
         return TensorDict(
             {
                 "observation": window.select(time, self._num_frames - 1),
-                # A copy, so that the two histories can be changed apart.
+                # A copy, so that writing into one history does not change the other.
                 "history": window.narrow(time, 0, self._num_frames).clone(),
                 "action": action,
                 "next": TensorDict(
@@ -117,7 +122,7 @@ class HistoryStorage(EpisodeStorage):
 
 
 def _expand(mask: Tensor, ndim: int) -> Tensor:
-    """A mask with as many dimensions more; [..., 1, 1]."""
+    """Appends ``ndim`` dimensions to a mask; [...] -> [..., 1, 1]."""
     return mask.view(*mask.shape, *[1] * ndim)
 
 

@@ -1,4 +1,4 @@
-"""One array out of many files."""
+"""Reads one array from many files."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 
 
 class JoinedField:
-    """A field of numbered parts that each hold it as [S, T, ...]: [S * T, ...], stream by stream.
+    """Joins a field of numbered parts, [S, T, ...] each, into [S * T, ...], stream after stream.
 
-    A slice opens the parts that it needs, one at a time. HDF5's own virtual data sets would keep
-    all of them open, of which a process may have a thousand or so.
+    A slice opens the parts it needs, one at a time. HDF5's own virtual data sets would keep all
+    parts open, and a process may have about a thousand open files.
 
     Args:
         name: The field.
         numbers: The parts.
         open_part: Opens the file of a part.
-        check: Is given each part's number and shape, [S, T, ...], and raises where it does not fit.
+        check: Called with each part's number and shape [S, T, ...]; raises if it does not fit.
 
     Example:
         >>> import tempfile
@@ -50,7 +50,10 @@ class JoinedField:
                 steps.append(part.shape[1])
                 if number == numbers[0]:
                     self._streams, row, self.dtype = part.shape[0], part.shape[2:], part.dtype
-        self._bounds = [0, *accumulate(steps)]  # steps of a stream before each part, and of all
+        self._bounds = [
+            0,
+            *accumulate(steps),
+        ]  # steps before each part, and in all
         self.shape = (self._streams * self._bounds[-1], *row)
 
     def __len__(self) -> int:
@@ -62,7 +65,7 @@ class JoinedField:
         total = self._bounds[-1]
         streams = range(start // total, (stop - 1) // total + 1)
         for number, (before, after) in zip(self._numbers, pairwise(self._bounds), strict=True):
-            spans = []  # of each stream: first row of the part, and those of it that are asked for
+            spans = []  # of each stream: first row in the part, and the requested rows in it
             for stream in streams:
                 origin = stream * total + before
                 low, high = max(start, origin), min(stop, origin + after - before)

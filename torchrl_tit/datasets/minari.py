@@ -25,14 +25,14 @@ from torchrl_tit.datasets.checks import (
 )
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
-from torchrl_tit.datasets.memory import memory_mapped_rows
+from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
 from torchrl_tit.datasets.tasks import TaskSpaces, check_shape, check_task_name
 
-# What a damaged data set, or one that cannot be downloaded, makes Minari raise.
+# What Minari raises if a data set is damaged or cannot be downloaded.
 _FAILURES = (AssertionError, ImportError, KeyError, OSError, TypeError, ValueError)
-ATTRIBUTES = "attributes"  # our entry in Minari's metadata
-# What Minari itself has a place for there, by the names of our attributes.
-TOLD = {
+ATTRIBUTES = "attributes"  # the entry of this library in Minari's metadata
+# Minari's own metadata fields, by the names of our attributes.
+METADATA_FIELDS = {
     "algorithm": "algorithm_name",
     "description": "description",
     "author": "author",
@@ -40,7 +40,7 @@ TOLD = {
     "code_permalink": "code_permalink",
 }
 
-# Minari's name of each field, and how many rows an episode has beside its steps.
+# Minari's name of each field, and the number of rows of an episode beyond its steps.
 FIELDS = {
     "observation": ("observations", 1),
     "action": ("actions", 0),
@@ -61,20 +61,20 @@ def read_minari(
 
     Args:
         name: A folder with a data set, or a data set's name such as "mujoco/hopper/medium-v0",
-            which Minari downloads where it is not in its own folder yet.
-        task: The task whose sizes and action bounds the data must have; not checked where None.
-        dtype: What floats are turned into; each field keeps its own where None. Integers stay.
-        directory: Where the memory-mapped rows go on the disk; see
-            :func:`~torchrl_tit.datasets.memory.memory_mapped_rows`.
+            which Minari downloads if it is not in its own folder yet.
+        task: The task whose shapes and action bounds the data must have; not checked if None.
+        dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
+        directory: Folder for the memory-mapped rows; see
+            :func:`~torchrl_tit.datasets.memory_mapping.memory_mapped_rows`.
 
     Returns:
-        The episodes. One that ends without a flag is unfinished. What the set says about itself is
-        among the attributes, the name of its task as "env_id".
+        The episodes. One whose last step has no flag is unfinished. The attributes contain the
+        metadata, and the name of the task as "env_id".
 
     Raises:
         FileNotFoundError: If Minari has no such data set, or cannot download it.
-        DatasetError: If it is damaged or of another task, or a field is missing, of the wrong
-            length, shape or dtype, or holds NaN, infinity, or actions out of bounds.
+        DatasetError: If it is damaged or of another task, or a field is missing, has the wrong
+            length, shape or dtype, or contains NaN, infinity, or actions out of bounds.
 
     Example:
         >>> import tempfile
@@ -102,7 +102,7 @@ def read_minari(
     lengths, left_out = _lengths(dataset, source)
     spec = dataset.env_spec
     if spec is not None and (spec.kwargs or spec.additional_wrappers):
-        left_out.add("env_spec")  # but for the name
+        left_out.add("env_spec")  # except for the name
     bounds = [0, *(lengths + 1).cumsum(0).tolist()]
     rows = TensorDict({}, [0])
     for number, (start, stop) in enumerate(pairwise(bounds)):
@@ -131,13 +131,10 @@ def read_minari(
 
 
 def is_minari_name(name: str) -> bool:
-    """Says whether Minari takes a name for a data set's, such as "mujoco/hopper/medium-v0".
+    """Returns whether a name has the form of Minari's, such as "mujoco/hopper/medium-v0".
 
     Args:
         name: The name.
-
-    Returns:
-        Whether it does.
 
     Example:
         >>> is_minari_name("mujoco/hopper/medium-v0"), is_minari_name("./data.hdf5")
@@ -145,13 +142,13 @@ def is_minari_name(name: str) -> bool:
     """
     try:
         parse_dataset_id(name)
-    except (TypeError, ValueError):  # no version in it; not of that form
+    except (TypeError, ValueError):  # no version; not of that form
         return False
     return True
 
 
 def _open(name: str | os.PathLike[str]) -> minari.MinariDataset:
-    folder = Path(name).absolute()  # Minari loses itself in relative paths
+    folder = Path(name).absolute()  # Minari cannot handle relative paths
     if folder.is_dir():
         data = folder / "data" if (folder / "data").is_dir() else folder
     else:
@@ -159,7 +156,7 @@ def _open(name: str | os.PathLike[str]) -> minari.MinariDataset:
         if not data.is_dir():
             try:
                 minari.download_dataset(str(name))
-            except Exception as error:  # whatever the network and its client raise
+            except Exception as error:  # anything that the network or its client raises
                 raise FileNotFoundError(
                     f"There is no Minari data set {str(name)!r} in {data.parent}, and it cannot be "
                     f"downloaded: {error}"
@@ -168,22 +165,22 @@ def _open(name: str | os.PathLike[str]) -> minari.MinariDataset:
         return minari.MinariDataset(data)
     except _FAILURES as error:
         raise DatasetError(
-            str(name), f"is not a whole Minari data set ({error}): look into {data}."
+            str(name), f"is not a whole Minari data set ({error}): see {data}."
         ) from error
 
 
 def _attributes(dataset: minari.MinariDataset) -> dict[str, Any]:
-    """What the data set says about itself, as text, numbers and lists of them."""
+    """The metadata of the data set, as strings, numbers and lists of them."""
     metadata = dataset.storage.metadata
-    told = {name: metadata[place] for name, place in TOLD.items() if place in metadata}
-    told = {name: sorted(v) if isinstance(v, set) else v for name, v in told.items()}
+    known = {name: metadata[place] for name, place in METADATA_FIELDS.items() if place in metadata}
+    known = {name: sorted(v) if isinstance(v, set) else v for name, v in known.items()}
     if dataset.env_spec is not None:
-        told["env_id"] = dataset.env_spec.id
-    return {**told, **metadata.get(ATTRIBUTES, {})}
+        known["env_id"] = dataset.env_spec.id
+    return {**known, **metadata.get(ATTRIBUTES, {})}
 
 
 def _lengths(dataset: minari.MinariDataset, source: str) -> tuple[torch.Tensor, set[str]]:
-    """Steps of each episode, and what else is noted of episodes, which is not read."""
+    """The length of each episode, and the names of episode metadata that are not read."""
     noted: set[str] = set()
     steps = []
     try:
@@ -210,7 +207,7 @@ def _episode(dataset: minari.MinariDataset, number: int, place: str) -> minari.E
 def _checked(
     place: str, episode: minari.EpisodeData, length: int, task: TaskSpaces | None
 ) -> dict[str, NDArray]:
-    """An episode's fields under the names of our rows, with a row beside each observation."""
+    """Checks the fields of an episode, and returns them under the names of our rows."""
     fields = {}
     for field, (name, more) in FIELDS.items():
         array = np.asarray(getattr(episode, name))
@@ -218,28 +215,31 @@ def _checked(
             raise DatasetError(
                 place, f"has the shape {list(array.shape)}, but needs {length + more} rows.", name
             )
-        # One number a row is one column, but for actions, which are then discrete.
+        # A field of numbers becomes a column, except for actions, which are discrete then.
         fields[field] = array[:, None] if array.ndim == 1 and field != "action" else array
     if task is not None:
         actions = fields["action"]
         if task.action.shape == () and actions.shape[1:] == (1,):
-            fields["action"] = actions[:, 0]  # a choice, which stands in a column of its own
+            fields["action"] = actions[:, 0]  # discrete, in a column of its own
         check_shape(place, "observations", fields["observation"].shape[1:], task.observation, task)
         check_shape(place, "actions", fields["action"].shape[1:], task.action, task)
         check_actions(place, fields["action"], task.action)
     inside = ((fields["terminated"] != 0) | (fields["truncated"] != 0))[:-1].any(1)
     if inside.any():
         raise DatasetError(
-            place, "ends the episode, but it goes on.", "terminations", int(inside.argmax())
+            place,
+            "ends the episode, but more steps follow.",
+            "terminations",
+            int(inside.argmax()),
         )
     return fields
 
 
 def _check_alike(place: str, name: str, array: NDArray, target: torch.Tensor) -> None:
-    """Checks that an episode's field fits into the rows made for that of the first."""
+    """Checks that a field has the shape and dtype that it has in the first episode."""
     if array.shape != tuple(target.shape):
         problem = f"one row has the shape {list(array.shape[1:])}, not {list(target.shape[1:])}."
         raise DatasetError(place, problem, name)
     if array.dtype.kind == "f" and not target.is_floating_point() and name not in FLAGS:
-        raise DatasetError(place, f"holds {array.dtype}, but in episode 0 integers.", name)
+        raise DatasetError(place, f"has the dtype {array.dtype}, but integers in episode 0.", name)
     check_finite(place, name, array, kept_as=target.dtype)

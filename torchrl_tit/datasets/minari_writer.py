@@ -18,7 +18,7 @@ from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
 
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
-from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, TOLD, is_minari_name
+from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, METADATA_FIELDS, is_minari_name
 from torchrl_tit.datasets.tasks import task_spaces
 from torchrl_tit.envs import is_atari
 from torchrl_tit.files import whole_or_not_at_all
@@ -29,22 +29,22 @@ def write_minari(
 ) -> None:
     """Writes episodes as a Minari data set, one at a time.
 
-    Every field has the dtype it has in memory. It is written from Minari's episode buffers, since
-    Minari's collector needs packages that a conversion does not. The data's attributes "algorithm",
-    "description", "author", "author_email" and "code_permalink" are also what Minari lists as such.
+    Fields keep their dtypes. The data set is written from Minari's episode buffers, because its
+    collector requires packages that a conversion does not need. The attributes "algorithm",
+    "description", "author", "author_email" and "code_permalink" also go into Minari's own metadata.
 
     Args:
         episodes: The data.
-        name: The folder to make, an absolute path or one that begins with a dot, whose last part
-            ends in a version such as "-v0"; or else a data set's name for Minari's own folder.
-        env_name: The Gymnasium task that the data are from, for Minari to recover. For Atari games
-            it only says which actions there are: what Minari would recover shows other pictures
-            than :func:`~torchrl_tit.envs.make_env`.
+        name: The folder to create, an absolute path or one that begins with a dot, whose last part
+            ends in a version such as "-v0"; or the name of a data set in Minari's own folder.
+        env_name: The Gymnasium task of the data, from which Minari can recreate the environment.
+            For Atari games it only determines the action space, because the environment that
+            Minari recreates has other images than :func:`~torchrl_tit.envs.make_env`.
 
     Raises:
-        FileExistsError: If there is such a data set already.
-        ValueError: If the name is none that Minari takes, or Gymnasium does not know the task.
-        DatasetError: If an episode was cut off in an observation that is unknown.
+        FileExistsError: If the data set exists already.
+        ValueError: If Minari does not accept the name, or Gymnasium does not know the task.
+        DatasetError: If the final observation of a truncated episode is unknown.
         OSError: If it cannot be written.
 
     Example:
@@ -67,7 +67,7 @@ def write_minari(
             observation_space=_box(episodes.rows["observation"]),
             action_space=action_space,
             env_spec=_env_spec(env_name),
-            jpeg_encoding=False,  # images as they are
+            jpeg_encoding=False,  # images are stored exactly
         )
         storage.update_metadata(
             {
@@ -81,16 +81,16 @@ def write_minari(
 
 
 def _target(name: str | os.PathLike[str]) -> tuple[Path, str]:
-    """The folder that a data set is written to, and its name."""
+    """Returns the folder to write to, and the data set's name."""
     path = Path(name)
     if path.is_absolute() or str(name).startswith("."):
-        folder, dataset_id = path.absolute(), path.name  # Minari loses itself in relative ones
+        folder, dataset_id = path.absolute(), path.name  # Minari cannot handle relative ones
     else:
         folder, dataset_id = get_dataset_path(str(name)), str(name)
     if not is_minari_name(dataset_id):
         raise ValueError(
-            f"{dataset_id!r} is no name for a Minari data set: it must end in a version, as "
-            f"'medium-v0' does."
+            f"{dataset_id!r} is not a valid name of a Minari data set: it must end in a version, "
+            f"as 'medium-v0' does."
         )
     return folder, dataset_id
 
@@ -100,8 +100,8 @@ def _env_spec(env_name: str | None) -> EnvSpec | None:
 
 
 def _listed(episodes: Episodes) -> dict[str, Any]:
-    """Those of the data's attributes that Minari has a place for."""
-    known = {place: episodes.attributes.get(name) for name, place in TOLD.items()}
+    """The attributes that Minari's metadata have a field for."""
+    known = {place: episodes.attributes.get(name) for name, place in METADATA_FIELDS.items()}
     people = {place: known.pop(place) for place in ("author", "author_email")}
     texts = {place: value for place, value in known.items() if isinstance(value, str)}
     names = {place: [v] if isinstance(v, str) else v for place, v in people.items()}
@@ -116,7 +116,7 @@ def _action_space(episodes: Episodes) -> gymnasium.Space:
 
 
 def _box(values: torch.Tensor) -> Box:
-    """The space of arrays without known bounds."""
+    """A space of arrays whose bounds are unknown."""
     array = values[:1].numpy()
     floating = np.issubdtype(array.dtype, np.floating)
     low = -np.inf if floating else np.iinfo(array.dtype).min

@@ -17,12 +17,12 @@ def make_replay_buffer(
 ) -> ReplayBuffer:
     """Makes a replay buffer that draws items uniformly, with replacement.
 
-    It draws from a random generator of its own, which is part of its ``state_dict()``: a buffer
-    that loads it goes on with the same batches. The data are not part of it.
+    The buffer has a random generator of its own, which is part of its ``state_dict()``: a buffer
+    that loads it continues with the same batches. The data are not part of the state.
 
     Args:
-        storage: What is drawn from: transitions with histories
-            (:class:`~torchrl_tit.datasets.HistoryStorage`) or subsequences
+        storage: The data: transitions with histories
+            (:class:`~torchrl_tit.datasets.HistoryStorage`) or windows
             (:class:`~torchrl_tit.datasets.SequenceStorage`).
         batch_size: Items in a batch.
         seed: Seed of the generator.
@@ -49,12 +49,12 @@ def make_replay_buffer(
     return ReplayBuffer(
         storage=storage,
         writer=ImmutableDatasetWriter(),
-        collate_fn=_as_it_is,
+        collate_fn=_identity,
         batch_size=batch_size,
         generator=torch.Generator(storage.device).manual_seed(seed),
         **{"sampler": RandomSampler(), **settings},
     )
 
 
-def _as_it_is(batch: TensorDict) -> TensorDict:
+def _identity(batch: TensorDict) -> TensorDict:
     return batch

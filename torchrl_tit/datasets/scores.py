@@ -1,4 +1,4 @@
-"""Returns on the scale from a random to an expert policy, as offline RL reports them."""
+"""Normalized scores of returns, as reported in offline RL."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ REFERENCE_RETURNS = {
 
 
 def normalized_score(returns: Returns, name: str) -> Returns:
-    """Puts returns on D4RL's scale: 0 is a random policy's, 100 an expert's.
+    """Normalizes returns to D4RL's scale: a random policy has 0, an expert 100.
 
     Args:
         returns: One return or many.
-        name: Name of a data set or task, which begins with one of ``REFERENCE_RETURNS``, such as
+        name: Name of a data set or task that begins with a key of ``REFERENCE_RETURNS``, such as
             "hopper-medium-v0" or "Hopper-v5".
 
     Returns:
         100 * (return - random) / (expert - random), of the same kind and shape.
 
     Raises:
-        ValueError: If there are no reference values for that name.
+        ValueError: If there are no reference returns for the name.
 
     Source: D4RL (arXiv 2004.07219), section 5.
 
@@ -44,17 +44,17 @@ def normalized_score(returns: Returns, name: str) -> Returns:
 
 
 def normalized_spread(spread: Returns, name: str) -> Returns:
-    """Puts a standard deviation of returns, or another difference of them, on D4RL's scale.
+    """Normalizes a standard deviation of returns, or another difference, to D4RL's scale.
 
     Args:
         spread: The difference of returns.
         name: As for :func:`normalized_score`.
 
     Returns:
-        100 * spread / (expert - random): a difference has no offset.
+        100 * spread / (expert - random), without the offset of returns.
 
     Raises:
-        ValueError: If there are no reference values for that name.
+        ValueError: If there are no reference returns for the name.
 
     Example:
         >>> round(normalized_spread(325.4572305, "Hopper-v5"), 6)
@@ -65,13 +65,10 @@ def normalized_spread(spread: Returns, name: str) -> Returns:
 
 
 def has_reference(name: str) -> bool:
-    """Says whether returns of a data set or task can be normalised.
+    """Returns whether there are reference returns for a data set or task.
 
     Args:
         name: As for :func:`normalized_score`.
-
-    Returns:
-        Whether there are reference values.
 
     Example:
         >>> has_reference("CartPole-v1")
@@ -90,6 +87,6 @@ def _reference(name: str) -> tuple[float, float]:
 
 
 def _family(name: str) -> str:
-    """The task that a name begins with: "hopper" of "mujoco/hopper/medium-v0" and "Hopper-v5"."""
+    """The task in a name: "hopper" in "mujoco/hopper/medium-v0" and "Hopper-v5"."""
     parts = name.lower().removeprefix("mujoco/").replace("/", "-").split("-")
     return parts[0]

@@ -1,4 +1,4 @@
-"""Some episodes out of many, and many out of some."""
+"""Selecting and joining episodes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
 
     Args:
         episodes: The data.
-        index: Which ones, in the order that they are to have; int64 [M].
+        index: Indices of the episodes, in the order of the result; int64 [M].
 
     Returns:
-        Those episodes.
+        The selected episodes.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -28,7 +28,7 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
         >>> select_episodes(episodes, torch.tensor([1])).rows["observation"].flatten()
         tensor([2., 3., 4., 0.])
     """
-    lengths = episodes.lengths[index] + 1  # with the observation that each ended in
+    lengths = episodes.lengths[index] + 1  # including the final observation
     shifts = episodes.first_rows[index] - (lengths.cumsum(0) - lengths)
     steps = torch.arange(int(lengths.sum()), device=lengths.device)
     rows = steps + shifts.repeat_interleave(lengths)
@@ -41,10 +41,11 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
 
 
 def join_episodes(parts: Sequence[Episodes]) -> Episodes:
-    """Copies episodes behind each other.
+    """Concatenates data sets.
 
     Args:
-        parts: Data sets of the same fields, at least one; the first names the source.
+        parts: Data sets with the same fields, at least one; the result has the source and the
+            attributes of the first.
 
     Returns:
         The episodes of all of them.

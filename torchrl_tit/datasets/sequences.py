@@ -1,4 +1,4 @@
-"""Subsequences of episodes, as Decision Transformer is trained on."""
+"""Windows of episodes on which Decision Transformer is trained."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from torchrl_tit.datasets.storage import EpisodeStorage
 
 
 class SequenceStorage(EpisodeStorage):
-    """Up to K steps from any step of a finished episode on, padded on the left.
+    """Windows of up to K steps that start at any step of a finished episode, padded on the left.
 
     An item has "observation" [K, *obs], "action" [K, *action] (int64 if it is discrete),
     "return_to_go" [K, 1], "timestep" int64 [K] and "mask" bool [K], which is False at padding.
-    Drawing indices uniformly draws an episode with a probability proportional to its length, and
-    then a uniform start inside it.
+    A uniformly drawn index is an episode, drawn with a probability proportional to its length, and
+    a uniformly drawn start within it.
 
     Args:
         episodes: The data.
-        context: K, the number of steps, at least 1.
+        num_frames: Number K of steps, at least 1.
         mean: Subtracted from observations; [*obs], as of
             :meth:`~torchrl_tit.datasets.Episodes.observation_statistics`.
         std: Observations are divided by it; [*obs].
         return_scale: Returns-to-go are divided by it.
-        action_padding: What stands for the actions of padding; all else is 0 there.
+        action_padding: Value of the actions at padding, where all else is 0.
 
     Raises:
-        ValueError: If ``context`` is less than 1, ``return_scale`` is not positive, or one of
+        ValueError: If ``num_frames`` is less than 1, ``return_scale`` is not positive, or one of
             ``mean`` and ``std`` is missing.
         DatasetError: If no episode is finished.
 
@@ -39,7 +39,7 @@ class SequenceStorage(EpisodeStorage):
         >>> from torchrl_tit.datasets import episodes_from_arrays
         >>> ends = np.array([False, True, False, True])
         >>> episodes = episodes_from_arrays(np.ones((4, 2)), np.ones((4, 1)), np.arange(4), ends)
-        >>> item = SequenceStorage(episodes, context=3, return_scale=1.0)[2]
+        >>> item = SequenceStorage(episodes, num_frames=3, return_scale=1.0)[2]
         >>> item["mask"], item["return_to_go"].flatten()
         (tensor([False,  True,  True]), tensor([0., 5., 3.]))
     """
@@ -47,26 +47,26 @@ class SequenceStorage(EpisodeStorage):
     def __init__(
         self,
         episodes: Episodes,
-        context: int = 20,
+        num_frames: int = 20,
         *,
         mean: Tensor | None = None,
         std: Tensor | None = None,
         return_scale: float = 1000.0,
         action_padding: float = -10.0,
     ) -> None:
-        if context < 1:
-            raise ValueError(f"context must be at least 1, but is {context}.")
+        if num_frames < 1:
+            raise ValueError(f"num_frames must be at least 1, not {num_frames}")
         if not return_scale > 0:
-            raise ValueError(f"return_scale must be positive, but is {return_scale}.")
+            raise ValueError(f"return_scale must be positive, not {return_scale}")
         if (mean is None) != (std is None):
-            raise ValueError("mean and std go together: give both, or neither.")
+            raise ValueError("mean and std go together: give both, or neither")
         super().__init__(episodes, episodes.lengths * episodes.finished)
         self._last_rows = episodes.last_rows
         self._returns_to_go = _returns_to_go(episodes).div_(return_scale).float()  # [R]
         self._mean = None if mean is None else mean.to(self.device)
         self._std = None if std is None else std.to(self.device)
         self._action_padding = action_padding
-        self._steps = torch.arange(context, device=self.device)
+        self._steps = torch.arange(num_frames, device=self.device)
 
     def _cut(self, row: Tensor, episode: Tensor) -> TensorDict:
         row, last = row.unsqueeze(-1), self._last_rows[episode].unsqueeze(-1)
@@ -102,7 +102,7 @@ def _returns_to_go(episodes: Episodes) -> Tensor:
     """Sum of the rewards from each row to its episode's end; float64 [R]."""
     rewards = episodes.rows["reward"].squeeze(-1).cpu().double().numpy()
     total = np.cumsum(rewards[::-1])[::-1]
-    # Beside an episode's final observation stands no reward: the sum there is that of later ones.
+    # The row of an episode's final observation has no reward: the sum there is of later episodes.
     later = torch.from_numpy(total.copy()).to(episodes.lengths.device)
     after = later[episodes.last_rows + 1]
     return later - after.repeat_interleave(episodes.lengths + 1)

@@ -1,4 +1,4 @@
-"""One way in for data of every kind."""
+"""Loads a data set from any supported source."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ def load_episodes(
     directory: str | os.PathLike[str] | None = None,
     cache_dir: str | os.PathLike[str] | None = None,
 ) -> Episodes:
-    """Reads a data set from wherever it is, in chunks, into memory-mapped rows.
+    """Reads a data set of any supported kind, in chunks, into memory-mapped rows.
 
     Args:
         source: An HDF5 file in D4RL's layout (".hdf5" or ".h5"); a folder with a Minari data set;
             D4RL's name of a data set, such as "hopper-medium-replay-v0"; or Minari's, such as
-            "mujoco/hopper/medium-v0". What has a name is downloaded once.
-        task: The task whose sizes and action bounds the data must have, and whose name, where they
-            give one: a name that Gymnasium has registered, such as "Hopper-v5", or its spaces. Not
-            checked where None.
-        max_episode_steps: The time limit of an HDF5 file that does not say where it struck: see
+            "mujoco/hopper/medium-v0". Named data sets are downloaded once.
+        task: The task whose shapes and action bounds the data must have, and whose name, if they
+            record one: a name registered with Gymnasium, such as "Hopper-v5", or the spaces. Not
+            checked if None.
+        max_episode_steps: The time limit of an HDF5 file without "timeouts": see
             :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
-        gaps: What to do where an HDF5 file's episode goes on with another observation than its
-            "next_observations" says: see there too.
-        dtype: What floats are turned into; each field keeps its own where None. Integers stay.
-        directory: A folder on a disk with room for the rows, which leave nothing there; the
-            system's for temporary files where None.
-        cache_dir: Where D4RL's files are kept: see :func:`~torchrl_tit.datasets.download_d4rl`.
+        gaps: What to do where "next_observations" of an HDF5 file is not the observation of the
+            next row: see there too.
+        dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
+        directory: A folder on a disk with room for the rows, where no files remain; by default the
+            system's folder for temporary files.
+        cache_dir: Folder of D4RL's files: see :func:`~torchrl_tit.datasets.download_d4rl`.
 
     Returns:
         The episodes.
@@ -55,20 +55,20 @@ def load_episodes(
     Raises:
         ValueError: If the source is none of these, or the task is unknown.
         FileNotFoundError: If there is no such file or data set.
-        OSError: If it cannot be downloaded, or the disk has no room.
-        DatasetError: If its data cannot be used; says which file, field and row.
+        OSError: If it cannot be downloaded, or the disk is full.
+        DatasetError: If the data cannot be used; the message names the file, field and row.
 
     Example:
         >>> load_episodes("hopper")
         Traceback (most recent call last):
         ...
-        ValueError: 'hopper' is no data set: give an HDF5 file, a Minari folder, D4RL's name (as ...
+        ValueError: 'hopper' is not a data set: give an HDF5 file, a Minari folder, D4RL's name ...
     """
     spaces = task_spaces(task) if isinstance(task, str) else task
     name = os.fspath(source)
     path = Path(source)
     if name in D4RL_DATASETS and not path.exists():
-        if spaces is not None and has_reference(name):  # such a name begins with the task's
+        if spaces is not None and has_reference(name):  # such names begin with that of the task
             check_task_name(name, name.split("-")[0], spaces)
         path = download_d4rl(name, cache_dir)
     if path.is_file() or path.suffix in HDF5_SUFFIXES:
@@ -87,16 +87,16 @@ def load_episodes(
     if path.is_absolute() or name.startswith("."):
         raise FileNotFoundError(f"There is no data set {name}.")
     raise ValueError(
-        f"{name!r} is no data set: give an HDF5 file, a Minari folder, D4RL's name (as "
-        f"'hopper-medium-replay-v0') or Minari's (as 'mujoco/hopper/medium-v0')."
+        f"{name!r} is not a data set: give an HDF5 file, a Minari folder, D4RL's name (such as "
+        f"'hopper-medium-replay-v0') or Minari's (such as 'mujoco/hopper/medium-v0')."
     )
 
 
 def _check_spelling(name: str) -> None:
-    """Refuses what is nearly one of D4RL's names, which Minari would look for in vain."""
+    """Raises ValueError if the name is a misspelling of one of D4RL's."""
     nearest = difflib.get_close_matches(name, D4RL_DATASETS, n=3, cutoff=0.8)
     if nearest and name not in minari.list_local_datasets():
         raise ValueError(
-            f"{name!r} is no data set: did you mean {' or '.join(nearest)}? Minari has none "
-            "of that name on this machine."
+            f"{name!r} is not a data set: did you mean {' or '.join(nearest)}? Minari has no "
+            "data set of that name on this machine."
         )

@@ -1,4 +1,4 @@
-"""A TorchRL storage that cuts what a sample needs out of episodes, by index, when it is drawn."""
+"""A TorchRL storage that gathers samples from episodes when they are drawn."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from torchrl_tit.datasets.errors import DatasetError
 
 
 class EpisodeStorage(Storage):
-    """Items that start at the steps of episodes, the same number from each step on; read only.
+    """A read-only storage with one item for each step of episodes.
 
-    Any TorchRL sampler draws their indices, and uniform sampling of indices is uniform over steps.
+    Any TorchRL sampler can draw the indices; uniform sampling of indices is uniform over steps.
 
     Args:
-        episodes: The data, on the device where items are cut.
-        counts: How many steps of each episode, from its first on, are items; int64 [E].
+        episodes: The data, on the device where items are gathered.
+        counts: Number of steps of each episode, from its first, that are items; int64 [E].
 
     Raises:
         DatasetError: If no step is left.
@@ -33,23 +33,23 @@ class EpisodeStorage(Storage):
         if self.max_size == 0:
             raise DatasetError(
                 episodes.source,
-                f"nothing can be drawn from its {len(episodes.lengths)} episodes: none ends, or "
-                f"the transitions of all are left out.",
+                f"nothing can be drawn from its {len(episodes.lengths)} episodes: none is "
+                f"finished, or all their transitions are left out.",
             )
         self.device = episodes.lengths.device
         self._fields = dict(episodes.rows.items())  # [R, ...]
         self._first_rows = episodes.first_rows
-        self._ends = counts.cumsum(0)  # [E]: the index after each episode's last item
-        self._shifts = episodes.first_rows - (self._ends - counts)  # [E]: from index to row
+        self._ends = counts.cumsum(0)  # [E]: index after the last item of each episode
+        self._shifts = episodes.first_rows - (self._ends - counts)  # [E]: row minus index
 
     def get(self, index: int | slice | Sequence[int] | Tensor) -> TensorDict:
-        """Cuts items out of the data.
+        """Gathers items.
 
         Args:
             index: Indices of items; negative ones count from the end.
 
         Returns:
-            The items, of the index's shape.
+            The items, with the shape of the index.
 
         Raises:
             IndexError: If there is no such item (on a CPU; elsewhere that is not checked).
@@ -60,7 +60,7 @@ class EpisodeStorage(Storage):
 
     @abstractmethod
     def _cut(self, row: Tensor, episode: Tensor) -> TensorDict:
-        """The items whose steps stand in these rows and episodes, [...] each."""
+        """Gathers the items of these rows and episodes, int64 [...] each."""
 
     def _take(self, name: str, rows: Tensor) -> Tensor:
         """Rows of a field; index_select is several times as fast as indexing."""
@@ -71,7 +71,7 @@ class EpisodeStorage(Storage):
         if isinstance(index, slice):
             return torch.arange(*index.indices(len(self)), device=self.device)
         index = torch.as_tensor(index, device=self.device)
-        if index.device.type != "cpu":  # where looking at the values would wait for the device
+        if index.device.type != "cpu":  # reading the values would synchronize
             return torch.where(index < 0, index + len(self), index)
         low, high = (int(index.min()), int(index.max())) if index.numel() else (0, 0)
         if low < -len(self) or high >= len(self):
@@ -89,20 +89,20 @@ class EpisodeStorage(Storage):
         raise RuntimeError("A data set cannot be emptied.")
 
     def state_dict(self) -> dict[str, Any]:
-        """What tells whether a saved state belongs to these data, which are not part of it."""
+        """Returns what identifies the data, which are not part of the state."""
         return {"num_items": len(self)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Checks that a state was saved over these data.
+        """Checks that a state was saved with the same data.
 
         Args:
-            state_dict: What `state_dict` returned.
+            state_dict: A return value of `state_dict`.
 
         Raises:
-            ValueError: If it was saved over others.
+            ValueError: If it was saved with other data.
         """
         if state_dict["num_items"] != len(self):
             raise ValueError(
-                f"The state was saved over {state_dict['num_items']} items, but there are "
+                f"The state was saved with {state_dict['num_items']} items, but there are "
                 f"{len(self)}; load the same data with the same settings."
             )

@@ -1,4 +1,4 @@
-"""What a Gymnasium task asks of its data."""
+"""What a Gymnasium task requires of its data."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchrl_tit.envs import is_atari, make_games
 
 
 class TaskSpaces(NamedTuple):
-    """What the observations and actions of a task look like.
+    """The spaces of a task.
 
     Args:
         observation: Gymnasium's space of one observation.
@@ -27,12 +27,12 @@ class TaskSpaces(NamedTuple):
 
 
 def task_spaces(env_name: str) -> TaskSpaces:
-    """Asks a Gymnasium task for its spaces.
+    """Returns the spaces of a Gymnasium task.
 
     Args:
         env_name: A name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
-            "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one picture
-            of 84 x 84 grey levels.
+            "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one grey
+            image of 84 x 84.
 
     Returns:
         Its spaces.
@@ -59,15 +59,16 @@ def task_spaces(env_name: str) -> TaskSpaces:
 
 
 def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
-    """Checks that data that say what task they are of are of that which is asked for.
+    """Checks that the data set's recorded task is the requested one.
 
-    Tasks of the same sizes, such as HalfCheetah and Walker2d, cannot be told apart otherwise.
+    Tasks whose spaces have the same shapes, such as HalfCheetah and Walker2d, cannot be told apart
+    otherwise.
 
     Args:
         source: What the data came from, for messages.
-        recorded: The name of the data's task; anything but text where they do not say.
-        task: The task. Its version may be another, and nothing is known of one without a name of
-            Gymnasium's form.
+        recorded: The recorded name of the task; anything but a string if there is none.
+        task: The requested task. The versions may differ. Nothing is checked if its name does not
+            have Gymnasium's form.
 
     Raises:
         DatasetError: If it is another task.
@@ -87,14 +88,16 @@ def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
         return
     if space == task_space and name.lower() != task_name.lower():
         raise DatasetError(
-            source, f"is {recorded}, but the task is {task.name}: take data of that.", "env_id"
+            source,
+            f"is {recorded}, but the task is {task.name}: use other data.",
+            "env_id",
         )
 
 
 def check_shape(
     source: str, field: str, shape: tuple[int, ...], space: Space, task: TaskSpaces
 ) -> None:
-    """Checks that observations or actions have the size that a task's have.
+    """Checks that observations or actions have the shape of the task's.
 
     Args:
         source: What the data came from, for messages.
@@ -104,18 +107,18 @@ def check_shape(
         task: The task, for messages.
 
     Raises:
-        DatasetError: If they have another.
+        DatasetError: If the shape differs.
 
     Example:
         >>> task = task_spaces("Pendulum-v1")
         >>> check_shape("a.hdf5", "actions", (1,), task.action, task)
     """
     expected = space.shape or ()
-    # One number is kept in a column of its own.
+    # A single number may be a column of its own.
     if shape != expected and not (expected == () and shape == (1,)):
         raise DatasetError(
             source,
             f"one row has the shape {list(shape)}, but in {task.name} it is {list(expected)}; "
-            f"these data are of another task.",
+            f"the data set is of another task.",
             field,
         )

@@ -1,4 +1,4 @@
-"""Reads D4RL's fields in chunks, and says clearly what is wrong with them."""
+"""Reads and checks fields in D4RL's layout, in chunks."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _REQUIRED = FIELDS[:4]
 
 
 class TransitionReader:
-    """The fields of one source, whose names, lengths and shapes are checked at once.
+    """The fields of one source; names, lengths and shapes are checked on construction.
 
     Args:
-        fields: Arrays by D4RL's names: NumPy arrays or HDF5 data sets, whose slices are read.
-        source: What the data came from, for messages.
-        task: The task whose sizes and action bounds they must have; not checked where None.
-        dtype: What floats are turned into; each field keeps its own where None.
+        fields: Arrays by D4RL's names: NumPy arrays or HDF5 data sets, which are read in slices.
+        source: Name of the source, for messages.
+        task: The task whose shapes and action bounds the data must have; not checked if None.
+        dtype: The dtype for floats; None keeps that of each field.
 
     Raises:
         DatasetError: If a field is missing, empty, or of the wrong length, shape or dtype.
@@ -65,11 +65,11 @@ class TransitionReader:
         """Shape of one row."""
         shape = getattr(self.fields[name], "shape", None)
         if not shape:
-            raise DatasetError(self.source, "is not an array with a row a transition.", name)
+            raise DatasetError(self.source, "is not an array with one row per transition.", name)
         row = tuple(shape[1:])
         numbers = {*FLAGS, "rewards"}
         if self.task is not None and self.task.action.shape == ():
-            numbers.add("actions")  # a choice, which may stand in a column of its own
+            numbers.add("actions")  # discrete, which may be a column of its own
         return () if row == (1,) and name in numbers else row
 
     def _check_sizes(self) -> None:
@@ -80,7 +80,9 @@ class TransitionReader:
                 )
             if name in (*FLAGS, "rewards") and shape != ():
                 raise DatasetError(
-                    self.source, f"one row has the shape {list(shape)}, but is one number.", name
+                    self.source,
+                    f"one row has the shape {list(shape)}, but must be a number.",
+                    name,
                 )
             self.torch_dtype(name)
         if self.shapes["observations"] == ():
@@ -103,11 +105,11 @@ class TransitionReader:
                 check_shape(self.source, name, self.shapes[name], space, self.task)
 
     def torch_dtype(self, name: str) -> torch.dtype:
-        """What a field is kept as."""
+        """The dtype in which a field is kept."""
         return kept_dtype(self.source, name, np.dtype(self.fields[name].dtype), self.dtype)
 
     def row_fields(self) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
-        """Shapes and dtypes of the rows to make."""
+        """Shapes and dtypes of the rows of the episodes."""
         return {
             "observation": (self.shapes["observations"], self.torch_dtype("observations")),
             "action": (self.shapes["actions"], self.torch_dtype("actions")),
@@ -117,7 +119,7 @@ class TransitionReader:
         }
 
     def flags(self, name: str) -> NDArray:
-        """All of a field of flags; bool [N]."""
+        """All values of a field of flags; bool [N]."""
         values = self._slice(name, 0, self.num_rows).reshape(self.num_rows)
         wrong = (values != 0) & (values != 1)
         if wrong.any():
@@ -126,14 +128,14 @@ class TransitionReader:
         return values.astype(bool)
 
     def chunks(self, name: str) -> Iterator[tuple[int, Tensor]]:
-        """A field in pieces, each with the number of its first row."""
+        """The chunks of a field, each with the index of its first row."""
         dtype = self.fields[name].dtype
         size = rows_per_chunk(dtype.itemsize * int(np.prod(self.shapes[name])))
         for start in range(0, self.num_rows, size):
             yield start, self.read(name, start, start + size)
 
     def read(self, name: str, start: int, stop: int) -> Tensor:
-        """Checked rows as they are kept; [n, *row]."""
+        """Reads, checks and converts some rows; [n, *row]."""
         values = self._slice(name, start, stop)
         dtype = self.torch_dtype("observations" if name == "next_observations" else name)
         check_finite(self.source, name, values, start, dtype)
@@ -145,7 +147,7 @@ class TransitionReader:
     def _slice(self, name: str, start: int, stop: int) -> NDArray:
         try:
             return np.asarray(self.fields[name][start:stop])
-        except OSError as error:  # a file that is damaged further in
+        except OSError as error:  # a file that is damaged here
             raise DatasetError(
                 self.source, f"rows from here on cannot be read ({error}).", name, start
             ) from error

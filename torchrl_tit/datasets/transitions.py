@@ -1,4 +1,4 @@
-"""Episodes from transitions that stand in arrays, one row each, as D4RL keeps them."""
+"""Builds episodes from arrays of transitions, the layout of D4RL."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
-from torchrl_tit.datasets.memory import memory_mapped_rows
+from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
 from torchrl_tit.datasets.tasks import TaskSpaces, check_task_name
 from torchrl_tit.datasets.transition_reader import FIELDS, TransitionReader
 
@@ -30,17 +30,17 @@ def episodes_from_arrays(
     next_observations: ArrayLike | None = None,
     **settings: Any,
 ) -> Episodes:
-    """Makes episodes from transitions in arrays, one row each, in the order they happened.
+    """Builds episodes from arrays of transitions, in the order in which they happened.
 
     Args:
-        observations: [N, *obs]; floats, or integers such as the uint8 of images, one frame each.
+        observations: [N, *obs]; floats, or integers such as uint8 images, one frame each.
         actions: [N, A] floats, or [N] integers.
         rewards: [N].
         terminals: Whether the transition led into a terminal state; bool [N].
-        timeouts: Whether the episode was cut off after it; bool [N].
+        timeouts: Whether the episode was truncated after it; bool [N].
         next_observations: [N, *obs].
-        **settings: As for :func:`episodes_from_transitions`, where the rules for what is missing
-            stand too.
+        **settings: As for :func:`episodes_from_transitions`, which describes how missing arrays are
+            replaced.
 
     Returns:
         The episodes.
@@ -74,38 +74,36 @@ def episodes_from_transitions(
     directory: str | os.PathLike[str] | None = None,
     attributes: Mapping[str, Any] | None = None,
 ) -> Episodes:
-    """Makes episodes from transitions in D4RL's layout, read in chunks.
+    """Builds episodes from transitions in D4RL's layout, read in chunks.
 
-    An episode ends at a row that ``terminals`` or ``timeouts`` marks. Without ``timeouts``, it also
-    ends where ``next_observations`` is not the observation of the row after, and after
-    ``max_episode_steps`` steps. Without ``next_observations``, the observation in which an episode
-    ended is unknown: zeros stand for it at a terminal, where nothing is learned from it, and the
-    last transition before a time limit is there for returns and sequences, but never drawn as a
-    transition.
+    An episode ends at a row that ``terminals`` or ``timeouts`` marks. Without ``timeouts``, it is
+    also truncated where ``next_observations`` is not the observation of the next row, and after
+    ``max_episode_steps`` steps. Without ``next_observations``, final observations are unknown.
+    Those of terminal states become zeros, since nothing is learned from them. The last transition
+    before a time limit then counts for returns and sequences, but is never drawn as a transition.
 
     Args:
-        fields: Arrays by D4RL's names, whose slices are read once: NumPy arrays or HDF5 data sets.
-            See :func:`episodes_from_arrays` for what they hold.
-        source: What the data came from, for messages.
-        task: The task whose sizes and action bounds the data must have; not checked where None.
-        max_episode_steps: The time limit of data that do not say where it struck.
-        gaps: What to do where an episode goes on with another observation than
-            ``next_observations`` says: ``"error"`` refuses the data, ``"cut"`` ends the episode
-            there, as cut off.
-        dtype: What floats are turned into; each field keeps its own where None. Integers stay.
-        directory: Where the memory-mapped rows go on the disk; see
-            :func:`~torchrl_tit.datasets.memory.memory_mapped_rows`.
-        attributes: What the source says about itself; where that includes "env_id", the name of
-            the task, it must be that of ``task``, though the version may be another.
+        fields: Arrays by D4RL's names: NumPy arrays or HDF5 data sets, which are read in slices.
+            See :func:`episodes_from_arrays` for their shapes.
+        source: Name of the source, for messages.
+        task: The task whose shapes and action bounds the data must have; not checked if None.
+        max_episode_steps: The time limit of data without ``timeouts``.
+        gaps: What to do where ``next_observations`` is not the observation of the next row within
+            an episode: ``"error"`` raises, ``"cut"`` truncates the episode there.
+        dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
+        directory: Folder for the memory-mapped rows; see
+            :func:`~torchrl_tit.datasets.memory_mapping.memory_mapped_rows`.
+        attributes: Metadata of the source. If they contain "env_id", the name of the task, it must
+            be that of ``task``, except for the version.
 
     Returns:
-        The episodes. The last one may be unfinished, where the data break off.
+        The episodes. The last one may be unfinished.
 
     Raises:
-        ValueError: If ``max_episode_steps`` is less than 1, or ``gaps`` is none of the above.
-        DatasetError: If a field is missing, empty, of another length, shape or dtype than it must
-            be, holds NaN, infinity, or actions out of bounds, if no episode ends, or an episode
-            goes on with another observation than ``next_observations`` says.
+        ValueError: If ``max_episode_steps`` is less than 1, or ``gaps`` is not one of the above.
+        DatasetError: If a field is missing or empty, has the wrong length, shape or dtype, or
+            contains NaN, infinity, or actions out of bounds; if no episode ends; or if
+            ``next_observations`` is not the observation of the next row within an episode.
 
     Example:
         >>> fields = {"observations": np.zeros((2, 3)), "rewards": np.zeros(2)}
@@ -131,7 +129,7 @@ def episodes_from_transitions(
         last_steps = np.append(last_steps, reader.num_rows - 1)
 
     rows = memory_mapped_rows(reader.num_rows + len(last_steps), reader.row_fields(), directory)
-    # An episode's final observation is one more row, so what comes after it moves by one.
+    # The final observation of an episode is one more row, so all later rows move by one.
     row_of = np.arange(reader.num_rows)
     row_of[1:] += ends[:-1].cumsum()
     for name in ("observations", "actions", "rewards"):
@@ -160,7 +158,7 @@ _ROW_NAMES = {"observations": "observation", "actions": "action", "rewards": "re
 def _ends(
     reader: TransitionReader, terminated: NDArray, max_episode_steps: int | None, gaps: Gaps
 ) -> tuple[NDArray, NDArray]:
-    """Where episodes were cut off, and where they end at all; bool [N] each."""
+    """Where episodes were truncated, and where they end; bool [N] each."""
     marked = "timeouts" in reader.fields
     truncated = reader.flags("timeouts") if marked else np.zeros_like(terminated)
     if "next_observations" in reader.fields and (gaps == "cut" or not marked):
@@ -175,10 +173,10 @@ def _ends(
 
 
 def _gaps(reader: TransitionReader) -> NDArray:
-    """Where the next observation is not the observation of the row after; bool [N]."""
+    """Where the next observation is not the observation of the next row; bool [N]."""
     gaps = np.zeros(reader.num_rows, dtype=bool)
     for start, following in reader.chunks("next_observations"):
-        # The last row has no row after it to compare with.
+        # The last row has no next row to compare with.
         after = reader.read("observations", start + 1, start + 1 + len(following))
         differs = (following[: len(after)] != after).flatten(1).any(1)
         gaps[start : start + len(after)] = differs.numpy()
@@ -188,11 +186,11 @@ def _gaps(reader: TransitionReader) -> NDArray:
 def _place_next_observations(
     reader: TransitionReader, observations: Tensor, row_of: NDArray, ends: NDArray
 ) -> None:
-    """Writes the observation that each episode ended in, and checks the others; row_of [N]."""
+    """Writes the final observations, and checks the others; row_of int64 [N]."""
     for start, following in reader.chunks("next_observations"):
         part = slice(start, start + len(following))
         target = torch.from_numpy(row_of[part] + 1)
-        # Where an episode ends, and after the very last row, there is nothing to compare with.
+        # At the end of an episode, and after the very last row, there is nothing to compare with.
         is_final = torch.from_numpy(ends[part].copy())
         is_final[reader.num_rows - 1 - start :] = True
         observations[target[is_final]] = following[is_final]
@@ -200,8 +198,8 @@ def _place_next_observations(
         if differs.any():
             raise DatasetError(
                 reader.source,
-                "is not the observation of the row after, but the episode goes on there; "
-                'gaps="cut" ends it there.',
+                "is not the observation of the next row, but the episode continues there; "
+                'gaps="cut" truncates it there.',
                 "next_observations",
                 start + int(differs.int().argmax()),
             )

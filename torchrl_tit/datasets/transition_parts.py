@@ -1,4 +1,4 @@
-"""Transitions in the making: a file for each piece of work, and episodes of all of them."""
+"""Transitions that are collected in parts, one file each, and joined into episodes."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from torchrl_tit.files import whole_or_not_at_all
 
 
 class TransitionParts:
-    """A folder of numbered files with transitions, each written whole or not at all.
+    """A folder of numbered files of transitions, each written atomically.
 
-    A part holds S streams of transitions side by side, as environments that are stepped together
-    give them, and each stream goes on in the next part. So an episode can reach over many parts,
-    and what a killed process had written is still there.
+    A part contains S streams of transitions, one from each environment of a batch, and each stream
+    continues in the next part. So an episode can span many parts, and the parts that a killed
+    process has written are not lost.
 
     Args:
-        folder: Where the files are; made where missing.
+        folder: The folder of the files, which is created if missing.
 
     Example:
         >>> import tempfile
@@ -50,10 +50,10 @@ class TransitionParts:
         """Lists the parts.
 
         Args:
-            last: Leaves out those that come after this number.
+            last: Number of the last part to list; all by default.
 
         Returns:
-            Their numbers, the smallest first.
+            The numbers of the parts in ascending order.
         """
         found = sorted(int(path.stem) for path in self.folder.glob("[0-9]*.hdf5"))
         return [number for number in found if last is None or number <= last]
@@ -62,11 +62,11 @@ class TransitionParts:
         """Writes a part.
 
         Args:
-            number: What it comes behind the others by.
-            fields: All of D4RL's fields, by name: [S, T, ...] each, with a row a transition.
+            number: The part's number, which determines the order of the parts.
+            fields: All of D4RL's fields, by name: [S, T, ...] each, one row per transition.
 
         Raises:
-            FileExistsError: If there is one of that number already.
+            FileExistsError: If a part of that number exists already.
             OSError: If it cannot be written.
         """
         with whole_or_not_at_all(self._path(number)) as hidden, h5py.File(hidden, "w") as file:
@@ -81,7 +81,7 @@ class TransitionParts:
             number: Its number.
 
         Returns:
-            What was written.
+            The fields as they were written.
 
         Raises:
             DatasetError: If it is damaged.
@@ -90,10 +90,10 @@ class TransitionParts:
             return {name: file[name][:] for name in FIELDS}
 
     def drop_after(self, number: int) -> None:
-        """Removes the parts behind a number, and what a killed process left half-written.
+        """Removes the parts after a number, and unfinished files of a killed process.
 
         Args:
-            number: Of the last part that stays.
+            number: Number of the last part to keep.
         """
         for path in self.folder.glob(".*.tmp"):
             path.unlink()
@@ -105,10 +105,10 @@ class TransitionParts:
         """Counts transitions.
 
         Args:
-            last: Leaves out the parts that come after this number.
+            last: Number of the last part to count; all by default.
 
         Returns:
-            How many there are.
+            The number of transitions.
         """
         total = 0
         for number in self.numbers(last):
@@ -117,24 +117,24 @@ class TransitionParts:
         return total
 
     def episodes(self, last: int | None = None, **settings: Any) -> Episodes:
-        """Puts the parts together, one stream after the other, without reading them all at once.
+        """Joins the parts, one stream after the other, without reading them all at once.
 
-        An episode that a stream leaves unfinished, at its end or because the next part begins with
-        another observation than the one before ended in, counts as cut off there.
+        An episode that is unfinished at the end of a stream, or where the next part begins with
+        another observation than the last part ended with, is truncated there.
 
         Args:
-            last: Leaves out the parts that come after this number.
+            last: Number of the last part to join; all by default.
             **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
 
         Returns:
-            The episodes, in the dtypes that were written.
+            The episodes, with the dtypes of the files.
 
         Raises:
-            DatasetError: If there are none, a part is damaged, or the parts do not fit each other.
+            DatasetError: If there are no parts, one is damaged, or their shapes differ.
         """
         numbers = self.numbers(last)
         if not numbers:
-            raise DatasetError(str(self.folder), "holds no transitions.")
+            raise DatasetError(str(self.folder), "contains no transitions.")
         fields: dict[str, Any] = {name: self._joined(numbers, name) for name in FIELDS}
         streams = self._shape(numbers[0], "rewards")[0]
         ends = fields["terminals"][:].reshape(streams, -1)
@@ -146,14 +146,14 @@ class TransitionParts:
         )
 
     def _joined(self, numbers: list[int], name: str) -> JoinedField:
-        """All rows of a field, stream by stream; [S * T, ...]."""
+        """All rows of a field, stream after stream; [S * T, ...]."""
         first = self._shape(numbers[0], name)
 
         def check(number: int, shape: tuple[int, ...]) -> None:
             if (shape[0], *shape[2:]) != (first[0], *first[2:]):
                 raise DatasetError(
                     str(self._path(number)),
-                    f"has the shape {list(shape)}, which does not go on with that of "
+                    f"has the shape {list(shape)}, which does not fit that in "
                     f"{self._path(numbers[0]).name}, {list(first)}.",
                     name,
                 )
@@ -161,7 +161,7 @@ class TransitionParts:
         return JoinedField(name, numbers, self._open, check)
 
     def _shape(self, number: int, name: str) -> tuple[int, ...]:
-        """Streams of a part, steps of each, and the shape of a row."""
+        """Shape of a field of a part: streams, steps, and the shape of a row."""
         with self._open(number) as file:
             return file[name].shape
 

@@ -1,4 +1,4 @@
-"""Tensors that lie on the disk and are read and written as if they were in memory."""
+"""Memory-mapped tensors, for data that are larger than the memory."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ def memory_mapped_rows(
     fields: Mapping[str, tuple[tuple[int, ...], torch.dtype]],
     directory: str | os.PathLike[str] | None = None,
 ) -> TensorDict:
-    """Makes rows of zeros in memory-mapped files, so that they may be larger than the memory.
+    """Creates rows of zeros in memory-mapped files.
 
-    The files have no name once they are mapped (where the system allows that), so nothing is left
-    of them when the tensors are gone, however the program ends.
+    The files are unlinked once they are mapped (where the system allows that), so nothing remains
+    of them when the tensors are freed, however the program ends.
 
     Args:
-        num_rows: R, the number of rows.
+        num_rows: Number R of rows.
         fields: The shape of one row of each field, and its dtype.
-        directory: A folder on the disk that the files go to; the system's for temporary files where
-            None, which may be a small one.
+        directory: Folder for the files; by default the system's folder for temporary files, which
+            may be small.
 
     Returns:
         Tensors [R, *shape] by name.
 
     Raises:
-        OSError: If the disk has no room for them, or the folder cannot be written.
+        OSError: If the disk is full, or the folder cannot be written.
 
     Example:
         >>> memory_mapped_rows(5, {"reward": ((1,), torch.float32)})["reward"].shape
@@ -52,7 +52,7 @@ def memory_mapped_rows(
 def _map(file: Path, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     size = prod(shape)
     if hasattr(os, "posix_fallocate"):
-        # Room is taken now: a disk that is full later would kill the program instead of raising.
+        # Allocated now: a disk that is full later would kill the program instead of raising.
         descriptor = os.open(file, os.O_RDWR | os.O_CREAT)
         try:
             os.posix_fallocate(descriptor, 0, max(1, size * dtype.itemsize))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_tit.datasets.memory import memory_mapped_rows
+from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
 
 ROWS, WIDTH = 400_000, 100  # 160 MB of observations, and as much of the next ones
 

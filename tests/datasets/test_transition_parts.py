@@ -1,4 +1,4 @@
-"""Transitions in parts, and the episodes that come out of them."""
+"""Transitions in parts, and the episodes that they form."""
 
 import os
 import sys
@@ -22,7 +22,7 @@ from torchrl_tit.datasets import (
 
 
 def split(arrays: Transitions, streams: int, steps: list[int]) -> list[Transitions]:
-    """The first rows as streams [S, T], cut into parts of so many steps."""
+    """The first rows as streams [S, T], split into parts of the given numbers of steps."""
     total = sum(steps)
     side_by_side = {
         name: array[: streams * total].reshape(streams, total, *array.shape[1:])
@@ -41,12 +41,12 @@ def write_all(folder: Path, pieces: list[Transitions]) -> TransitionParts:
     return parts
 
 
-def test_streams_go_on_from_part_to_part(arrays: Transitions, tmp_path: Path) -> None:
+def test_streams_continue_from_part_to_part(arrays: Transitions, tmp_path: Path) -> None:
     parts = write_all(tmp_path / "parts", split(arrays, 3, [40, 7, 53]))
 
     episodes = parts.episodes()
 
-    # Where a stream ends in the middle of an episode, that is cut off there.
+    # An episode that is unfinished at the end of a stream is truncated there.
     expected = {name: array[:300] for name, array in arrays.items()}
     for last in (99, 199, 299):
         expected["timeouts"][last] |= not expected["terminals"][last]
@@ -58,7 +58,7 @@ def test_streams_go_on_from_part_to_part(arrays: Transitions, tmp_path: Path) ->
     assert episodes.left_out == ()
 
 
-def test_a_restart_between_two_parts_cuts_an_episode_off(
+def test_a_restart_between_two_parts_truncates_an_episode(
     arrays: Transitions, tmp_path: Path
 ) -> None:
     first, lost, later = split(arrays, 1, [4, 3, 30])
@@ -111,7 +111,7 @@ def test_more_parts_than_files_may_be_open(arrays: Transitions, tmp_path: Path) 
     assert (rows == expected).all()
 
 
-def test_pictures_and_discrete_actions_keep_their_dtypes(tmp_path: Path) -> None:
+def test_images_and_discrete_actions_keep_their_dtypes(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     frames = generator.integers(0, 256, (1, 7, 84, 84), dtype=np.uint8)
     ends = np.array([[False, False, True] * 2])
@@ -137,7 +137,7 @@ def test_pictures_and_discrete_actions_keep_their_dtypes(tmp_path: Path) -> None
 
 
 def test_a_game_of_minaris(tmp_path: Path) -> None:
-    """All of the game's actions, and its pictures as they are; not what Minari would recover."""
+    """All actions of the game, and its exact images, not those of Minari's environment."""
     frames = np.zeros((2, 84, 84), np.uint8)
     episodes = episodes_from_arrays(
         frames,
@@ -158,12 +158,12 @@ def test_a_game_of_minaris(tmp_path: Path) -> None:
     assert dataset.storage.metadata["description"] == "two pictures"
 
 
-def test_what_cannot_be_put_together(arrays: Transitions, tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="holds no transitions"):
+def test_parts_that_do_not_fit(arrays: Transitions, tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="contains no transitions"):
         TransitionParts(tmp_path / "none").episodes()
 
     parts = write_all(tmp_path / "parts", [*split(arrays, 2, [10]), *split(arrays, 3, [10])])
-    with pytest.raises(DatasetError, match=r"000000000010.hdf5: .* does not go on with"):
+    with pytest.raises(DatasetError, match=r"000000000010.hdf5: .* does not fit"):
         parts.episodes()
     with pytest.raises(FileExistsError, match="exists already"):
         parts.write(10, split(arrays, 2, [10])[0])
