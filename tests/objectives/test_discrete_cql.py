@@ -1,4 +1,4 @@
-"""The loss of discrete CQL against its formulas, on fixed numbers, by loops in NumPy."""
+"""The loss of discrete CQL equals its formulas, written as loops in NumPy."""
 
 import math
 
@@ -12,6 +12,8 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import SoftUpdate
 
 from torchrl_tit.objectives import DelayedDiscreteCQLLoss
+
+pytestmark = pytest.mark.numerics
 
 BATCH, OBSERVATION, ACTIONS, GAMMA = 6, 4, 3, 0.9
 SPECS = {"categorical": Categorical(ACTIONS), "one-hot": OneHot(ACTIONS)}
@@ -64,7 +66,7 @@ def test_the_formulas(kind):
         index = int(action if kind == "categorical" else action.long().argmax())
         q = values(loss.value_network_params, batch["state"][b])
         best = max(values(loss.target_value_network_params, batch["next", "state"][b]))
-        # Time limits go on; only what is terminated has no future.
+        # Truncated episodes bootstrap, terminated ones do not.
         future = 0.0 if batch["next", "terminated"][b] else GAMMA * best
         error += (q[index] - batch["next", "reward"][b].item() - future) ** 2 / 2 / BATCH
         gap += (math.log(np.exp(q).sum()) - q[index]) / BATCH
@@ -73,13 +75,13 @@ def test_the_formulas(kind):
     assert losses["loss_cql"].item() == pytest.approx(gap, rel=1e-6)
 
 
-def test_gradients_are_of_the_trained_network_alone():
+def test_only_the_trained_network_gets_gradients():
     loss, batch = make_loss(), make_batch()
     losses = loss(batch)
     (losses["loss_qvalue"] + losses["loss_cql"]).backward()
     assert all(w.grad is not None for w in loss.value_network_params.values(True, True))
     assert all(w.grad is None for w in loss.target_value_network_params.values(True, True))
-    updater = SoftUpdate(loss, tau=0.5)  # lets targets begin as copies
+    updater = SoftUpdate(loss, tau=0.5)  # which copies the weights to the targets first
     with torch.no_grad():
         loss.value_network_params.data.add_(1.0)
     before = loss.target_value_network_params.clone()
@@ -88,8 +90,8 @@ def test_gradients_are_of_the_trained_network_alone():
     assert all(torch.allclose(w, torch.full_like(w, 0.5)) for w in moved.values(True, True))
 
 
-def test_target_networks_move_the_loss():
-    """In `DiscreteCQLLoss` of TorchRL 0.14 they do not."""
+def test_the_loss_depends_on_the_target_network():
+    """Unlike that of `DiscreteCQLLoss` in TorchRL 0.14.1."""
     loss, batch = make_loss(), make_batch()
     before = loss(batch.clone())["target_value"]
     for weight in loss.target_value_network_params.values(True, True):

@@ -1,4 +1,4 @@
-"""The contrastive loss of CoBERL: which step does a prediction belong to?"""
+"""The contrastive loss of CoBERL, which TorchRL lacks."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from torch.nn import functional as F
 def contrastive_prediction_loss(
     encodings: Tensor, predictions: Tensor, mask: Tensor, *, temperature: float = 0.1
 ) -> Tensor:
-    r"""Compares the predictions of hidden steps with the encodings of all steps of a batch.
+    r"""Contrasts the predictions of masked steps with the encodings of all steps of a batch.
 
-    With x the predictions, y the encodings and s their cosine similarity over the temperature, a
-    hidden step t costs
+    With x the predictions, y the encodings and s their cosine similarity divided by the
+    temperature, the loss of a masked step t is
 
     .. math::
 
@@ -21,18 +21,19 @@ def contrastive_prediction_loss(
         -\log \frac{e^{s(y_t, x_t)}}{\sum_i e^{s(y_t, x_i)}}
         + \mathrm{KL}(\mathrm{sg}\,p(\cdot | y_t) \,\|\, p(\cdot | x_t))
 
-    where p are the two softmaxes, over the steps i of all histories, and sg stops the gradient.
-    The last term asks both to see the same likeness among steps. Banino et al. (arXiv 2107.05431,
-    section 2.1) publish no code: temperature, cosine and the equal weight of the three are ours.
+    where p are the two softmaxes over the steps i of all histories, and sg stops the gradient. The
+    last term makes the two distributions agree. Banino et al. (arXiv 2107.05431, section 2.1)
+    publish no code: the temperature, the cosine and the equal weight of the three terms are our
+    choices.
 
     Args:
         encodings: y, float [N, K, D], see :meth:`~torchrl_tit.networks.CoBERL.predict_masked`.
         predictions: x, float [N, K, D].
-        mask: bool [N, K], True where a step was hidden from the prediction.
-        temperature: by which similarities are divided.
+        mask: bool [N, K], True where a step was masked.
+        temperature: divides the similarities.
 
     Returns:
-        The mean over the hidden steps, float []; 0 where none is hidden.
+        The mean over the masked steps, float []; 0 where none is masked.
 
     Example:
         >>> encodings, mask = torch.eye(6).view(2, 3, 6), torch.tensor([[True, False, False]] * 2)
@@ -45,8 +46,8 @@ def contrastive_prediction_loss(
     y = F.normalize(encodings.flatten(0, 1), dim=-1)
     similarity = x @ y.T / temperature  # [N * K, N * K]
     log_p_x, log_p_y = similarity.log_softmax(-1), similarity.T.log_softmax(-1)
-    same_view = F.kl_div(log_p_x, log_p_y.detach(), reduction="none", log_target=True).sum(-1)
-    loss = same_view - log_p_x.diagonal() - log_p_y.diagonal()  # [N * K]
-    hidden = mask.flatten()
-    # A sum, not a choice of rows, whose number would vary: that could not be compiled.
-    return torch.where(hidden, loss, 0).sum() / hidden.sum().clamp(min=1)
+    agreement = F.kl_div(log_p_x, log_p_y.detach(), reduction="none", log_target=True).sum(-1)
+    loss = agreement - log_p_x.diagonal() - log_p_y.diagonal()  # [N * K]
+    masked = mask.flatten()
+    # Selecting rows would make a shape depend on data, which cannot be compiled.
+    return torch.where(masked, loss, 0).sum() / masked.sum().clamp(min=1)

@@ -14,14 +14,13 @@ from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import CQLLoss, distance_loss
 
 from torchrl_tit.modules.many_actions import ManyActions
-from torchrl_tit.objectives.cql_terms import CQLWeights, PolicySamples, Questions
-from torchrl_tit.objectives.relu_mlp import ReLUMLP
+from torchrl_tit.objectives.cql_terms import CriticBatch, PolicySamples
 
 OverCritics = Literal["mean", "sum"]
 
 
 class ContinuousCQLLoss(CQLLoss):
-    """TorchRL's `CQLLoss` with the formulas of the paper's agents.
+    """Replaces TorchRL's `CQLLoss`, whose formulas are not those of the paper's agents.
 
     Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning", arXiv 2006.04779,
     equation 4 (CQL(H)) and appendix F, as in d3rlpy 1.1.1, which arXiv 2212.14538 trained with.
@@ -31,39 +30,40 @@ class ContinuousCQLLoss(CQLLoss):
         loss_qvalue  mean over s of (Q(s, a) - r - gamma min_i Q_i'(s', tanh(mean(s'))))^2
         loss_cql     w * mean over s of [logsumexp_j (Q(s, a_j) - log p(a_j)) - Q(s, a)]
 
-    the squared errors summed over the critics, the conservative terms averaged (or summed:
-    ``over_critics``); the actor's is the mean of ``alpha log p(a) - min_i Q_i(s, a)``, and the
-    temperature's ``-alpha (log p(a) - target_entropy)`` with ``alpha = exp(log_alpha)``.
+    The squared errors are summed over the critics, the conservative terms averaged (or summed, see
+    ``over_critics``). The actor minimises the mean of ``alpha log p(a) - min_i Q_i(s, a)``, and the
+    temperature that of ``-alpha (log p(a) + target_entropy)`` with ``alpha = exp(log_alpha)``.
 
-    `CQLLoss` of TorchRL 0.14 takes a logsumexp over 3 values m times, evaluates the policy's
-    actions at s' there instead of at s, samples the action in the target, hands the critics the
-    actor's entries, and runs the actor on m copies of each state. Here each distribution is
-    computed once and sampled m times, and whatever of a critic does not read the action runs once
-    a state.
+    `CQLLoss` of TorchRL 0.14.1 takes a separate logsumexp over 3 values for each of the m samples,
+    evaluates the actions sampled at s' in s' instead of in s, samples the action of the target,
+    requires that critics read the same entries as the actor, and runs the actor on m copies of each
+    state. Here the actor runs once a state, its distribution is sampled m times, and the modules of
+    a critic that do not read the action run once a state.
 
-    The terms are meant to be stepped one after the other, in this order, on the samples of one
-    pass: :meth:`alpha_loss`, :meth:`critic_losses`, :meth:`actor_loss`; each then sees what the
-    steps before it changed. ``forward`` gives them all at once.
+    The terms are meant to be optimized one after the other, in this order, on the samples of one
+    pass: :meth:`alpha_loss`, :meth:`critic_losses`, :meth:`actor_loss`. Each then sees the weights
+    that the optimizers before it have updated. ``forward`` computes all terms at once.
 
     Args:
-        actor_network: Policy with a distribution that has a ``deterministic_sample``, such as that
-            of :func:`~torchrl_tit.modules.make_squashed_actor`.
-        qvalue_network: Reads what keys it likes (of "next", in the target) and the action, and
-            writes "state_action_value", float [..., 1]. Two of them, which start as they were
-            built; of a single one TorchRL makes two, and draws their weights anew.
-        action_spec: The bounds of an action, a ``Bounded`` spec of shape [A].
-        min_q_weight: Weight w of the conservative term.
-        num_random: Samples m of each kind.
-        over_critics: Whether the conservative term is the mean over the critics, as in d3rlpy
-            1.1.1, or their sum, as from its version 2.5 on.
-        alpha_init: Temperature at the start.
-        target_entropy: What the temperature aims at; minus the entries of an action where "auto".
-        loss_function: Distance to the target; "l2" is the square.
-        deactivate_vmap: Whether critics run one after the other; needed where they cannot be
-            stacked.
+        actor_network: policy whose distribution has a ``deterministic_sample``, such as that of
+            :func:`~torchrl_tit.modules.make_squashed_actor`.
+        qvalue_network: reads any keys (those under "next" for the target) and the action, and
+            writes "state_action_value", float [..., 1]. Either two critics, which keep their
+            initial weights, or one, of which TorchRL makes two and draws new weights.
+        action_spec: bounds of an action, a ``Bounded`` spec of shape [A].
+        min_q_weight: weight w of the conservative term.
+        num_random: number m of samples of each kind.
+        over_critics: whether the conservative term is the mean over the critics, as in d3rlpy
+            1.1.1, or their sum, as in d3rlpy since 2.5.
+        alpha_init: initial temperature.
+        target_entropy: target of the temperature; minus the number of entries of an action where
+            "auto".
+        loss_function: distance to the target; "l2" is the square.
+        deactivate_vmap: whether to run the critics one after the other, for networks that vmap
+            does not support.
 
     Raises:
-        ValueError: If the actions have no bounds, or a setting is not possible.
+        ValueError: if the actions have no bounds, or a setting is invalid.
 
     Example:
         >>> from torchrl_tit.modules import make_squashed_actor
@@ -133,7 +133,7 @@ class ContinuousCQLLoss(CQLLoss):
         self.register_buffer("_high", action_spec.space.high.clone())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes all terms of a batch [B], which is left as it is.
+        """Computes all terms of a batch [B], which is not changed.
 
         Returns:
             "loss_actor", "loss_qvalue", "loss_cql" (weighted), "loss_alpha", "alpha" (the
@@ -152,105 +152,69 @@ class ContinuousCQLLoss(CQLLoss):
             }
         )
 
-    def sample_policy(
-        self, tensordict: TensorDictBase, weights: CQLWeights | None = None
-    ) -> PolicySamples:
-        """Runs the actor once at s and once at s', and draws what the terms need.
+    def sample_policy(self, tensordict: TensorDictBase) -> PolicySamples:
+        """Runs the actor once at s and once at s', and samples what the terms need.
 
         Args:
             tensordict: a batch [B].
-            weights: to use instead of the loss's own.
-        """
-        return self.draw(*self.run_policy(tensordict, weights))
-
-    def run_policy(
-        self, tensordict: TensorDictBase, weights: CQLWeights | None = None
-    ) -> tuple[TensorDictBase, TensorDictBase]:
-        """Runs the actor once at s and, without gradient, once at s'.
-
-        Args:
-            tensordict: a batch [B].
-            weights: to use instead of the loss's own.
-
-        Returns:
-            Parameters of the distributions at s and at s', [B].
         """
         network = self.actor_network
-        keys, outputs = network.in_keys, network.dist_params_keys
-        actor = (weights or CQLWeights.of(self)).actor
-        with actor.to_module(network, preserve_module_state=False):
-            here = network.get_dist_params(tensordict.select(*keys))
+        with self.actor_network_params.to_module(network, preserve_module_state=False):
+            dist = network.get_dist(tensordict.select(*network.in_keys))
             with torch.no_grad():
-                after = network.get_dist_params(tensordict["next"].select(*keys))
-        return here.select(*outputs), after.select(*outputs)
-
-    def draw(self, here: TensorDictBase, after: TensorDictBase) -> PolicySamples:
-        """Draws what the terms need.
-
-        Args:
-            here: parameters of distributions at s, of any batch shape.
-            after: those at s'.
-        """
-        dist, next_dist = map(self.actor_network.build_dist_from_params, (here, after))
+                next_dist = network.get_dist(tensordict["next"].select(*network.in_keys))
         action, log_prob = rsample_and_log_prob(dist)
         with torch.no_grad():
             shape = torch.Size([self.num_random])
             drawn = [rsample_and_log_prob(d, shape) for d in (dist, next_dist)]
-            actions = torch.cat([a for a, _ in drawn]).movedim(0, -2)  # [B, 2n, A]
-            log_probs = torch.cat([p for _, p in drawn]).movedim(0, -1)  # [B, 2n]
+            actions = torch.cat([a for a, _ in drawn]).movedim(0, -2)  # [B, 2m, A]
+            log_probs = torch.cat([p for _, p in drawn]).movedim(0, -1)  # [B, 2m]
             next_action = next_dist.deterministic_sample
         return PolicySamples(action, log_prob, actions, log_probs, next_action)
 
-    def alpha_loss(self, samples: PolicySamples, weights: CQLWeights | None = None) -> Tensor:
+    def alpha_loss(self, samples: PolicySamples) -> Tensor:
         """The temperature's loss, float []."""
-        surprise = samples.log_prob.detach() + self.target_entropy
-        log_alpha = (weights or CQLWeights.of(self)).log_alpha
-        return -(log_alpha.exp() * surprise).mean()
+        excess = samples.log_prob.detach() + self.target_entropy
+        return -(self.log_alpha.exp() * excess).mean()
 
     def critic_losses(
-        self,
-        tensordict: TensorDictBase,
-        samples: PolicySamples | None = None,
-        weights: CQLWeights | None = None,
+        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
     ) -> tuple[Tensor, Tensor]:
         """The critics' squared error and weighted conservative term, float [] each.
 
         Args:
             tensordict: a batch [B].
-            samples: of :meth:`sample_policy`; drawn anew where not given.
-            weights: to use instead of the loss's own.
+            samples: of :meth:`sample_policy`; sampled here where not given.
         """
-        weights = weights or CQLWeights.of(self)
-        samples = samples or self.sample_policy(tensordict, weights)
-        questions = self._questions(tensordict, samples, weights.target_critics)
-        values = self._values(questions.inputs, weights.critics)
-        return self._losses(values, questions, len(questions.target))
+        batch = self._critic_batch(tensordict, samples or self.sample_policy(tensordict))
+        values = self._values(batch.inputs, self.qvalue_network_params)
+        return self._losses(values, batch, len(batch.target))
 
     def critic_gradients(
-        self, tensordict: TensorDictBase, samples: PolicySamples, states_at_once: int
+        self, tensordict: TensorDictBase, samples: PolicySamples, chunk_size: int
     ) -> tuple[Tensor, Tensor]:
-        """Adds the gradients of :meth:`critic_losses`, summed, to the critics' weights.
+        """Adds the gradients of the sum of :meth:`critic_losses` to the critics' weights.
 
-        A few states pass forth and back at a time. On a CPU that is faster than all at once: what
-        the pass forth leaves is still in the cache when the pass back reads it.
+        Runs forward and backward on ``chunk_size`` states at a time. On a CPU this takes about a
+        fifth less time than the whole batch at once, because the backward pass finds the
+        activations of the forward pass still in the cache.
 
         Args:
             tensordict: a batch [B].
             samples: of :meth:`sample_policy`.
-            states_at_once: states that pass at a time, each with its 3m + 1 actions.
+            chunk_size: states at a time, each with its 3m + 1 actions.
 
         Returns:
-            what :meth:`critic_losses` gives, without gradient.
+            The values of :meth:`critic_losses`, detached.
         """
-        questions = self._questions(tensordict, samples, self.target_qvalue_network_params)
-        parts = questions.split(states_at_once)
-        values_of = ReLUMLP.of(self.qvalue_network) or self._values_of_one
+        batch = self._critic_batch(tensordict, samples)
         losses = []
         for critic in self._critics():
             with critic.to_module(self.qvalue_network, preserve_module_state=False):
-                for part in parts:
-                    values = values_of(part.inputs)  # [b, 3n + 1]
-                    loss_qvalue, loss_cql = self._losses(values, part, len(questions.target))
+                for chunk in batch.split(chunk_size):
+                    outputs = self.qvalue_network(chunk.inputs.copy())
+                    values = outputs.get(self.tensor_keys.state_action_value).squeeze(-1)
+                    loss_qvalue, loss_cql = self._losses(values, chunk, len(batch.target))
                     (loss_qvalue + loss_cql).backward()
                     losses.append(torch.stack([loss_qvalue, loss_cql]).detach())
         loss_qvalue, loss_cql = torch.stack(losses).sum(dim=0).unbind()
@@ -259,42 +223,52 @@ class ContinuousCQLLoss(CQLLoss):
     def q_loss(
         self, tensordict: TensorDictBase, samples: PolicySamples | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
-        """The critics' squared error alone; use :meth:`critic_losses` where both are needed."""
+        """The critics' squared error alone; call :meth:`critic_losses` if you need both."""
         return self.critic_losses(tensordict, samples)[0], {}
 
     def cql_loss(
         self, tensordict: TensorDictBase, samples: PolicySamples | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
-        """The weighted conservative term alone; see :meth:`critic_losses`."""
+        """The weighted conservative term alone; call :meth:`critic_losses` if you need both."""
         return self.critic_losses(tensordict, samples)[1], {}
 
     def actor_loss(
-        self,
-        tensordict: TensorDictBase,
-        samples: PolicySamples | None = None,
-        weights: CQLWeights | None = None,
+        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
-        """The actor's loss, float [], through critics that get no gradient.
+        """The actor's loss, float []; the critics get no gradient.
 
         Args:
             tensordict: a batch [B].
-            samples: of :meth:`sample_policy`; drawn anew where not given.
-            weights: to use instead of the loss's own.
+            samples: of :meth:`sample_policy`; sampled here where not given.
         """
-        weights = weights or CQLWeights.of(self)
-        samples = samples or self.sample_policy(tensordict, weights)
+        samples = samples or self.sample_policy(tensordict)
         inputs = self._inputs(tensordict, samples.action.unsqueeze(1))
-        values = self._values(inputs, weights.critics.detach())  # [critics, B, 1]
+        values = self._values(inputs, self.qvalue_network_params.detach())  # [critics, B, 1]
         value = values.squeeze(-1).amin(0)  # [B]
-        return (weights.log_alpha.detach().exp() * samples.log_prob - value).mean(), {}
+        alpha = self.log_alpha.detach().exp()
+        return (alpha * samples.log_prob - value).mean(), {}
 
-    def _target(
-        self, tensordict: TensorDictBase, next_action: Tensor, critics: TensorDictBase
-    ) -> Tensor:
-        """What the critics aim at, without gradient; float [B]."""
+    def _critic_batch(self, tensordict: TensorDictBase, samples: PolicySamples) -> CriticBatch:
+        """Adds uniform samples to those of the policy, and computes the target."""
+        action = tensordict.get(self.tensor_keys.action)
+        num_states, size = action.shape
+        width = self._high - self._low
+        uniform = self._low + width * torch.rand(
+            num_states, self.num_random, size, dtype=action.dtype, device=action.device
+        )
+        log_uniform = -width.log().sum().expand(num_states, self.num_random)
+        actions = torch.cat([uniform, samples.actions, action.unsqueeze(1)], dim=1)
+        return CriticBatch(
+            inputs=self._inputs(tensordict, actions),
+            log_density=torch.cat([log_uniform, samples.log_probs], dim=1),
+            target=self._target(tensordict, samples.next_action),
+        )
+
+    def _target(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
+        """Target of the critics, without gradient; float [B]."""
         with torch.no_grad():
             inputs = self._inputs(tensordict["next"], next_action.unsqueeze(1))
-            values = self._values(inputs, critics)  # [critics, B, 1]
+            values = self._values(inputs, self.target_qvalue_network_params)  # [critics, B, 1]
             outcome = tensordict["next"].select(
                 self.tensor_keys.reward, self.tensor_keys.terminated, self.tensor_keys.done
             )
@@ -302,57 +276,34 @@ class ContinuousCQLLoss(CQLLoss):
             batch = TensorDict({"next": outcome}, tensordict.batch_size)
             return self.value_estimator.value_estimate(batch).squeeze(-1)
 
-    def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """What all critics say of m actions in each state; [critics, B, m]."""
-        answers = self._vmap_qvalue_networkN0(inputs, params)
-        return answers.get(self.tensor_keys.state_action_value).squeeze(-1)
-
-    def _values_of_one(self, inputs: TensorDictBase) -> Tensor:
-        """What the critic says whose weights are in the network; [B, m]."""
-        answers = self.qvalue_network(inputs.copy())
-        return answers.get(self.tensor_keys.state_action_value).squeeze(-1)
-
     def _inputs(self, tensordict: TensorDictBase, actions: Tensor) -> TensorDictBase:
-        """What critics read of each state, and several actions there, [B, m, A]."""
+        """What critics read in each state, and m actions there, [B, m, A]."""
         keys = [key for key in self.qvalue_network.in_keys if key != self.tensor_keys.action]
         return tensordict.select(*keys).set(self.tensor_keys.action, actions)
 
-    def _questions(
-        self, tensordict: TensorDictBase, samples: PolicySamples, targets: TensorDictBase
-    ) -> Questions:
-        """What the critics are asked, and what the answers are held against."""
-        action = tensordict.get(self.tensor_keys.action)
-        batch, size = action.shape
-        width = self._high - self._low
-        uniform = self._low + width * torch.rand(
-            batch, self.num_random, size, dtype=action.dtype, device=action.device
-        )
-        log_uniform = -width.log().sum().expand(batch, self.num_random)
-        actions = torch.cat([uniform, samples.actions, action.unsqueeze(1)], dim=1)
-        return Questions(
-            inputs=self._inputs(tensordict, actions),
-            log_density=torch.cat([log_uniform, samples.log_probs], dim=1),
-            target=self._target(tensordict, samples.next_action, targets),
-        )
+    def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """Values of m actions in each state by all critics; [critics, B, m]."""
+        outputs = self._vmap_qvalue_networkN0(inputs, params)
+        return outputs.get(self.tensor_keys.state_action_value).squeeze(-1)
 
-    def _losses(self, values: Tensor, questions: Questions, batch: int) -> tuple[Tensor, Tensor]:
-        """The share of b states, and of one critic or all, in the losses of a batch [B].
+    def _losses(self, values: Tensor, batch: CriticBatch, num_states: int) -> tuple[Tensor, Tensor]:
+        """The two losses over b of the B states of a batch, for one critic or all of them.
 
         Args:
-            values: of the actions, float [b, 3n + 1] or [critics, b, 3n + 1].
-            questions: what was asked in the states.
-            batch: B.
+            values: of the actions, float [b, 3m + 1] or [critics, b, 3m + 1].
+            batch: the b states.
+            num_states: B.
         """
         value = values[..., -1]  # of the action taken; [b] or [critics, b]
-        errors = distance_loss(value, questions.target.expand_as(value), self.loss_function)
-        optimism = torch.logsumexp(values[..., :-1] - questions.log_density, dim=-1)
-        gap = (optimism - value).sum() / batch
+        errors = distance_loss(value, batch.target.expand_as(value), self.loss_function)
+        soft_maximum = torch.logsumexp(values[..., :-1] - batch.log_density, dim=-1)
+        gap = (soft_maximum - value).sum() / num_states
         if self.over_critics == "mean":
             gap = gap / self.num_qvalue_nets
-        return errors.sum() / batch, self.min_q_weight * gap
+        return errors.sum() / num_states, self.min_q_weight * gap
 
     def _critics(self) -> list[TensorDictBase]:
-        """The weights of each critic, as leaves whose gradients are parts of the stacked ones."""
+        """The weights of each critic, as leaves whose gradients are views of the stacked ones."""
         params = self.qvalue_network_params
         critics = params.data.unbind(0)
         for key, stacked in params.items(True, True):

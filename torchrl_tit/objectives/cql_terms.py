@@ -7,62 +7,39 @@ from typing import NamedTuple
 
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.objectives import CQLLoss
 
 
 class PolicySamples(NamedTuple):
-    """What one pass of the actor over a batch, at s and at s', gives to all terms of the loss.
+    """What all terms of the loss share: one pass of the actor over a batch, at s and at s'.
 
-    B states, n samples of each distribution, A entries of an action.
+    B states, m samples of each distribution, A entries of an action.
     """
 
     action: Tensor
-    """Drawn at s, with a gradient to the actor; float [B, A]."""
+    """Sampled at s, differentiable; float [B, A]."""
     log_prob: Tensor
-    """Its log density, with a gradient too; float [B]."""
+    """Its log density, differentiable; float [B]."""
     actions: Tensor
-    """n drawn at s and n at s', without gradient; float [B, 2n, A]."""
+    """m samples at s, then m at s', detached; float [B, 2m, A]."""
     log_probs: Tensor
-    """Their log densities; float [B, 2n]."""
+    """Their log densities; float [B, 2m]."""
     next_action: Tensor
-    """The deterministic action at s' (tanh of the mean), without gradient; float [B, A]."""
-
-
-class CQLWeights(NamedTuple):
-    """All that is trained, and the delayed critics; two critics are stacked in front."""
-
-    actor: TensorDictBase
-    """Weights of the actor."""
-    critics: TensorDictBase
-    """Weights of the critics, [2, ...]."""
-    target_critics: TensorDictBase
-    """Weights of the critics that the target is computed with, [2, ...]."""
-    log_alpha: Tensor
-    """Logarithm of the temperature; float []."""
-
-    @classmethod
-    def of(cls, loss: CQLLoss) -> CQLWeights:
-        """The weights in a loss."""
-        return cls(
-            loss.actor_network_params,
-            loss.qvalue_network_params,
-            loss.target_qvalue_network_params,
-            loss.log_alpha,
-        )
+    """The deterministic action at s' (the squashed mean), detached; float [B, A]."""
 
 
 @dataclass(frozen=True)
-class Questions:
-    """What critics are asked of B states: values of 3n drawn actions in each, and of that taken."""
+class CriticBatch:
+    """What the critics evaluate: in each of B states 3m sampled actions, and the action taken."""
 
     inputs: TensorDictBase
-    """What critics read; the actions are float [B, 3n + 1, A], that taken last."""
+    """What the critics read; the actions are float [B, 3m + 1, A], the action taken last."""
     log_density: Tensor
-    """How likely the drawn actions were; float [B, 3n]."""
+    """Log densities of the sampled actions; float [B, 3m]."""
     target: Tensor
-    """What the value of the action taken should be; float [B]."""
+    """Target of the value of the action taken; float [B]."""
 
-    def split(self, size: int) -> list[Questions]:
-        """Splits the states."""
+    def split(self, size: int) -> list[CriticBatch]:
+        """Splits the batch into chunks of ``size`` states."""
         fields = (self.inputs, self.log_density, self.target)
-        return [Questions(*part) for part in zip(*(f.split(size) for f in fields), strict=True)]
+        chunks = zip(*(field.split(size) for field in fields), strict=True)
+        return [CriticBatch(*chunk) for chunk in chunks]

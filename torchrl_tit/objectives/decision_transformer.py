@@ -1,4 +1,4 @@
-"""Decision Transformer's loss, which does not count padding and knows discrete actions."""
+"""Decision Transformer's loss: it leaves padding out and takes discrete actions."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from torch.nn import functional as F
 from torchrl.objectives import DTLoss
 
 _LOSSES = ("l2", "l1", "smooth_l1", "cross_entropy")
-"""Between continuous actions, and the last one between discrete ones."""
+"""The last one is for discrete actions, the others for continuous ones."""
 
 
 class MaskedDTLoss(DTLoss):
-    """TorchRL's `DTLoss` over the steps that are no padding.
+    """TorchRL's `DTLoss` over the steps that are not padding.
 
-    `DTLoss` counts padding until its ``loss_mask_key`` is set, which is done here, and has no loss
-    for discrete actions; with ``loss_function="cross_entropy"`` this one has. The mean is taken
-    over all entries of all unmasked actions.
+    `DTLoss` counts padding unless its ``loss_mask_key`` is set, as it is here, and has no loss for
+    discrete actions, which ``loss_function="cross_entropy"`` adds. The mean is taken over all
+    entries of all unmasked actions.
 
     Args:
-        actor_network: Reads a batch and writes the predicted action of every step over "action":
+        actor_network: Reads a batch and replaces "action" with the predicted action of every step:
             see :func:`~torchrl_tit.modules.make_dt_predictor`.
         loss_function: "l2", "l1" or "smooth_l1" between continuous actions [..., K, A], or
             "cross_entropy" between logits and discrete ones, integers [..., K] or one-hot.
-        mask_key: Where the mask stands, bool [..., K], False at padding.
+        mask_key: Key of the mask, bool [..., K], False at padding.
         **settings: Of `DTLoss`: ``reduction``.
 
     Returns:
@@ -34,14 +34,15 @@ class MaskedDTLoss(DTLoss):
 
     Raises:
         ValueError: if there is no such ``loss_function``.
-        TypeError: in ``forward``, if it is not for actions of the batch's kind.
+        TypeError: in ``forward``, if it does not fit the actions of the batch.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3.
 
     Example:
-        >>> from torchrl_tit.modules import make_dt_predictor
+        >>> from torchrl_tit.modules import DTHead, make_dt_predictor
         >>> from torchrl_tit.networks import DecisionTransformer
-        >>> loss = MaskedDTLoss(make_dt_predictor(DecisionTransformer((11,), 3)))
+        >>> network = DecisionTransformer((11,), action_dim=3)
+        >>> loss = MaskedDTLoss(make_dt_predictor(network, DTHead(network.features_dim, 3)))
         >>> batch = TensorDict(
         ...     {
         ...         "observation": torch.randn(8, 20, 11),
@@ -86,7 +87,7 @@ class MaskedDTLoss(DTLoss):
             logits = self.actor_network(tensordict).get(self.tensor_keys.action_pred)
         if target.ndim == logits.ndim:  # one-hot
             target = target.to(torch.int8).argmax(-1)
-        # Padding is no class; what stands for it here is masked below.
+        # Padding is negative, which is not a class; whatever replaces it is masked below.
         classes = target.long().clamp(min=0)
         loss = F.cross_entropy(logits.flatten(0, -2), classes.flatten(), reduction="none")
         loss = self._reduce_loss(loss.view_as(classes), tensordict=tensordict)

@@ -1,4 +1,4 @@
-"""Conservative Q-learning with discrete actions, aimed at what the target network says."""
+"""Conservative Q-learning with discrete actions and a target network."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchrl.objectives import DiscreteCQLLoss
 
 
 class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
-    """TorchRL's `DiscreteCQLLoss` with a target network that counts.
+    """Replaces TorchRL's `DiscreteCQLLoss`, which ignores its target network.
 
     Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning", arXiv 2006.04779,
     equation 4 (CQL(H)) over the values of all actions::
@@ -19,13 +19,14 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         loss_qvalue  mean over s of (Q(s, a) - r - gamma max_b Q'(s', b))^2 / 2
         loss_cql     mean over s of [logsumexp_b Q(s, b) - Q(s, a)]
 
-    `DiscreteCQLLoss` of TorchRL 0.14 keeps target parameters Q', but takes Q itself at s'. Beside
-    what it writes into the batch, the value at s' is written there.
+    `DiscreteCQLLoss` of TorchRL 0.14.1 has target parameters Q', but passes them to its value
+    estimator as ``params``, which that does not read, so its target is computed with Q. Beside what
+    `DiscreteCQLLoss` writes into the batch, this loss writes the value at s'.
 
     Args:
-        value_network: Writes "action_value", float [..., n], and "chosen_action_value", float
+        value_network: writes "action_value", float [..., n], and "chosen_action_value", float
             [..., 1].
-        **settings: Of `DiscreteCQLLoss`: ``action_space``, ``loss_function``, ``reduction``.
+        **settings: of `DiscreteCQLLoss`: ``action_space``, ``loss_function``, ``reduction``.
 
     Example:
         >>> from tensordict import TensorDict
@@ -57,16 +58,16 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Chooses how targets are computed; see TorchRL's `LossModule.make_value_estimator`."""
         super().make_value_estimator(value_type, **hyperparams)
-        self.value_estimator.value_network = None  # it would be asked with the trained weights
+        self.value_estimator.value_network = None  # which would use the trained weights
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The squared error of a batch [B], float [], and means to look at."""
-        following = tensordict["next"].select(*self.value_network.in_keys)
+        """The squared error of a batch [B], float [], and mean values to log."""
+        next_state = tensordict["next"].select(*self.value_network.in_keys)
         params = self._cached_detached_target_value_params
         with (
             torch.no_grad(),
             params.to_module(self.value_network, preserve_module_state=False),
         ):
-            value = self.value_network(following).get(self.tensor_keys.value)
+            value = self.value_network(next_state).get(self.tensor_keys.value)
         tensordict.set(("next", self.tensor_keys.value), value)
         return super().value_loss(tensordict)
