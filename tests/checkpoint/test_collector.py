@@ -1,4 +1,4 @@
-"""A collector that is saved and put into a new one returns the same batches."""
+"""A collector that is restored returns the same batches as the saved one."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -40,7 +40,7 @@ def make_policy(env: EnvBase) -> ProbabilisticActor:
 
 
 def make_own_vector(name: str, num_envs: int, max_episode_steps: int) -> EnvBase:
-    return make_env(name, num_envs, history=4, max_episode_steps=max_episode_steps)
+    return make_env(name, num_envs, num_frames=4, max_episode_steps=max_episode_steps)
 
 
 def make_collector(
@@ -71,7 +71,7 @@ def collect(collector: Collector, batches: int) -> list[TensorDictBase]:
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "Hopper-v5"])
 @pytest.mark.parametrize("track", [True, False], ids=["tracked", "untracked"])
 @pytest.mark.parametrize("make", [make_vector, make_own_vector])
-def test_goes_on_bit_for_bit(
+def test_resumes_bit_for_bit(
     tmp_path: Path, name: str, track: bool, make: Callable[..., EnvBase]
 ) -> None:
     first = make_collector(name, track, make=make)
@@ -137,5 +137,5 @@ def test_of_an_environment_that_cannot_be_saved_only_the_counters(tmp_path: Path
 
 def test_tracking_must_agree() -> None:
     first, second = make_collector("CartPole-v1", True), make_collector("CartPole-v1", False)
-    with pytest.raises(ValueError, match="only one tracks trajectories"):
+    with pytest.raises(ValueError, match="only one of the saved collector"):
         set_collector_state(second, collector_state(first))

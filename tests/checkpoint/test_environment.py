@@ -1,4 +1,4 @@
-"""An environment that is saved and put into a new one goes on bit for bit."""
+"""An environment resumes bit for bit from the state of another one."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -156,7 +156,7 @@ def test_mujoco_vector(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "Ant-v5"])
 def test_our_own_vector(tmp_path: Path, name: str, reset_first: bool) -> None:
     def make() -> EnvBase:
-        env = make_env(name, 3, history=4, padding="constant", max_episode_steps=13)
+        env = make_env(name, 3, num_frames=4, padding="constant", max_episode_steps=13)
         return TransformedEnv(env, StepCounter())
 
     steps = check_continues(tmp_path, make, before=20, after=30, reset_first=reset_first)
@@ -315,7 +315,7 @@ def test_environments_that_cannot_be_saved() -> None:
 def test_state_of_another_environment() -> None:
     state = env_state(make_vector("CartPole-v1", 2))
     for other in (make_vector("CartPole-v1", 3), make_vector("Acrobot-v1", 2)):
-        with pytest.raises(ValueError, match="make it as the saved one was made"):
+        with pytest.raises(ValueError, match="use the settings of the saved environment"):
             set_env_state(other, state)
     plain = GymEnv("CartPole-v1")
     with pytest.raises(ValueError, match="levels of transforms"):

@@ -271,7 +271,7 @@ class Trap:
 @pytest.mark.parametrize("name", ["data.pkl", "policy.pt", "extra.pickle", ".hidden", "x.json"])
 def test_planted_file(folder: Path, tmp_path: Path, name: str) -> None:
     (folder / "000000000002" / name).write_bytes(pickle.dumps(Trap(tmp_path / "sprung")))
-    expect_refusal(folder, f"files that no checkpoint has: {name}")
+    expect_refusal(folder, f"unknown files: {name}")
     assert not (tmp_path / "sprung").exists()
 
 

@@ -1,8 +1,8 @@
-"""Checkpoints that survive: whole or not there, never executed, exact to the bit.
+"""Checkpoints that are complete or absent, run no code when loaded, and resume bit for bit.
 
 save_checkpoint, load_checkpoint    a folder of numbered checkpoints
 encode, decode                      nested state as tensors and JSON
-env_state, collector_state, ...     the state of what TorchRL cannot save
+env_state, collector_state, ...     state that TorchRL cannot save
 """
 
 from torchrl_tit.checkpoint.codec import decode, encode

@@ -1,13 +1,13 @@
-"""Nested Python state as named tensors and a JSON tree, and back without a loss.
+"""Nested Python state as named tensors and a JSON tree, and back without loss.
 
-What JSON cannot say is said by an object whose first key is a tag:
+An object whose first key is a tag stands for what JSON cannot express:
 
     {"$tensor": name, ...}    {"$array": name, ...}    {"$scalar": hex, ...}
     {"$tuple": [...]}         {"$size": [...]}         {"$dict": [[key, value], ...]}
     {"$int": hex}             {"$float": "nan"}        {"$ordered": [[key, value], ...]}
     {"$tensordict": {...}, ...}
 
-Nothing here can name a class or a function, so reading a tree never runs anybody's code.
+A tree cannot name a class or a function, so reading one never runs code from a file.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torch.nn.parameter import is_lazy
 
-# Safetensors stores these under their own names; every other dtype goes in as bytes.
+# Safetensors stores these dtypes; all others are stored as bytes.
 _NATIVE_DTYPES = {
     *(torch.bool, torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64),
     *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
@@ -29,11 +29,11 @@ _NATIVE_DTYPES = {
 _DTYPES: dict[str, torch.dtype] = {
     str(value): value for value in vars(torch).values() if isinstance(value, torch.dtype)
 }
-_EXACT_IN_JSON = 2**53  # other readers of JSON hold numbers as doubles
+_EXACT_IN_JSON = 2**53  # other JSON readers use doubles
 
 
 def encode(state: Any) -> tuple[dict[str, Tensor], Any]:
-    """Take a nested state apart into tensors and a tree that JSON can hold.
+    """Split a nested state into tensors and a tree for JSON.
 
     Args:
         state: Dicts with str or int keys (ordered ones too), lists, tuples, `torch.Size`, None,
@@ -46,7 +46,7 @@ def encode(state: Any) -> tuple[dict[str, Tensor], Any]:
         parameters become plain tensors.
 
     Raises:
-        TypeError: Anything else; the message names the place in the state and the type.
+        TypeError: The state holds anything else; the message gives the place and the type.
 
     Example:
         >>> import torch
@@ -61,7 +61,7 @@ def encode(state: Any) -> tuple[dict[str, Tensor], Any]:
 
 
 def decode(tensors: dict[str, Tensor], tree: Any) -> Any:
-    """Put a state together again that :func:`encode` took apart.
+    """Rebuild a state that :func:`encode` split.
 
     Args:
         tensors: Tensors by their place in the state.
@@ -71,7 +71,7 @@ def decode(tensors: dict[str, Tensor], tree: Any) -> Any:
         The state, with the same types, keys, dtypes and values, on the CPU.
 
     Raises:
-        ValueError: The tree and the tensors do not belong together, or a tag is unknown.
+        ValueError: The tree and the tensors do not match, or a tag is unknown.
 
     Example:
         >>> decode(*encode({0: (1, 2.5, float("inf"))}))
@@ -133,7 +133,7 @@ def _encode_dict(value: dict[Any, Any], path: str, tensors: dict[str, Tensor]) -
 
 
 def _encode_tensor(value: Tensor, path: str, tensors: dict[str, Tensor]) -> Any:
-    # Copied even where it is on the CPU already: safetensors refuses tensors that share memory.
+    # Copied even if it is on the CPU: safetensors refuses tensors that share memory.
     plain = value.detach().resolve_conj().resolve_neg().cpu()
     plain = plain.clone(memory_format=torch.contiguous_format)
     if value.dtype in _NATIVE_DTYPES:
@@ -194,8 +194,8 @@ def _decode_tensor(tree: dict[str, Any], tensor: Tensor) -> Tensor:
 def _take(name: str, left: dict[str, Tensor]) -> Tensor:
     if name not in left:
         raise ValueError(f"no tensor for {name}")
-    # Tensors read from a file lie in its memory map at any address. Kernels may round differently
-    # on unaligned memory, and a resumed run must not.
+    # Tensors read from a file may be unaligned in its memory map. Kernels can round differently
+    # on unaligned memory, which would change a resumed run.
     return left.pop(name).clone()
 
 
@@ -204,7 +204,7 @@ def _has_data(tensor: Tensor) -> bool:
 
 
 def _is_plain(dtype: np.dtype[Any]) -> bool:
-    """Whether a dtype's bytes and its short name say all: no pointers and no fields."""
+    """Whether a dtype is defined by its short name and holds no pointers or fields."""
     return not dtype.hasobject and dtype.kind != "V" and dtype.itemsize > 0
 
 

@@ -12,18 +12,18 @@ from torchrl_tit.checkpoint.environment import can_save_env, env_state, set_env_
 
 
 def collector_state(collector: Collector) -> dict[str, Any]:
-    """Take down where a collector is, between two of its batches.
+    """Return the state of a collector between two of its batches.
 
-    TorchRL's own `state_dict` has neither the environment nor the tensordict that the collector
-    carries from one batch to the next; both are here. The policy is not: save it apart.
+    TorchRL's own `state_dict` lacks the environment and the tensordict that the collector carries
+    from one batch to the next; this state has both. It lacks the policy, which is saved separately.
 
     Args:
         collector: A synchronous collector.
 
     Returns:
-        A state that a checkpoint can hold; it shares no memory with the collector. Of an
-        environment that :func:`~torchrl_tit.checkpoint.can_save_env` refuses, and of what is
-        carried of it, there is nothing (None): :func:`reset_unsavable_env` starts it anew.
+        A state that a checkpoint can hold; it shares no memory with the collector. If
+        :func:`~torchrl_tit.checkpoint.can_save_env` is False, the environment's state and the
+        carried tensordict are None: :func:`reset_unsavable_env` resets such an environment.
 
     Example:
         >>> from torchrl.collectors import Collector
@@ -45,18 +45,18 @@ def collector_state(collector: Collector) -> dict[str, Any]:
 
 
 def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
-    """Bring a new collector to where another one was; iterate over it afterwards.
+    """Restore the state of a collector, before iterating over it.
 
-    Building a collector and its environment draws from the global random generators: set those
-    last.
+    Building a collector and its environment draws from the global random generators, so restore
+    those last.
 
     Args:
-        collector: A collector made as the saved one was, with the same policy weights.
+        collector: A collector with the same settings and policy weights as the saved one.
         state: What :func:`collector_state` returned.
 
     Raises:
-        ValueError: The state is that of another kind of environment, or only one of the two
-            collectors tracks trajectories.
+        ValueError: The state is of another kind of environment, or only one of the two collectors
+            tracks trajectories.
 
     Example:
         >>> from torchrl.collectors import Collector
@@ -71,8 +71,8 @@ def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
     """
     if collector.track_traj_ids != (state["trajectories"] is not None):
         raise ValueError(
-            "of the saved collector and this one only one tracks trajectories; "
-            "make the collector as the saved one was made"
+            "only one of the saved collector and this one tracks trajectories; use the settings of "
+            "the saved collector"
         )
     if state["env"] is not None:
         set_env_state(collector.env, state["env"])
@@ -84,16 +84,16 @@ def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
 
 
 def reset_unsavable_env(collector: BaseCollector, seed: int, step: int) -> None:
-    """Start new episodes where an environment cannot be saved.
+    """Start new episodes if the environment cannot be saved.
 
-    Call it at each checkpoint, whether or not the run is stopped there, and after loading one: the
-    seed follows from the run's and the step, so that both go on alike. An environment that can be
-    saved stays as it is, and so do the processes of a collector that has some.
+    Call it after saving a checkpoint and after loading one. The seed depends only on the run's seed
+    and the step, so a resumed run is the same as one that was not stopped. Environments that can be
+    saved, and collectors with several processes, are left unchanged.
 
     Args:
         collector: The run's collector.
         seed: The run's seed.
-        step: Of the checkpoint.
+        step: The checkpoint's step.
 
     Example:
         >>> from torchrl.collectors import Collector
@@ -104,13 +104,13 @@ def reset_unsavable_env(collector: BaseCollector, seed: int, step: int) -> None:
     """
     if not isinstance(collector, Collector):
         return
-    # After its last batch a collector has closed the environment.
+    # A collector closes its environment after the last batch.
     if not can_save_env(collector.env) and not collector.env.is_closed:
         collector.reset(seed=np.random.SeedSequence([seed, step]).generate_state(1).item())
 
 
 def _placed_like(carried: TensorDictBase, present: TensorDictBase) -> TensorDictBase:
-    """Copy a loaded tensordict to the devices of the one whose place it takes."""
+    """Copy a loaded tensordict to the devices of the present one."""
     placed = carried.clone().clear_device_()
     for key, value in present.items(include_nested=True, leaves_only=True):
         if key in placed.keys(include_nested=True):

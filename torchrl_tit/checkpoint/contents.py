@@ -1,4 +1,4 @@
-"""The two files of one checkpoint, written with checksums and read with suspicion."""
+"""The two files of one checkpoint, written and checked with checksums."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _VERSION = 1
 
 
 def write_contents(path: Path, step: int, tensors: dict[str, Tensor], tree: Any) -> None:
-    """Write a checkpoint's files into an empty folder and force them to the disk.
+    """Write a checkpoint's files into an empty folder and flush them to the disk.
 
     Args:
         path: The folder.
         step: The checkpoint's number.
         tensors: Tensors by name, see :func:`~torchrl_tit.checkpoint.codec.encode`.
-        tree: The tree that goes with them.
+        tree: The tree that belongs to them.
 
     Raises:
         OSError: A file could not be written.
@@ -63,18 +63,18 @@ def write_contents(path: Path, step: int, tensors: dict[str, Tensor], tree: Any)
 
 
 def read_contents(path: Path, step: int) -> Any:
-    """Read a checkpoint's files back, after they have been held against their checksums.
+    """Check a checkpoint's files against their checksums and read them.
 
     Args:
         path: The checkpoint's folder.
-        step: The step that its name says.
+        step: The step in its name.
 
     Returns:
         The state.
 
     Raises:
-        CheckpointError: The checkpoint is damaged, of another program or version, or has a file in
-            it that does not belong there.
+        CheckpointError: The checkpoint is damaged, of another program or version, or contains an
+            unknown file.
 
     Example:
         >>> import tempfile
@@ -88,8 +88,8 @@ def read_contents(path: Path, step: int) -> Any:
         document = _read_document(path / _STATE, step)
         _check_tensors(path / _TENSORS, document["tensors"])
         return decode(load_file(path / _TENSORS), document["state"])
-    # A tree made by someone else can be wrong in any way, so whatever its reading raises is its
-    # fault: a wrong hex number, a shape that does not fit, a list where an object should be.
+    # A foreign tree can be wrong in many ways (a wrong hex number, a wrong shape, a list instead
+    # of an object), so any of these errors means that the checkpoint is unusable.
     except (
         *(ArithmeticError, AttributeError, LookupError, OSError, RuntimeError),
         *(SafetensorError, TypeError, ValueError),
@@ -108,7 +108,7 @@ def _check_names(path: Path) -> None:
         if (path / name).is_symlink() or not (path / name).is_file():
             raise ValueError(f"{name} is not a plain file")
     if foreign := sorted(names - {_STATE, _TENSORS}):
-        raise ValueError(f"it holds files that no checkpoint has: {', '.join(foreign)}")
+        raise ValueError(f"it contains unknown files: {', '.join(foreign)}")
 
 
 def _read_document(file: Path, step: int) -> dict[str, Any]:

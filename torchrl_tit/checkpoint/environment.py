@@ -1,4 +1,4 @@
-"""The state of a TorchRL environment, from which it continues bit for bit."""
+"""The state of a TorchRL environment, which resumes bit for bit from it."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from torchrl_tit.envs import GymVectorEnv
 
 
 def can_save_env(env: EnvBase) -> bool:
-    """Tell whether an environment can be saved and continued.
+    """Return whether an environment can be saved and resumed.
 
-    It can where every layer is known: Gymnasium's classic control and MuJoCo tasks (v4, v5) with
-    the wrappers that `gymnasium.make` adds and a few more, single or in a `SyncVectorEnv`, inside
-    `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`. An Atari environment, for
-    example, cannot: reset it at each checkpoint instead.
+    This requires that every layer is known: Gymnasium's classic control and MuJoCo tasks (v4, v5)
+    with the wrappers that `gymnasium.make` adds and a few more, single or in a `SyncVectorEnv`,
+    inside `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`. Others, such as Atari
+    environments, have to be reset at each checkpoint.
 
     Args:
         env: A TorchRL environment.
 
     Returns:
-        Whether :func:`env_state` takes it.
+        Whether :func:`env_state` accepts it.
 
     Example:
         >>> from torchrl.envs import GymEnv
@@ -38,21 +38,22 @@ def can_save_env(env: EnvBase) -> bool:
 
 
 def env_state(env: EnvBase) -> dict[str, Any]:
-    """Take down everything that an environment remembers.
+    """Return the whole state of an environment.
 
-    That is physics, random generators, the elapsed steps and flags of wrappers, the buffers of a
-    vector of environments, and the buffers of TorchRL's transforms. A transform with memory outside
-    of its `state_dict` is not known to this function, except the one that TorchRL itself puts
-    around vectors. The tensordict that the caller carries from step to step is not part of it.
+    It consists of the physics, the random generators, the elapsed steps and flags of wrappers, the
+    buffers of vector environments, and the buffers of TorchRL's transforms, such as the histories
+    of :class:`~torchrl_tit.transforms.History`. Transforms that keep state outside of their
+    `state_dict` are not supported, except the one that TorchRL adds to vector environments. The
+    tensordict that the caller carries from step to step is not part of the state.
 
     Args:
-        env: An environment that :func:`can_save_env`.
+        env: An environment for which :func:`can_save_env` is True.
 
     Returns:
         A state that a checkpoint can hold; it shares no memory with the environment.
 
     Raises:
-        TypeError: The environment, or a wrapper in it, cannot be saved; the message names it.
+        TypeError: The environment or one of its wrappers cannot be saved; the message names it.
 
     Example:
         >>> from torchrl.envs import GymEnv
@@ -76,38 +77,39 @@ def env_state(env: EnvBase) -> dict[str, Any]:
 
 
 def set_env_state(env: EnvBase, state: dict[str, Any]) -> None:
-    """Bring an environment, which need not have been reset, to where another one was.
+    """Restore the state of an environment, which need not have been reset.
 
     Args:
-        env: An environment made as the saved one was.
+        env: An environment with the same settings as the saved one.
         state: What :func:`env_state` returned.
 
     Raises:
         TypeError: The environment cannot be saved.
-        ValueError: The state is that of another kind of environment.
+        ValueError: The state is of another kind of environment.
 
     Example:
         >>> from torchrl.envs import GymEnv
         >>> env, other = GymEnv("Pendulum-v1"), GymEnv("CartPole-v1")
         >>> set_env_state(other, env_state(env))  # doctest: +ELLIPSIS
         Traceback (most recent call last):
-        ValueError: the state is that of ...PendulumEnv, ...
+        ValueError: the state is of ...PendulumEnv, ...
     """
     if obstacle := _obstacle(env):
-        raise TypeError(f"an environment with {obstacle} in it cannot be continued from a state")
+        raise TypeError(f"an environment with {obstacle} in it cannot be restored")
     modules, base = _unwrap(env)
     present = list(layers(base._env))
     names = [class_name(layer) for layer in present]
     saved = [layer["class"] for layer in state["layers"]]
     if names != saved:
         raise ValueError(
-            f"the state is that of {', '.join(saved)}, but the environment is {', '.join(names)}; "
-            "make it as the saved one was made"
+            f"the state is of {', '.join(saved)}, but the environment is {', '.join(names)}; "
+            "use the settings of the saved environment"
         )
     if len(modules) != len(state["modules"]):
         raise ValueError(
-            f"the state is that of an environment with {len(state['modules']) - 1} levels of "
-            f"transforms, but this one has {len(modules) - 1}; make it as the saved one was made"
+            f"the state is of an environment with {len(state['modules']) - 1} levels of "
+            f"transforms, but this one has {len(modules) - 1}; use the settings of the saved "
+            "environment"
         )
     for module, saved_module in zip(modules, state["modules"], strict=True):
         _set_module_state(module, saved_module)
@@ -116,7 +118,7 @@ def set_env_state(env: EnvBase, state: dict[str, Any]) -> None:
 
 
 def _unwrap(env: EnvBase) -> tuple[list[nn.Module], EnvBase]:
-    """All that has buffers, from the outermost transform to the core, and the core itself."""
+    """Return the modules with buffers, from the outermost transform to the core, and the core."""
     transforms: list[nn.Module] = []
     while isinstance(env, TransformedEnv):
         transforms.append(env.transform)
@@ -125,7 +127,7 @@ def _unwrap(env: EnvBase) -> tuple[list[nn.Module], EnvBase]:
 
 
 def _obstacle(env: EnvBase) -> str | None:
-    """The class that keeps an environment from being saved."""
+    """Return the name of the class because of which an environment cannot be saved, if any."""
     _, base = _unwrap(env)
     if type(base) not in (GymVectorEnv, GymWrapper, GymEnv):
         return class_name(base)
@@ -135,12 +137,12 @@ def _obstacle(env: EnvBase) -> str | None:
 
 def _module_state(module: nn.Module) -> dict[str, Any]:
     return {
-        # None stands for a buffer that is only made when the first data come.
+        # None stands for a lazy buffer that has no data yet.
         "buffers": {
             key: None if isinstance(value, UninitializedBuffer) else _copy(value)
             for key, value in _buffers(module).items()
         },
-        # TorchRL keeps here what a vector of environments returned from its automatic resets.
+        # TorchRL keeps the results of a vector environment's automatic resets here.
         "resets": {
             name: {key: _copy(value) for key, value in part._memo.items()}
             for name, part in module.named_modules()
@@ -153,13 +155,13 @@ def _set_module_state(module: nn.Module, state: dict[str, Any]) -> None:
     buffers, present = state["buffers"], _buffers(module)
     if buffers.keys() != present.keys():
         raise ValueError(
-            f"the state is that of an environment with the buffers {sorted(buffers)}, but this one "
-            f"has {sorted(present)}; make it as the saved one was made"
+            f"the state is of an environment with the buffers {sorted(buffers)}, but this one has "
+            f"{sorted(present)}; use the settings of the saved environment"
         )
     known = {key: value for key, value in buffers.items() if value is not None}
     for key, value in known.items():
         if isinstance(present[key], UninitializedBuffer):
-            # load_state_dict fills buffers, it does not make them.
+            # load_state_dict does not materialize lazy buffers.
             path, _, leaf = key.rpartition(".")
             module.get_submodule(path).register_buffer(leaf, value.clone())
     module.load_state_dict(known, strict=False)
@@ -169,7 +171,7 @@ def _set_module_state(module: nn.Module, state: dict[str, Any]) -> None:
 
 
 def _buffers(module: nn.Module) -> dict[str, Any]:
-    # Without keep_vars PyTorch detaches, and a buffer that has no data yet cannot be detached.
+    # Without keep_vars PyTorch detaches, and lazy buffers cannot be detached.
     return dict(module.state_dict(keep_vars=True))
 
 

@@ -1,10 +1,10 @@
-"""What goes wrong with checkpoints."""
+"""Errors of checkpoints."""
 
 from __future__ import annotations
 
 
 class CheckpointError(OSError):
-    """A checkpoint could not be written or must not be used; the message says why and what to do.
+    """A checkpoint cannot be written or used; the message says why and what to do.
 
     Example:
         >>> issubclass(CheckpointError, OSError)
@@ -13,7 +13,7 @@ class CheckpointError(OSError):
 
 
 class CheckpointNotFoundError(CheckpointError, FileNotFoundError):
-    """There is no checkpoint where one was asked for.
+    """The requested checkpoint does not exist.
 
     Example:
         >>> issubclass(CheckpointNotFoundError, FileNotFoundError)

@@ -1,4 +1,4 @@
-"""A folder of numbered checkpoints: written whole or not at all, the newest one loaded.
+"""A folder of numbered checkpoints, written atomically.
 
 folder/
 000000018432/           one checkpoint, named after its step
@@ -32,17 +32,17 @@ _TEMPORARY = ".tmp-"
 def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep: int = 3) -> Path:
     """Save a state as a new numbered checkpoint and remove the oldest ones.
 
-    The checkpoint is written into a hidden folder beside, forced to the disk and renamed, so a
-    process that is killed at any moment leaves either all of it or none. Saving a step that is
-    there already replaces it, and never without a whole one in place. One process at a time may
-    save into a folder.
+    The checkpoint is written into a hidden folder, flushed to the disk and renamed, so a process
+    that is killed at any moment leaves a complete checkpoint or none. Saving a step again replaces
+    its checkpoint, and a complete one exists at any time. Only one process at a time may save into
+    a folder.
 
     Args:
-        folder: Where the run keeps its checkpoints; made where missing.
+        folder: Folder of the run's checkpoints; made if missing.
         step: Environment steps or updates done so far; the checkpoint's number.
         state: A nested state as :func:`~torchrl_tit.checkpoint.encode` takes it.
-        keep: How many checkpoints to leave: this one and the ones before it. Checkpoints of later
-            steps (of a run that was continued from an earlier one) are left alone.
+        keep: How many checkpoints to keep: this one and the ones before it. Checkpoints of later
+            steps (of a run that was resumed from an earlier one) are kept too.
 
     Returns:
         The checkpoint's own folder.
@@ -50,7 +50,7 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep:
     Raises:
         ValueError: `step` is negative or `keep` is not positive.
         TypeError: The state holds something that a checkpoint cannot hold.
-        CheckpointError: It could not be written, a full disk for example. What was there before is
+        CheckpointError: It could not be written (the disk is full, say). Earlier checkpoints are
             still there.
 
     Example:
@@ -65,7 +65,7 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep:
         raise ValueError(f"step must not be negative, got {step}")
     if keep < 1:
         raise ValueError(f"keep must be at least 1, got {keep}")
-    tensors, tree = encode(state)  # what cannot be saved fails before the disk is touched
+    tensors, tree = encode(state)  # fails before anything is written
     folder = Path(folder)
     try:
         if not folder.is_dir():
@@ -84,12 +84,12 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep:
 
 
 def load_checkpoint(folder: str | os.PathLike[str], step: int | None = None) -> tuple[int, Any]:
-    """Load the newest checkpoint, or that of one step.
+    """Load the newest checkpoint, or the one of a step.
 
-    Nothing in a checkpoint is ever executed, and both its files are held against their checksums.
+    Nothing in a checkpoint is ever executed, and both files are checked against their checksums.
 
     Args:
-        folder: Where the run keeps its checkpoints.
+        folder: Folder of the run's checkpoints.
         step: The checkpoint's number; the newest one by default.
 
     Returns:
@@ -97,8 +97,8 @@ def load_checkpoint(folder: str | os.PathLike[str], step: int | None = None) -> 
 
     Raises:
         CheckpointNotFoundError: There is no checkpoint, or none of this step.
-        CheckpointError: The checkpoint is damaged, of another program or version, or has a file in
-            it that does not belong there. The message names its folder.
+        CheckpointError: The checkpoint is damaged, of another program or version, or contains an
+            unknown file. The message names its folder.
 
     Example:
         >>> import tempfile, torch
@@ -131,7 +131,7 @@ def checkpoint_steps(folder: str | os.PathLike[str]) -> list[int]:
     """List the checkpoints in a folder.
 
     Args:
-        folder: Where the run keeps its checkpoints; it need not exist.
+        folder: Folder of the run's checkpoints; it need not exist.
 
     Returns:
         Their steps, the oldest first.
@@ -147,10 +147,10 @@ def latest_step(folder: str | os.PathLike[str]) -> int | None:
     """Find the newest checkpoint in a folder.
 
     Args:
-        folder: Where the run keeps its checkpoints; it need not exist.
+        folder: Folder of the run's checkpoints; it need not exist.
 
     Returns:
-        Its step, or None where there is none.
+        Its step, or None if there is none.
 
     Example:
         >>> latest_step("nowhere") is None
@@ -164,7 +164,7 @@ def _name(step: int) -> str:
 
 
 def _checkpoints(folder: Path) -> dict[int, Path]:
-    """Every checkpoint's folder by its step; of two of one step the one saved last."""
+    """Return the folder of each step's checkpoint; of two of the same step, the newer one."""
     found: dict[int, Path] = {}
     # Sorted, "NAME.new" comes after "NAME" and takes its place.
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
@@ -191,7 +191,7 @@ def _add(folder: Path, step: int, tensors: dict[str, Any], tree: Any) -> Path:
 
 
 def _promote(new: Path) -> None:
-    """Let a complete checkpoint of a step saved twice take the place of the first one."""
+    """Replace a step's checkpoint with the one saved again."""
     path = new.with_suffix("")
     if path.exists():
         _remove(path)
@@ -200,7 +200,7 @@ def _promote(new: Path) -> None:
 
 
 def _remove(path: Path) -> None:
-    # Under a hidden name first: a folder that is half removed must not look like a checkpoint.
+    # Renamed first: a partly removed folder must not look like a checkpoint.
     hidden = path.with_name(f"{_TEMPORARY}{path.name}-{secrets.token_hex(4)}")
     os.rename(path, hidden)
     shutil.rmtree(hidden)

@@ -19,13 +19,13 @@ _SPACES = ("action_space", "observation_space", "_action_space", "_observation_s
 
 
 def layers(env: _Layer) -> Iterator[_Layer]:
-    """Go through an environment from its outermost wrapper to its core.
+    """Iterate over an environment from its outermost wrapper to its core.
 
     Args:
         env: A Gymnasium environment or vector of environments.
 
     Yields:
-        Every wrapper, the environment itself, and for a vector every layer of each of its parts.
+        Each wrapper, the environment itself, and the layers of each copy in a vector.
 
     Example:
         >>> import gymnasium as gym
@@ -41,7 +41,7 @@ def layers(env: _Layer) -> Iterator[_Layer]:
 
 
 def layer_state(layer: _Layer) -> dict[str, Any]:
-    """Take down what one layer remembers.
+    """Return the state of one layer.
 
     Args:
         layer: One of :func:`layers`; its class must be listed in
@@ -58,7 +58,7 @@ def layer_state(layer: _Layer) -> dict[str, Any]:
         {'_elapsed_steps': 0}
     """
     name = class_name(layer)
-    # Some environments only have their state from the first reset on.
+    # Some environments have no state before the first reset.
     attributes = {key: getattr(layer, key, None) for key in ATTRIBUTES[name]}
     state: dict[str, Any] = {
         "class": name,
@@ -69,8 +69,8 @@ def layer_state(layer: _Layer) -> dict[str, Any]:
         "spaces": {key: _space_generator(space) for key, space in _spaces(layer).items()},
     }
     if _is_core(layer):
-        # A generator that is only made when it is first used is made here, so that both the run
-        # that goes on and the one that is restored have the same.
+        # This creates a lazy generator, so that the run that is saved and the one that is restored
+        # have the same.
         state["np_random"] = _generator_state(layer.np_random)
         state["np_random_seed"] = layer._np_random_seed
         if hasattr(layer, "model"):
@@ -79,7 +79,7 @@ def layer_state(layer: _Layer) -> dict[str, Any]:
 
 
 def set_layer_state(layer: _Layer, state: dict[str, Any]) -> None:
-    """Set what one layer remembers, see :func:`layer_state`.
+    """Restore the state of one layer, see :func:`layer_state`.
 
     Args:
         layer: A layer of the same class.
@@ -102,7 +102,7 @@ def set_layer_state(layer: _Layer, state: dict[str, Any]) -> None:
             setattr(layer, key, deepcopy(value))
     for key, space in _spaces(layer).items():
         if state["spaces"][key] is None:
-            space._np_random = None  # type: ignore[assignment]  # how Gymnasium says "not seeded"
+            space._np_random = None  # type: ignore[assignment]  # not seeded, in Gymnasium
         else:
             space.np_random.bit_generator.state = state["spaces"][key]
     if _is_core(layer):
@@ -117,12 +117,12 @@ def set_layer_state(layer: _Layer, state: dict[str, Any]) -> None:
 
 
 def _is_core(layer: _Layer) -> bool:
-    """Whether a layer is a single environment itself, which alone has generator and physics."""
+    """Whether a layer is an environment without wrappers, which has a generator and physics."""
     return isinstance(layer, gym.Env) and not isinstance(layer, gym.Wrapper)
 
 
 def _spaces(layer: _Layer) -> dict[str, gym.Space[Any]]:
-    """The spaces that a layer owns; a wrapper shows those of the layer below as well."""
+    """Return a layer's own spaces; a wrapper also shows those of the layer below."""
     owned = {key: vars(layer).get(key) for key in _SPACES}
     return {key: space for key, space in owned.items() if isinstance(space, gym.Space)}
 

@@ -1,4 +1,4 @@
-"""What each Gymnasium environment and wrapper remembers between two steps."""
+"""The state of each Gymnasium environment and wrapper between two steps."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ _MUJOCO = "gymnasium.envs.mujoco"
 
 _EPISODE_QUEUES = ("time_queue", "return_queue", "length_queue")
 
-# The attributes that change after construction, by the full name of the class. Whatever is not
-# listed here cannot be saved: a subclass or an unknown wrapper may remember more than we know.
+# The attributes that change after construction, by the full name of the class. Other classes cannot
+# be saved: a subclass or an unknown wrapper may have further state.
 ATTRIBUTES: dict[str, tuple[str, ...]] = {
     f"{_CLASSIC}.acrobot.AcrobotEnv": ("state",),
     f"{_CLASSIC}.cartpole.CartPoleEnv": ("state", "steps_beyond_terminated"),
     f"{_CLASSIC}.continuous_mountain_car.Continuous_MountainCarEnv": ("state",),
     f"{_CLASSIC}.mountain_car.MountainCarEnv": ("state",),
     f"{_CLASSIC}.pendulum.PendulumEnv": ("state", "last_u"),
-    # Of a MuJoCo environment all that changes is its mjData, see mujoco_state.
+    # All state of a MuJoCo environment is in its mjData, see mujoco_state.
     **{
         f"{_MUJOCO}.{module}_{version}.{name}": ()
         for version in ("v4", "v5")
@@ -48,7 +48,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
         *("checked_reset", "checked_step", "checked_render", "checked_data_reuse"),
         *("close_called", "_previous_data"),
     ),
-    # When an episode began is left out: the clock of another process means nothing here.
+    # Without the start times of episodes: clocks of different processes cannot be compared.
     f"{_WRAPPERS}.common.RecordEpisodeStatistics": (
         *("episode_count", "episode_returns", "episode_lengths"),
         *_EPISODE_QUEUES,
@@ -65,14 +65,14 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     f"{_WRAPPERS}.transform_reward.ClipReward": (),
 }
 
-# Positions that MuJoCo derives from the state, but one substep late: after a step they belong to
-# the state before its last substep. Ant, Humanoid and Reacher read them before they step, so they
-# cannot be computed anew from the state.
+# Positions that MuJoCo derives from the state one substep late: after a step they belong to the
+# state before the last substep. Ant, Humanoid and Reacher read them before they step, so they
+# cannot be recomputed from the state.
 _LATE_POSITIONS = ("xpos", "xipos")
 
 
 def class_name(env: object) -> str:
-    """Give the full name of an object's class.
+    """Return the full name of an object's class.
 
     Args:
         env: An environment or a wrapper.
@@ -89,21 +89,21 @@ def class_name(env: object) -> str:
 
 
 def mujoco_state(env: Any) -> dict[str, np.ndarray]:
-    """Take down the physics of a MuJoCo environment.
+    """Return the physics state of a MuJoCo environment.
 
     Args:
         env: An unwrapped Gymnasium MuJoCo environment.
 
     Returns:
-        MuJoCo's integration state (float64), which includes the solver's warm start, and body
-        positions that are not a function of it.
+        MuJoCo's integration state (float64), including the solver's warm start, and body positions
+        that are not a function of it.
 
     Example:
         >>> import gymnasium as gym
         >>> sorted(mujoco_state(gym.make("Hopper-v5").unwrapped))
         ['integration', 'xipos', 'xpos']
     """
-    import mujoco  # only for those who have one of its environments
+    import mujoco  # here, since most tasks do not need it
 
     kind = mujoco.mjtState.mjSTATE_INTEGRATION
     integration = np.empty(mujoco.mj_stateSize(env.model, kind))
@@ -113,7 +113,7 @@ def mujoco_state(env: Any) -> dict[str, np.ndarray]:
 
 
 def set_mujoco_state(env: Any, state: dict[str, np.ndarray]) -> None:
-    """Set the physics of a MuJoCo environment, see :func:`mujoco_state`.
+    """Restore the physics state of a MuJoCo environment, see :func:`mujoco_state`.
 
     Args:
         env: An unwrapped environment of the same model.

@@ -1,4 +1,4 @@
-"""The random generators that a whole process shares."""
+"""The global random generators."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import torch
 
 
 def global_rng_state() -> dict[str, Any]:
-    """Take down every global random generator: Python's, numpy's, PyTorch's on the CPU and GPUs.
+    """Return the states of the global random generators of Python, NumPy and PyTorch (CPU, GPUs).
 
     Returns:
-        A state that a checkpoint can hold. `"cuda"` is empty where this process has not used CUDA.
+        A state that a checkpoint can hold. `"cuda"` is empty if this process has not used CUDA.
 
     Example:
         >>> import random
@@ -27,17 +27,17 @@ def global_rng_state() -> dict[str, Any]:
         "python": random.getstate(),
         "numpy": np.random.get_state(legacy=False),
         "torch": torch.get_rng_state(),
-        # Asking for it would start CUDA on every GPU, and unused generators have nothing to tell.
+        # Reading it would initialize CUDA on every GPU, and unused generators have no state.
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
     }
 
 
 def set_global_rng_state(state: dict[str, Any]) -> None:
-    """Set every global random generator, see :func:`global_rng_state`.
+    """Restore the states of the global random generators, see :func:`global_rng_state`.
 
     Args:
-        state: What :func:`global_rng_state` returned. Where it was taken with more GPUs than this
-            machine has, those are left out; GPUs beyond the ones in it keep their state.
+        state: What :func:`global_rng_state` returned. States of GPUs that this machine lacks are
+            ignored; GPUs that the state lacks keep theirs.
 
     Example:
         >>> import torch
