@@ -1,1 +1,1 @@
-"""Experiments as data: dataclasses that assemble them, each beside the loop that it drives."""
+"""Experiments: settings, algorithms, one training loop, and a command line."""

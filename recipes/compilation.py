@@ -1,4 +1,4 @@
-"""Whether torch.compile works and pays on this machine."""
+"""Whether torch.compile works on this machine, and whether it is worth its time."""
 
 from __future__ import annotations
 
@@ -6,19 +6,17 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache, wraps
-from typing import Any, Literal, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from tqdm import tqdm
 
+from .recipe import Compile, Precision
+
 P = ParamSpec("P")
 T = TypeVar("T")
-
-Compile = Literal["auto", "on", "off"]
-
-Precision = Literal["auto", "float32", "bfloat16"]
 
 STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
 """How torch.compile is called: which kernels run must not depend on the sizes seen before, or a
@@ -54,42 +52,14 @@ def should_compile(setting: Compile, gradient_steps: int) -> bool:
     return setting == "on"
 
 
-def compile_options(cuda_graphs: Compile, device: torch.device) -> dict[str, Any]:
-    """Decides how ``torch.compile`` is called.
-
-    Args:
-        cuda_graphs: whether kernels are recorded and launched together; "auto" is on on a GPU,
-            where launching small kernels one by one takes longer than running them.
-        device: where the networks are.
-
-    Raises:
-        ValueError: if it is "on" and the networks are not on a GPU.
-
-    Example:
-        >>> compile_options("auto", torch.device("cpu"))
-        {'dynamic': False}
-    """
-    if cuda_graphs == "on" and device.type != "cuda":
-        raise ValueError(
-            f"cuda_graphs is on, but the networks are on {device}: set device to cuda, or "
-            "cuda_graphs to off"
-        )
-    if cuda_graphs == "off" or device.type != "cuda":
-        return STATIC_SHAPES
-    return {**STATIC_SHAPES, "mode": "reduce-overhead"}
-
-
-def compile_and_time(
-    function: Callable[P, T], options: Mapping[str, Any], name: str
-) -> Callable[P, T]:
+def compile_and_time(function: Callable[P, T], name: str) -> Callable[P, T]:
     """Compiles a function, and prints how long its first call took, which does the compiling.
 
     Args:
         function: what to compile.
-        options: of ``torch.compile``.
         name: what it is, for the message.
     """
-    fast = torch.compile(function, **options)
+    fast = torch.compile(function, **STATIC_SHAPES)
     first = True
 
     @wraps(function)
@@ -107,7 +77,7 @@ def compile_and_time(
 
 
 def autocast_type(precision: Precision, device: torch.device) -> torch.dtype | None:
-    """Decides what matrix products are computed in: None is the type of the weights.
+    """Returns the dtype of matrix products for autocast; None is the dtype of the weights.
 
     Args:
         precision: "auto" is bfloat16 on a GPU that has it, where it is several times as fast.
@@ -133,6 +103,6 @@ def _works() -> bool:
     """Compiles something small: a compiler can be there and still lack headers or OpenMP."""
     try:
         torch.compile(lambda x: x.sin() + 1)(torch.ones(8))
-    except Exception:  # whatever the toolchain says, "auto" goes on without it
+    except Exception:  # whatever the toolchain says, "auto" then does not compile
         return False
     return True

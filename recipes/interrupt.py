@@ -1,4 +1,4 @@
-"""Stopping a run in good order."""
+"""Stopping a run without losing work."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from types import FrameType
 class Interrupt:
     """Turns the first Ctrl-C (or SIGTERM) into a request that the training loop reads.
 
-    The loop ends its batch, saves a checkpoint and stops. A second Ctrl-C stops at once; the last
-    checkpoint is still there then. So does an error of the batch that was to be ended: the same
-    Ctrl-C stops a C++ compiler that is at work for it.
+    The loop completes its batch, saves a checkpoint and stops. A second Ctrl-C stops at once, with
+    the last checkpoint kept. So does an error in the batch: the same Ctrl-C also stops a C++
+    compiler that works for it.
 
     Example:
         >>> with Interrupt() as interrupt:
@@ -39,14 +39,17 @@ class Interrupt:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
-        print("\nsaving a checkpoint after this batch; again to stop at once", file=sys.stderr)
+        print(
+            "\nsaving a checkpoint after this batch; press Ctrl-C again to stop at once",
+            file=sys.stderr,
+        )
 
 
 @contextmanager
 def raise_on_signals() -> Iterator[None]:
-    """Within it SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that workers are stopped too.
+    """Lets SIGTERM raise KeyboardInterrupt as Ctrl-C does, so that workers are stopped too.
 
-    So does SIGINT where a shell that started the process in the background had it ignored.
+    So does SIGINT, which a shell ignores for a process that it starts in the background.
 
     Example:
         >>> with raise_on_signals():

@@ -19,8 +19,8 @@ class Metrics:
     """One row of numbers at a time, in ``metrics.csv`` and in ``tensorboard/``.
 
     The CSV is the record: its first two columns are ``step`` and ``time`` (seconds since 1970).
-    TensorBoard's files are written from it anew when a run is resumed, so that neither holds a row
-    of work that was lost.
+    TensorBoard's files are rewritten from it when a run is resumed, so that neither holds a row of
+    work that was lost.
 
     Args:
         folder: the run folder.
@@ -32,7 +32,7 @@ class Metrics:
         self.path = folder / "metrics.csv"
         self._columns = ["step", "time", *columns]
         kept = [row for row in read_metrics(self.path) if row["step"] <= last_step]
-        # All in one go: a process that is killed here loses no row.
+        # Written at once: a process that is killed here loses no row.
         lines = [self._line(self._columns), *(self._line(self._cells(row)) for row in kept)]
         write_text_atomic(self.path, "".join(lines))
         shutil.rmtree(folder / "tensorboard", ignore_errors=True)
@@ -57,7 +57,9 @@ class Metrics:
         try:
             return [int(row["step"]), *(float(row[column]) for column in self._columns[1:])]
         except KeyError as error:
-            raise ValueError(f"{self.path} has no column {error}: it is not of this run") from error
+            raise ValueError(
+                f"{self.path} has no column {error}: it belongs to another run"
+            ) from error
 
     @staticmethod
     def _line(cells: list[Any]) -> str:
@@ -74,7 +76,7 @@ class Metrics:
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:
-    """Reads the complete rows of a ``metrics.csv``; none where there is no file.
+    """Reads the complete rows of a ``metrics.csv``; none if there is no file.
 
     Args:
         path: the file.
@@ -87,7 +89,7 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
     """
     if not path.exists():
         return []
-    # A row that a killed process left without its line end is no row.
+    # A row without its line end was left by a killed process; it does not count.
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
     rows = []
     for row in csv.DictReader(line for line in lines if line.endswith("\n")):

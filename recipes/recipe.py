@@ -1,43 +1,21 @@
-"""What every recipe has, and recipes as JSON."""
+"""What every recipe has: the settings of an experiment, without its code."""
 
 from __future__ import annotations
 
-import dataclasses
-import difflib
-import json
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
-from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    ClassVar,
-    Literal,
-    TypeVar,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
 import msgspec
-import torch
 import tyro
 
-from .networks import NETWORKS, NetworkConfig
+from torchrl_tit.settings import Network, Part
+from torchrl_tit.settings.checks import check_at_least, check_at_most, nearest
 
-if TYPE_CHECKING:
-    from tensordict.nn import TensorDictModuleBase
-    from torchrl.envs import EnvBase
-
-    from .run import Run
-
-ALGORITHMS: dict[str, type[Recipe]] = {}
-"""Recipe classes by the name of their algorithm."""
-
-T = TypeVar("T")
+Compile = Literal["auto", "on", "off"]
+Precision = Literal["auto", "float32", "bfloat16"]
+Padding = Literal["same", "constant"]
 
 # NumPy takes 32 bits, and environments are seeded with this seed and those that follow.
 _MAX_SEED = 2**31
@@ -45,44 +23,70 @@ _MAX_SEED = 2**31
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Settings that every experiment has."""
+    """Settings that every experiment has.
+
+    The recipes of an algorithm are a subclass, which registers itself by its definition:
+    ``algorithm`` is the name that JSON and the command line use, ``builds`` the
+    :class:`~recipes.algorithm.Algorithm` that they drive, as "module:Class".
+    """
 
     algorithm: ClassVar[str]
+    builds: ClassVar[str]
+    registered: ClassVar[dict[str, type[Recipe]]] = {}
+    """Recipes by the name of their algorithm."""
     offline: ClassVar[bool] = False
     """Whether steps are gradient steps, and returns those of evaluations."""
-    trains_side_by_side: ClassVar[bool] = False
-    """Whether several seeds can be trained in one process; see :meth:`train_side_by_side`."""
+    supplies_actions: ClassVar[bool] = False
+    """Whether networks are given past actions and returns to go beside observations."""
 
     name: Annotated[str, tyro.conf.Suppress] = ""
     """The recipe's name, such as ppo/cartpole/enhanced-tit."""
-    backbone: NetworkConfig
-    """The network, one of those in recipes/networks.py, and its hyperparameters."""
+    backbone: Network
+    """The network: its frame encoder, its history encoder, and the number of frames it reads."""
+    env: str
+    """Name of a Gymnasium environment: the task."""
     seed: int = 0
-    """Seed of the networks, the environments and the update's order."""
+    """Seed of the networks, the environments and the order of minibatches."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Where the networks are: "auto" is the GPU where there is one."""
+    """Device of the networks; "auto" is the GPU if there is one."""
     threads: int = 1
-    """PyTorch's threads on the CPU; small networks run fastest on one."""
+    """PyTorch's CPU threads; small networks are fastest with one."""
+    log_interval: int = 1
+    """Steps between rows of metrics; at least one batch."""
+    checkpoint_interval: int = 10_000
+    """Steps between checkpoints."""
     evaluation_episodes: int = 100
-    """Episodes of an evaluation."""
+    """Number of episodes in an evaluation."""
     evaluation_seed: int = 1_000_000
-    """Seed of the first evaluation episode; the others follow one by one."""
+    """Seed of the first evaluation episode; episode i has this seed + i."""
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "algorithm" in vars(cls):  # not what several recipes share
-            ALGORITHMS[cls.algorithm] = cls
+    def __init_subclass__(cls, *, algorithm: str | None = None, builds: str | None = None) -> None:
+        super().__init_subclass__()
+        if algorithm is not None and builds is not None:  # not what several recipes share
+            cls.algorithm, cls.builds = algorithm, builds
+            Recipe.registered[algorithm] = cls
 
     def __post_init__(self) -> None:
-        if not isinstance(self.backbone, NetworkConfig):
+        if not isinstance(self.backbone, Network):
             raise ValueError(
-                f"field 'backbone' must be the settings of a network, such as MLPConfig(), not "
-                f"{self.backbone!r}"
+                f"field 'backbone' must be the settings of a network, such as "
+                f"torchrl_tit.settings.networks.mlp(), not {self.backbone!r}"
             )
-        for name, kind in _field_types(type(self)).items():  # type: ignore[arg-type]
-            if name != "backbone":  # which algorithm takes which network, it says itself
-                _checked(name, getattr(self, name), kind)
-        check_at_least(self, threads=1, seed=0, evaluation_episodes=1, evaluation_seed=0)
+        check_types(self)
+        if self.backbone.history.reads_actions and not self.supplies_actions:
+            raise ValueError(
+                f"{self.backbone.history.name} reads actions and returns beside observations, "
+                f"which {self.algorithm} does not supply: use a dt or odt recipe"
+            )
+        check_at_least(
+            self,
+            threads=1,
+            seed=0,
+            log_interval=1,
+            checkpoint_interval=1,
+            evaluation_episodes=1,
+            evaluation_seed=0,
+        )
         check_at_most(self, seed=_MAX_SEED, evaluation_seed=_MAX_SEED)
         if self.name and not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", self.name):
             raise ValueError(
@@ -91,137 +95,71 @@ class Recipe:
 
     @property
     def final_step(self) -> int:
-        """Environment steps, or updates, at which training is complete."""
+        """Environment steps, or gradient steps, at which training is complete."""
         raise NotImplementedError
 
-    def check(self) -> None:
-        """Raises ValueError where environment or networks cannot be built as the fields say."""
-        raise NotImplementedError
+    @property
+    def target_columns(self) -> dict[float, str]:
+        """Columns of metrics for each target return of the evaluations."""
+        return {}
 
-    def train(self, run: Run) -> None:
-        """Trains in a run folder, from its newest checkpoint where there is one."""
-        raise NotImplementedError
-
-    def train_side_by_side(self, runs: Sequence[Run]) -> None:
-        """Trains runs whose recipes are this one with seeds of their own, all at once."""
-        raise NotImplementedError
-
-    def evaluate(self, run: Run) -> dict[str, Any]:
-        """Evaluates a run's newest checkpoint and returns what ``evaluation.json`` is to hold."""
-        raise NotImplementedError
-
-    def load_player(self, run: Run, **settings: Any) -> tuple[TensorDictModuleBase, EnvBase]:
-        """Loads the policy of a run's newest checkpoint, in evaluation mode, and one environment.
-
-        Args:
-            run: a run folder with a checkpoint.
-            **settings: of the task, such as ``render_mode="rgb_array"``.
-
-        Raises:
-            FileNotFoundError: if there is no checkpoint.
-        """
-        raise NotImplementedError
-
-    def torch_device(self) -> torch.device:
-        """The device that ``device`` names on this machine.
-
-        Raises:
-            ValueError: if there is no such device.
-        """
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("device is 'cuda', but PyTorch finds no GPU: use 'cpu' or 'auto'")
-        if self.device == "auto":
-            return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        return torch.device(self.device)
+    def evaluation_due(self, step: int) -> bool:
+        """Returns whether to evaluate at a step, in addition to the evaluation at the end."""
+        return False
 
 
-def check_at_least(recipe: object, **minima: float) -> None:
-    """Raises ValueError where a field of a recipe is below its minimum."""
-    for field, minimum in minima.items():
-        value = getattr(recipe, field)
-        if not value >= minimum:
-            raise ValueError(f"{field} must be at least {minimum}, not {value}")
+def check_types(settings: object, prefix: str = "") -> None:
+    """Raises ValueError where a field of settings, or of settings within, has a wrong type.
 
-
-def check_at_most(recipe: object, **maxima: float) -> None:
-    """Raises ValueError where a field of a recipe is above its maximum."""
-    for field, maximum in maxima.items():
-        value = getattr(recipe, field)
-        if not value <= maximum:
-            raise ValueError(f"{field} must be at most {maximum}, not {value}")
-
-
-def recipe_to_json(recipe: Recipe) -> str:
-    """Writes a recipe as JSON, from which :func:`recipe_from_json` makes it again."""
-    network = next(name for name, (kind, _) in NETWORKS.items() if kind is type(recipe.backbone))
-    fields = dataclasses.asdict(recipe)
-    fields["backbone"] = {"network": network, **fields["backbone"]}
-    return json.dumps({"algorithm": recipe.algorithm, **fields}, indent=2) + "\n"
-
-
-def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
-    """Makes a recipe from JSON.
-
-    Args:
-        text: what :func:`recipe_to_json` wrote; fields that are missing take their defaults.
-        source: the file it came from, for messages.
-
-    Raises:
-        ValueError: if it is no JSON, a field is unknown or has the wrong type or value.
+    Example:
+        >>> from torchrl_tit.settings import Inner
+        >>> check_types(Inner(patch_size=2.5))
+        Traceback (most recent call last):
+            ...
+        ValueError: field 'patch_size' is 2.5: Expected `int | null`, got `float`
     """
-    from . import registry  # noqa: F401  imports, and so registers, every algorithm
-
-    try:
-        fields = json.loads(text)
-        if not isinstance(fields, dict):
-            raise ValueError("expected an object with the recipe's fields")
-        recipe = _take(fields, "algorithm", ALGORITHMS)
-        backbone = fields.get("backbone", {})
-        if not isinstance(backbone, dict):
-            raise ValueError(f"field 'backbone': expected an object, not {backbone!r}")
-        network = _take(backbone, "network", {name: kind for name, (kind, _) in NETWORKS.items()})
-        return _convert(recipe, fields, backbone=_convert(network, backbone, "backbone."))
-    except (RecursionError, ValueError) as error:  # json.JSONDecodeError is one
-        raise ValueError(f"{source} is not a recipe: {error}") from error
+    for name, kind in field_types(type(settings)).items():
+        value = getattr(settings, name)
+        if hasattr(value, "__dataclass_fields__"):
+            if isinstance(kind, type) and not isinstance(value, kind):
+                raise ValueError(
+                    f"field {prefix + name!r} must be settings of type {kind.__name__}, not "
+                    f"{type(value).__name__}"
+                )
+            check_types(value, f"{prefix}{name}.")
+        else:
+            checked(prefix + name, value, kind)
 
 
-def nearest(name: str, names: Mapping[str, object]) -> str:
-    """Words for an error message: the names nearest to an unknown one."""
-    matches = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
-    return f"did you mean {' or '.join(matches)}?" if matches else f"choose from {', '.join(names)}"
-
-
-def _take(fields: dict[str, Any], key: str, choices: Mapping[str, T]) -> T:
-    """Removes the entry that says what the fields belong to and looks it up."""
-    name = fields.pop(key, None)
-    if name not in choices:
-        raise ValueError(f"unknown {key} {name!r}: {nearest(str(name), choices)}")
-    return choices[name]
-
-
-def _convert(kind: type[T], fields: dict[str, Any], prefix: str = "", **made: Any) -> T:
-    """Builds a dataclass from fields, each strictly of its type; ``made`` are built already."""
-    types = _field_types(kind)  # type: ignore[arg-type]
-    values = dict(made)
-    for name, value in fields.items():
-        if name not in types:
-            raise ValueError(f"unknown field {prefix + name!r}: {nearest(name, types)}")
-        if name not in made:
-            values[name] = _checked(prefix + name, value, types[name])
-    return kind(**values)
+def field_types(kind: type) -> dict[str, Any]:
+    """Returns the fields of a dataclass with their types."""
+    return _field_types(kind)
 
 
 @cache
 def _field_types(kind: type) -> dict[str, Any]:
-    """The fields of a dataclass with their types."""
     hints = get_type_hints(kind)
-    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+    return {field.name: hints[field.name] for field in fields(kind)}
 
 
-def _checked(name: str, value: object, kind: Any) -> Any:
+def checked(name: str, value: object, kind: Any) -> Any:
     """Returns a value as its type, or raises ValueError where it is of another."""
+    if isinstance(kind, type) and issubclass(kind, Part | Network):
+        raise ValueError(f"field {name!r} must be settings of a {kind.__name__}, not {value!r}")
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         choices = f", not one of {get_args(kind)}" if get_origin(kind) is Literal else ""
         raise ValueError(f"field {name!r} is {value!r}{choices}: {error}") from error
+
+
+def get_recipe_class(algorithm: str) -> type[Recipe]:
+    """Looks up the recipes of an algorithm.
+
+    Raises:
+        ValueError: if there is no such algorithm.
+    """
+    if algorithm not in Recipe.registered:
+        names = nearest(str(algorithm), Recipe.registered)
+        raise ValueError(f"unknown algorithm {algorithm!r}: {names}")
+    return Recipe.registered[algorithm]

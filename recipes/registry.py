@@ -4,17 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .cql.named import CQL_RECIPES
-from .decision_transformer.named import DT_RECIPES
-from .ppo.atari import ATARI_RECIPES
-from .ppo.named import ARRAY_RECIPES
-from .ppo.no_velocity import NO_VELOCITY_RECIPES
-from .recipe import Recipe, nearest, recipe_from_json
+from torchrl_tit.settings.checks import nearest
+
+from .presets.cql import CQL_RECIPES
+from .presets.decision_transformer import DT_RECIPES
+from .presets.ppo_arrays import ARRAY_RECIPES
+from .presets.ppo_atari import ATARI_RECIPES
+from .presets.ppo_no_velocity import NO_VELOCITY_RECIPES
+from .presets.sac import SAC_RECIPES
+from .recipe import Recipe
+from .recipe_json import recipe_from_json
 
 RECIPES: dict[str, Recipe] = {
     **ARRAY_RECIPES,
     **NO_VELOCITY_RECIPES,
     **ATARI_RECIPES,
+    **SAC_RECIPES,
     **CQL_RECIPES,
     **DT_RECIPES,
 }
@@ -50,7 +55,7 @@ def find_recipe(name: str) -> Recipe:
     path = Path(name)
     if path.is_dir():
         raise ValueError(
-            f"{name} is a folder, not a recipe: name the recipe.json in it, or go on with a run by "
+            f"{name} is a folder, not a recipe: name the recipe.json in it, or resume the run with "
             f"`train --resume {name}`"
         )
     if path.suffix == ".json":

@@ -1,4 +1,4 @@
-"""A run folder: everything that an experiment leaves, and what it needs to go on."""
+"""A run folder: everything that an experiment writes, and what it needs to resume."""
 
 from __future__ import annotations
 
@@ -12,22 +12,27 @@ from typing import Any
 
 import filelock
 
-from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint, save_checkpoint
+from torchrl_tit.checkpoint import (
+    CheckpointError,
+    checkpoint_steps,
+    load_checkpoint,
+    save_checkpoint,
+)
 from torchrl_tit.files import write_text_atomic
 
 from .metrics import Metrics
-from .recipe import Recipe, recipe_from_json, recipe_to_json
-from .results.plot import plot_learning_curve
+from .recipe import Recipe
+from .recipe_json import recipe_to_json
+from .registry import find_recipe
 
-_CURVE = "learning_curve.png"
 _PACKAGES = ["torchrl-tit", "torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy"]
 
 
 class Run:
     """The folder of one training run.
 
-        recipe.json        the recipe, from which the run can be started again
-        versions.json      Python and the packages it ran with
+        recipe.json        the recipe, from which the run can be repeated
+        versions.json      the versions of Python and packages that it ran with
         metrics.csv        one row of numbers a batch
         tensorboard/       the same for TensorBoard
         checkpoints/       numbered by step; the newest complete one is loaded
@@ -51,7 +56,7 @@ class Run:
         """Makes a new run folder.
 
         Raises:
-            FileExistsError: if the folder is there already and not empty.
+            FileExistsError: if the folder exists already and is not empty.
         """
         cls.check_new(folder)
         folder.mkdir(parents=True, exist_ok=True)
@@ -62,7 +67,7 @@ class Run:
     @staticmethod
     def check_new(folder: Path) -> None:
         """Raises FileExistsError where :meth:`create` would."""
-        # recipe.json comes last: without it, what a killed process began here is no run yet.
+        # recipe.json is written last: without it, what a killed process left here is not a run.
         if folder.exists() and (
             not folder.is_dir()
             or any(
@@ -70,22 +75,22 @@ class Run:
             )
         ):
             raise FileExistsError(
-                f"{folder} exists already: continue it with `train --resume {folder}`, or name "
+                f"{folder} exists already: resume it with `train --resume {folder}`, or name "
                 "another folder with --out"
             )
 
     @classmethod
     def open(cls, folder: Path) -> Run:
-        """Opens a run folder that is there.
+        """Opens an existing run folder.
 
         Raises:
-            FileNotFoundError: if there is no run in the folder.
+            FileNotFoundError: if the folder is not a run folder.
             ValueError: if its recipe cannot be read.
         """
         path = folder / "recipe.json"
         if not path.is_file():
-            raise FileNotFoundError(f"{folder} is no run folder: there is no {path}")
-        return cls(folder, recipe_from_json(path.read_bytes(), path))
+            raise FileNotFoundError(f"{folder} is not a run folder: there is no {path}")
+        return cls(folder, find_recipe(str(path)))
 
     def __enter__(self) -> Run:
         try:
@@ -109,12 +114,20 @@ class Run:
         save_checkpoint(self.checkpoints, step, state)
 
     def load(self) -> tuple[int, dict[str, Any]] | None:
-        """Loads the newest checkpoint: (step, state), or None where there is none yet.
+        """Loads the newest checkpoint: (step, state), or None if there is none.
 
         Raises:
-            CheckpointError: if it is damaged or not one of ours.
+            CheckpointError: if it is damaged, from an older version, or not one of ours.
         """
-        return load_checkpoint(self.checkpoints) if checkpoint_steps(self.checkpoints) else None
+        if not checkpoint_steps(self.checkpoints):
+            return None
+        step, state = load_checkpoint(self.checkpoints)
+        if "networks" not in state:
+            raise CheckpointError(
+                f"the checkpoint of step {step} in {self.checkpoints} is from an older version of "
+                "torchrl-tit, whose networks had other parts: train the run again"
+            )
+        return step, state
 
     def load_trained(self) -> tuple[int, dict[str, Any]]:
         """Loads the newest checkpoint of a run that has been trained: (step, state).
@@ -130,17 +143,17 @@ class Run:
 
     @contextmanager
     def restoring(self, step: int) -> Iterator[None]:
-        """Says what is wrong where a checkpoint's state does not fit what the recipe builds."""
+        """Raises ValueError where a checkpoint's state does not fit what the recipe builds."""
         try:
             yield
         except (LookupError, RuntimeError, TypeError, ValueError) as error:
             raise ValueError(
                 f"the checkpoint of step {step} in {self.checkpoints} does not fit "
-                f"{self.folder / 'recipe.json'}; was that changed since? ({error})"
+                f"{self.folder / 'recipe.json'}; was that file changed since? ({error})"
             ) from error
 
     def metrics(self, columns: list[str], last_step: int) -> Metrics:
-        """Opens the metrics, keeping the rows up to a step."""
+        """Opens the metrics and keeps the rows up to a step."""
         return Metrics(self.folder, columns, last_step)
 
     def save_evaluation(self, evaluation: dict[str, Any], path: Path | None = None) -> Path:
@@ -150,27 +163,21 @@ class Run:
         return path
 
     def is_complete(self) -> bool:
-        """Whether the run is trained, evaluated and drawn: there is nothing left to do."""
+        """Whether the run is trained and evaluated and its learning curve is drawn."""
         try:
             evaluation = json.loads((self.folder / "evaluation.json").read_text(encoding="utf-8"))
             evaluated = evaluation["steps"] >= self.recipe.final_step
         except (OSError, ValueError, LookupError, TypeError):
             return False
-        return evaluated and (self.folder / _CURVE).is_file()
+        return evaluated and self.curve.is_file()
 
-    def plot(self) -> Path:
-        """Draws ``learning_curve.png`` from the metrics and returns its path."""
-        path = self.folder / _CURVE
-        plot_learning_curve(
-            self.folder / "metrics.csv",
-            path,
-            title=self.recipe.name,
-            offline=self.recipe.offline,
-        )
-        return path
+    @property
+    def curve(self) -> Path:
+        """The picture of the learning curve."""
+        return self.folder / "learning_curve.png"
 
     def version_changes(self) -> list[str]:
-        """What differs between the versions the run began with and those of this process."""
+        """Returns how the versions of this process differ from those that the run began with."""
         path = self.folder / "versions.json"
         try:
             before = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""The command line: main.py knows the commands, which read their words and call the rooms."""
+"""The command line: main.py names the commands, each of which parses its arguments and runs."""
 
 from .main import main
 

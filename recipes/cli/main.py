@@ -1,72 +1,68 @@
-"""Which commands there are."""
+"""Which commands there are. Each is imported only when it is called, so that all start quickly."""
 
 from __future__ import annotations
 
 import sys
-from fnmatch import fnmatchcase
 
-from ..recipe import recipe_to_json
-from ..registry import RECIPES, find_recipe
-from .finished import compare, evaluate, render, table
-from .many import sweep, tune
-from .train import train
-from .words import USAGE, Parser, fail, program
+from torchrl_tit.settings import resolve
+
+from .arguments import fail, program
+
+COMMANDS = {
+    "list": "named_recipes:list_recipes",
+    "show": "named_recipes:show",
+    "train": "train:train",
+    "evaluate": "evaluate:evaluate",
+    "render": "evaluate:render",
+    "sweep": "sweep:sweep",
+    "tune": "sweep:tune",
+    "compare": "compare:compare",
+    "table": "compare:table",
+    "data": "data:data",
+}
+"""The commands by name, each a "module:function" of this package."""
+
+USAGE = """\
+usage: {program} COMMAND ...
+
+  list [PATTERN]              list the named recipes, those whose name contains PATTERN
+  show NAME                   print a recipe's settings as JSON
+  train NAME [--FIELD VALUE]  train a named recipe, or one in a JSON file;
+                              `train NAME --help` explains every field
+  train --resume RUN          resume a run that was stopped or killed
+  evaluate RUN                evaluate a run's newest checkpoint
+  render RUN --out FILE       film a run's agent: a GIF or MP4
+  sweep NAME [NAME ...]       train many recipes and seeds at once; names can be patterns
+  tune NAME --out FOLDER      search for the best values of a recipe's fields, with Optuna
+  compare RUN [RUN ...]       plot learning curves of several runs, a recipe's seeds as one band
+  table FOLDER [FOLDER ...]   print the paper's tables with all runs in the folders
+  data info SOURCE            describe a data set: an HDF5 file, D4RL's or Minari's name
+  data convert SOURCE TARGET  convert between HDF5 in D4RL's layout and Minari
+  data collect TASK           make medium, mixed, expert and random data sets, as D4RL does
+
+Common options: --seed, --out, --device, --threads where they apply; see COMMAND --help.
+"""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs the command line.
 
     Args:
-        arguments: the words after the program's name; those of this process where None.
+        arguments: the arguments after the program's name; those of this process where None.
     """
-    words = sys.argv[1:] if arguments is None else arguments
-    commands = {
-        "list": list_recipes,
-        "show": show,
-        "train": train,
-        "evaluate": evaluate,
-        "render": render,
-        "sweep": sweep,
-        "tune": tune,
-        "compare": compare,
-        "table": table,
-        "data": _data,
-    }
-    if not words or words[0] not in commands:
-        asked = not words or words[0] in ("-h", "--help")
-        print(USAGE.format(program=program()), file=sys.stdout if asked else sys.stderr)
-        if not asked:
-            fail(f"unknown command {words[0]!r}: choose from {', '.join(commands)}")
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE.format(program=program()))
         return
+    name, *rest = arguments
+    if name not in COMMANDS:
+        print(USAGE.format(program=program()), file=sys.stderr)
+        fail(f"unknown command {name!r}: choose from {', '.join(COMMANDS)}")
     try:
-        commands[words[0]](words[1:])
+        resolve(f"{__package__}.{COMMANDS[name]}")(rest)
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # `list | head`: nobody reads on
+    except BrokenPipeError:  # `list | head`: the reader is gone
         sys.stdout = None
     except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
         fail(str(error))
-
-
-def list_recipes(words: list[str]) -> None:
-    """Names of recipes."""
-    parser = Parser(f"{program()} list")
-    parser.add_argument("pattern", nargs="?", default="", help="part of a name; * is any text")
-    pattern = parser.parse_args(words).pattern
-    names = [name for name in RECIPES if fnmatchcase(name, f"*{pattern.lower()}*")]
-    if not names:
-        fail(f"no recipe contains {pattern!r}: `{program()} list` names all of them")
-    print("\n".join(names))
-
-
-def show(words: list[str]) -> None:
-    """A recipe as JSON."""
-    parser = Parser(f"{program()} show")
-    parser.add_argument("name", help="name of a recipe, or a JSON file")
-    print(recipe_to_json(find_recipe(parser.parse_args(words).name)), end="")
-
-
-def _data(words: list[str]) -> None:
-    from .data import data  # takes a second that others save
-
-    data(words)

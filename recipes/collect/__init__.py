@@ -1,6 +1,5 @@
-"""`data collect`: data sets of a task, made the way D4RL's were. Begin with data_sets.py."""
+"""`data collect`: data sets of a task, made the way D4RL's were. Begin with collect.py."""
 
-from .data_sets import collect
 from .settings import Collection
 
-__all__ = ["Collection", "collect"]
+__all__ = ["Collection"]

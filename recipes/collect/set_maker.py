@@ -24,11 +24,11 @@ from torchrl_tit.datasets import (
 )
 from torchrl_tit.envs import make_env
 
-from .agents import FinishedRun, Source
-from .folder import hdf5_path, minari_path
-from .rollout import roll_out
+from .agent import Agent, Score
+from .agent_in_training import AgentInTraining
+from .episodes import play_episodes
+from .output_folder import hdf5_path
 from .settings import KINDS, Collection, Kind
-from .training import Score, Training
 
 
 class SetMaker:
@@ -38,8 +38,8 @@ class SetMaker:
         settings: what to make.
         folder: where.
         task: the task's spaces.
-        agent: where the agent comes from; None where only random actions are asked for.
-        provenance: what every set says about where it is from.
+        agent: the agent; None where only random actions are needed.
+        provenance: what every set records.
     """
 
     def __init__(
@@ -47,75 +47,70 @@ class SetMaker:
         settings: Collection,
         folder: Path,
         task: TaskSpaces,
-        agent: Source | None,
+        agent: Agent | None,
         provenance: dict[str, Any],
     ) -> None:
         self._settings = settings
         self._folder = folder
         self._task = task
+        self._agent = agent
         self._provenance = provenance
-        self._agent: Training | FinishedRun | None
-        if agent is None or isinstance(agent, FinishedRun):
-            self._agent = agent
-        else:
-            marks = (settings.medium_return, settings.expert_return)
-            self._agent = Training(
-                folder / "training",
-                agent,
-                task.action,
-                marks=[mark for mark in marks if mark is not None],
-                evaluation_interval=settings.evaluation_interval,
-                evaluation_episodes=settings.evaluation_episodes,
-                deterministic=settings.deterministic,
-            )
 
     def make(self, kind: Kind) -> str:
-        """Makes a set, or as much of it as is not there yet.
+        """Makes a set, or as much of it as is missing.
 
         Args:
             kind: the kind of data.
 
         Returns:
-            What is there now, in words.
+            A summary of the set.
         """
-        hdf5, minari = hdf5_path(self._folder, kind), minari_path(self._folder, kind)
-        rolled = self._folder / f"{kind}.parts"
+        hdf5 = hdf5_path(self._folder, kind)
+        minari = self._folder.absolute() / f"{kind}-v0"  # Minari requires a version in its names
+        parts = self._folder / f"{kind}.parts"
         if not hdf5.exists():
-            episodes = self._see(kind) if kind == "mixed" else self._roll(kind, rolled)
+            episodes = self._random(parts) if kind == "random" else self._of_agent(kind, parts)
             write_hdf5(episodes, hdf5)
         episodes = load_episodes(hdf5, task=self._task, dtype=None)
         if not minari.exists():
             write_minari(episodes, minari, self._settings.env)
-        shutil.rmtree(rolled, ignore_errors=True)
+        shutil.rmtree(parts, ignore_errors=True)
         return (
             f"{kind}: {episodes.num_transitions} transitions in {len(episodes.lengths)} episodes, "
             f"mean return {episodes.returns.mean():.1f}: {hdf5} and {minari.name}"
         )
 
-    def _see(self, kind: Kind) -> Episodes:
-        """What the agent saw on its way to the mark."""
-        agent, score = self._trained(kind)
-        assert isinstance(agent, Training)
-        episodes = agent.parts.episodes(score.step, task=self._task)
-        return self._signed(episodes, kind, agent.algorithm, score)
+    def _random(self, folder: Path) -> Episodes:
+        """Episodes with uniformly drawn actions."""
+        env = make_env(self._settings.env, self._settings.num_envs, clip_actions=False)
+        episodes = self._play(env, RandomPolicy(env.action_spec), "random", folder)
+        return self._with_provenance(episodes, "random", "uniform actions")
 
-    def _roll(self, kind: Kind, folder: Path) -> Episodes:
-        """What a policy does that learns no more."""
-        policy: Callable[[TensorDictBase], TensorDictBase]
-        settings = self._settings
-        if kind == "random":
-            algorithm, score = "uniform actions", None
-            env: EnvBase = make_env(settings.env, settings.num_envs, clip_actions=False)
-            policy = RandomPolicy(env.action_spec)
+    def _of_agent(self, kind: Kind, folder: Path) -> Episodes:
+        """What the agent saw until it reached the set's mark, or what it does from then on."""
+        agent = self._agent
+        assert agent is not None
+        score = agent.reach(*self._settings.mark(kind))
+        if kind == "mixed":
+            assert isinstance(agent, AgentInTraining)  # a finished run is refused before
+            episodes = agent.parts.episodes(score.step, task=self._task)
         else:
-            agent, score = self._trained(kind)
-            algorithm = agent.algorithm
-            env = agent.make_env(settings.num_envs, 0)
-            policy = agent.load_policy(score)
-        parts = TransitionParts(folder)
+            env = agent.algorithm.make_env(self._settings.num_envs)
+            episodes = self._play(env, agent.load_policy(score), kind, folder)
+        return self._with_provenance(episodes, kind, agent.recipe.algorithm.upper(), score)
+
+    def _play(
+        self,
+        env: EnvBase,
+        policy: Callable[[TensorDictBase], TensorDictBase],
+        kind: Kind,
+        folder: Path,
+    ) -> Episodes:
+        """Episodes of a policy that no longer learns; closes the environment."""
+        settings, parts = self._settings, TransitionParts(folder)
         seed = np.random.SeedSequence([settings.seed, KINDS.index(kind)]).generate_state(1)
         with closing(env):
-            roll_out(
+            play_episodes(
                 parts,
                 env,
                 policy,
@@ -124,17 +119,12 @@ class SetMaker:
                 seed=int(seed[0]),
                 deterministic=settings.deterministic,
             )
-        return self._signed(parts.episodes(task=self._task), kind, algorithm, score)
+        return parts.episodes(task=self._task)
 
-    def _trained(self, kind: Kind) -> tuple[Training | FinishedRun, Score]:
-        """The agent, trained until it reached the mark of a kind of data."""
-        assert self._agent is not None
-        return self._agent, self._agent.reach(*self._settings.mark(kind))
-
-    def _signed(
-        self, episodes: Episodes, kind: Kind, algorithm: str, score: Score | None
+    def _with_provenance(
+        self, episodes: Episodes, kind: Kind, algorithm: str, score: Score | None = None
     ) -> Episodes:
-        """The episodes with their provenance."""
+        """The episodes with what they record of their origin."""
         attributes: dict[str, Any] = {
             "kind": kind,
             "algorithm": algorithm,

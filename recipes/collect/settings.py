@@ -1,66 +1,66 @@
-"""What `data collect` is told to make."""
+"""The settings of `data collect`."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
 import tyro
 
-from ..recipe import check_at_least, check_at_most
-from .sac import SAC
+from torchrl_tit.settings.checks import check_at_least, check_at_most
 
 Kind = Literal["random", "mixed", "medium", "expert"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-"""The kinds of data, in the order in which they are made."""
+"""The kinds of data sets, in the order in which they are made."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Collection:
     """Data sets of one task and one agent, made the way D4RL's were (arXiv 2004.07219).
 
-    An agent is trained until it reaches a mark: everything it saw until then is the mixed set
-    ("medium-replay"), and what it does from then on, without learning, the medium set. At a second
-    mark it is the expert. The random set has uniformly drawn actions.
+    An agent is trained until its mean return reaches a mark. The mixed set ("medium-replay")
+    holds everything that it saw until then; the medium set holds episodes with the weights of that
+    moment. At a second mark the agent becomes the expert. The random set has uniformly random
+    actions.
     """
 
     env: Annotated[str, tyro.conf.Positional]
     """Name of the Gymnasium task, such as Hopper-v5, CartPole-v1 or ALE/Pong-v5."""
     agent: str = "sac"
-    """What is trained: sac (continuous actions), or a PPO recipe by name or JSON file. Or what was
-    trained before: the folder of a PPO run, which gives a medium or an expert set."""
+    """The agent: sac, which is SAC's defaults with an MLP, for continuous actions; any ppo or sac
+    recipe, by name or as a JSON file; or the folder of a finished run of one, which gives a medium
+    or an expert set."""
     sets: tuple[Kind, ...] = ("random", "mixed", "medium", "expert")
-    """Which sets are made. More can be asked for later, with the same folder."""
+    """Which sets to make. More sets can be added to the same folder later."""
     transitions: int = 100_000
-    """Transitions in a set, but for the mixed one, which has those that the training took; the last
-    episode is played to its end."""
+    """Minimum number of transitions in a set; the last episode is always complete. The mixed set
+    has as many as the training took."""
     medium_return: float | None = None
-    """Mean return of the evaluation that ends the mixed set and makes the medium agent; where
-    missing, these are those of the whole training."""
+    """Mean return in an evaluation at which the mixed set ends and the agent is medium; by default
+    at the end of training."""
     expert_return: float | None = None
-    """Mean return that makes the expert; where missing, that is the agent at the training's end."""
+    """Mean return in an evaluation at which the agent is the expert; by default at the end of
+    training."""
     total_steps: int = 1_000_000
-    """Environment steps that the agent is trained for at most, and a PPO recipe no longer than it
-    says itself. Can be raised later where a mark was not reached."""
+    """Maximum number of environment steps to train the agent for; the recipe's own maximum also
+    holds. Can be raised later if a mark was not reached."""
     evaluation_interval: int = 5_000
-    """Environment steps between the evaluations that marks are held against."""
+    """Environment steps between the evaluations that are compared with the marks."""
     evaluation_episodes: int = 10
-    """Episodes in each."""
+    """Number of episodes in an evaluation."""
     deterministic: bool = False
-    """Whether medium and expert take their most likely actions, in the data and in the evaluations,
-    instead of drawn ones."""
+    """Whether medium and expert agents take their most likely actions instead of sampled ones, in
+    the data and in the evaluations."""
     num_envs: int = 8
-    """Environments side by side that medium, expert and random sets are played in."""
+    """Number of environments for medium, expert and random sets."""
     checkpoint_interval: int = 10_000
-    """Environment steps of the training that a kill loses at most. Games and other tasks that
-    cannot be saved begin new episodes at each checkpoint, so for these it should be large."""
+    """Environment steps between checkpoints of the training. It should be large for games and other
+    tasks that cannot be saved, which begin new episodes at each checkpoint."""
     seed: int = 0
-    """Seed of everything."""
+    """Seed of agent, environments and sets."""
     threads: int = 1
-    """PyTorch's threads on the CPU."""
-    sac: SAC = field(default_factory=SAC)
-    """Settings of SAC."""
+    """PyTorch's CPU threads."""
 
     def __post_init__(self) -> None:
         check_at_least(
@@ -99,6 +99,6 @@ class Collection:
             )
 
     def mark(self, kind: Kind) -> tuple[str, float | None]:
-        """The name of the mark that the agent of a kind of data must reach, and the mark."""
+        """The name of the mark that the agent of a set must reach, and the mark."""
         name = "expert_return" if kind == "expert" else "medium_return"
         return name, getattr(self, name)

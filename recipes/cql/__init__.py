@@ -1,6 +1,5 @@
-"""Conservative Q-learning: settings and gradient steps in continuous.py and discrete.py."""
+"""Conservative Q-learning: settings in settings.py, code in algorithm.py and discrete.py."""
 
-from .continuous import CQL
-from .discrete import DiscreteCQL
+from .settings import CQL, DiscreteCQL
 
 __all__ = ["CQL", "DiscreteCQL"]

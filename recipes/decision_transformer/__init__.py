@@ -1,6 +1,5 @@
 """Decision Transformer, offline in dt.py, and Online Decision Transformer in odt.py."""
 
-from .dt import DT
-from .odt import ODT
+from .settings import DT, ODT
 
 __all__ = ["DT", "ODT"]

@@ -1,110 +1,65 @@
-"""Decision Transformer, offline: the settings, and the gradient step that they drive."""
+"""Decision Transformer, offline."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Mapping
+from pathlib import Path
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
 
-from torchrl_tit.datasets import SequenceStorage, make_replay_buffer
+from torchrl_tit.datasets import make_replay_buffer
 from torchrl_tit.modules import make_dt_predictor
 from torchrl_tit.objectives import MaskedDTLoss
 
-from ..finite import check_finite
-from ..offline.state import TrainingState
-from ..offline.training import Training, run_updates
-from ..recipe import check_at_least
-from ..run import Run
-from .data import load_data, warn_of_targets
-from .recipe import SequenceRecipe
-
-TERMS = ["loss", "gradient_norm"]
+from ..algorithm import Stateful, check_finite
+from .sequence_algorithm import SequenceAlgorithm
+from .settings import DT
 
 
-@dataclass(frozen=True, kw_only=True)
-class DT(SequenceRecipe):
-    """Decision Transformer (arXiv 2106.01345) on a data set.
-
-    The defaults are those of its paper's MuJoCo runs, which arXiv 2212.14538 repeats with DT_TIT.
-    """
-
-    algorithm: ClassVar[str] = "dt"
-
-    iterations: int = 10
-    """Evaluations of the network, one after each share of the updates."""
-    updates_per_iteration: int = 10_000
-    """Gradient steps before each evaluation."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(self, iterations=1, updates_per_iteration=1)
-        if self.backbone.action_space == "gaussian":
-            raise ValueError(
-                "backbone.action_space is 'gaussian', which this loss cannot train: use "
-                "'continuous', or an odt recipe"
-            )
-
-    @property
-    def final_step(self) -> int:
-        """Gradient steps of the whole run."""
-        return self.iterations * self.updates_per_iteration
-
-    def evaluation_due(self, step: int) -> bool:
-        """Whether an iteration ends after so many gradient steps."""
-        return step % self.updates_per_iteration == 0
-
-    def train(self, run: Run) -> None:
-        """Trains in a run folder; see :func:`train`."""
-        train(self, run)
-
-
-def train(recipe: DT, run: Run) -> None:
-    """Trains a network, from the newest checkpoint of the run where there is one.
+class DTAlgorithm(SequenceAlgorithm[DT]):
+    """Decision Transformer: AdamW on the error of the predicted actions.
 
     Args:
         recipe: the settings.
-        run: an open run folder.
-
-    Raises:
-        FloatingPointError: if the loss or the gradient is not finite.
     """
-    torch.set_num_threads(recipe.threads)
-    torch.manual_seed(recipe.seed)
-    episodes = load_data(recipe.dataset, recipe.backbone, **recipe.reading())
-    warn_of_targets(recipe.target_returns, episodes)
-    agent = recipe.make_agent()
-    agent.fit_statistics(episodes)
-    storage = SequenceStorage(
-        episodes.to(recipe.torch_device()),
-        recipe.backbone.context,
-        mean=agent.mean if agent.normalizes else None,
-        std=agent.std if agent.normalizes else None,
-        return_scale=recipe.return_scale,
-    )
-    buffer = make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed)
-    discrete = recipe.backbone.action_space == "discrete"
-    loss = MaskedDTLoss(
-        make_dt_predictor(agent.network), loss_function="cross_entropy" if discrete else "l2"
-    )
-    parameters = list(agent.parameters())
-    optimizer = torch.optim.AdamW(
-        parameters, lr=recipe.learning_rate, weight_decay=recipe.weight_decay, fused=True
-    )
-    state = TrainingState(
-        {"agent": agent, "optimizer": optimizer, "buffer": buffer}, recipe.evaluation_seed
-    )
 
-    def update(step: int) -> Tensor:
-        optimizer.param_groups[0]["lr"] = recipe.learning_rate_at(step)
-        total = loss(buffer.sample())["loss"]
-        optimizer.zero_grad()
-        total.backward()
-        norm = nn.utils.clip_grad_norm_(parameters, recipe.max_grad_norm)
-        terms = torch.stack([total.detach(), norm])
-        check_finite(TERMS, terms, step, state.saved_step)
-        optimizer.step()
-        return terms
+    columns = ("loss", "gradient_norm", "learning_rate")
 
-    run_updates([Training(recipe, run, agent, state)], TERMS, update)
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds replay buffer, loss and optimizer."""
+        recipe, agent = self.recipe, self.agent.train()
+        self.buffer = self.make_buffer()
+        self.loss = MaskedDTLoss(
+            make_dt_predictor(agent.network, agent.head),
+            loss_function="cross_entropy" if recipe.action_space == "discrete" else "l2",
+        )
+        self.optimizer = torch.optim.AdamW(
+            agent.parameters(),
+            lr=recipe.learning_rate,
+            weight_decay=recipe.weight_decay,
+            fused=True,
+        )
+
+    def make_buffer(self) -> ReplayBuffer:
+        """Reads the data set into a replay buffer of windows."""
+        storage = self.make_storage(self.load_data())
+        return make_replay_buffer(storage, self.recipe.batch_size, seed=self.recipe.seed)
+
+    def state(self) -> Mapping[str, Stateful]:
+        """Optimizer, and the position of the replay buffer in its draws."""
+        return {"optimizer": self.optimizer, "buffer": self.buffer}
+
+    def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor | float]:
+        """Takes a gradient step on windows [B]."""
+        learning_rate = self.recipe.learning_rate_at(step)
+        self.optimizer.param_groups[0]["lr"] = learning_rate
+        loss = self.loss(batch)["loss"]
+        self.optimizer.zero_grad()
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.agent.parameters(), self.recipe.max_grad_norm)
+        check_finite(self.columns[:2], torch.stack([loss.detach(), norm]))
+        self.optimizer.step()
+        return {"loss": loss.detach(), "gradient_norm": norm, "learning_rate": learning_rate}

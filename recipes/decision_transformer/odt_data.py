@@ -23,17 +23,17 @@ _LIMIT = 1 - 1e-6
 
 
 class OnlineData:
-    """Draws batches from a data set, and from the first rollout on from a first-in first-out store.
+    """Draws batches from a data set; after the first rollout, from a first-in first-out store.
 
-    The store begins with the data's best episodes; each episode that is added takes the place of
-    the oldest, the data's worst first.
+    The store begins with the best episodes of the data set. Each episode that is added replaces the
+    oldest one; those of the data set go first, from the worst to the best.
 
     Args:
         episodes: the data set.
-        make_storage: cuts sequences out of episodes.
-        batch_size: sequences in a batch.
+        make_storage: cuts windows out of episodes.
+        batch_size: windows in a batch.
         capacity: episodes in the store.
-        seed: of what is drawn.
+        seed: of the draws.
     """
 
     def __init__(
@@ -46,9 +46,9 @@ class OnlineData:
         seed: int,
     ) -> None:
         self.rounds = 0
-        """Times that episodes were added."""
+        """Number of times that episodes were added."""
         self.newest_return = math.nan
-        """Mean return of the episodes that were added last."""
+        """Mean return of the episodes added last; NaN before the first."""
         self._episodes = episodes
         self._make_storage = make_storage
         self._batch_size = batch_size
@@ -57,7 +57,7 @@ class OnlineData:
         self._buffer = self._make_buffer()
 
     def sample(self) -> TensorDictBase:
-        """Draws a batch, its actions within what a squashed Gaussian can give."""
+        """Draws a batch, with actions clipped to those that a squashed Gaussian can give."""
         batch = self._buffer.sample()
         batch["action"].clamp_(-_LIMIT, _LIMIT)
         return batch
@@ -78,7 +78,7 @@ class OnlineData:
         self._buffer = self._make_buffer()
 
     def state_dict(self) -> dict[str, Any]:
-        """What the store holds, without the data set, and the state of what is drawn."""
+        """Returns the episodes of the store, without the data set, and the state of the draws."""
         state: dict[str, Any] = {"rounds": self.rounds, "buffer": self._buffer.state_dict()}
         if self.rounds:
             state["newest_return"] = self.newest_return
@@ -87,7 +87,7 @@ class OnlineData:
             state["final_known"] = self._episodes.final_known
         return state
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
         """Takes a state over."""
         self.rounds = state_dict["rounds"]
         if self.rounds:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
@@ -13,49 +10,23 @@ from tensordict.nn import (
     TensorDictModuleBase,
 )
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_tit.datasets import Episodes, episodes_from_arrays, join_episodes
-from torchrl_tit.modules import acting
-
-from .agent import DTAgent
-
-if TYPE_CHECKING:
-    from .odt import ODT
 
 _STEP: list[NestedKey] = [
     "observation",
     "action",
     *(("next", name) for name in ("observation", "reward", "terminated", "done")),
 ]
-"""What an episode keeps of a step."""
-
-
-def explore(agent: DTAgent, recipe: ODT, number: int) -> Episodes:
-    """Plays a round's episodes side by side, with actions that are drawn.
-
-    Args:
-        agent: the network, which is put into evaluation mode for it.
-        recipe: the settings.
-        number: of the round, which its seeds follow from together with the recipe's.
-    """
-    seed = int(np.random.SeedSequence([recipe.seed, number]).generate_state(1)[0]) % 2**31
-    env = agent.make_env(recipe.episodes_per_round, recipe.online_return, seed)
-    actor = scale_noise(agent.actor, recipe.exploration_scale)
-    agent.eval()
-    with torch.no_grad(), acting(actor), set_exploration_type(ExplorationType.RANDOM):
-        episodes = play_episodes(env, actor)
-    agent.train()
-    env.close()
-    return episodes
+"""The entries of a step that an episode keeps."""
 
 
 def scale_noise(actor: TensorDictModuleBase, factor: float) -> TensorDictModuleBase:
-    """The same policy, whose standard deviation is multiplied by a factor.
+    """Returns the same policy with the standard deviation multiplied by a factor.
 
     Args:
         actor: a policy of :func:`~torchrl_tit.modules.make_dt_actor` with Gaussian actions.
-        factor: 1 leaves it as it is.
+        factor: 1 returns the policy itself.
     """
     if factor == 1:
         return actor

@@ -1,5 +1,5 @@
-"""PPO with any backbone: settings in recipe.py, the loop in training.py, and named recipes."""
+"""PPO with any backbone: settings in settings.py, the algorithm in algorithm.py."""
 
-from .recipe import PPO
+from .settings import PPO
 
 __all__ = ["PPO"]

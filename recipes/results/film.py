@@ -15,6 +15,7 @@ from torchrl_tit.files import whole_or_not_at_all
 
 from ..recipe import Recipe
 from ..run import Run
+from ..runner import load_trained
 
 _SUFFIXES = (".gif", ".mp4")
 
@@ -39,7 +40,9 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
     """
     if video.suffix not in _SUFFIXES:
         raise ValueError(f"a film is one of {', '.join(_SUFFIXES)}, not {video.name!r}")
-    policy, env = recipe.load_player(run, render_mode="rgb_array")
+    _, algorithm, _ = load_trained(run, recipe)
+    policy = algorithm.policy
+    env = algorithm.make_env(1, render_mode="rgb_array")
     base = env.base_env  # transforms have no pictures
     try:
         with (

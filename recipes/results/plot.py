@@ -1,4 +1,4 @@
-"""Learning curves as pictures."""
+"""Figures of learning curves."""
 
 from __future__ import annotations
 
@@ -7,23 +7,33 @@ from collections.abc import Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
 from textwrap import wrap
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from torchrl_tit.files import write_bytes_atomic
 
 from ..metrics import read_metrics
+from ..run import Run
+from .cell import Cell
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from .table import Cell
-
-# Letters of a name with which two stand side by side below a picture.
+# The longest name, in letters, of which two fit side by side below a figure.
 _WIDEST_OF_TWO = 40
 # Letters of a line beside a panel.
 _WIDEST_LABEL = 26
+
+
+def plot_run(run: Run) -> None:
+    """Draws a run's learning curve into its folder.
+
+    Args:
+        run: a run folder with metrics.
+    """
+    recipe = run.recipe
+    plot_learning_curve(
+        run.folder / "metrics.csv", run.curve, title=recipe.name, offline=recipe.offline
+    )
 
 
 def plot_learning_curve(
@@ -34,7 +44,7 @@ def plot_learning_curve(
     Args:
         metrics: a run's ``metrics.csv`` with the columns ``step`` and ``return_mean``.
         picture: the PNG file to write.
-        title: title of the picture.
+        title: title of the figure.
         window: batches over which the bold line is averaged.
         offline: whether it is of evaluation episodes over gradient steps instead.
     """
@@ -62,7 +72,7 @@ def plot_comparison(
         curves: ``metrics.csv`` files of the runs (seeds) of each group, by the group's name; what
             the names begin with in common, up to a "/", stands in the title alone.
         picture: the PNG file to write.
-        title: title of the picture, instead of what the names have in common.
+        title: title of the figure, instead of the common part of the names.
         points: steps at which the runs are compared; between batches, returns are interpolated.
         offline: as for :func:`plot_learning_curve`.
 
@@ -158,10 +168,6 @@ def _break(label: str) -> str:
 
 
 def _blank(size: tuple[float, float]) -> Figure:
-    # Not at the top: Matplotlib takes a second that only drawing should cost.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=size, dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     return figure

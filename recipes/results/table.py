@@ -6,17 +6,21 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.stats import bootstrap, trim_mean
 
-from ..offline.recipe import OfflineRecipe
-from ..recipe import Recipe, recipe_to_json
+from ..dataset_recipe import DatasetRecipe
+from ..recipe import Recipe
+from ..recipe_json import recipe_to_json
 from ..registry import RECIPES
 from ..run import Run
+from .cell import Cell
 
 OTHER = "not in the paper"
 
@@ -28,45 +32,6 @@ class Result:
     table: str
     mean: float
     std: float
-
-
-@dataclass(frozen=True)
-class Cell:
-    """All runs of the same settings: one cell of a table.
-
-    A run's value is the mean return of its evaluation, or its best normalised score where it has
-    one (offline recipes).
-    """
-
-    table: str
-    """The paper's table that it belongs to."""
-    recipe: str
-    runs: int
-    steps: int
-    """Steps of training, the fewest of all runs."""
-    mean: float
-    """Mean of the runs' values."""
-    std: float
-    """Standard deviation of the runs' values (population)."""
-    std_episodes: float
-    """Standard deviation over the episodes of a run, as the paper's online tables seem to give it;
-    the mean over the runs."""
-    iqm: float
-    """Interquartile mean of the runs' values (arXiv 2108.13264)."""
-    low: float
-    """Lower end of its 95% confidence interval, by bootstrap over runs; NaN for a single run."""
-    high: float
-    """Upper end."""
-    paper_mean: float
-    """The paper's value; NaN where it has none. That of a tuned recipe is that of the plain one."""
-    paper_std: float
-    changes: str = ""
-    """What the runs have otherwise than the recipe of that name: fields and their values."""
-
-    @property
-    def label(self) -> str:
-        """The recipe's name, and what was changed."""
-        return f"{self.recipe} ({self.changes})" if self.changes else self.recipe
 
 
 def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
@@ -158,7 +123,8 @@ def to_markdown(cells: Sequence[Cell]) -> str:
 def to_csv(cells: Sequence[Cell]) -> str:
     """Writes cells as CSV, one row each; what is not known is empty."""
     buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, list(Cell.__dataclass_fields__), lineterminator="\n")
+    names = [field.name for field in fields(Cell)]
+    writer = csv.DictWriter(buffer, names, lineterminator="\n")
     writer.writeheader()
     for cell in cells:
         writer.writerow({k: "" if v != v else v for k, v in asdict(cell).items()})
@@ -180,9 +146,6 @@ def _value(evaluation: dict) -> float:
 
 
 def _cell(settings: Recipe, named: Recipe, runs: Sequence[tuple[Run, dict]]) -> Cell:
-    # Not at the top: SciPy takes a second that only tables should cost.
-    from scipy.stats import bootstrap, trim_mean
-
     name = settings.name or str(runs[0][0].folder)
     seeds: dict[int, Run] = {}
     for run, _ in runs:
@@ -227,7 +190,7 @@ def _cell(settings: Recipe, named: Recipe, runs: Sequence[tuple[Run, dict]]) -> 
 def _paper_result(recipe: Recipe) -> Result | None:
     """What the paper reports of a recipe, unless it was trained on other data than there."""
     plain = _plain(recipe.name)
-    if isinstance(recipe, OfflineRecipe) and _stem(recipe.dataset) not in plain.split("/"):
+    if isinstance(recipe, DatasetRecipe) and _stem(recipe.dataset) not in plain.split("/"):
         return None
     return paper_results().get(plain)
 
@@ -243,16 +206,19 @@ def _plain(name: str) -> str:
 
 
 def _changes(named: Recipe, settings: Recipe) -> str:
-    """Fields that settings have otherwise, with their values: "backbone.embed_dim 64"."""
-    before, now = _fields(named), _fields(settings)
+    """Names the fields in which settings differ: "backbone.frame.embed_dim 64"."""
+    before, now = (_fields(json.loads(recipe_to_json(recipe))) for recipe in (named, settings))
     changed = [k for k in now if k != "seed" and (k not in before or before[k] != now[k])]
     return ", ".join(f"{field} {now[field]}" for field in changed)
 
 
-def _fields(recipe: Recipe) -> dict[str, object]:
-    fields = json.loads(recipe_to_json(recipe))
-    backbone = fields.pop("backbone")
-    return fields | {f"backbone.{name}": value for name, value in backbone.items()}
+def _fields(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Puts the fields of settings, and of those within, in one dictionary by their full names."""
+    fields: dict[str, Any] = {}
+    for name, value in settings.items():
+        nested = isinstance(value, dict)
+        fields |= _fields(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+    return fields
 
 
 def _row(cell: Cell) -> str:

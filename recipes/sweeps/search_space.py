@@ -6,21 +6,21 @@ import json
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import msgspec
+import optuna
 
-from torchrl_tit.networks import EnhancedTITConfig, VanillaTITConfig
+from torchrl_tit.settings import Inner, Outer, PairedOuter
+from torchrl_tit.settings.checks import nearest
 
-from ..recipe import Recipe, nearest, recipe_from_json, recipe_to_json
-
-if TYPE_CHECKING:
-    import optuna
+from ..recipe import Recipe
+from ..recipe_json import recipe_from_json, recipe_to_json
 
 Number = float | int
 
-# What a search is of, not what it searches; it has seeds of its own.
-_FIXED = {"algorithm", "name", "seed", "backbone", "backbone.network"}
+# What the search is about, not what it varies. A search has seeds of its own.
+_FIXED = {"algorithm", "name", "seed", "backbone.frame.encoder", "backbone.history.encoder"}
 
 
 class Categorical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="categorical"):
@@ -29,7 +29,7 @@ class Categorical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
     choices: Annotated[list[str | bool | int | float | None], msgspec.Meta(min_length=1)]
 
     def suggest(self, trial: optuna.Trial, field: str) -> Any:
-        """Asks for a value."""
+        """Asks Optuna for a value."""
         return trial.suggest_categorical(field, self.choices)
 
     def examples(self) -> list[Any]:
@@ -48,7 +48,7 @@ class Float(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="float"
         _check_bounds(self.low, self.high, self.log)
 
     def suggest(self, trial: optuna.Trial, field: str) -> Any:
-        """Asks for a value."""
+        """Asks Optuna for a value."""
         return trial.suggest_float(field, self.low, self.high, log=self.log)
 
     def examples(self) -> list[Any]:
@@ -70,7 +70,7 @@ class Int(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="int"):
             raise ValueError("log goes with a step of 1 only")
 
     def suggest(self, trial: optuna.Trial, field: str) -> Any:
-        """Asks for a value."""
+        """Asks Optuna for a value."""
         return trial.suggest_int(field, self.low, self.high, step=self.step, log=self.log)
 
     def examples(self) -> list[Any]:
@@ -79,7 +79,7 @@ class Int(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="int"):
 
 
 SearchSpace = dict[str, Categorical | Float | Int]
-"""Ranges by field; a network's fields begin with "backbone."."""
+"""Ranges by the full name of a field, such as "backbone.frame.patch_size"."""
 
 
 def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
@@ -97,7 +97,8 @@ def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
         text = resources.files(__package__).joinpath("search_spaces.json").read_bytes()
         spaces = msgspec.json.decode(text, type=dict[str, SearchSpace])
         name = _default_space(recipe)
-        space, source = spaces[name], Path(f"the search space {name!r}")
+        space = spaces[name] | spaces.get(f"{name}/{recipe.backbone.history.name}", {})
+        source = Path(f"the search space {name!r}")
     else:
         try:
             space = msgspec.json.decode(source.read_bytes(), type=SearchSpace)
@@ -112,11 +113,11 @@ def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
 
 
 def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Recipe:
-    """A recipe with other values in some fields.
+    """Returns a recipe with other values in some fields.
 
     Args:
         recipe: the recipe.
-        values: by field; a network's fields begin with "backbone.".
+        values: by the full name of a field, such as "backbone.frame.patch_size".
         source: where they come from, for messages.
 
     Raises:
@@ -125,31 +126,39 @@ def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Reci
     Example:
         >>> from recipes.registry import get_recipe
         >>> recipe = get_recipe("ppo/cartpole/enhanced-tit")
-        >>> with_values(recipe, {"backbone.embed_dim": 64}, Path("here")).backbone.embed_dim
-        64
+        >>> with_values(recipe, {"backbone.frame.embed_dim": 64}, Path("here")).backbone.frame
+        Inner(num_heads=1, ...embed_dim=64...)
     """
     fields = json.loads(recipe_to_json(recipe))
-    names = [*fields, *(f"backbone.{name}" for name in fields["backbone"])]
-    known = dict.fromkeys(name for name in names if name not in _FIXED)
+    owners = {name: owner for name, owner in _owners(fields).items() if name not in _FIXED}
     for name, value in values.items():
-        if name not in known:
+        if name not in owners:
             raise ValueError(
-                f"{source} searches the unknown field {name!r}: {nearest(name, known)}"
+                f"{source} searches the unknown field {name!r}: {nearest(name, owners)}"
             )
-        prefix, _, field = name.rpartition(".")
-        (fields[prefix] if prefix else fields)[field] = value
+        owners[name][name.rpartition(".")[2]] = value
     return recipe_from_json(json.dumps(fields), source)
+
+
+def _owners(fields: dict[str, Any], prefix: str = "") -> dict[str, dict[str, Any]]:
+    """The dictionary that holds a field, by the field's full name."""
+    owners: dict[str, dict[str, Any]] = {}
+    for name, value in fields.items():
+        nested = isinstance(value, dict)
+        owners |= _owners(value, f"{prefix}{name}.") if nested else {prefix + name: fields}
+    return owners
 
 
 def _default_space(recipe: Recipe) -> str:
     if recipe.algorithm != "ppo":
         raise ValueError(
-            f"no search space comes with the algorithm {recipe.algorithm}: write one and name it "
-            "with --space (docs/recipes.md shows how)"
+            f"there is no default search space for the algorithm {recipe.algorithm}: write one and "
+            "pass it with --space (docs/recipes.md shows how)"
         )
-    if not isinstance(recipe.backbone, EnhancedTITConfig | VanillaTITConfig):
+    network = recipe.backbone
+    if not (isinstance(network.frame, Inner) and isinstance(network.history, Outer | PairedOuter)):
         return "ppo"
-    return "tit-images" if getattr(recipe, "env", "").startswith("ALE/") else "tit-arrays"
+    return "tit-images" if recipe.env.startswith("ALE/") else "tit-arrays"
 
 
 def _check_bounds(low: Number, high: Number, log: bool) -> None:

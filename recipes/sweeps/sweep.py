@@ -1,4 +1,4 @@
-"""Many recipes and seeds, in worker processes on this machine or others."""
+"""Sweeps: many recipes and seeds, in worker processes on this machine or others."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ from typing import Any, Protocol
 
 from tqdm import tqdm
 
+from torchrl_tit.settings.checks import nearest
+
+from ..algorithm import make_algorithm
 from ..interrupt import raise_on_signals
-from ..recipe import Recipe, nearest
+from ..recipe import Recipe
 from ..registry import RECIPES, find_recipe
 from ..run import Run
 
@@ -38,8 +41,8 @@ class Job:
         """What the worker prints."""
         return self.folder.with_name(self.folder.name + ".log")
 
-    def words(self) -> list[str]:
-        """The words of the command line that start or resume the run."""
+    def arguments(self) -> list[str]:
+        """Returns the arguments of the command that starts or resumes the run."""
         if self._exists():
             return ["train", "--resume", str(self.folder)]
         return [
@@ -56,7 +59,7 @@ class Job:
         return self._exists() and Run.open(self.folder).is_complete()
 
     def is_in_use(self) -> bool:
-        """Whether a process is at work there, such as one that a killed sweep left behind."""
+        """Whether a process works on the run, such as one that a killed sweep left behind."""
         if not self._exists():
             return False
         try:
@@ -88,9 +91,9 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if a pattern fits no recipe, a file holds none or one without a name, two have
-            one name and other settings, a recipe cannot be built, or a folder holds a run with
-            other settings.
+        ValueError: if a pattern fits no recipe, a file holds no recipe or one without a name, two
+            recipes have the same name and different settings, a recipe cannot be built, or a
+            folder holds a run with other settings.
 
     Example:
         >>> jobs = make_jobs(["ppo/cartpole/*-tit"], [0, 1], Path("runs/sweep"))
@@ -104,11 +107,11 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
             if replace(recipe, seed=0) != replace(other, seed=0):
                 raise ValueError(
                     f"{source or 'the named recipe'} and {other_source or 'the named recipe'} are "
-                    f"both called {recipe.name!r} and differ: change the field name in the file"
+                    f"both called {recipe.name!r} and differ: change the field 'name' in the file"
                 )
     jobs = []
     for recipe, source in found.values():
-        recipe.check()
+        make_algorithm(recipe).check()
         for seed in dict.fromkeys(seeds):
             folder = out / recipe.name / f"seed-{seed}"
             job = Job(replace(recipe, seed=seed), folder, source)
@@ -118,11 +121,13 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
 
 
 def _find(pattern: str) -> list[tuple[Recipe, str]]:
-    """The recipes that a pattern fits, or the one in a JSON file, each with its file."""
+    """Returns the recipes that a pattern matches, or the one in a JSON file, each with its file."""
     if pattern.endswith(".json"):
         recipe = find_recipe(pattern)
         if not recipe.name:
-            raise ValueError(f"the recipe in {pattern} has no name, which its runs' folders take")
+            raise ValueError(
+                f"the recipe in {pattern} has no name, which the folders of its runs need"
+            )
         return [(recipe, pattern)]
     fitting = [(recipe, "") for name, recipe in RECIPES.items() if fnmatchcase(name, pattern)]
     if not fitting:
@@ -131,7 +136,7 @@ def _find(pattern: str) -> list[tuple[Recipe, str]]:
 
 
 class Worker(Protocol):
-    """A run in a process of its own, which may be on another machine."""
+    """A run in its own process, which may be on another machine."""
 
     def poll(self) -> int | None:
         """Returns the exit code, which is 0 where the run is complete; None before the end."""
@@ -144,12 +149,12 @@ class Worker(Protocol):
 
 
 def start(job: Job) -> subprocess.Popen[bytes]:
-    """Starts or resumes a run in a process of its own, which prints to the job's log."""
+    """Starts or resumes a run in its own process, which prints to the job's log."""
     job.log.parent.mkdir(parents=True, exist_ok=True)
     with job.log.open("ab") as log:
-        # A session of its own: the terminal's Ctrl-C reaches this process, which passes it on.
+        # In a new session: the terminal's Ctrl-C reaches only this process, which passes it on.
         return subprocess.Popen(
-            [sys.executable, "-m", PROGRAM, *job.words()],
+            [sys.executable, "-m", PROGRAM, *job.arguments()],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -161,21 +166,21 @@ def run_jobs(
     jobs: list[Job],
     workers: int,
     start: Callable[[Job], Worker] = start,
-    at_work: Callable[[Collection[Any]], int] = len,
+    count_begun: Callable[[Collection[Any]], int] = len,
 ) -> list[Job]:
-    """Runs what is not complete yet, some at a time; a run that was killed goes on where it was.
+    """Runs the jobs that are not complete yet, some at a time, and resumes those that were killed.
 
-    A run that another process is at work on is left to that process, and gone on with afterwards.
-    Ctrl-C (or SIGTERM) is passed on: every worker saves a checkpoint and stops.
+    A run in use by another process is left to that process, and resumed afterwards. Ctrl-C (or
+    SIGTERM) is passed on: every worker saves a checkpoint and stops.
 
     Args:
         jobs: the runs.
         workers: runs at a time.
-        start: starts or resumes a run, in a process on this machine unless told otherwise.
-        at_work: how many of the runs that were started wait for nothing.
+        start: starts or resumes a run; by default in a process on this machine.
+        count_begun: counts the started runs that are not waiting for a machine.
 
     Returns:
-        The runs that failed; what they printed is in their logs.
+        The runs that failed; their output is in their logs.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C, once all workers have stopped.
@@ -192,7 +197,7 @@ def run_jobs(
                 for job in list(islice(idle, workers - len(running))):
                     waiting.remove(job)
                     running[job] = start(job)
-                text = f"{at_work(running.values())} at work"
+                text = f"{count_begun(running.values())} running"
                 if waiting and len(running) < workers:
                     text += ", others in use by other processes"
                 if text != shown:
@@ -204,8 +209,8 @@ def run_jobs(
                     if code is None:
                         continue
                     del running[job]
-                    # Refused, as another process began it a moment before. Where a worker on Ray
-                    # is lost (1), its run can still be in use, by what it leaves behind.
+                    # Code 2: refused, as another process began the run a moment before. Where a
+                    # worker on Ray is lost (code 1), the process that it left may still use it.
                     if code == 2 and job.is_in_use():
                         waiting.append(job)
                         continue

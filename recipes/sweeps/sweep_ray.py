@@ -1,7 +1,7 @@
 """The runs of a sweep on the machines of a Ray cluster, which share a file system.
 
-Each run has an actor, which starts it in a process of its own, as a sweep on one machine does, and
-is asked every now and then whether it has ended.
+Each run has an actor, which starts it in its own process, as a sweep on one machine does. The
+sweep polls the actor until the run has ended.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 from ..interrupt import raise_on_signals
 from .sweep import PROGRAM, Job
 
-_PATIENCE = 30.0  # seconds in which a cluster has to answer, which takes it two or three
+_PATIENCE = 30.0  # seconds that a cluster has to answer; it needs two or three
 
 
 def connect(address: str) -> None:
@@ -38,7 +38,7 @@ def connect(address: str) -> None:
         import ray
     except ImportError as error:
         raise ValueError("sweep --ray needs Ray: pip install 'torchrl-tit[ray]'") from error
-    # Ray itself waits for ten minutes and more where nobody answers, or not a cluster.
+    # Ray itself waits for ten minutes and more where no cluster answers.
     program = "import sys, ray; ray.init(sys.argv[1], log_to_driver=False)"
     try:
         subprocess.run(
@@ -74,7 +74,7 @@ def find_unmet_needs(jobs: Iterable[Job]) -> list[str]:
 
 
 class RayWorker:
-    """A run on some machine of the cluster; it waits in Ray's queue until there is room for it.
+    """A run on a machine of the cluster; it waits in Ray's queue until one has room for it.
 
     It takes as many CPUs as the recipe has threads, and a GPU where the recipe's device is "cuda",
     or "auto" and the cluster has GPUs.
@@ -94,7 +94,7 @@ class RayWorker:
         self._code: int | None = None
         actor: Any = ray.remote(_actor_class())
         self._actor = actor.options(num_cpus=needs["CPU"], num_gpus=needs["GPU"]).remote(
-            f"{__package__}.sweep_ray", job.words(), Path.cwd(), job.log.absolute()
+            f"{__package__}.sweep_ray", job.arguments(), Path.cwd(), job.log.absolute()
         )
         self._answer = self._actor.poll.remote()
 
@@ -114,7 +114,7 @@ class RayWorker:
         return self._code
 
     def send_signal(self, number: int, /) -> None:
-        """Sends the process a signal; a run that has not begun does not begin any more."""
+        """Sends the process a signal; a run that has not begun is cancelled."""
         import ray
 
         if self.has_begun:
@@ -139,27 +139,27 @@ def _needs(job: Job) -> dict[str, int]:
 
 
 def count_begun(workers: Iterable[RayWorker]) -> int:
-    """Counts the runs that have got a machine."""
+    """Counts the runs that have a machine."""
     return sum(worker.has_begun for worker in workers)
 
 
 def _actor_class() -> type:
-    """What Ray runs beside a run's process; a local class, so that it is sent with its code.
+    """The actor that starts a run's process. The class is local, so that Ray sends its code.
 
-    Otherwise the actor would import this package, and with it PyTorch, for nothing.
+    Otherwise the actor would needlessly import this package, and with it PyTorch.
     """
 
     class Actor:
-        def __init__(self, module: str, words: list[str], folder: Path, log: Path) -> None:
+        def __init__(self, module: str, arguments: list[str], folder: Path, log: Path) -> None:
             if not (folder.is_dir() and log.is_file()):
                 raise FileNotFoundError(
                     f"{platform.node()} does not see {folder} with {log}: the machines of the "
                     "cluster must share a file system"
                 )
             with log.open("ab") as file:
-                # The pipe to the process breaks when this one dies in whatever way.
+                # The pipe to the process breaks when this process dies, however it dies.
                 self.process = subprocess.Popen(
-                    [sys.executable, "-m", module, *words],
+                    [sys.executable, "-m", module, *arguments],
                     cwd=folder,
                     stdin=subprocess.PIPE,
                     stdout=file,
@@ -180,7 +180,7 @@ def _actor_class() -> type:
 
 
 def _main() -> None:
-    """The process of a run: the command line, stopped as by Ctrl-C once its actor is gone."""
+    """Runs the command line, and stops it as Ctrl-C does once its actor is gone."""
 
     def follow() -> None:
         os.read(sys.stdin.fileno(), 1)

@@ -9,29 +9,31 @@ import subprocess
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import filelock
 import msgspec
+import optuna
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import FrozenTrial, Trial, TrialState
 from tqdm import tqdm
 
 from torchrl_tit.files import write_text_atomic
 
+from ..algorithm import make_algorithm
 from ..interrupt import raise_on_signals
 from ..metrics import read_metrics
-from ..recipe import Recipe, recipe_to_json
+from ..recipe import Recipe
+from ..recipe_json import recipe_to_json
 from .search_space import SearchSpace, with_values
 from .sweep import Job, start
-
-if TYPE_CHECKING:
-    import optuna
 
 _WINDOW = 5  # batches over which a trial's return is averaged where trials are compared
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a search is; the folder of a search that is resumed must hold the same."""
+    """What defines a search; a search is resumed only with the same settings."""
 
     recipe: Recipe
     space: SearchSpace
@@ -48,7 +50,7 @@ class Settings:
 
 
 class Search:
-    """A search in a folder, which a second process can go on with after the first was killed.
+    """A search in a folder, which another process can resume after the first was killed.
 
         settings.json   recipe, seeds and pruning
         space.json      the search space
@@ -57,24 +59,18 @@ class Search:
         best.json       the recipe of the best trial, which ``train`` takes
 
     Trials are drawn by Optuna's tree-structured Parzen estimator and stopped early by its median
-    pruner, on returns of training episodes. A trial's value is the mean of its evaluations, and its
-    recipe's name that of the recipe that is searched, with ``/trial-N`` behind.
+    pruner, on returns of training episodes. A trial's value is the mean of its evaluations. Its
+    recipe is called as the searched one, followed by ``/trial-N``.
 
     Args:
         folder: the folder.
         settings: the search.
 
     Raises:
-        ValueError: if Optuna is missing, or the folder holds another search.
+        ValueError: if the folder holds another search.
     """
 
     def __init__(self, folder: Path, settings: Settings) -> None:
-        try:
-            import optuna
-            from optuna.storages import JournalStorage
-            from optuna.storages.journal import JournalFileBackend
-        except ImportError as error:
-            raise ValueError("tune needs Optuna: pip install 'torchrl-tit[tune]'") from error
         self.folder = folder
         self.settings = settings
         _write_or_compare(folder / "settings.json", _to_json(settings))
@@ -96,7 +92,7 @@ class Search:
         )
 
     def run(self, trials: int, workers: int) -> list[int]:
-        """Goes on until there are so many trials that ended, some at a time.
+        """Runs trials, some at a time, until the given number has ended.
 
         Args:
             trials: trials of the whole search, those of earlier calls included.
@@ -107,7 +103,7 @@ class Search:
 
         Raises:
             KeyboardInterrupt: after Ctrl-C, once all workers have saved a checkpoint.
-            RuntimeError: if another process is at work on the search.
+            RuntimeError: if another process works on the search.
         """
         try:
             with filelock.FileLock(self.folder / ".lock", timeout=0):
@@ -118,18 +114,15 @@ class Search:
             ) from error
 
     def _run(self, trials: int, workers: int) -> list[int]:
-        import optuna
-        from optuna.trial import TrialState
-
         ended = [trial for trial in self.study.trials if trial.state.is_finished()]
-        # Those that a killed process left go on where they were.
+        # Trials that a killed process left are resumed.
         running = [
-            _Trial(self, optuna.trial.Trial(self.study, trial._trial_id))
+            _Trial(self, Trial(self.study, trial._trial_id))
             for trial in self.study.trials
             if trial.state == TrialState.RUNNING
         ]
         failed = [t.number for t in ended if t.state == TrialState.FAIL]
-        done = len(ended)  # a progress bar that is switched off does not count
+        done = len(ended)  # not progress.n: a disabled progress bar does not count
         progress = tqdm(total=trials, initial=done, unit=" trials")
         with raise_on_signals(), progress:
             try:
@@ -155,10 +148,8 @@ class Search:
                 raise
         return failed
 
-    def best(self) -> optuna.trial.FrozenTrial | None:
+    def best(self) -> FrozenTrial | None:
         """The best trial so far, whose recipe is in ``best.json``; None before the first."""
-        from optuna.trial import TrialState
-
         if not self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             return None
         best = self.study.best_trial
@@ -170,9 +161,9 @@ class Search:
 
 
 class _Trial:
-    """A trial at work: its runs, one seed after the other, each in a process of its own."""
+    """A running trial: its runs, one seed after the other, each in its own process."""
 
-    def __init__(self, search: Search, trial: optuna.trial.Trial) -> None:
+    def __init__(self, search: Search, trial: Trial) -> None:
         self.study = search.study
         self.trial = trial
         self.number = trial.number
@@ -188,12 +179,12 @@ class _Trial:
                 for field in search.settings.space
             }
             recipe = with_values(search.settings.recipe, values, search.folder / "space.json")
-            recipe.check()
-        except ValueError as error:  # values that do not go together
+            make_algorithm(recipe).check()
+        except ValueError as error:  # values that do not fit together
             self.folder.mkdir(exist_ok=True)
             write_text_atomic(self.folder / "error.log", f"error: {error}\n")
             return
-        if recipe.name:  # which stands for other settings
+        if recipe.name:  # it belongs to other settings
             recipe = replace(recipe, name=f"{recipe.name}/trial-{self.number}")
         write_text_atomic(self.file, recipe_to_json(recipe))
         self.jobs = [
@@ -201,10 +192,8 @@ class _Trial:
             for seed in search.settings.seeds
         ]
 
-    def advance(self) -> optuna.trial.TrialState | None:
+    def advance(self) -> TrialState | None:
         """Starts, watches or ends the trial; returns its state once it has ended."""
-        from optuna.trial import TrialState
-
         if self.jobs is None:
             return self._end(TrialState.FAIL)
         if self.process is not None and self.process.poll() is None:
@@ -221,12 +210,12 @@ class _Trial:
                 for job in self.jobs
             ]
             return self._end(TrialState.COMPLETE, sum(means) / len(means))
-        if not job.is_in_use():  # by what a search that was killed left behind
+        if not job.is_in_use():  # by a process that a killed search left
             self.process = start(job)
         return None
 
     def stop(self) -> None:
-        """Lets the process save a checkpoint and waits for it."""
+        """Lets the process save a checkpoint, and waits for its end."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
             self.process.wait()
@@ -245,9 +234,7 @@ class _Trial:
         self.trial.report(sum(returns) / len(returns), self.reported)
         return self.trial.should_prune()
 
-    def _end(
-        self, state: optuna.trial.TrialState, value: float | None = None
-    ) -> optuna.trial.TrialState:
+    def _end(self, state: TrialState, value: float | None = None) -> TrialState:
         self.study.tell(self.number, value, state=state)
         return state
 

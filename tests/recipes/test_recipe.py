@@ -1,12 +1,18 @@
 """What every recipe has: fields whose values are of their types."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from recipes.ppo import PPO
 from recipes.registry import get_recipe
-from torchrl_tit.networks import MLP, MLPConfig
+from torchrl_tit.networks import MLP
+from torchrl_tit.settings import Head, Outer
+from torchrl_tit.settings.networks import mlp
+
+HALF: Any = 2.5
+OUTER: Any = Outer()
 
 
 @pytest.mark.parametrize(
@@ -25,6 +31,11 @@ from torchrl_tit.networks import MLP, MLPConfig
             "must be the settings of a network, .* not 'mlp'",
         ),
         ({"backbone": MLP((4,))}, "must be the settings of a network"),
+        (
+            {"backbone": replace(mlp(), head=Head(features_dim=HALF))},
+            "field 'backbone.head.features_dim' is 2.5",
+        ),
+        ({"backbone": replace(mlp(), frame=OUTER)}, "field 'backbone.frame' must be"),
     ],
 )
 def test_values_of_other_types_are_refused_in_python_too(changes, message):
@@ -33,5 +44,5 @@ def test_values_of_other_types_are_refused_in_python_too(changes, message):
 
 
 def test_whole_numbers_are_numbers():
-    recipe = PPO(env="CartPole-v1", backbone=MLPConfig(), learning_rate=1)
+    recipe = PPO(env="CartPole-v1", backbone=mlp(), learning_rate=1)
     assert recipe.learning_rate == 1

@@ -15,18 +15,21 @@ import pytest
 import torch
 from gymnasium.envs.classic_control import CartPoleEnv
 
+from recipes import runner
 from recipes.cli import main
 from recipes.metrics import Metrics, read_metrics
 from recipes.ppo import PPO
+from recipes.recipe_json import settings_to_dict
+from recipes.results.plot import plot_run
 from recipes.run import Run
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
-from torchrl_tit.networks import EnhancedTITConfig
+from torchrl_tit.settings.networks import enhanced_tit
 
 ROOT = Path(__file__).parents[2]
 SMALL = PPO(
     name="ppo/cartpole/small",
     env="CartPole-v1",
-    backbone=EnhancedTITConfig(embed_dim=8, features_dim=8),
+    backbone=enhanced_tit(embed_dim=8, features_dim=8),
     total_steps=128,
     steps_per_batch=64,
     num_envs=2,
@@ -35,6 +38,9 @@ SMALL = PPO(
     checkpoint_interval=64,
     evaluation_episodes=2,
 )
+
+
+BACKBONE = settings_to_dict(SMALL.backbone)
 
 
 class UnknownCartPole(CartPoleEnv):
@@ -53,7 +59,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 def trained(folder: Path, recipe: PPO = SMALL) -> Run:
     with Run.create(folder, recipe) as run:
-        recipe.train(run)
+        runner.train(recipe, run)
     return run
 
 
@@ -105,11 +111,10 @@ def test_only_a_new_or_empty_folder_becomes_a_run(tmp_path):
 def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(time, "strftime", lambda _: "20260101-000000")
-    monkeypatch.setattr(PPO, "train", lambda *_: None)
-    monkeypatch.setattr(Run, "plot", lambda run: run.folder)
-    monkeypatch.setattr(
-        PPO, "evaluate", lambda *_: {"mean": 0, "std": 0, "episodes": 1, "steps": 0}
-    )
+    monkeypatch.setattr(runner, "train", lambda *_: None)
+    monkeypatch.setattr("recipes.cli.training.plot_run", lambda run: None)
+    evaluation = {"mean": 0, "std": 0, "episodes": 1, "steps": 0}
+    monkeypatch.setattr(runner, "evaluate", lambda *_: evaluation)
     for _ in range(3):
         main(["train", "ppo/cartpole/enhanced-tit"])
     folders = sorted(path.name for path in Path("runs/ppo/cartpole/enhanced-tit").iterdir())
@@ -121,7 +126,7 @@ def test_is_complete_only_when_trained_evaluated_and_drawn(tmp_path):
     run = trained(tmp_path / "run")
     assert not run.is_complete()
     run.save_evaluation({"steps": 64})  # of a checkpoint on the way
-    run.plot()
+    plot_run(run)
     assert not run.is_complete()
     run.save_evaluation({"steps": 128})
     assert run.is_complete()
@@ -141,7 +146,7 @@ def test_a_run_that_was_stopped_in_its_evaluation_is_evaluated_then(tmp_path, mo
     arguments = ["train", "ppo/cartpole/enhanced-tit", "--out", str(tmp_path / "run")]
     arguments += ["--total-steps", "64", "--steps-per-batch", "64", "--epochs", "1"]
     with monkeypatch.context() as patch:
-        patch.setattr(PPO, "evaluate", ctrl_c)
+        patch.setattr(runner, "evaluate", ctrl_c)
         with pytest.raises(SystemExit) as exit_:
             main([*arguments, "--evaluation-episodes", "2"])
     assert exit_.value.code == 130
@@ -167,12 +172,12 @@ def test_ctrl_c_saves_and_the_resumed_run_is_the_same(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(Metrics, "log", ctrl_c)
             with pytest.raises(KeyboardInterrupt):
-                recipe.train(run)
+                runner.train(recipe, run)
         assert checkpoint_steps(run.checkpoints) == [128]
-        recipe.train(run)
+        runner.train(recipe, run)
     (_, expected), (_, state) = (load_checkpoint(r.checkpoints) for r in (whole, run))
-    for name, weight in expected["agent"].items():
-        assert torch.equal(state["agent"][name], weight), name
+    for name, weight in expected["networks"].items():
+        assert torch.equal(state["networks"][name], weight), name
 
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path, monkeypatch):
@@ -180,9 +185,9 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("recipes.ppo.training.add_advantages", twice)
+    monkeypatch.setattr("recipes.ppo.algorithm.add_advantages", twice)
     with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
-        SMALL.train(run)
+        runner.train(SMALL, run)
     assert checkpoint_steps(run.checkpoints) == []
     assert read_metrics(run.folder / "metrics.csv") == []
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -193,9 +198,9 @@ def test_an_error_that_ctrl_c_brings_about_is_a_stop(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
         raise RuntimeError("C++ compile error")
 
-    monkeypatch.setattr("recipes.ppo.training.add_advantages", compiler_stopped)
+    monkeypatch.setattr("recipes.ppo.algorithm.add_advantages", compiler_stopped)
     with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
-        SMALL.train(run)
+        runner.train(SMALL, run)
 
 
 def test_version_changes(tmp_path):
@@ -211,7 +216,7 @@ def test_an_edited_recipe_takes_effect(tmp_path):
     run = trained(tmp_path / "run")
     edit(run.folder / "recipe.json", total_steps=192, learning_rate=0.01)
     with Run.open(run.folder) as again:
-        again.recipe.train(again)
+        runner.train(again.recipe, again)
     rows = read_metrics(run.folder / "metrics.csv")
     assert [row["learning_rate"] for row in rows] == [3e-4, 3e-4, 0.01]
     _, state = load_checkpoint(run.checkpoints)
@@ -223,9 +228,10 @@ def test_an_edited_recipe_takes_effect(tmp_path):
     [
         {"env": "Acrobot-v1"},
         {"num_envs": 4},
-        {"history": 2},
-        {"backbone": {"network": "enhanced-tit", "embed_dim": 16}},
-        {"backbone": {"network": "mlp"}},
+        {"backbone": {**BACKBONE, "num_frames": 2}},
+        {"backbone": {**BACKBONE, "frame": {"encoder": "inner", "embed_dim": 16}}},
+        {"backbone": {**BACKBONE, "frame": {"encoder": "linear", "embed_dim": 8}}},
+        {"backbone": {**BACKBONE, "trunks": "separate"}},
     ],
     ids=str,
 )
@@ -250,11 +256,25 @@ def test_a_damaged_recipe_is_named(text, tmp_path, capsys):
     assert contents(run.folder) == before
 
 
+def test_a_run_of_an_older_version_is_named(tmp_path, capsys):
+    run = trained(tmp_path / "run")
+    _, state = load_checkpoint(run.checkpoints)
+    state["agent"] = state.pop("networks")
+    run.save(192, state)
+    edit(run.folder / "recipe.json", total_steps=256)
+    for words in (["train", "--resume"], ["evaluate"]):
+        line = fails(capsys, *words, run.folder)
+        assert "the checkpoint of step 192" in line
+        assert "is from an older version of torchrl-tit" in line
+    edit(run.folder / "recipe.json", backbone={"network": "enhanced-tit", "embed_dim": 8})
+    assert "'backbone.network' is from an older version" in fails(capsys, "evaluate", run.folder)
+
+
 def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(tmp_path):
     run = trained(tmp_path / "run")
     recipe = replace(SMALL, total_steps=192, steps_per_batch=96, checkpoint_interval=10**6)
     with run:
-        recipe.train(run)
+        runner.train(recipe, run)
     assert run.load()[0] == 224  # type: ignore[index]
 
 
@@ -263,11 +283,11 @@ def test_a_task_that_cannot_be_saved_starts_anew_at_each_checkpoint(tmp_path):
     whole = trained(tmp_path / "whole", recipe)
     with Run.create(tmp_path / "parts", recipe) as parts:
         for steps in (64, 192, 320):
-            replace(recipe, total_steps=steps).train(parts)
+            runner.train(replace(recipe, total_steps=steps), parts)
     (_, expected), (_, state) = (load_checkpoint(run.checkpoints) for run in (whole, parts))
-    assert state["collector"]["env"] is None
-    for name, weight in expected["agent"].items():
-        assert torch.equal(state["agent"][name], weight), name
+    assert state["collector"]["collector"]["env"] is None
+    for name, weight in expected["networks"].items():
+        assert torch.equal(state["networks"][name], weight), name
     rows, expected_rows = (
         [list(row.values())[2:] for row in read_metrics(run.folder / "metrics.csv")]
         for run in (parts, whole)
@@ -282,7 +302,8 @@ def test_no_episode_ends_at_all(tmp_path):
     rows = read_metrics(run.folder / "metrics.csv")
     assert [row["episodes"] for row in rows] == [0, 0]
     assert np.isnan([row["return_mean"] for row in rows]).all()
-    assert run.plot().read_bytes().startswith(b"\x89PNG")
+    plot_run(run)
+    assert run.curve.read_bytes().startswith(b"\x89PNG")
 
 
 def test_fewer_steps_than_a_batch_are_one_batch(tmp_path):
@@ -296,7 +317,7 @@ def test_weights_that_explode_are_never_saved(minibatch_size, tmp_path):
     run = trained(tmp_path / "run", replace(recipe, total_steps=64))
     message = r"weights became (inf|nan) in the update at step 128; the checkpoint of step 64 is"
     with run, pytest.raises(FloatingPointError, match=message):
-        replace(recipe, learning_rate=1e30).train(run)
+        runner.train(replace(recipe, learning_rate=1e30), run)
     assert run.load()[0] == 64  # type: ignore[index]
     assert len(read_metrics(run.folder / "metrics.csv")) == 1
 
@@ -315,6 +336,7 @@ def test_a_disk_that_is_full_stops_the_process_with_one_line(tmp_path):
     """The limit on a file's size stands for the disk; the metrics still fit, a checkpoint not."""
     program = """
 import resource, sys
+from recipes import runner
 from recipes.cli import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 main(sys.argv[1:])

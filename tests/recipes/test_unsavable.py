@@ -1,41 +1,41 @@
-"""A run goes on bit for bit where the environment cannot be saved, too."""
+"""A run resumes bit for bit also where the environment cannot be saved."""
 
 from dataclasses import replace
-from functools import partial
 
 import pytest
 import torch
 
-from recipes.networks import MLPConfig, NatureCNNConfig
+from recipes import runner
 from recipes.ppo import PPO
 from recipes.run import Run
 from torchrl_tit.envs import make_env
+from torchrl_tit.settings.networks import mlp, nature_cnn
 
 
 def weights(recipe, folder):
     """Trains in a run folder, new or not, and returns what was learnt."""
     with Run(folder, recipe) as run:
-        recipe.train(run)
+        runner.train(recipe, run)
         loaded = run.load()
     assert loaded is not None
-    return loaded[1]["agent"]
+    return loaded[1]["networks"]
 
 
 @pytest.mark.parametrize(
     ("mode", "env", "backbone"),
     [
-        ("async", "CartPole-v1", MLPConfig()),
-        ("sync", "ALE/Breakout-v5", NatureCNNConfig()),
+        ("async", "CartPole-v1", mlp()),
+        ("sync", "ALE/Breakout-v5", nature_cnn()),
     ],
 )
-def test_goes_on_bit_for_bit(tmp_path, monkeypatch, mode, env, backbone):
+def test_resumes_bit_for_bit(tmp_path, mode, env, backbone):
     if env.startswith("ALE/"):
         pytest.importorskip("ale_py")
-    monkeypatch.setattr("recipes.ppo.recipe.make_env", partial(make_env, vectorization_mode=mode))
     recipe = PPO(
         env=env,
         backbone=backbone,
         num_envs=2,
+        vectorization_mode=mode,
         total_steps=96,
         steps_per_batch=32,
         minibatch_size=16,
@@ -54,7 +54,7 @@ def test_goes_on_bit_for_bit(tmp_path, monkeypatch, mode, env, backbone):
 
 def test_processes_have_the_numbers_of_one():
     envs = [
-        make_env("CartPole-v1", 3, seed=0, history=2, vectorization_mode=mode)
+        make_env("CartPole-v1", 3, seed=0, num_frames=2, vectorization_mode=mode)
         for mode in ("sync", "async")
     ]
     roots = [env.reset() for env in envs]

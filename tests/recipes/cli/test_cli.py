@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from recipes.cli import main
-from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import RECIPES, get_recipe
 
 SHORT = [
@@ -35,17 +35,18 @@ def test_list_and_show(capsys):
     assert "ppo/cartpole/enhanced-tit" in names
     assert all("cartpole" in name for name in names)
     main(["show", "ppo/cartpole/enhanced-tit"])
-    assert json.loads(capsys.readouterr().out)["backbone"]["network"] == "enhanced-tit"
+    assert json.loads(capsys.readouterr().out)["backbone"]["frame"]["encoder"] == "inner"
 
 
 def test_train_evaluate_and_resume(capsys, tmp_path):
     run = tmp_path / "run"
     words = ["train", "ppo/cartpole/enhanced-tit", "--out", str(run), "--num-envs", "2"]
-    main([*words, "--backbone.embed-dim", "16", "--seed", "3", *SHORT])
+    main([*words, "--backbone.frame.embed-dim", "16", "--seed", "3", *SHORT])
     out = capsys.readouterr().out
     assert f"learning curve: {run / 'learning_curve.png'}" in out.splitlines()[-1]
     recipe = json.loads((run / "recipe.json").read_text())
-    assert (recipe["backbone"]["embed_dim"], recipe["seed"], recipe["num_envs"]) == (16, 3, 2)
+    assert (recipe["seed"], recipe["num_envs"]) == (3, 2)
+    assert recipe["backbone"]["frame"]["embed_dim"] == 16
 
     other = tmp_path / "other.json"
     main(["evaluate", str(run), "--episodes", "3", "--seed", "7", "--out", str(other)])
@@ -77,9 +78,9 @@ def test_help_explains_every_field(capsys):
         main(["train", "ppo/cartpole/enhanced-tit", "--help"])
     assert exit_.value.code == 0
     out = capsys.readouterr().out
-    for option in ("--seed", "--out", "--device", "--threads", "--backbone.embed-dim"):
+    for option in ("--seed", "--out", "--device", "--threads", "--backbone.frame.embed-dim"):
         assert option in out
-    assert "Width of a token" in out
+    assert "Width D of a token" in out
 
 
 @pytest.mark.parametrize(
@@ -87,17 +88,17 @@ def test_help_explains_every_field(capsys):
     [
         (["train", "ppo/cartpole/enhanced-tt"], "did you mean ppo/cartpole/enhanced-tit"),
         (["train", "NAME", "--env", "CartPole-v7"], "CartPole-v1"),
-        (["train", "NAME", "--history", "0"], "history must be at least 1, not 0"),
-        (["train", "NAME", "--backbone.num-heads-inner", "3"], "width 32"),
-        (["train", "NAME", "--num-envs", "3"], "multiple of num_envs"),
-        (["train", "NAME", "--critic-coeff", "0"], "critic_coeff must be above 0, not 0.0"),
+        (["train", "NAME", "--backbone.num-frames", "0"], "num_frames must be at least 1, not 0"),
+        (["train", "NAME", "--backbone.frame.num-heads", "3"], "width 32"),
+        (["train", "NAME", "--num-envs", "3"], "num_envs 3 does not divide steps_per_batch 2048"),
+        (["train", "NAME", "--critic-coeff", "0"], "critic_coeff must be positive, not 0.0"),
         (["train", "."], ". is a folder, not a recipe"),
-        (["train", "NAME", "--backbone.patch-size", "0"], "patch_size"),
-        (["train"], "train needs a recipe's name"),
-        (["train", "--resume", "nowhere"], "no run folder"),
-        (["evaluate", "nowhere"], "no run folder"),
+        (["train", "NAME", "--backbone.frame.patch-size", "0"], "patch_size"),
+        (["train"], "train needs the name of a recipe"),
+        (["train", "--resume", "nowhere"], "is not a run folder"),
+        (["evaluate", "nowhere"], "is not a run folder"),
         (["show", "nothing.json"], "nothing.json"),
-        (["list", "atlantis"], "no recipe contains 'atlantis'"),
+        (["list", "atlantis"], "no recipe's name contains 'atlantis'"),
         (["fly"], "unknown command 'fly'"),
     ],
 )
@@ -113,7 +114,9 @@ def test_list_takes_names_as_gymnasium_writes_them(capsys):
     assert capsys.readouterr().out == "ppo/cartpole/mlp\n"
 
 
-@pytest.mark.parametrize("option", [["--backbone.embed-dim", "wide"], ["--no-such-field", "1"]])
+@pytest.mark.parametrize(
+    "option", [["--backbone.frame.embed-dim", "wide"], ["--no-such-field", "1"]]
+)
 def test_wrong_types_and_unknown_options(option, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as exit_:
@@ -137,9 +140,19 @@ def test_recipes_come_back_from_json(name):
         ({"num_envs": "2"}, r"field 'num_envs' is '2'.*int"),
         ({"learning_rate": None}, r"field 'learning_rate'"),
         ({"algorithm": "pppo"}, r"unknown algorithm 'pppo'.*ppo"),
-        ({"backbone": {"network": "enhanced-tit", "embed_dim": 1.5}}, r"backbone\.embed_dim"),
-        ({"backbone": {"network": "tat"}}, r"unknown network 'tat'"),
-        ({"backbone": 3}, r"field 'backbone'"),
+        (
+            {"backbone": {"frame": {"encoder": "inner", "embed_dim": 1.5}}},
+            r"frame\.embed_dim' is 1",
+        ),
+        ({"backbone": {"frame": {"encoder": "iner"}}}, r"unknown frame encoder 'iner'.*inner"),
+        ({"backbone": {"frame": {"embed_dim": 8}}}, r"field 'backbone\.frame\.encoder'"),
+        ({"backbone": {"frame": "inner"}}, r"field 'backbone\.frame': expected an object"),
+        ({"backbone": {"frame": {"encoder": "inner"}}}, r"backbone lacks the field 'history'"),
+        (
+            {"backbone": {"network": "enhanced-tit"}},
+            r"backbone\.network.*older version",
+        ),
+        ({"backbone": 3}, r"field 'backbone': expected an object"),
         ({"device": "tpu"}, r"field 'device' is 'tpu', not one of \('cpu', 'cuda', 'auto'\)"),
     ],
 )

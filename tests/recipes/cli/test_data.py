@@ -59,9 +59,9 @@ def test_convert_there_and_back(
     ("words", "message"),
     [
         (["info", "{file}", "--env", "Walker2d-v5"], "field 'observations': one row has the shape"),
-        (["info", "hopper"], "'hopper' is no data set"),
+        (["info", "hopper"], "'hopper' is not a data set"),
         (["convert", "{file}", "{file}"], "exists already"),
-        (["convert", "{file}", "unnumbered"], "'unnumbered' is no name for a Minari data set"),
+        (["convert", "{file}", "unnumbered"], "'unnumbered' is not a valid name"),
         (["info"], "the following arguments are required: source"),
         (["inspect"], "invalid choice: 'inspect'"),
     ],

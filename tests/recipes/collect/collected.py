@@ -1,4 +1,4 @@
-"""Small collections of data, and how they are read and compared."""
+"""Small collections of data, and how to read and compare them."""
 
 from pathlib import Path
 from typing import Any
@@ -7,18 +7,18 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from recipes.collect.sac import SAC
-from recipes.collect.settings import KINDS, Collection
+from recipes.collect import Collection
+from recipes.collect.settings import KINDS
 from recipes.ppo import PPO
+from recipes.sac import SAC
 from torchrl_tit.datasets import load_episodes
-from torchrl_tit.networks import MLPConfig
+from torchrl_tit.settings.networks import mlp
 
 FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
-RECIPE = PPO(
+CARTPOLE_RECIPE = PPO(
     name="ppo/cartpole/small",
     env="CartPole-v1",
-    backbone=MLPConfig(hidden_dim=32),
-    history=2,
+    backbone=mlp(num_frames=2, hidden_dim=32),
     num_envs=4,
     total_steps=100_000,
     steps_per_batch=256,
@@ -28,16 +28,26 @@ RECIPE = PPO(
     compile="off",
     decay_learning_rate=True,
 )
+PENDULUM_RECIPE = SAC(
+    name="sac/pendulum/small",
+    env="Pendulum-v1",
+    backbone=mlp(hidden_dim=16, activation="relu"),
+    critic_hidden=(16, 16),
+    batch_size=16,
+    random_steps=100,
+    total_steps=400,
+    updates_per_step=0.2,
+)
+# The fixtures in conftest.py write the recipes and fill in their paths.
 CARTPOLE = Collection(
     env="CartPole-v1",
-    agent="to be written",
     transitions=300,
     medium_return=100,
-    expert_return=180,
+    expert_return=130,
     total_steps=8192,
     evaluation_interval=256,
     evaluation_episodes=4,
-    checkpoint_interval=1024,
+    checkpoint_interval=768,
     num_envs=3,
     deterministic=True,
 )
@@ -45,12 +55,11 @@ PENDULUM = Collection(
     env="Pendulum-v1",
     transitions=300,
     medium_return=-2000,
-    total_steps=600,
+    total_steps=400,
     evaluation_interval=200,
     evaluation_episodes=2,
     checkpoint_interval=150,
     num_envs=2,
-    sac=SAC(hidden_dim=16, batch_size=16, random_steps=100, updates_per_step=0.2),
 )
 
 
@@ -77,7 +86,7 @@ def assert_same(left: Path, right: Path) -> None:
 
 
 def check_episodes(data: dict[str, NDArray]) -> None:
-    """Each episode goes on from row to row, and all have an end."""
+    """Each episode continues from row to row, and all have an end."""
     ends = data["terminals"] | data["timeouts"]
     assert ends[-1]
     np.testing.assert_array_equal(

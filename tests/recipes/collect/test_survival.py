@@ -1,4 +1,4 @@
-"""`data collect` that is killed, gone on with, and asked for more."""
+"""`data collect` that is killed, resumed, and given more sets to make."""
 
 import signal
 import subprocess
@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recipes.collect import agents, collect, set_maker, training
+from recipes import runner
+from recipes.collect import Collection, agent_in_training, set_maker
+from recipes.collect.agent_in_training import AgentInTraining
+from recipes.collect.collect import collect
 from recipes.collect.settings import KINDS
 from tests.recipes.collect.collected import (
-    CARTPOLE,
-    PENDULUM,
     assert_same,
     attributes,
     check_episodes,
@@ -27,78 +28,99 @@ ROOT = Path(__file__).parents[3]
 
 
 class Kill(BaseException):
-    """Nothing of the project catches it."""
+    """Not caught by any part of the project."""
 
 
 @pytest.mark.parametrize("which", ["cartpole", "pendulum"])
-def test_a_killed_collection_goes_on_to_the_same_data(
-    which: str, agent: str, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: Any
+def test_a_killed_collection_resumes_to_the_same_data(
+    which: str, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: Any
 ) -> None:
-    """Killed at many places, one after the other, each time a little later."""
-    settings = replace(CARTPOLE, agent=agent) if which == "cartpole" else PENDULUM
-    places = [
-        (training.TransitionParts, "write"),
-        (training.Training, "updated"),
-        (training, "save_checkpoint"),
-        (set_maker, "write_hdf5"),
-        (set_maker, "write_minari"),
+    """Killed at many places, one after the other."""
+    settings: Collection = request.getfixturevalue(f"{which}_settings")
+    write, train, save = (
+        (agent_in_training.TransitionParts, "write"),
+        (AgentInTraining, "updated"),
+        (runner, "_save"),
+    )
+    keep_agent = (agent_in_training, "save_checkpoint")
+    write_hdf5, write_minari = (set_maker, "write_hdf5"), (set_maker, "write_minari")
+    # The place, and how often it is reached before the process is killed there.
+    places: list[tuple[tuple[Any, str], int]] = [
+        (write, 1),
+        (write_hdf5, 1),
+        (write_minari, 1),
+        (train, 2),
+        (keep_agent, 1),
+        (save, 1),
+        (write_hdf5, 1),
+        (write_minari, 1),
+        (write, 1),
+        (write_hdf5, 1),
+        (train, 1),
+        (save, 2),
+        (keep_agent, 1),
+        (write, 2),
+        (write_minari, 1),
     ]
     folder, kills = tmp_path / "killed", 0
-    for owner, name in places:
-        for after in (1, 2, 5):
-            calls = 0
-            real = getattr(owner, name)
+    for (owner, name), after in places:
+        calls = 0
+        real = getattr(owner, name)
 
-            def dying(*args: Any, _real: Any = real, _after: int = after, **kwargs: Any) -> Any:
-                nonlocal calls
-                calls += 1
-                if calls == _after:
-                    raise Kill
-                return _real(*args, **kwargs)
+        def dying(*args: Any, _real: Any = real, _after: int = after, **kwargs: Any) -> Any:
+            nonlocal calls
+            calls += 1
+            if calls == _after:
+                raise Kill
+            return _real(*args, **kwargs)
 
-            with monkeypatch.context() as patch:
-                patch.setattr(owner, name, dying)
-                try:
-                    collect(settings, folder, "the command")
-                except Kill:
-                    kills += 1
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, dying)
+            try:
+                collect(settings, folder, "the command")
+            except Kill:
+                kills += 1
     collect(settings, folder, "the command")
 
-    assert kills >= 7
+    assert kills >= 12
     assert_same(folder, request.getfixturevalue(which))
 
 
-def test_what_is_finished_is_not_done_again(cartpole: Path, agent: str, monkeypatch: Any) -> None:
+def test_what_is_finished_is_not_repeated(
+    cartpole: Path, cartpole_settings: Collection, monkeypatch: Any
+) -> None:
     def refuse(*args: object, **kwargs: object) -> None:
-        raise AssertionError("this was done already")
+        raise AssertionError("this is finished")
 
     before = {path: path.stat().st_mtime_ns for path in cartpole.rglob("*.hdf5")}
-    monkeypatch.setattr(agents, "train_ppo", refuse)
-    monkeypatch.setattr(set_maker, "roll_out", refuse)
+    monkeypatch.setattr(agent_in_training, "train", refuse)
+    monkeypatch.setattr(set_maker, "play_episodes", refuse)
     monkeypatch.setattr(set_maker, "write_hdf5", refuse)
     monkeypatch.setattr(set_maker, "write_minari", refuse)
-    lines = collect(replace(CARTPOLE, agent=agent), cartpole, "the command")
+    lines = collect(cartpole_settings, cartpole, "the command")
     assert [line.split(":")[0] for line in lines] == list(KINDS)
     assert {path: path.stat().st_mtime_ns for path in cartpole.rglob("*.hdf5")} == before
     assert not list(cartpole.glob("*.parts"))
 
 
-def test_a_task_that_cannot_be_saved(tmp_path: Path, monkeypatch: Any) -> None:
-    """Begins anew at each checkpoint, whether or not it is killed there."""
+def test_a_task_that_cannot_be_saved(
+    pendulum_settings: Collection, tmp_path: Path, monkeypatch: Any
+) -> None:
+    """Begins new episodes at each checkpoint, whether or not it is killed there."""
     monkeypatch.setattr("torchrl_tit.checkpoint.collector.can_save_env", lambda env: False)
-    settings = replace(PENDULUM, sets=("mixed",), medium_return=None)
+    settings = replace(pendulum_settings, sets=("mixed",), medium_return=None)
     collect(settings, tmp_path / "whole")
     data = read(tmp_path / "whole" / "mixed.hdf5")
-    assert np.flatnonzero(data["timeouts"]).tolist() == [149, 299, 449, 599]
+    assert np.flatnonzero(data["timeouts"]).tolist() == [149, 299, 399]
     check_episodes(data)
 
     def die_late(self: object, step: int, policy: object) -> bool:
-        if step > 400:
+        if step > 300:
             raise Kill
         return False
 
     with monkeypatch.context() as patch:
-        patch.setattr(training.Training, "updated", die_late)
+        patch.setattr(AgentInTraining, "updated", die_late)
         with pytest.raises(Kill):
             collect(settings, tmp_path / "killed")
     collect(settings, tmp_path / "killed")
@@ -107,19 +129,18 @@ def test_a_task_that_cannot_be_saved(tmp_path: Path, monkeypatch: Any) -> None:
 
 
 @pytest.mark.slow
-def test_killed_for_good_and_gone_on_with(pendulum: Path, tmp_path: Path) -> None:
-    """By SIGKILL, from outside, at some time during the training and during the roll-out."""
-    words = "Pendulum-v1 --transitions 300 --medium-return -2000 --total-steps 600 "
-    words += "--evaluation-interval 200 --evaluation-episodes 2 --checkpoint-interval 150 "
-    words += "--num-envs 2 --sac.hidden-dim 16 --sac.batch-size 16 --sac.random-steps 100 "
-    words += f"--sac.updates-per-step 0.2 --out {tmp_path / 'killed'}"
-    command = [sys.executable, "-m", "recipes", "data", "collect", *words.split()]
+def test_killed_and_resumed(pendulum: Path, pendulum_settings: Collection, tmp_path: Path) -> None:
+    """By SIGKILL, from outside, during the training."""
+    options = f"Pendulum-v1 --agent {pendulum_settings.agent} --out {tmp_path / 'killed'} "
+    options += "--transitions 300 --medium-return -2000 --total-steps 400 --num-envs 2 "
+    options += "--evaluation-interval 200 --evaluation-episodes 2 --checkpoint-interval 150 "
+    command = [sys.executable, "-m", "recipes", "data", "collect", *options.split()]
     checkpoints = tmp_path / "killed" / "training" / "checkpoints"
 
     def start() -> subprocess.Popen:
         return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
 
-    for step in (150, 400):
+    for step in (150, 300):
         process = start()
         while process.poll() is None and max(checkpoint_steps(checkpoints), default=0) < step:
             time.sleep(0.005)
@@ -132,9 +153,11 @@ def test_killed_for_good_and_gone_on_with(pendulum: Path, tmp_path: Path) -> Non
     assert_same(tmp_path / "killed", pendulum)
 
 
-def test_a_mark_that_is_never_reached_and_a_longer_training(agent: str, tmp_path: Path) -> None:
+def test_a_mark_that_is_never_reached_and_a_longer_training(
+    cartpole_settings: Collection, tmp_path: Path
+) -> None:
     settings = replace(
-        CARTPOLE, agent=agent, sets=("random", "medium"), total_steps=256, expert_return=None
+        cartpole_settings, sets=("random", "medium"), total_steps=256, expert_return=None
     )
     with pytest.raises(ValueError, match="medium_return 100 was never reached in 256 steps"):
         collect(settings, tmp_path / "c")
@@ -151,8 +174,9 @@ def test_a_mark_that_is_never_reached_and_a_longer_training(agent: str, tmp_path
         collect(settings, tmp_path / "c")
 
 
-def test_more_sets_later_are_those_of_one_go(cartpole: Path, agent: str, tmp_path: Path) -> None:
-    settings = replace(CARTPOLE, agent=agent)
+def test_sets_that_are_made_later_are_the_same(
+    cartpole: Path, cartpole_settings: Collection, tmp_path: Path
+) -> None:
     for kinds in (("random",), ("expert",), KINDS):
-        collect(replace(settings, sets=kinds), tmp_path / "c", "the command")
+        collect(replace(cartpole_settings, sets=kinds), tmp_path / "c", "the command")
     assert_same(tmp_path / "c", cartpole)

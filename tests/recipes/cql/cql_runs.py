@@ -7,17 +7,28 @@ from typing import Any
 
 import numpy as np
 
+from recipes import algorithm
 from recipes.cql import CQL, DiscreteCQL
+from recipes.recipe import Recipe
 from tests.datasets.rollouts import NAMES, Transitions, roll, write
-from tests.recipes.offline.sequence_runs import make_data
+from tests.recipes.dataset_runs import make_data
 from torchrl_tit.envs import make_env
-from torchrl_tit.networks import EnhancedTITConfig
+from torchrl_tit.settings import Network
+from torchrl_tit.settings.networks import enhanced_tit
 
-TIT = EnhancedTITConfig(
-    embed_dim=8, features_dim=8, attention_dropout_outer=0.1, ffn_dropout_inner=0.2
-)
+
+def tit(num_frames: int = 1, **hyperparameters: Any) -> Network:
+    small: dict[str, Any] = {
+        "embed_dim": 8,
+        "features_dim": 8,
+        "attention_dropout_outer": 0.1,
+        "ffn_dropout_inner": 0.2,
+    }
+    return enhanced_tit(num_frames, **{**small, **hyperparameters})
+
+
 SETTINGS: dict[str, Any] = {
-    "backbone": TIT,
+    "backbone": tit(),
     "batch_size": 8,
     "total_updates": 18,
     "evaluation_interval": 9,
@@ -46,12 +57,17 @@ def make_discrete_cql(folder: Path, **settings: Any) -> DiscreteCQL:
     return DiscreteCQL(**{**SETTINGS, **fields, **settings})
 
 
+def make_algorithm(recipe: Recipe) -> Any:
+    """The algorithm, as Any: it has more than what all algorithms have."""
+    return algorithm.make_algorithm(recipe)
+
+
 def make_cartpole_data(folder: Path) -> Path:
     return write(folder / "cartpole.hdf5", roll(task="CartPole-v1", max_episode_steps=20))
 
 
 def roll_pong(steps: int = 60) -> Transitions:
-    """Random actions in Pong, cut into episodes of 20 pictures each."""
+    """Random actions in Pong, cut into episodes of 20 images each."""
     env = make_env("ALE/Pong-v5", seed=0)
     step = env.rollout(steps)[0]
     env.close()

@@ -1,4 +1,4 @@
-"""A gradient step of continuous CQL against the same by hand, on one batch."""
+"""A gradient step of continuous CQL against one written out by hand, on the same batch."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from tests.recipes.cql.cql_runs import make_cql
-from torchrl_tit.networks import MLPConfig
+from recipes.cql.algorithm import CQLAlgorithm
+from tests.recipes.cql.cql_runs import make_algorithm, make_cql
 from torchrl_tit.objectives import PolicySamples
+from torchrl_tit.settings import Network
+from torchrl_tit.settings.networks import enhanced_tit, mlp
 
 ORDER = ("temperature", "critic", "actor", "target")
 BATCH, WEIGHT, SAMPLES, GAMMA, TAU = 200, 3.0, 4, 0.97, 0.1
@@ -79,10 +81,10 @@ class ByHand:
         return F.linear(x, *critic[-2:]).squeeze(-1)
 
     def step(self, batch: TensorDictBase, drawn: PolicySamples, uniform: Tensor, order) -> None:
-        """One of everything; what the actor gives is of the weights that it had before."""
+        """Steps everything once; the samples are those of the actor before its step."""
         s, a, after = batch["observation"], batch["action"], batch["next"]
         mean, std = self.policy(s)
-        # The noise behind what was drawn, through which the gradient goes.
+        # The noise that the action was drawn with; the gradient flows through mean and std.
         noise = ((drawn.action.detach().atanh() - mean) / std).detach()
         action, log_prob = squash(mean, std, noise)
         with torch.no_grad():
@@ -106,8 +108,8 @@ class ByHand:
                 best = torch.minimum(
                     *(self.value(t, after["observation"], next_action) for t in self.targets)
                 )
-                going_on = 1 - after["terminated"].squeeze(-1).double()
-                target = after["reward"].squeeze(-1) + GAMMA * going_on * best
+                alive = 1 - after["terminated"].squeeze(-1).double()
+                target = after["reward"].squeeze(-1) + GAMMA * alive * best
             actions = torch.cat([2 * uniform - 1, drawn.actions], 1)
             states = s.unsqueeze(1).expand(-1, 3 * SAMPLES, -1)
             flat = torch.full_like(densities[0], ENTRIES * math.log(0.5))
@@ -115,9 +117,9 @@ class ByHand:
             loss = torch.zeros((), dtype=torch.float64)
             for weights in self.critics:
                 q = self.value(weights, s, a)
-                optimism = (self.value(weights, states, actions) - density).logsumexp(1)
+                soft_maximum = (self.value(weights, states, actions) - density).logsumexp(1)
                 # Half the weight for each: the mean over the critics.
-                loss = loss + (q - target).square().mean() + WEIGHT / 2 * (optimism - q).mean()
+                loss = loss + (q - target).square().mean() + WEIGHT / 2 * (soft_maximum - q).mean()
             self.adam["critic"].descend(loss)
 
         def actor() -> None:
@@ -145,41 +147,47 @@ def log_density(action: Tensor, mean: Tensor, std: Tensor) -> Tensor:
     return squash(mean, std, (action.atanh() - mean) / std)[1]
 
 
-@pytest.fixture
-def step(tmp_path, monkeypatch):
-    """Two updates: the state before and after, the batch, and what each of them drew."""
+@pytest.fixture(scope="module")
+def step(tmp_path_factory):
+    """Two updates: the state before and after, the batch, and the samples of each."""
+    folder = tmp_path_factory.mktemp("step")
     recipe = make_cql(
-        tmp_path,
-        backbone=MLPConfig(hidden_dim=12, num_layers=1, activation="relu"),
+        folder,
+        backbone=mlp(hidden_dim=12, num_layers=1, activation="relu"),
         conservative_weight=WEIGHT,
         action_samples=SAMPLES,
+        batch_size=BATCH,
         gamma=GAMMA,
         tau=TAU,
         temperature_init=0.4,
         **{f"{name}_learning_rate": rate for name, rate in RATES.items()},
     )
-    agent = recipe.make_agent()
-    agent.loss.double()
-    batch = recipe.make_buffer().sample(BATCH)
-    batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
-    batch["action"] *= 0.9  # off the bounds, where densities have no end
+    algorithm = make_algorithm(recipe)
+    loss = algorithm.loss.double()
+    batch = sample_doubles(algorithm)
+    batch["action"] *= 0.9  # off the bounds, where densities are infinite
     draws: list[tuple[PolicySamples, Tensor]] = []
-    sample_policy = agent.loss.sample_policy
+    sample_policy = loss.sample_policy
     uniform = torch.rand(BATCH, SAMPLES, ENTRIES, dtype=torch.float64)
 
     def record(tensordict):
         draws.append((sample_policy(tensordict), uniform))
         return draws[-1][0]
 
-    monkeypatch.setattr(agent.loss, "sample_policy", record)
-    update, _ = recipe.make_update(agent)
-    before = {name: weight.clone() for name, weight in agent.state_dict().items()}
-    monkeypatch.setattr(torch, "rand", lambda *shape, **_: uniform.reshape(shape))
-    for number in range(2):
-        update(batch, number, 0)
-    monkeypatch.undo()
+    loss.sample_policy = record
+    algorithm.prepare(0, folder)
+    before = {name: weight.clone() for name, weight in loss.state_dict().items()}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "rand", lambda *shape, **_: uniform.reshape(shape))
+        for number in range(2):
+            algorithm.update(batch, number)
     assert len(draws) == 2
-    return before, ByHand(agent.state_dict()), batch, draws
+    return before, ByHand(loss.state_dict()), batch, draws
+
+
+def sample_doubles(algorithm: CQLAlgorithm) -> TensorDictBase:
+    batch = algorithm.make_buffer().sample()
+    return batch.apply(lambda x: x.double() if x.is_floating_point() else x)
 
 
 def difference(left: ByHand, right: ByHand) -> float:
@@ -192,16 +200,54 @@ def difference(left: ByHand, right: ByHand) -> float:
     return max((a - b).abs().max().item() for a, b in pairs)
 
 
-@pytest.mark.parametrize("order", permutations(ORDER), ids="-".join)
+@pytest.mark.parametrize("order", [*permutations(ORDER)], ids="-".join)
 def test_the_order_is_temperature_critic_actor_target(step, order):
     before, after, batch, draws = step
     ours = ByHand(before)
     assert difference(ours, after) > 1e-3  # the updates did something
     for samples, uniform in draws:
         ours.step(batch, samples, uniform, order)
-    # All that can be seen of the order: what the actor and the targets read was stepped before.
+    # What shows of the order: the actor and the targets read weights that were stepped before.
     place = order.index
     same = place("actor") > max(place("temperature"), place("critic"))
     same = same and place("target") > place("critic")
     assert (difference(ours, after) < 1e-8) == same
     assert same or difference(ours, after) > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("backbone", "critic"),
+    [
+        (mlp(hidden_dim=12, num_layers=1, activation="relu"), "mlp"),
+        (enhanced_tit(4, embed_dim=8, features_dim=8, share_blocks=True), "backbone"),
+    ],
+    ids=["mlp", "backbone"],
+)
+def test_a_whole_batch_through_vmap_is_the_same_as_chunks(tmp_path, backbone: Network, critic: str):
+    """A GPU runs both critics on all states at once, a CPU one after the other on some states."""
+    recipe = make_cql(
+        tmp_path,
+        backbone=backbone,
+        critic=critic,
+        action_samples=SAMPLES,
+        over_critics="sum",
+        tau=TAU,
+        **{f"{name}_learning_rate": rate for name, rate in RATES.items()},
+    )
+    states, terms = [], []
+    for whole in (False, True):
+        torch.manual_seed(0)
+        algorithm = make_algorithm(recipe)
+        algorithm.loss.double()
+        algorithm.prepare(0, tmp_path)
+        algorithm.chunk_size = None if whole else 3
+        if whole:
+            algorithm.loss.deactivate_vmap = False
+            algorithm.loss._make_vmap()
+        batch = sample_doubles(algorithm)
+        for number in range(3):
+            torch.manual_seed(number)
+            terms.append(torch.stack([*algorithm.update(batch, number).values()]))
+        states.append(algorithm.loss.state_dict())
+    torch.testing.assert_close(terms[3:], terms[:3], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(states[1], states[0], rtol=1e-9, atol=1e-9)

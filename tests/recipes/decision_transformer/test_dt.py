@@ -11,19 +11,17 @@ import numpy as np
 import pytest
 import torch
 
+from recipes import runner
 from recipes.cli import main
 from recipes.decision_transformer import DT
+from recipes.decision_transformer.sequence_algorithm import check_data
 from recipes.metrics import read_metrics
-from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
 from recipes.run import Run
 from tests.datasets.rollouts import roll, write
-from tests.recipes.offline.sequence_runs import (
-    SMALL,
-    assert_resumes_bit_for_bit,
-    make_dt,
-    train,
-)
+from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train
+from tests.recipes.decision_transformer.sequence_runs import SMALL, make_algorithm, make_dt
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import (
     SequenceStorage,
@@ -31,25 +29,26 @@ from torchrl_tit.datasets import (
     normalized_score,
     normalized_spread,
 )
-from torchrl_tit.networks import DecisionTransformerConfig, MLPConfig
+from torchrl_tit.settings.networks import decision_transformer, dt_tit, mlp
 
 pytestmark = pytest.mark.filterwarnings("ignore:target_returns")
 
 
 def test_named_recipes_have_the_protocols_settings():
-    encoders: dict[str, Any] = {"dt": "linear", "dt-tit": "inner_transformer"}
+    networks = {"dt": decision_transformer(), "dt-tit": dt_tit()}
     for task, targets in {
         "halfcheetah": (12000, 6000),
         "hopper": (3600, 1800),
         "walker2d": (5000, 2500),
     }.items():
         for dataset in (f"{task}-medium-v2", f"{task}-medium-replay-v2"):
-            for network, encoder in encoders.items():
+            for network, backbone in networks.items():
                 recipe = get_recipe(f"dt/{dataset}/{network}")
                 assert isinstance(recipe, DT)
                 assert recipe.dataset == dataset
                 assert list(recipe.target_returns) == list(targets)
-                assert recipe.backbone == DecisionTransformerConfig(state_encoder=encoder)
+                assert recipe.backbone == backbone
+                assert recipe.backbone.num_frames == 20
                 assert recipe.final_step == 100_000
                 assert (recipe.batch_size, recipe.learning_rate) == (64, 1e-4)
                 assert (recipe.weight_decay, recipe.max_grad_norm) == (1e-4, 0.25)
@@ -69,11 +68,12 @@ def test_resumes_bit_for_bit(tmp_path):
     assert_resumes_bit_for_bit(make_dt(tmp_path), tmp_path)
 
 
+@pytest.mark.numerics
 def test_a_step_is_the_protocols(tmp_path):
     """Weights after two steps are those of AdamW on the masked error, with clipped gradients."""
-    config = DecisionTransformerConfig(**SMALL, dropout=0.0)
+    backbone = dt_tit(**SMALL, dropout=0.0)
     settings: dict[str, Any] = {"iterations": 1, "updates_per_iteration": 2}
-    recipe = make_dt(tmp_path, backbone=config, return_scale=50.0, weight_decay=10.0, **settings)
+    recipe = make_dt(tmp_path, backbone=backbone, return_scale=50.0, weight_decay=10.0, **settings)
     _, state = load_checkpoint(train(recipe, tmp_path / "run").checkpoints)
 
     episodes = load_episodes(recipe.dataset)
@@ -81,28 +81,34 @@ def test_a_step_is_the_protocols(tmp_path):
     storage = SequenceStorage(episodes, 6, mean=mean, std=std, return_scale=50.0)
     generator = torch.Generator().manual_seed(recipe.seed)
     torch.manual_seed(recipe.seed)
-    network = recipe.make_agent().network
-    optimizer = torch.optim.AdamW(network.parameters(), lr=1.0, weight_decay=10.0)
+    agent = make_algorithm(recipe).agent
+    optimizer = torch.optim.AdamW(agent.parameters(), lr=1.0, weight_decay=10.0)
     for step in range(2):
         batch = storage[torch.randint(len(storage), (8,), generator=generator)]
         names = ("observation", "action", "return_to_go", "timestep", "mask")
-        error = (network(*(batch[name] for name in names)) - batch["action"])[batch["mask"]]
+        features = agent.network.every_frame(*(batch[name] for name in names))
+        error = (agent.head(features) - batch["action"])[batch["mask"]]
         optimizer.zero_grad()
         error.square().mean().backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.25)
+        torch.nn.utils.clip_grad_norm_(agent.parameters(), 0.25)
         optimizer.param_groups[0]["lr"] = 1e-3 * (step + 1) / 4
         optimizer.step()
-    for name, weight in network.named_parameters():
-        trained = state["agent"][f"network.{name}"]
+    for name, weight in agent.named_parameters():
+        trained = state["networks"][name]
         torch.testing.assert_close(trained, weight.detach(), rtol=1e-4, atol=1e-6, msg=name)
-    torch.testing.assert_close(state["agent"]["mean"], mean)
+    torch.testing.assert_close(state["networks"]["mean"], mean)
+    torch.testing.assert_close(state["networks"]["std"], std)
 
 
 def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
     """Step by step in Gymnasium: normalised states, return to go and actions of the last steps."""
-    recipe = make_dt(tmp_path, acting_context=4, return_scale=50.0)
-    agent = recipe.make_agent().eval()
-    agent.fit_statistics(load_episodes(recipe.dataset))
+    settings: dict[str, Any] = {"target_returns": (60.0,), "evaluation_episodes": 1}
+    recipe = make_dt(
+        tmp_path, acting_num_frames=4, return_scale=50.0, evaluation_seed=3, **settings
+    )
+    algorithm = make_algorithm(recipe)
+    algorithm.load_data()
+    agent = algorithm.agent
     env = gymnasium.make("Hopper-v5")
     observation, _ = env.reset(seed=3)
     states, actions, to_go, ended = [], [torch.zeros(3)], [60.0], False
@@ -112,19 +118,20 @@ def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
         window = [torch.stack(x)[steps] for x in (states, actions)]
         returns_to_go = torch.tensor(to_go)[steps].unsqueeze(-1) / 50
         with torch.no_grad():
-            actions[-1] = agent.network(*window, returns_to_go, steps)[-1]
+            actions[-1] = agent.head(agent.network(*window, returns_to_go, steps))
         observation, reward, terminated, truncated, _ = env.step(actions[-1].numpy())
         actions.append(torch.zeros(3))
         to_go.append(to_go[-1] - float(reward))
         ended = terminated or truncated
     assert len(states) > 6
-    assert agent.play(60.0, episodes=1, seed=3).item() == pytest.approx(60 - to_go[-1], rel=1e-4)
+    (outcome,) = algorithm.play(step=0)
+    assert outcome.mean == pytest.approx(60 - to_go[-1], rel=1e-4)
 
 
 def test_evaluation_is_of_both_targets_and_the_best_of_all(tmp_path):
     recipe = make_dt(tmp_path)
     with train(recipe, tmp_path / "run") as run:
-        evaluation = recipe.evaluate(run)
+        evaluation = runner.evaluate(run)
         rows = read_metrics(run.folder / "metrics.csv")
         last = rows[-1]
         played = [row for row in rows if not np.isnan(row["return_mean"])]
@@ -150,9 +157,9 @@ def test_evaluation_is_of_both_targets_and_the_best_of_all(tmp_path):
     assert (evaluation["steps"], evaluation["seed"]) == (18, recipe.evaluation_seed)
 
     with Run.open(run.folder) as again:  # other seeds are played, the same ones are not
-        other = replace(recipe, evaluation_seed=5).evaluate(again)
+        other = runner.evaluate(again, replace(recipe, evaluation_seed=5))
         assert other["returns"] != evaluation["returns"]
-        more = replace(recipe, evaluation_episodes=4).evaluate(again)
+        more = runner.evaluate(again, replace(recipe, evaluation_episodes=4))
         assert len(more["returns"]) == 4
         assert more["targets"]["40"]["returns"][:3] == pytest.approx(
             targets["40"]["returns"], rel=1e-4
@@ -164,13 +171,16 @@ def test_command_line(tmp_path, capsys):
     path.write_text(recipe_to_json(make_dt(tmp_path)))
     out = tmp_path / "run"
     main(
-        ["train", str(path), "--target-returns", "30", "--backbone.dropout", "0", "--out", str(out)]
+        [
+            *("train", str(path), "--target-returns", "30"),
+            *("--backbone.history.dropout", "0", "--out", str(out)),
+        ]
     )
     assert "over 3 episodes after 18 steps" in capsys.readouterr().out
     assert json.loads((out / "evaluation.json").read_text())["targets"].keys() == {"30"}
     recipe = Run.open(out).recipe
     assert isinstance(recipe, DT)
-    assert (recipe.target_returns, recipe.backbone.dropout) == ((30.0,), 0)
+    assert (recipe.target_returns, recipe.history.dropout) == ((30.0,), 0)
     assert (out / "learning_curve.png").is_file()
     main(["evaluate", str(out), "--episodes", "2"])
     assert "over 2 episodes" in capsys.readouterr().out
@@ -191,24 +201,25 @@ def test_discrete_actions_are_learnt(tmp_path):
         tmp_path,
         dataset=str(write(tmp_path / "cartpole.hdf5", arrays)),
         env="CartPole-v1",
-        backbone=DecisionTransformerConfig(**SMALL, action_space="discrete", dropout=0.0),
+        backbone=dt_tit(**SMALL, dropout=0.0),
+        action_space="discrete",
         learning_rate=1e-2,
         target_returns=(20.0,),
         updates_per_iteration=50,
         log_interval=10,
     )
-    recipe.check()
+    make_algorithm(recipe).check()
     run = train(recipe, tmp_path / "run")
     losses = [row["loss"] for row in read_metrics(run.folder / "metrics.csv")]
     assert losses[0] > 0.5
     assert losses[-1] < 0.35
     with run:
-        assert "std" in recipe.evaluate(run)  # of a task without reference returns
+        assert "std" in runner.evaluate(run)  # of a task without reference returns
 
 
-def test_a_target_that_the_data_never_reach_is_said(tmp_path):
+def test_a_target_that_the_data_never_reach_is_warned_of(tmp_path):
     recipe = make_dt(tmp_path, target_returns=(5000.0, 10.0), updates_per_iteration=1)
-    with pytest.warns(UserWarning, match=r"target_returns 5000: no episode in .*hopper\.hdf5.*rea"):
+    with pytest.warns(UserWarning, match=r"target_returns 5000: no episode in .*hopper\.hdf5.*ran"):
         train(recipe, tmp_path / "run")
 
 
@@ -219,15 +230,13 @@ def test_a_target_that_the_data_never_reach_is_said(tmp_path):
         ({"target_returns": (float("nan"),)}, "target_returns must be at least one finite"),
         ({"return_scale": 0.0}, "return_scale must be positive, not 0"),
         ({"iterations": 0}, "iterations must be at least 1"),
-        ({"acting_context": 0}, "acting_context must be at least 1"),
-        ({"acting_context": 7}, "acting_context must be at most 6, not 7"),
+        ({"acting_num_frames": 0}, "acting_num_frames must be at least 1"),
+        ({"acting_num_frames": 7}, "acting_num_frames must be at most 6, not 7"),
         ({"target_returns": (10.0, 5.0, 10.0)}, "must differ within six digits, unlike"),
         ({"target_returns": (1234567.0, 1234568.0)}, "must differ within six digits, unlike"),
-        ({"backbone": MLPConfig()}, "backbone is MLPConfig, but this recipe trains a decision-tr"),
-        (
-            {"backbone": DecisionTransformerConfig(action_space="gaussian")},
-            "'gaussian', which this loss cannot train",
-        ),
+        ({"backbone": mlp()}, "backbone.history is mlp, but this recipe trains a decision-tran"),
+        ({"action_space": "gaussian"}, "'gaussian', which this loss cannot train"),
+        ({"action_space": "box"}, "'action_space' is 'box', not one of"),
     ],
 )
 def test_wrong_settings(tmp_path, settings, message):
@@ -239,25 +248,25 @@ def test_wrong_settings(tmp_path, settings, message):
     ("settings", "message"),
     [
         (
-            {"backbone": DecisionTransformerConfig(max_ep_len=999)},
+            {"backbone": decision_transformer(max_ep_len=999)},
             "episodes of Hopper-v5 have up to 1000 steps, but max_ep_len is 999",
         ),
         (
-            {"backbone": DecisionTransformerConfig(action_space="discrete")},
+            {"action_space": "discrete"},
             "Hopper-v5 has continuous actions, but the head's are discrete",
         ),
         (
             {"env": "CartPole-v1"},
             "CartPole-v1 has discrete actions, but the head's are continuous",
         ),
-        ({"env": "Pendulum-v1"}, "actions of Pendulum-v1 reach from -2 to 2, but the head's"),
+        ({"env": "Pendulum-v1"}, "actions of Pendulum-v1 range from -2 to 2, but the head's"),
         ({"env": "Walker2d-v5"}, r"observations"),
-        ({"dataset": "hopper"}, "'hopper' is no data set"),
+        ({"dataset": "hopper"}, "'hopper' is not a data set"),
     ],
 )
 def test_tasks_and_data_that_do_not_fit(tmp_path, settings, message):
     with pytest.raises(ValueError, match=message):
-        make_dt(tmp_path, **settings).check()
+        make_algorithm(make_dt(tmp_path, **settings)).check()
 
 
 def test_data_that_do_not_fit_the_network(tmp_path):
@@ -268,30 +277,31 @@ def test_data_that_do_not_fit_the_network(tmp_path):
     path = write(tmp_path / "long.hdf5", arrays)
     long = len(arrays["rewards"])
     recipe = make_dt(tmp_path, dataset=str(path), env="InvertedPendulum-v5")
-    with pytest.raises(ValueError, match="reach from -3 to 3"):
-        recipe.check()
-    from recipes.decision_transformer.data import load_data
-
-    config = DecisionTransformerConfig(context=5, max_ep_len=long - 1)
+    with pytest.raises(ValueError, match="range from -3 to 3"):
+        make_algorithm(recipe).check()
+    episodes = load_episodes(str(path), task="Hopper-v5")
+    recipe = make_dt(tmp_path, backbone=decision_transformer(5, max_ep_len=long - 1))
     with pytest.raises(ValueError, match=f"have up to {long} steps, but max_ep_len is {long - 1}"):
-        load_data(str(path), config, task="Hopper-v5")
-    discrete = DecisionTransformerConfig(action_space="discrete")
+        check_data(recipe, episodes)
+    check_data(make_dt(tmp_path, backbone=decision_transformer(5, max_ep_len=long)), episodes)
     message = r"actions in .* are continuous \(torch.float32\), but .* \(discrete actions are int"
     with pytest.raises(ValueError, match=message):
-        load_data(str(path), discrete, task="Hopper-v5")
+        check_data(make_dt(tmp_path, action_space="discrete"), episodes)
 
 
 def test_other_algorithms_refuse_the_network():
-    recipe = replace(get_recipe("ppo/cartpole/mlp"), backbone=DecisionTransformerConfig())
-    with pytest.raises(ValueError, match="reads returns and actions beside a history"):
-        recipe.check()
+    for name in ("ppo/cartpole/mlp", "cql/hopper-medium-v0/mlp", "sac/hopper/mlp"):
+        with pytest.raises(
+            ValueError, match=r"reads actions and returns .* use a dt or odt recipe"
+        ):
+            replace(get_recipe(name), backbone=decision_transformer())
 
 
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
     recipe = make_dt(tmp_path, max_grad_norm=0.25)
     with Run.create(tmp_path / "run", recipe) as run:
-        replace(recipe, iterations=1).train(run)
+        runner.train(replace(recipe, iterations=1), run)
         poisoned = replace(recipe, return_scale=1e-38)
         with pytest.raises((FloatingPointError, ValueError)):
-            poisoned.train(run)
+            runner.train(poisoned, run)
     assert load_checkpoint(run.checkpoints)[0] == 9

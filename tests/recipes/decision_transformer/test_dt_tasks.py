@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -10,12 +11,16 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from recipes.decision_transformer.data import load_data
-from recipes.decision_transformer.odt_exploration import explore
+from recipes.decision_transformer.sequence_algorithm import check_data
 from tests.datasets.rollouts import roll, write
-from tests.recipes.offline.sequence_runs import SMALL, make_dt, make_odt
-from torchrl_tit.datasets import select_episodes, write_minari
-from torchrl_tit.networks import DecisionTransformerConfig
+from tests.recipes.decision_transformer.sequence_runs import (
+    SMALL,
+    make_algorithm,
+    make_dt,
+    make_odt,
+)
+from torchrl_tit.datasets import load_episodes, select_episodes, write_minari
+from torchrl_tit.settings.networks import decision_transformer, dt_tit
 
 
 class Endless(gymnasium.Env[Any, Any]):
@@ -40,39 +45,41 @@ gymnasium.register("tests/Long-v0", lambda **_: Endless(), max_episode_steps=30)
 
 
 def test_a_task_without_a_time_limit_is_cut_off_where_time_steps_end(tmp_path):
-    config = DecisionTransformerConfig(**SMALL, max_ep_len=12)
-    agent = make_dt(tmp_path, env="tests/Endless-v0", backbone=config).make_agent()
-    assert agent.play(20.0, episodes=2, seed=0).tolist() == [12, 12]
+    recipe = make_dt(
+        tmp_path,
+        env="tests/Endless-v0",
+        backbone=dt_tit(**SMALL, max_ep_len=12),
+        evaluation_episodes=2,
+    )
+    assert [outcome.returns for outcome in make_algorithm(recipe).play(0)] == [[12, 12]] * 2
 
 
 def test_episodes_that_are_explored_are_as_long_as_those_of_the_evaluation(tmp_path):
     """Without an embedding of time steps nothing ends at max_ep_len but endless tasks."""
-    config = DecisionTransformerConfig(
-        **SMALL, max_ep_len=12, action_space="gaussian", timestep_embedding=False
-    )
+    backbone = dt_tit(**SMALL, max_ep_len=12, timestep_embedding=False)
     for env, length in {"tests/Endless-v0": 12, "tests/Long-v0": 30}.items():
-        recipe = make_odt(tmp_path, env=env, backbone=config)
-        agent = recipe.make_agent()
-        episodes = explore(agent, recipe, 0)
-        assert episodes.lengths.tolist() == agent.play(20.0, 1, 0).tolist() == [length]
+        recipe = make_odt(tmp_path, env=env, backbone=backbone, evaluation_episodes=1)
+        algorithm = make_algorithm(recipe)
+        episodes = algorithm.explore(0)
+        assert episodes.lengths.tolist() == algorithm.play(0)[0].returns == [length]
         assert episodes.truncated.all()
 
 
 def test_every_entry_of_an_action_must_reach_as_far_as_the_heads(tmp_path):
-    with pytest.raises(ValueError, match="actions of tests/Lopsided-v0 reach from 0 to 1, but"):
-        make_dt(tmp_path, env="tests/Lopsided-v0").make_agent()
+    with pytest.raises(ValueError, match="actions of tests/Lopsided-v0 range from 0 to 1, but"):
+        make_algorithm(make_dt(tmp_path, env="tests/Lopsided-v0"))
 
 
 def test_whole_atari_games_need_as_many_time_steps(tmp_path):
     pytest.importorskip("ale_py")
-    settings: dict[str, Any] = {**SMALL, "action_space": "discrete", "patch_size": 42}
-    recipe = make_dt(tmp_path, env="ALE/Pong-v5", backbone=DecisionTransformerConfig(**settings))
+    settings: dict[str, Any] = {"env": "ALE/Pong-v5", "action_space": "discrete"}
+    recipe = make_dt(tmp_path, backbone=dt_tit(**SMALL, patch_size=42), **settings)
     with pytest.raises(ValueError, match="Pong-v5 have up to 27000 steps, but max_ep_len is 1000"):
-        recipe.make_agent()
-    config = DecisionTransformerConfig(**settings, max_ep_len=27_000)
-    agent = make_dt(tmp_path, env="ALE/Pong-v5", backbone=config).make_agent()
-    state = agent.make_env(2, 21.0).reset()
-    assert agent.actor(state)["action"].shape == (2,)
+        make_algorithm(recipe)
+    backbone = dt_tit(**SMALL, patch_size=42, max_ep_len=27_000)
+    algorithm = make_algorithm(make_dt(tmp_path, backbone=backbone, **settings))
+    state = algorithm.make_env(2).reset()
+    assert algorithm.policy(state)["action"].shape == (2,)
 
 
 def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):
@@ -80,11 +87,14 @@ def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):
     arrays = roll(max_episode_steps=15)
     arrays["terminals"][-40:] = arrays["timeouts"][-40:] = False
     arrays["next_observations"][-41:-1] = arrays["observations"][-40:]
-    path = str(write(tmp_path / "hopper.hdf5", arrays))
-    config = DecisionTransformerConfig(context=5, max_ep_len=15)
-    episodes = load_data(path, config, task="Hopper-v5")
+    path = str(write(tmp_path / "broken_off.hdf5", arrays))
+    recipe = make_dt(tmp_path, backbone=decision_transformer(5, max_ep_len=15))
+    episodes = load_episodes(path, task="Hopper-v5")
+    check_data(recipe, episodes)
     assert episodes.lengths.max() > 15
 
     write_minari(select_episodes(episodes, torch.tensor([-1])), folder := tmp_path / "hopper-v0")
     with pytest.raises(ValueError, match=r"no episode in .*hopper-v0 is finished"):
-        load_data(str(folder), config, task="Hopper-v5")
+        check_data(
+            replace(recipe, dataset=str(folder)), load_episodes(str(folder), task="Hopper-v5")
+        )

@@ -11,14 +11,17 @@ import torch
 from torch import nn
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
-from recipes.decision_transformer.odt import ODT, make_lamb
+from recipes import runner
+from recipes.decision_transformer import ODT
+from recipes.decision_transformer.odt import make_lamb
 from recipes.decision_transformer.odt_data import OnlineData
-from recipes.decision_transformer.odt_exploration import explore, scale_noise
+from recipes.decision_transformer.odt_exploration import scale_noise
 from recipes.metrics import read_metrics
-from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
 from tests.datasets.rollouts import roll
-from tests.recipes.offline.sequence_runs import SMALL, assert_resumes_bit_for_bit, make_odt, train
+from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train
+from tests.recipes.decision_transformer.sequence_runs import SMALL, make_algorithm, make_odt
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import (
     SequenceStorage,
@@ -26,28 +29,26 @@ from torchrl_tit.datasets import (
     load_episodes,
     select_episodes,
 )
-from torchrl_tit.networks import DecisionTransformerConfig
+from torchrl_tit.settings.networks import decision_transformer, dt_tit
 
 pytestmark = pytest.mark.filterwarnings("ignore:target_returns")
 
 
 def test_named_recipes_have_the_protocols_settings():
-    encoders: dict[str, Any] = {"odt": "linear", "odt-tit": "inner_transformer"}
-    for network, encoder in encoders.items():
+    for network, make_network in {"odt": decision_transformer, "odt-tit": dt_tit}.items():
         recipe = get_recipe(f"odt/hopper-medium-replay-v2/{network}")
         assert isinstance(recipe, ODT)
-        assert recipe.backbone == DecisionTransformerConfig(
-            action_space="gaussian",
+        assert recipe.backbone == make_network(
+            num_frames=20,
             embed_dim=512,
             num_blocks=4,
             num_heads=4,
             dropout=0.1,
             activation="relu",
-            context=20,
             timestep_embedding=False,
-            state_encoder=encoder,
         )
-        assert (recipe.acting_context, recipe.batch_size, recipe.capacity) == (5, 256, 1000)
+        assert recipe.action_space == "gaussian"
+        assert (recipe.acting_num_frames, recipe.batch_size, recipe.capacity) == (5, 256, 1000)
         assert (recipe.learning_rate, recipe.weight_decay) == (1e-4, 5e-4)
         assert (recipe.warmup_updates, recipe.pretraining_updates) == (10_000, 5000)
         assert (recipe.updates_per_round, recipe.alpha_init) == (300, 0.1)
@@ -55,7 +56,7 @@ def test_named_recipes_have_the_protocols_settings():
         assert recipe.evaluation_episodes == 10
         assert (recipe.online_return, recipe.target_returns) == (7200, (3600,))
         assert recipe_from_json(recipe_to_json(recipe), "it") == recipe
-        get_recipe(f"odt/hopper-medium-replay-v2/{network}-small").check()
+        runner.make_algorithm(get_recipe(f"odt/hopper-medium-replay-v2/{network}-small")).check()
 
 
 @pytest.mark.parametrize("rounds", [0, 3])
@@ -68,16 +69,14 @@ def test_resumes_bit_for_bit(tmp_path, rounds):
 
 
 def test_a_step_is_the_protocols(tmp_path):
-    """Weights and temperature after two steps: likelihood and entropy of steps that are no padding.
+    """Weights and temperature after two steps on the likelihood and entropy of unmasked steps.
 
     Gradients are clipped, LAMB warms up, and the temperature follows the entropy.
     """
-    config = DecisionTransformerConfig(
-        action_space="gaussian", timestep_embedding=False, dropout=0.0, **SMALL
-    )
+    backbone = dt_tit(**SMALL, timestep_embedding=False, dropout=0.0)
     settings: dict[str, Any] = {"pretraining_updates": 2, "rounds": 0, "evaluation_episodes": 1}
     settings |= {"return_scale": 50.0, "weight_decay": 1.0, "alpha_learning_rate": 0.1}
-    recipe = make_odt(tmp_path, backbone=config, **settings)
+    recipe = make_odt(tmp_path, backbone=backbone, **settings)
     _, state = load_checkpoint(train(recipe, tmp_path / "run").checkpoints)
 
     episodes = load_episodes(recipe.dataset)
@@ -86,14 +85,15 @@ def test_a_step_is_the_protocols(tmp_path):
     seed = np.random.SeedSequence([recipe.seed, 0]).generate_state(1).item()
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(recipe.seed)
-    network = recipe.make_agent().network
-    optimizer = make_lamb(list(network.parameters()), 1.0, 1.0)
+    agent = make_algorithm(recipe).agent
+    optimizer = make_lamb(list(agent.parameters()), 1.0, 1.0)
     log_alpha = torch.tensor(0.1).log().requires_grad_()
     alpha_optimizer = torch.optim.Adam([log_alpha], lr=0.1)
     for step in range(2):
         batch = storage[torch.randint(len(storage), (8,), generator=generator)]
         names = ("observation", "action", "return_to_go", "timestep", "mask")
-        normal = Normal(*network(*(batch[name] for name in names)))
+        features = agent.network.every_frame(*(batch[name] for name in names))
+        normal = Normal(*agent.head(features))
         policy = TransformedDistribution(normal, TanhTransform())
         action = batch["action"].clamp(-1 + 1e-6, 1 - 1e-6)
         likelihood = policy.log_prob(action).sum(-1)[batch["mask"]].mean()
@@ -102,14 +102,14 @@ def test_a_step_is_the_protocols(tmp_path):
         entropy = -surprise.sum(-1)[batch["mask"]].mean()
         optimizer.zero_grad()
         (-likelihood - log_alpha.exp().detach() * entropy).backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.25)
+        torch.nn.utils.clip_grad_norm_(agent.parameters(), 0.25)
         optimizer.param_groups[0]["lr"] = 1e-3 * (step + 1) / 4
         optimizer.step()
         alpha_optimizer.zero_grad()
         (log_alpha.exp() * (entropy.detach() + 3)).backward()
         alpha_optimizer.step()
-    for name, weight in network.named_parameters():
-        trained = state["agent"][f"network.{name}"]
+    for name, weight in agent.named_parameters():
+        trained = state["networks"][name]
         torch.testing.assert_close(trained, weight.detach(), rtol=1e-4, atol=1e-6, msg=name)
     torch.testing.assert_close(state["alpha"]["value"], log_alpha.detach(), rtol=1e-4, atol=1e-5)
 
@@ -118,7 +118,7 @@ def test_what_a_run_writes(tmp_path):
     recipe = make_odt(tmp_path)
     with train(recipe, tmp_path / "run") as run:
         rows = read_metrics(run.folder / "metrics.csv")
-        evaluation = recipe.evaluate(run)
+        evaluation = runner.evaluate(run)
     evaluated = [row["step"] for row in rows if not math.isnan(row["return_mean"])]
     assert evaluated == [6, 14, 18]  # after pre-training, two rounds, and the last one
     by_step = {row["step"]: row for row in rows}
@@ -130,10 +130,9 @@ def test_what_a_run_writes(tmp_path):
 
 
 def test_explores_with_drawn_actions_and_keeps_observations_as_they_are(tmp_path):
-    recipe = make_odt(tmp_path)
-    agent = recipe.make_agent()
-    agent.mean.fill_(100.0)
-    first, again, other = (explore(agent, recipe, number) for number in (0, 0, 1))
+    algorithm = make_algorithm(make_odt(tmp_path))
+    algorithm.agent.mean.fill_(100.0)
+    first, again, other = (algorithm.explore(number) for number in (0, 0, 1))
     assert len(first.lengths) == 1
     assert first.finished.all()
     assert 1.0 < first.rows["observation"][0, 0] < 1.5  # Hopper's height, not normalised
@@ -141,28 +140,26 @@ def test_explores_with_drawn_actions_and_keeps_observations_as_they_are(tmp_path
     assert not torch.equal(first.rows["observation"][0], other.rows["observation"][0])
     actions = [episode.rows["action"][0] for episode in (first, again)]
     assert not torch.equal(*actions)
-    assert agent.training
+    assert algorithm.agent.training
 
 
 def test_explores_with_its_own_target_and_noise(tmp_path, monkeypatch):
     recipe = make_odt(tmp_path, exploration_scale=1e-6)
-    agent = recipe.make_agent()
+    algorithm = make_algorithm(recipe)
     targets = []
 
-    def make_env(num_envs, target_return, *settings):
+    def make_env(*settings, target_return):
         targets.append(target_return)
-        return type(agent).make_env(agent, num_envs, target_return, *settings)
+        return type(algorithm).make_env(algorithm, *settings, target_return=target_return)
 
-    monkeypatch.setattr(agent, "make_env", make_env)
-    first, again = (explore(agent, recipe, 0).rows["action"] for _ in range(2))
+    monkeypatch.setattr(algorithm, "make_env", make_env)
+    first, again = (algorithm.explore(0).rows["action"] for _ in range(2))
     assert targets == [recipe.online_return] * 2
     torch.testing.assert_close(first, again, rtol=0, atol=1e-3)  # nor is anything dropped out
 
 
 def test_episodes_side_by_side_are_whole_and_differ(tmp_path):
-    recipe = make_odt(tmp_path, episodes_per_round=4)
-    agent = recipe.make_agent()
-    episodes = explore(agent, recipe, 0)
+    episodes = make_algorithm(make_odt(tmp_path, episodes_per_round=4)).explore(0)
     assert len(episodes.lengths) == 4
     assert episodes.finished.all()
     assert len(set(episodes.returns.tolist())) == 4
@@ -171,12 +168,12 @@ def test_episodes_side_by_side_are_whole_and_differ(tmp_path):
 
 
 def test_noise_is_scaled(tmp_path):
-    agent = make_odt(tmp_path).make_agent().eval()
-    start = agent.make_env(5, 60.0, 0).reset()
-    plain, scaled = (scale_noise(agent.actor, factor)(start.clone()) for factor in (1.0, 0.25))
+    algorithm = make_algorithm(make_odt(tmp_path))
+    policy, start = algorithm.policy, algorithm.make_env(5, 0).reset()
+    plain, scaled = (scale_noise(policy, factor)(start.clone()) for factor in (1.0, 0.25))
     torch.testing.assert_close(scaled["scale"], 0.25 * plain["scale"])
     torch.testing.assert_close(scaled["loc"], plain["loc"])
-    assert scale_noise(agent.actor, 1.0) is agent.actor
+    assert scale_noise(policy, 1.0) is policy
 
 
 def make_data(capacity):
@@ -253,8 +250,8 @@ def test_lamb_is_that_of_the_release():
         ({"episodes_per_round": 0}, "episodes_per_round must be at least 1"),
         ({"exploration_scale": 0.0}, "exploration_scale must be positive, not 0"),
         (
-            {"backbone": DecisionTransformerConfig()},
-            "action_space is 'continuous', but exploration takes a distribution",
+            {"action_space": "continuous"},
+            "action_space is 'continuous', but exploration needs a distribution",
         ),
     ],
 )

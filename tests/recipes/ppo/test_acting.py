@@ -5,17 +5,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from recipes.ppo import PPO, training
-from recipes.ppo.agent import Agent
+from recipes.ppo import PPO, algorithm
+from recipes.ppo.algorithm import Agent
 from recipes.run import Run
+from recipes.runner import evaluate, train
 from tests.modules.frames import CountedFrames
 from torchrl_tit.checkpoint import load_checkpoint
-from torchrl_tit.networks import EnhancedTITConfig
+from torchrl_tit.settings.networks import enhanced_tit
 
 RECIPE = PPO(
     env="Pendulum-v1",
-    history=4,
-    backbone=EnhancedTITConfig(embed_dim=8, features_dim=8),
+    backbone=enhanced_tit(4, embed_dim=8, features_dim=8),
     total_steps=128,
     steps_per_batch=64,
     num_envs=2,
@@ -43,12 +43,12 @@ def frames(monkeypatch):
 
 def test_collection_and_evaluation_encode_each_frame_once(frames, tmp_path):
     with Run.create(tmp_path / "run", RECIPE) as run:
-        RECIPE.train(run)
+        train(RECIPE, run)
         # A batch has 64 steps, the 3 older frames of both environments at its start, the 4 of both
         # next histories at its end, and a minibatch of 32 histories that is checked to be finite.
         # Before the first one the collector tries the policy on both environments.
         assert frames[0].take() <= 2 + 2 * (64 + 2 * 3 + 2 * 4 + 32 * 4)
-        RECIPE.evaluate(run)
+        evaluate(run)
     assert frames[1].take() <= 2 * (200 + 3)  # two episodes
 
 
@@ -58,10 +58,10 @@ def test_keeping_frames_changes_no_result(tmp_path, monkeypatch):
 
     def weights(name):
         with Run.create(tmp_path / name, recipe) as run:
-            recipe.train(run)
-            return load_checkpoint(run.checkpoints)[1]["agent"]
+            train(recipe, run)
+            return load_checkpoint(run.checkpoints)[1]["networks"]
 
     kept = weights("kept")
-    monkeypatch.setattr(training, "while_acting", lambda policy, collector: collector)
+    monkeypatch.setattr(algorithm, "while_acting", lambda policy, collector: collector)
     for name, weight in weights("plain").items():
         torch.testing.assert_close(kept[name], weight, rtol=0, atol=2e-5)

@@ -1,20 +1,23 @@
 """The Atari recipes: the protocol's settings, clipped rewards and raw returns."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
 pytest.importorskip("ale_py")
 
+from recipes.algorithm import make_algorithm
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO
-from recipes.ppo.atari import ATARI_RECIPES
-from recipes.ppo.update import add_advantages
-from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.ppo.algorithm import add_advantages
+from recipes.presets.ppo_atari import ATARI_RECIPES
+from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import RECIPES
 from recipes.run import Run
-from torchrl_tit.networks import EnhancedTITConfig, MLPConfig
+from recipes.runner import evaluate, train
+from torchrl_tit.settings.networks import enhanced_tit, mlp, vanilla_tit
 
 GAMES = {
     "breakout": "ALE/Breakout-v5",
@@ -42,7 +45,7 @@ def test_every_cell_of_the_tables_is_named():
 def test_protocol_settings(name):
     recipe = ATARI_RECIPES[name]
     expected = {
-        "env": "ALE/Pong-v5", "history": 4, "padding": "constant", "num_envs": 8,
+        "env": "ALE/Pong-v5", "padding": "constant", "num_envs": 8,
         "steps_per_batch": 1024, "minibatch_size": 64 if "tit" in name else 256, "epochs": 4,
         "learning_rate": 2.5e-4, "decay_learning_rate": True, "clip_epsilon": 0.1,
         "decay_clip_epsilon": True, "entropy_coeff": 0.01, "critic_coeff": 0.5, "gamma": 0.99,
@@ -50,11 +53,12 @@ def test_protocol_settings(name):
         "evaluation_episodes": 100, "initialization": "orthogonal",
     }  # fmt: skip
     assert {field: getattr(recipe, field) for field in expected} == expected
-    recipe.check()  # the network fits the game
+    assert recipe.backbone.num_frames == 4
+    make_algorithm(recipe).check()  # the network fits the game
 
 
 def test_zeros_stand_before_the_first_frame():
-    env = ATARI_RECIPES["ppo/pong/nature-cnn"].make_env(1, seed=0)
+    env = make_algorithm(ATARI_RECIPES["ppo/pong/nature-cnn"]).make_env(1, seed=0)
     history = env.reset()["history"]
     assert not history[:, :-1].any()
     assert history[:, -1].any()
@@ -62,8 +66,7 @@ def test_zeros_stand_before_the_first_frame():
 
 
 def test_settings_of_tit():
-    backbone = ATARI_RECIPES["ppo/pong/enhanced-tit"].backbone
-    expected = {
+    hyperparameters: dict[str, Any] = {
         "patch_size": 12, "embed_dim": 64, "num_blocks": 2, "num_heads_inner": 4,
         "num_heads_outer": 4, "ffn_expansion_inner": 4, "ffn_expansion_outer": 4,
         "attention_dropout_inner": 0.1, "attention_dropout_outer": 0.1, "ffn_dropout_inner": 0.1,
@@ -71,9 +74,9 @@ def test_settings_of_tit():
         "activation_inner": "gelu", "activation_outer": "gelu", "position_encoding": True,
         "share_blocks": False,
     }  # fmt: skip
-    assert {field: getattr(backbone, field) for field in expected} == expected
-    vanilla = vars(ATARI_RECIPES["ppo/pong/vanilla-tit"].backbone)
-    assert vanilla == {name: vars(backbone)[name] for name in vanilla}
+    enhanced = ATARI_RECIPES["ppo/pong/enhanced-tit"].backbone
+    assert enhanced == enhanced_tit(4, **hyperparameters)
+    assert ATARI_RECIPES["ppo/pong/vanilla-tit"].backbone == vanilla_tit(4, **hyperparameters)
 
 
 @pytest.fixture
@@ -85,7 +88,7 @@ def seen_rewards(monkeypatch):
         rewards.append(batch["next", "reward"].clone())
         add_advantages(batch, *args)
 
-    monkeypatch.setattr("recipes.ppo.training.add_advantages", recording)
+    monkeypatch.setattr("recipes.ppo.algorithm.add_advantages", recording)
     return rewards
 
 
@@ -94,7 +97,7 @@ def test_training_sees_the_signs_and_returns_are_raw(clip, seen_rewards, tmp_pat
     """Of Pendulum, whose rewards are between -16 and 0."""
     recipe = PPO(
         env="Pendulum-v1",
-        backbone=MLPConfig(hidden_dim=8),
+        backbone=mlp(hidden_dim=8),
         num_envs=2,
         total_steps=400,
         steps_per_batch=400,
@@ -103,8 +106,8 @@ def test_training_sees_the_signs_and_returns_are_raw(clip, seen_rewards, tmp_pat
         clip_rewards=clip,
     )
     with Run.create(tmp_path / "run", recipe) as run:
-        recipe.train(run)
-        returns = recipe.evaluate(run)["returns"]
+        train(recipe, run)
+        returns = evaluate(run)["returns"]
     (rewards,) = seen_rewards
     assert set(rewards.unique().tolist()) <= {-1.0, 0.0} if clip else rewards.min() < -2
     assert read_metrics(run.folder / "metrics.csv")[0]["return_mean"] < -200
@@ -122,7 +125,7 @@ def test_a_game_trains_with_signs_and_counts_points(seen_rewards, tmp_path):
         checkpoint_interval=10**6,
     )
     with Run.create(tmp_path / "run", recipe) as run:
-        recipe.train(run)
+        train(recipe, run)
     rewards = torch.cat(seen_rewards)
     assert rewards.unique().tolist() == [0, 1]  # a pill is worth 10
 
@@ -132,8 +135,7 @@ def test_a_game_trains_with_signs_and_counts_points(seen_rewards, tmp_path):
     [
         ({"env": "ALE/Pongg-v5"}, "Unknown task 'ALE/Pongg-v5'; did you mean"),
         ({"env": "CartPole-v1"}, "image"),
-        ({"backbone": MLPConfig()}, "image"),
-        ({"backbone": EnhancedTITConfig(patch_size=85)}, "patch"),
+        ({"backbone": enhanced_tit(4, patch_size=85)}, "patch"),
         ({"vectorization_mode": "async"}, "leave vectorization_mode at 'sync'"),
         ({"hide_velocities": True}, "velocities"),
     ],
@@ -141,4 +143,4 @@ def test_a_game_trains_with_signs_and_counts_points(seen_rewards, tmp_path):
 def test_what_does_not_fit_is_refused_before_anything_runs(fields, message):
     recipe = replace(ATARI_RECIPES["ppo/pong/nature-cnn"], **fields)
     with pytest.raises(ValueError, match=message):
-        recipe.check()
+        make_algorithm(recipe).check()

@@ -11,16 +11,16 @@ from torch import multiprocessing
 
 from recipes.metrics import Metrics
 from recipes.ppo import PPO
-from recipes.ppo.agent import Agent
-from recipes.ppo.collector import make_collector
+from recipes.ppo.algorithm import PPOAlgorithm
 from recipes.run import Run
+from recipes.runner import evaluate, train
+from tests.numerics import assert_near
 from torchrl_tit.checkpoint import checkpoint_steps
-from torchrl_tit.networks import EnhancedTITConfig
+from torchrl_tit.settings.networks import enhanced_tit
 
 RECIPE = PPO(
     env="CartPole-v1",
-    history=2,
-    backbone=EnhancedTITConfig(embed_dim=8, features_dim=8),
+    backbone=enhanced_tit(2, embed_dim=8, features_dim=8),
     total_steps=192,
     steps_per_batch=64,
     num_envs=4,
@@ -34,11 +34,11 @@ RECIPE = PPO(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("async_collection", [False, True])
-def test_batches_are_those_of_the_policy(async_collection):
+def test_batches_are_those_of_the_policy(async_collection, tmp_path):
     recipe = replace(RECIPE, async_collection=async_collection, reward_scale=1.0)
-    env = recipe.make_env(1, 0)
-    agent = Agent(recipe, env).eval()
-    collector = make_collector(recipe, env, agent, 0, None)
+    algorithm = PPOAlgorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    agent, collector = algorithm.agent, algorithm.collector
     envs = 2 if async_collection else 4
     starts = []
     for count, batch in enumerate(collector, start=1):
@@ -46,14 +46,14 @@ def test_batches_are_those_of_the_policy(async_collection):
         with torch.no_grad():
             features = agent.backbone.module(batch["history"])
         if count == 1 or not async_collection:  # a later one of those can be an update behind
-            torch.testing.assert_close(batch["features"], features, rtol=0, atol=1e-5)
+            assert_near(batch["features"], features)
         starts += batch["history"][:, 0, -1].tolist()
         for parameter in agent.parameters():
             parameter.data.add_(0.01)
         collector.update_policy_weights_()
     collector.shutdown()
     assert count * 64 == 192
-    first = RECIPE.make_env(4, RECIPE.seed).reset()["history"][:, -1].tolist()
+    first = algorithm.make_env(4, RECIPE.seed).reset()["history"][:, -1].tolist()
     assert all(start in first for start in starts[:envs])  # each environment has its own seed
     assert len(set(map(tuple, starts[:envs]))) == envs
 
@@ -76,25 +76,25 @@ def test_a_terminals_ctrl_c_reaches_every_process_and_saves(fields, tmp_path, mo
     monkeypatch.setattr(Metrics, "log", ctrl_c)
     recipe = replace(RECIPE, checkpoint_interval=10**6, **fields)
     with Run.create(tmp_path / "run", recipe) as run, pytest.raises(KeyboardInterrupt):
-        recipe.train(run)
+        train(recipe, run)
     assert checkpoint_steps(run.checkpoints) == [128]
 
 
 @pytest.mark.slow
 def test_a_run_trains_and_goes_on(tmp_path):
     with Run.create(tmp_path / "run", replace(RECIPE, total_steps=128)) as run:
-        run.recipe.train(run)
+        train(run.recipe, run)
         assert max(checkpoint_steps(run.checkpoints)) == 128
     with Run(tmp_path / "run", RECIPE) as run:
-        RECIPE.train(run)
+        train(RECIPE, run)
         assert max(checkpoint_steps(run.checkpoints)) == 192
-        assert RECIPE.evaluate(run)["steps"] == 192
+        assert evaluate(run)["steps"] == 192
 
 
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"num_envs": 3, "steps_per_batch": 63}, "num_envs 3 cannot be shared by 2 collectors"),
+        ({"num_envs": 3, "steps_per_batch": 63}, "collectors 2 does not divide num_envs 3"),
         ({"collectors": 1, "async_collection": True}, "one collector: set collectors"),
         ({"collectors": 0}, "collectors must be at least 1"),
     ],

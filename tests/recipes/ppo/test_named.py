@@ -1,18 +1,15 @@
 """The recipes of the paper's tables on arrays: the protocol's settings, in every cell."""
 
 from itertools import product
+from typing import Any
 
 import pytest
 
+from recipes.algorithm import make_algorithm
 from recipes.ppo import PPO
 from recipes.registry import RECIPES
-from torchrl_tit.networks import (
-    D2RLConfig,
-    EnhancedTITConfig,
-    MLPConfig,
-    OFENetConfig,
-    VanillaTITConfig,
-)
+from torchrl_tit.settings import Inner
+from torchrl_tit.settings.networks import d2rl, enhanced_tit, mlp, ofenet, vanilla_tit
 
 TASKS = {
     "acrobot": ("Acrobot-v1", 100_000),
@@ -24,18 +21,18 @@ TASKS = {
     "walker2d": ("Walker2d-v5", 1_000_000),
 }
 NETWORKS = {
-    "mlp": MLPConfig,
-    "ofenet": OFENetConfig,
-    "d2rl": D2RLConfig,
-    "vanilla-tit": VanillaTITConfig,
-    "enhanced-tit": EnhancedTITConfig,
+    "mlp": mlp,
+    "ofenet": ofenet,
+    "d2rl": d2rl,
+    "vanilla-tit": vanilla_tit,
+    "enhanced-tit": enhanced_tit,
 }
 SETTINGS = {
     "learning_rate": 3e-4, "decay_learning_rate": False, "warmup_steps": 0, "adam_eps": 1e-5,
     "max_grad_norm": 0.5, "num_envs": 1, "steps_per_batch": 2048, "minibatch_size": 64,
     "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "bootstrap_time_limit": True,
     "clip_epsilon": 0.2, "decay_clip_epsilon": False, "entropy_coeff": 0.0, "critic_coeff": 0.5,
-    "contrastive_coeff": 0.0, "clip_rewards": False, "reward_scale": 1.0, "history": 1,
+    "contrastive_coeff": 0.0, "clip_rewards": False, "reward_scale": 1.0,
     "hide_velocities": False, "initialization": "orthogonal", "evaluation_episodes": 100,
 }  # fmt: skip
 # Published for MountainCar alone: width, heads of outer blocks and inner blocks, features.
@@ -48,16 +45,16 @@ def test_every_cell_has_the_settings_of_the_protocol(task, network):
     assert isinstance(recipe, PPO)
     assert (recipe.env, recipe.total_steps) == TASKS[task]
     assert {name: getattr(recipe, name) for name in SETTINGS} == SETTINGS
-    assert type(recipe.backbone) is NETWORKS[network]
+    assert recipe.backbone.num_frames == 1
+    assert type(recipe.backbone.history) is type(NETWORKS[network]().history)
 
 
 @pytest.mark.parametrize(("task", "network"), list(product(TASKS, MOUNTAINCAR)))
 def test_settings_of_tit(task, network):
-    backbone = vars(RECIPES[f"ppo/{task}/{network}"].backbone)
     width, outer, inner, features = (
         MOUNTAINCAR[network] if task == "mountaincar" else (32, 1, 1, 64)
     )
-    expected = {
+    expected: dict[str, Any] = {
         "patch_size": 1, "embed_dim": width, "num_blocks": 2, "num_heads_outer": outer,
         "num_heads_inner": inner, "ffn_expansion_outer": 4, "ffn_expansion_inner": 4,
         "activation_outer": "gelu", "activation_inner": "gelu", "position_encoding": True,
@@ -65,14 +62,15 @@ def test_settings_of_tit(task, network):
         "activation_head": "tanh", "attention_dropout_inner": 0.0, "attention_dropout_outer": 0.0,
         "ffn_dropout_inner": 0.0, "ffn_dropout_outer": 0.0,
     }  # fmt: skip
-    ablations = {"dense": True, "inner": True, "outer": True} if "enhanced" in network else {}
-    assert backbone == expected | ablations
+    assert RECIPES[f"ppo/{task}/{network}"].backbone == NETWORKS[network](1, **expected)
 
 
 @pytest.mark.parametrize(("task", "network"), list(product(TASKS, ["mlp", "ofenet", "d2rl"])))
 def test_the_trunks_have_two_tanh_layers_of_64(task, network):
     backbone = RECIPES[f"ppo/{task}/{network}"].backbone
-    assert vars(backbone) == {"hidden_dim": 64, "num_layers": 2, "activation": "tanh"}
+    expected = {"hidden_dim": 64, "num_layers": 2, "activation": "tanh"}
+    assert vars(backbone.history) == expected
+    assert (backbone.trunks, backbone.head.features_dim) == ("separate", None)
 
 
 @pytest.mark.parametrize("task", ["ant", "halfcheetah", "hopper", "walker2d"])
@@ -80,7 +78,8 @@ def test_the_trunks_have_two_tanh_layers_of_64(task, network):
 def test_tuned_locomotion_takes_the_whole_observation_for_one_patch(task, network):
     recipe = RECIPES[f"ppo/{task}/{network}-tuned"]
     assert isinstance(recipe, PPO)
-    recipe.check()
-    env = recipe.make_env(1, seed=0)
-    assert isinstance(recipe.backbone, EnhancedTITConfig | VanillaTITConfig)
-    assert recipe.backbone.patch_size == env.observation_spec["history"].shape[-1]
+    algorithm = make_algorithm(recipe)
+    algorithm.check()
+    env = algorithm.make_env(1, seed=0)
+    assert isinstance(recipe.backbone.frame, Inner)
+    assert recipe.backbone.frame.patch_size == env.observation_spec["history"].shape[-1]

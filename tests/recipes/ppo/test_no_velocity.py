@@ -5,39 +5,43 @@ from dataclasses import replace
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 
-from recipes.ppo.no_velocity import NO_VELOCITY_RECIPES
+from recipes.algorithm import make_algorithm
+from recipes.presets.ppo_no_velocity import NO_VELOCITY_RECIPES
 from recipes.registry import RECIPES
 from recipes.run import Run
+from recipes.runner import evaluate, train
 from torchrl_tit.checkpoint import load_checkpoint
-from torchrl_tit.networks import EnhancedTITConfig, MLPConfig
+from torchrl_tit.settings import Inner, StackedInner
+from torchrl_tit.settings.networks import mlp
 
 
 @pytest.mark.parametrize("name", NO_VELOCITY_RECIPES)
 def test_recipes_can_be_built_and_hide_the_velocities(name):
     recipe = NO_VELOCITY_RECIPES[name]
     assert RECIPES[name] == recipe
-    recipe.check()
+    algorithm = make_algorithm(recipe)
+    algorithm.check()
     network = name.rpartition("/")[2]
-    assert recipe.history == (8 if "8" in network else 1)
+    assert recipe.backbone.num_frames == (8 if "8" in network else 1)
     backbone = recipe.backbone
-    assert getattr(backbone, "temporal_position_encoding", False) == (
+    assert getattr(backbone.history, "temporal_position_encoding", False) == (
         "positions" in network or "tuned" in network
     )
-    assert getattr(backbone, "outer", True) == ("wo-outer" not in network)
+    assert isinstance(backbone.history, StackedInner) == ("wo-outer" in network)
     entries = {"CartPole-v1": 2, "Acrobot-v1": 4, "Hopper-v5": 5}[recipe.env]
     if "tuned" in network:
-        assert isinstance(backbone, EnhancedTITConfig)
-        assert backbone.patch_size == entries
-    env = recipe.make_env(2, seed=0)
-    assert env.reset()["history"].shape == (2, recipe.history, entries)
+        assert isinstance(backbone.frame, Inner)
+        assert backbone.frame.patch_size == entries
+    env = algorithm.make_env(2, seed=0)
+    assert env.reset()["history"].shape == (2, backbone.num_frames, entries)
     assert recipe.num_envs == (16 if "acrobot" in name else 8)
 
 
 def test_all_networks_train_with_the_same_settings():
-    any_network = MLPConfig()
+    any_network = mlp()
     for task in ("cartpole", "acrobot", "hopper"):
         settings = {
-            replace(recipe, name="", history=1, backbone=any_network)
+            replace(recipe, name="", backbone=any_network)
             for name, recipe in NO_VELOCITY_RECIPES.items()
             if name.startswith(f"ppo/{task}-no-velocity/")
         }
@@ -65,9 +69,9 @@ def test_a_run_in_processes_is_the_run_in_one(tmp_path, monkeypatch):
     for mode in ("sync", "async"):
         recipe = replace(recipe, vectorization_mode=mode)
         with Run.create(tmp_path / mode, recipe) as run:
-            recipe.train(run)
-            evaluation = recipe.evaluate(run)
-        results.append((load_checkpoint(run.checkpoints)[1]["agent"], evaluation["returns"]))
+            train(recipe, run)
+            evaluation = evaluate(run)
+        results.append((load_checkpoint(run.checkpoints)[1]["networks"], evaluation["returns"]))
     assert made == ["async"]
     (sync, returns), (async_, async_returns) = results
     assert returns == async_returns

@@ -1,4 +1,4 @@
-"""PPO with a recurrent network: sequences, values across their ends, and going on."""
+"""PPO with a recurrent network: sequences, values across their ends, and resuming."""
 
 from dataclasses import replace
 
@@ -9,18 +9,18 @@ from torchrl.collectors import Collector
 from torchrl.objectives.value import GAE
 
 from recipes.ppo import PPO
-from recipes.ppo.agent import Agent
-from recipes.ppo.update import add_advantages, minibatches
+from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
 from recipes.results.film import film
 from recipes.run import Run
+from recipes.runner import evaluate, train
+from tests.numerics import assert_near
 from torchrl_tit.checkpoint import load_checkpoint
-from torchrl_tit.modules import LSTMConfig
-from torchrl_tit.networks import MLPConfig
+from torchrl_tit.settings.networks import lstm, mlp
 
 RECIPE = PPO(
     env="CartPole-v1",
     hide_velocities=True,
-    backbone=LSTMConfig(embed_dim=8, hidden_dim=8, features_dim=8),
+    backbone=lstm(embed_dim=8, hidden_dim=8, features_dim=8),
     num_envs=2,
     total_steps=256,
     steps_per_batch=64,
@@ -37,8 +37,8 @@ RECIPE = PPO(
 def batch():
     """A batch of 200 steps of 2 environments, and the agent that took them."""
     torch.manual_seed(0)
-    env = RECIPE.make_env(2, seed=0)
-    agent = Agent(RECIPE, env).eval()
+    algorithm = PPOAlgorithm(RECIPE)
+    env, agent = algorithm.make_env(2, seed=0), algorithm.agent.eval()
     torch.nn.init.normal_(agent.critic.module.weight)
     collector = Collector(
         env,
@@ -59,7 +59,9 @@ def test_the_next_values_know_the_state_before_them(batch):
     add_advantages(batch, agent, gae, bootstrap_time_limit=True)
     following = agent.critic(agent.backbone(batch["next"].select(*agent.backbone.in_keys)))
     torch.testing.assert_close(batch["next", "state_value"], following["state_value"])
-    forgetful = batch["next"].select("history", "is_init").set("is_init", batch["next", "done"])
+    forgetful = batch["next"].select(*agent.backbone.in_keys)
+    for key in ("recurrent_state_h", "recurrent_state_c"):
+        forgetful[key] = torch.zeros_like(forgetful[key])
     forgetful = agent.critic(agent.backbone(forgetful))["state_value"]
     assert (batch["next", "state_value"] - forgetful).abs().max() > 1e-3
 
@@ -69,7 +71,7 @@ def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
     number = torch.arange(400).view(2, 200, 1)
     batch["advantage"] = batch["value_target"] = number
     recipe = replace(RECIPE, steps_per_batch=400)
-    parts = list(minibatches(batch, recipe))
+    parts = list(minibatches(batch, agent, recipe))
     assert [part.shape for part in parts] == [(4, 8)] * 12 + [(2, 8)] + [(4, 8)] * 12 + [(2, 8)]
     for epoch in (parts[:13], parts[13:]):
         steps = torch.cat([part["advantage"] for part in epoch]).squeeze(-1)  # [sequences, 8]
@@ -80,23 +82,23 @@ def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
     for part in parts:
         rows = part["advantage"].flatten()
         features = agent.encode(part)["features"].flatten(0, 1)
-        torch.testing.assert_close(features, batch["features"].flatten(0, 1)[rows])
+        assert_near(features, batch["features"].flatten(0, 1)[rows])
 
 
 def final(run) -> TensorDict:
     _, state = load_checkpoint(run.checkpoints)
-    return TensorDict({**state["agent"], "rng": state["rng"]["torch"]})
+    return TensorDict({**state["networks"], "rng": state["rng"]["torch"]})
 
 
 def test_resumed_is_bit_for_bit_the_same_and_evaluated_alike(tmp_path):
     with Run.create(tmp_path / "whole", RECIPE) as run:
-        RECIPE.train(run)
-        expected, returns = final(run), RECIPE.evaluate(run)["returns"]
+        train(RECIPE, run)
+        expected, returns = final(run), evaluate(run)["returns"]
     with Run.create(tmp_path / "parts", RECIPE) as run:
-        replace(RECIPE, total_steps=128).train(run)
-        RECIPE.train(run)
+        train(replace(RECIPE, total_steps=128), run)
+        train(RECIPE, run)
         assert (final(run) == expected).all()
-        assert RECIPE.evaluate(run)["returns"] == returns
+        assert evaluate(run)["returns"] == returns
         # One episode after the other remembers no more of them than all side by side.
         rendered = replace(RECIPE, evaluation_seed=RECIPE.evaluation_seed)
         video = tmp_path / "film.gif"
@@ -106,8 +108,8 @@ def test_resumed_is_bit_for_bit_the_same_and_evaluated_alike(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"sequence_length": 5}, "sequence_length 5 does not divide minibatch_size = 32"),
-        ({"sequence_length": 32, "steps_per_batch": 80}, "steps_per_batch / num_envs = 40"),
+        ({"sequence_length": 5}, "sequence_length 5 does not divide minibatch_size 32"),
+        ({"sequence_length": 32, "steps_per_batch": 80}, "steps_per_batch / num_envs 40"),
         ({"sequence_length": 0}, "sequence_length must be at least 1"),
     ],
 )
@@ -115,9 +117,10 @@ def test_sequences_that_do_not_fit_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
         replace(RECIPE, **fields)
     if fields["sequence_length"]:
-        replace(RECIPE, **fields, backbone=MLPConfig())  # which has no use for it
+        replace(RECIPE, **fields, backbone=mlp())  # which has no use for it
 
 
-def test_a_history_is_refused_before_anything_runs():
-    with pytest.raises(ValueError, match="set history to 1"):
-        replace(RECIPE, history=4).check()
+def test_with_several_frames_it_reads_those_and_carries_no_state():
+    recipe = replace(RECIPE, backbone=replace(RECIPE.backbone, num_frames=4))
+    assert not recipe.is_recurrent
+    PPOAlgorithm(recipe).check()

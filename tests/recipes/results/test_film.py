@@ -4,15 +4,17 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from recipes import runner
 from recipes.cli import main
-from recipes.networks import EnhancedTITConfig, MLPConfig
 from recipes.ppo import PPO
 from recipes.run import Run
+from recipes.runner import load_trained
 from tests.recipes.cql.cql_runs import make_cartpole_data, make_discrete_cql
-from tests.recipes.offline.sequence_runs import SMALL as SMALL_DT
-from tests.recipes.offline.sequence_runs import make_dt, train
+from tests.recipes.dataset_runs import train
+from tests.recipes.decision_transformer.sequence_runs import SMALL as SMALL_DT
+from tests.recipes.decision_transformer.sequence_runs import make_dt
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.networks import DecisionTransformerConfig
+from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, mlp
 
 SMALL = {"total_steps": 64, "steps_per_batch": 64, "minibatch_size": 32, "epochs": 1}
 
@@ -20,13 +22,13 @@ SMALL = {"total_steps": 64, "steps_per_batch": 64, "minibatch_size": 32, "epochs
 def trained(folder, **fields):
     recipe = PPO(**{**SMALL, **fields})
     with Run.create(folder, recipe) as run:
-        recipe.train(run)
+        runner.train(recipe, run)
     return run
 
 
 @pytest.fixture(scope="module")
 def cartpole(tmp_path_factory):
-    return trained(tmp_path_factory.mktemp("run"), env="CartPole-v1", backbone=MLPConfig())
+    return trained(tmp_path_factory.mktemp("run"), env="CartPole-v1", backbone=mlp())
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
@@ -36,8 +38,8 @@ def test_one_picture_a_step(cartpole, tmp_path, capsys, suffix):
         pytest.importorskip("imageio_ffmpeg")
     film = tmp_path / f"film{suffix}"
     main(["render", str(cartpole.folder), "--out", str(film), "--episodes", "2", "--seed", "5"])
-    _, agent = cartpole.recipe.load_agent(cartpole)
-    returns = evaluate(lambda n: cartpole.recipe.make_env(n, 0), agent.policy, 2, seed=5)
+    _, algorithm, _ = load_trained(cartpole)
+    returns = evaluate(algorithm.make_env, algorithm.policy, 2, seed=5)
     assert capsys.readouterr().out.splitlines()[0] == f"returns {returns[0]:g}, {returns[1]:g}"
     pictures = imageio.imread(film)
     assert pictures.shape[1:] == (400, 600, 3)
@@ -56,7 +58,8 @@ def make_cartpole_dt(folder):
         dataset=str(make_cartpole_data(folder)),
         env="CartPole-v1",
         target_returns=(20.0,),
-        backbone=DecisionTransformerConfig(**SMALL_DT, action_space="discrete"),
+        backbone=decision_transformer(**SMALL_DT),
+        action_space="discrete",
     )
 
 
@@ -67,7 +70,7 @@ def test_runs_on_data(make, tmp_path, capsys):
     run = train(recipe, tmp_path / "run")
     film = tmp_path / "film.gif"
     main(["render", str(run.folder), "--out", str(film)])
-    (played, *_) = recipe.evaluate(run)["returns"]  # the first episode of the evaluation
+    (played, *_) = runner.evaluate(run)["returns"]  # the first episode of the evaluation
     assert capsys.readouterr().out.splitlines()[0] == f"returns {played:g}"
     pictures = range(len(imageio.imread(film)))
     shown = [imageio.immeta(film, index=i)["duration"] for i in pictures]
@@ -76,17 +79,16 @@ def test_runs_on_data(make, tmp_path, capsys):
 
 def test_atari(tmp_path, capsys):
     pytest.importorskip("ale_py")
-    backbone = EnhancedTITConfig(patch_size=42, embed_dim=8, num_blocks=1, features_dim=8)
-    run = trained(tmp_path / "run", env="ALE/Breakout-v5", history=2, num_envs=2, backbone=backbone)
+    backbone = enhanced_tit(2, patch_size=42, embed_dim=8, num_blocks=1, features_dim=8)
+    run = trained(tmp_path / "run", env="ALE/Breakout-v5", num_envs=2, backbone=backbone)
     # Films only the start, as a game can be long where an agent does nothing.
-    recipe = run.recipe
-    env = recipe.make_env(1, 0, render_mode="rgb_array", max_num_frames_per_episode=400)
-    _, agent = recipe.load_agent(run)
+    _, algorithm, _ = load_trained(run)
+    env = algorithm.make_env(1, 0, render_mode="rgb_array", max_num_frames_per_episode=400)
     screens = []
 
     def filmed(root):
         screens.append(env.base_env.render()[0])
-        return agent.policy(root)
+        return algorithm.policy(root)
 
     evaluate(env, filmed, 1)
     assert env.base_env.render_fps == 15
@@ -105,7 +107,7 @@ def test_bad_input(cartpole, tmp_path, capsys):
     assert "a film is one of .gif, .mp4, not 'film.avi'" in error(
         folder, "--out", tmp_path / "film.avi"
     )
-    assert "is no run folder" in error(tmp_path, "--out", film)
+    assert "is not a run folder" in error(tmp_path, "--out", film)
     assert "episodes must be at least 1" in error(folder, "--out", film, "--episodes", 0)
     assert not any(tmp_path.iterdir())
     film.write_bytes(b"mine")
@@ -138,7 +140,7 @@ def test_a_folder_that_is_missing(cartpole, tmp_path, capsys):
 
 
 def test_tasks_without_pictures(cartpole):
-    env = cartpole.recipe.make_env(1, 0)
+    env = load_trained(cartpole)[1].make_env(1, 0)
     env.reset()
     with pytest.raises(ValueError, match="have no pictures; make them with render_mode"):
-        env.render()
+        env.base_env.render()

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from matplotlib.image import imread
 
+from recipes.results.cell import Cell
 from recipes.results.plot import plot_comparison, plot_table
-from recipes.results.table import Cell
 
 
 def height(folder: Path, groups: int) -> int:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from recipes.cli import main
-from recipes.recipe import recipe_to_json
+from recipes.recipe_json import recipe_to_json
 from recipes.registry import RECIPES, get_recipe
 from recipes.results.table import make_table, paper_results, to_csv, to_markdown
-from torchrl_tit.networks import MLPConfig
+from torchrl_tit.settings import Linear
+from torchrl_tit.settings.networks import enhanced_tit, mlp
 
 
 def write_run(folder, of, seed, returns, **fields):
@@ -150,14 +151,30 @@ def test_fewer_episodes_are_named(tmp_path):
 
 
 def test_what_was_changed_is_named(tmp_path):
-    wide = MLPConfig(hidden_dim=256)
+    wide = mlp(hidden_dim=256)
     write_run(tmp_path / "0", "ppo/cartpole/mlp", 3, [20.0], total_steps=1000, backbone=wide)
     write_run(tmp_path / "1", "ppo/cartpole/d2rl", 0, [500.0])
     cells, _ = make_table([tmp_path])
-    assert [cell.changes for cell in cells] == ["total_steps 1000, backbone.hidden_dim 256", ""]
+    assert [cell.changes for cell in cells] == [
+        "backbone.history.hidden_dim 256, total_steps 1000",
+        "",
+    ]
     text = to_markdown(cells)
-    assert "| ppo/cartpole/mlp (total_steps 1000, backbone.hidden_dim 256) | 1 | 20.0" in text
+    assert (
+        "| ppo/cartpole/mlp (backbone.history.hidden_dim 256, total_steps 1000) | 1 | 20.0" in text
+    )
     assert "| ppo/cartpole/d2rl | 1 | 500" in text
+
+
+def test_another_encoder_is_named_with_its_fields(tmp_path):
+    network = enhanced_tit(dense=False)
+    write_run(tmp_path / "0", "ppo/cartpole/enhanced-tit", 0, [20.0], backbone=network)
+    ((cell,), _) = make_table([tmp_path])
+    assert cell.changes == "backbone.frame.every_block False"
+    linear = replace(network, frame=Linear(embed_dim=8))
+    write_run(tmp_path / "1", "ppo/cartpole/enhanced-tit", 0, [20.0], backbone=linear)
+    ((cell,), _) = make_table([tmp_path / "1"])
+    assert "backbone.frame.encoder linear, backbone.frame.embed_dim 8" in cell.changes
 
 
 def test_other_settings_under_one_name_are_another_cell(tmp_path):

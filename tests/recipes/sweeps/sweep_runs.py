@@ -8,12 +8,12 @@ from recipes.ppo import PPO
 from recipes.recipe import Recipe
 from recipes.run import Run
 from recipes.sweeps.sweep import Job
-from torchrl_tit.networks import MLPConfig
+from torchrl_tit.settings.networks import mlp
 
 TINY = PPO(
     name="ppo/cartpole/mlp",
     env="CartPole-v1",
-    backbone=MLPConfig(hidden_dim=8),
+    backbone=mlp(hidden_dim=8),
     total_steps=128,
     steps_per_batch=64,
     minibatch_size=32,

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import pytest
 
+from recipes import runner
 from recipes.cli import main
-from recipes.recipe import recipe_to_json
+from recipes.recipe_json import recipe_to_json
 from recipes.registry import RECIPES
+from recipes.results.plot import plot_run
 from recipes.run import Run
 from recipes.sweeps import sweep
 from tests.recipes.sweeps.sweep_runs import TINY, begin
@@ -37,8 +39,8 @@ def test_files_of_recipes_are_swept_beside_named_ones(tmp_path):
     assert [job.recipe for job in jobs[:2]] == [replace(mine, seed=0), replace(mine, seed=1)]
     assert [job.recipe.name for job in jobs[2:]] == ["ppo/cartpole/mlp"] * 2
     assert jobs[0].folder == tmp_path / "ppo/cartpole/mine/seed-0"
-    assert jobs[1].words()[:4] == ["train", str(file), "--seed", "1"]
-    assert jobs[2].words()[:2] == ["train", "ppo/cartpole/mlp"]
+    assert jobs[1].arguments()[:4] == ["train", str(file), "--seed", "1"]
+    assert jobs[2].arguments()[:2] == ["train", "ppo/cartpole/mlp"]
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -63,9 +65,9 @@ def test_sweep_resumes_runs_and_leaves_complete_ones(tmp_path, capsys):
     for job in jobs:
         begin(job.folder, job.recipe)
     with Run.open(jobs[0].folder) as run:  # complete already
-        run.recipe.train(run)
-        run.save_evaluation(run.recipe.evaluate(run))
-        run.plot()
+        runner.train(run.recipe, run)
+        run.save_evaluation(runner.evaluate(run))
+        plot_run(run)
     before = (jobs[0].folder / "evaluation.json").stat().st_mtime_ns
     assert [job.is_complete() for job in jobs] == [True, False, False]
     assert sweep.run_jobs(jobs, workers=2) == []
@@ -119,7 +121,7 @@ def test_a_run_that_another_sweep_began_first_is_no_failure(completes, tmp_path,
             other.__enter__()
         return subprocess.Popen([sys.executable, "-c", f"raise SystemExit({codes.pop(0)})"])
 
-    def at_work(running):
+    def count_begun(running):
         if len(codes) == 1 and not running:
             other.__exit__()
         return len(running)
@@ -127,7 +129,7 @@ def test_a_run_that_another_sweep_began_first_is_no_failure(completes, tmp_path,
     if completes:  # before this sweep sees its own worker end
         monkeypatch.setattr(sweep.Job, "is_in_use", lambda job: False)
         monkeypatch.setattr(sweep.Job, "is_complete", lambda job: len(codes) == 1)
-    assert sweep.run_jobs([job], workers=1, start=start, at_work=at_work) == []
+    assert sweep.run_jobs([job], workers=1, start=start, count_begun=count_begun) == []
     assert len(codes) == completes
 
 
@@ -165,7 +167,7 @@ def test_ctrl_c_stops_every_worker(tmp_path, number):
     process.send_signal(number)
     _, errors = process.communicate(timeout=90)
     assert process.returncode == 130
-    assert "the same command goes on" in errors
+    assert "the same command resumes it" in errors
     assert list((job.folder / "checkpoints").iterdir())
     with Run.open(job.folder):  # nobody is at work there any more
         pass

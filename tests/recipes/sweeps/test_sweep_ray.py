@@ -115,7 +115,7 @@ def test_a_sweep_goes_on_after_its_driver_was_killed_and_stops_at_ctrl_c(
     steps = [row["step"] for row in read_metrics(long.folder / "metrics.csv")]
     assert steps == [64 * (i + 1) for i in range(len(steps))]  # none lost, none twice
     assert checkpoint_steps(long.folder / "checkpoints")[-1] == steps[-1]
-    assert "stopped; go on: " in long.log.read_text()
+    assert "stopped; to resume: " in long.log.read_text()
     assert queued.log.read_text() == ""
 
 

@@ -15,19 +15,19 @@ from tqdm import tqdm
 
 from recipes.cli import main
 from recipes.ppo import PPO
-from recipes.recipe import recipe_from_json, recipe_to_json
+from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
 from recipes.run import Run
 from recipes.sweeps.search_space import load_space, with_values
 from recipes.sweeps.tune import Search, Settings
-from torchrl_tit.networks import MLPConfig
+from torchrl_tit.settings.networks import mlp
 
 optuna = pytest.importorskip("optuna")
 
 RECIPE = PPO(
     name="ppo/cartpole/mine",
     env="CartPole-v1",
-    backbone=MLPConfig(),
+    backbone=mlp(),
     total_steps=256,
     steps_per_batch=64,
     epochs=1,
@@ -37,7 +37,7 @@ RECIPE = PPO(
 SPACE = {
     "learning_rate": {"type": "float", "low": 1e-4, "high": 1e-2, "log": True},
     "epochs": {"type": "int", "low": 1, "high": 2},
-    "backbone.hidden_dim": {"type": "categorical", "choices": [8, 16]},
+    "backbone.history.hidden_dim": {"type": "categorical", "choices": [8, 16]},
 }
 
 
@@ -149,8 +149,8 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, monkeypatch):
     [
         ({"learning_rat": {"type": "float", "low": 0, "high": 1}}, "unknown field 'learning_rat'"),
         (
-            {"backbone.depth": {"type": "int", "low": 0, "high": 1}},
-            "unknown field 'backbone.depth'",
+            {"backbone.history.depth": {"type": "int", "low": 0, "high": 1}},
+            "unknown field 'backbone.history.depth'",
         ),
         ({"seed": {"type": "int", "low": 0, "high": 1}}, "unknown field 'seed'"),
         ({"epochs": {"type": "int", "low": 0, "high": 3}}, "epochs must be at least 1, not 0"),
@@ -175,11 +175,11 @@ def test_bad_spaces_are_refused_before_anything_runs(space, message, files, caps
 def test_values_that_do_not_go_together_fail_the_trial_only(tmp_path):
     recipe = get_recipe("ppo/cartpole/enhanced-tit")
     (tmp_path / "space.json").write_text(
-        json.dumps({"backbone.num_heads_outer": {"type": "categorical", "choices": [1, 3]}})
+        json.dumps({"backbone.history.num_heads": {"type": "categorical", "choices": [1, 3]}})
     )
     space = load_space(tmp_path / "space.json", recipe)
     search = Search(tmp_path / "out", Settings(recipe, space))
-    search.study.enqueue_trial({"backbone.num_heads_outer": 3})  # does not divide the width
+    search.study.enqueue_trial({"backbone.history.num_heads": 3})  # does not divide the width
     assert search.run(1, workers=1) == [0]
     assert "width 32" in (tmp_path / "out/trial-0/error.log").read_text()
 
@@ -270,5 +270,5 @@ def test_every_default_space_fits_its_recipes(name):
 
 
 def test_other_algorithms_need_a_space():
-    with pytest.raises(ValueError, match="no search space comes with the algorithm dt"):
+    with pytest.raises(ValueError, match="there is no default search space for the algorithm dt"):
         load_space(None, get_recipe("dt/hopper-medium-v2/dt"))

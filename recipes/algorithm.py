@@ -1,0 +1,183 @@
+"""The contract of algorithms: everything in an experiment except the training loop."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_tit.settings import resolve
+
+from .outcomes import Outcome
+from .recipe import Recipe
+
+RecipeT = TypeVar("RecipeT", bound=Recipe)
+
+
+class Stateful(Protocol):
+    """An object whose state a checkpoint stores: a module, an optimizer, a replay buffer."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the state."""
+
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> Any:
+        """Restores a state."""
+
+
+class NotFiniteError(FloatingPointError):
+    """A loss, a gradient or a weight became NaN or infinite."""
+
+
+class Algorithm(ABC, Generic[RecipeT]):
+    """Networks, data and update of an experiment.
+
+    The constructor builds only the networks, which is enough for evaluation. :meth:`prepare` builds
+    the rest. The runner (:mod:`recipes.runner`) has the only loop: it takes a batch, calls
+    :meth:`update`, and handles what all experiments share (progress, metrics, checkpoints, resume,
+    interrupts, evaluation).
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if the networks cannot be built with these settings.
+    """
+
+    columns: Sequence[str]
+    """Names of the numbers that an update returns: columns of the metrics."""
+    optional_columns: Sequence[str] = ()
+    """The columns that may be NaN, because there is nothing to measure yet."""
+
+    def __init__(self, recipe: RecipeT) -> None:
+        self.recipe = recipe
+        self.device = torch_device(recipe.device)
+
+    @property
+    @abstractmethod
+    def policy(self) -> TensorDictModuleBase:
+        """The policy, which acts in the environments of :meth:`make_env`."""
+
+    @abstractmethod
+    def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
+        """Builds the environment with everything that the policy reads.
+
+        Args:
+            num_envs: number of environments.
+            seed: seed of the first environment; environment i has seed + i.
+            **settings: further settings of the task, such as ``render_mode="rgb_array"``.
+        """
+
+    @abstractmethod
+    def networks(self) -> Stateful:
+        """Returns the networks with all weights, for evaluation and checkpoints."""
+
+    @abstractmethod
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds what training needs besides the networks: optimizers, data, environments.
+
+        Afterwards, networks are in training mode if batches come from a data set, and in evaluation
+        mode, without dropout, if the policy collects them.
+
+        Args:
+            step: number of steps done so far: 0, or more if a run is resumed.
+            folder: the run folder, where the algorithm may store data.
+        """
+
+    @abstractmethod
+    def batches(self) -> Iterator[Any]:
+        """Yields the batch of each update."""
+
+    def size(self, batch: Any) -> int:
+        """Returns the number of steps in a batch; by default, a batch is one gradient step."""
+        return 1
+
+    @abstractmethod
+    def update(self, batch: Any, step: int) -> Mapping[str, Tensor | float]:
+        """Updates the networks on a batch.
+
+        Args:
+            batch: what :meth:`batches` yielded.
+            step: number of steps done before.
+
+        Returns:
+            A number for each of ``columns``, float [].
+
+        Raises:
+            NotFiniteError: if a loss, a gradient or a weight is not finite.
+        """
+
+    @abstractmethod
+    def state(self) -> Mapping[str, Stateful]:
+        """Returns what a checkpoint stores besides the networks, to resume a run bit for bit."""
+
+    def returns(self, batch: Any) -> Tensor | None:
+        """Gets the returns of episodes that ended in a batch, float [episodes]; None if offline."""
+        return None
+
+    @abstractmethod
+    def play(self, step: int) -> list[Outcome]:
+        """Evaluates the current weights, for each target return if there are any.
+
+        Args:
+            step: number of steps done so far.
+        """
+
+    def check(self) -> None:
+        """Lets the policy act once, and makes other cheap checks before a run starts.
+
+        Raises:
+            ValueError: if environment, networks and data do not match.
+        """
+        with closing(self.make_env(1, self.recipe.seed)) as env, torch.no_grad():
+            self.policy(env.reset())
+
+    def close(self) -> None:
+        """Closes the environments and processes that :meth:`prepare` started."""
+
+
+def make_algorithm(recipe: Recipe) -> Algorithm[Any]:
+    """Builds the algorithm of a recipe.
+
+    Raises:
+        ValueError: if its networks cannot be built with these settings.
+    """
+    try:
+        return resolve(recipe.builds)(recipe)
+    except TypeError as error:  # a kind of observation, say, that no network here reads
+        raise ValueError(str(error)) from error
+
+
+def torch_device(device: str) -> torch.device:
+    """Returns the PyTorch device for a recipe's ``device``.
+
+    Raises:
+        ValueError: if there is no such device.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device is 'cuda', but PyTorch finds no GPU: use 'cpu' or 'auto'")
+    if device == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return torch.device(device)
+
+
+def check_finite(names: Sequence[str], values: Tensor) -> None:
+    """Checks that values are finite.
+
+    Args:
+        names: names of the values.
+        values: float [names].
+
+    Raises:
+        NotFiniteError: if one is not; the message names the first.
+    """
+    finite = values.isfinite()
+    if not finite.all():
+        index = int(finite.logical_not().nonzero()[0])
+        raise NotFiniteError(f"{names[index]} became {values[index].item()}")

@@ -1,0 +1,83 @@
+"""Reading a command's arguments, and reporting in one line what is wrong with them."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import sys
+from contextlib import redirect_stderr
+from dataclasses import make_dataclass, replace
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ..recipe import Recipe
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that reports errors as the rest of the command line does."""
+
+    def error(self, message: str) -> NoReturn:
+        """Ends the program with one line that says what is wrong with the arguments."""
+        fail(f"{message} (see `{self.prog} --help`)")
+
+
+def add_machine_options(parser: argparse.ArgumentParser) -> None:
+    """Adds the options that say where to compute, which may differ from the recipe's."""
+    parser.add_argument("--device", choices=["cpu", "cuda", "auto"], help="default: the recipe's")
+    parser.add_argument("--threads", type=int, help="default: the recipe's")
+
+
+def override(recipe: Recipe, **fields: Any) -> Recipe:
+    """Returns the recipe with the given fields replaced; None leaves a field as it is."""
+    return replace(recipe, **{key: value for key, value in fields.items() if value is not None})
+
+
+def parse_fields(
+    fields: list[Any], arguments: list[str], command: str, description: str | None
+) -> Any:
+    """Reads dataclasses from the command line.
+
+    Args:
+        fields: what to read, as :func:`dataclasses.make_dataclass` takes it.
+        arguments: the arguments after the command's name.
+        command: the command, for the help.
+        description: the text at the start of the help.
+    """
+    import tyro  # takes half a second, which commands without such fields save
+
+    settings = make_dataclass("settings", fields)
+    errors = io.StringIO()
+    try:
+        with redirect_stderr(errors):
+            return tyro.cli(
+                tyro.conf.AvoidSubcommands[settings],  # type: ignore[misc, valid-type]
+                args=arguments,
+                prog=f"{program()} {command}",
+                description=description,
+            )
+    except SystemExit as stop:
+        if stop.code:
+            fail(_unboxed(errors.getvalue()))
+        raise
+
+
+def _unboxed(message: str) -> str:
+    """Turns tyro's box into one sentence: the reason, and similar options if there are any."""
+    lines = [line.strip("│ ") for line in message.splitlines()]
+    reason = " ".join(takewhile(lambda line: line[:1] not in "─╰", lines[1:]))
+    similar = [line.split()[0] for line in lines if line.startswith("--") and line != "--help"]
+    hint = f"; did you mean {' or '.join(similar)}?" if "Perhaps you meant" in message else ""
+    return (reason or message) + hint
+
+
+def program() -> str:
+    """Returns what users type to start this program."""
+    name = Path(sys.argv[0]).name
+    return "python -m recipes" if name == "__main__.py" else name
+
+
+def fail(message: str) -> NoReturn:
+    """Ends the program with one line that gives the reason."""
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(2)

@@ -1,0 +1,63 @@
+"""`compare` and `table`: several runs side by side."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from torchrl_tit.files import write_text_atomic
+
+from ..recipe import Recipe
+from ..results.plot import plot_comparison, plot_table
+from ..results.table import make_table, to_csv, to_markdown
+from ..run import Run
+from .arguments import Parser, fail, program
+
+
+def compare(arguments: list[str]) -> None:
+    """Plots learning curves of several runs."""
+    parser = Parser(f"{program()} compare")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders")
+    parser.add_argument("--out", type=Path, default=Path("comparison.png"), help="PNG to write")
+    parser.add_argument("--title", default="", help="title of the figure")
+    options = parser.parse_args(arguments)
+    if options.out.suffix != ".png":
+        fail(f"--out {options.out} must end in .png: the figure is a PNG")
+    seeds: dict[Recipe, list[Path]] = {}  # runs of the same settings
+    for folder in dict.fromkeys(options.runs):
+        seeds.setdefault(replace(Run.open(folder).recipe, seed=0), []).append(folder)
+    offline = {recipe.offline for recipe in seeds}
+    if len(offline) > 1:
+        fail(
+            "environment steps and gradient steps do not share an axis: compare such runs "
+            "separately"
+        )
+    names = [recipe.name for recipe in seeds]
+    curves = {}
+    for recipe, folders in seeds.items():
+        name = recipe.name
+        if not name or names.count(name) > 1:
+            name = f"{name} {folders[0]}".lstrip()
+        curves[name] = [folder / "metrics.csv" for folder in folders]
+    plot_comparison(curves, options.out, title=options.title, offline=offline.pop())
+    print(f"written to {options.out}")
+
+
+def table(arguments: list[str]) -> None:
+    """Prints the paper's tables with the runs in folders."""
+    parser = Parser(f"{program()} table")
+    parser.add_argument("folders", type=Path, nargs="+", help="folders that contain run folders")
+    parser.add_argument("--format", choices=["md", "csv"], default="md", help="format to print")
+    parser.add_argument("--out", type=Path, help="folder for table.md, table.csv and table.png")
+    options = parser.parse_args(arguments)
+    cells, notes = make_table(options.folders)
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+    print(to_csv(cells) if options.format == "csv" else to_markdown(cells), end="")
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(options.out / "table.md", to_markdown(cells))
+        write_text_atomic(options.out / "table.csv", to_csv(cells))
+        plot_table(cells, options.out / "table.png")
+        print(f"written to {options.out}")

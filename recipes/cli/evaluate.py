@@ -1,0 +1,63 @@
+"""`evaluate` and `render`: a trained run plays episodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ..recipe import Recipe
+from .arguments import Parser, add_machine_options, fail, override, program
+
+
+def evaluate(arguments: list[str]) -> None:
+    """Evaluates the newest checkpoint of a run."""
+    parser = Parser(f"{program()} evaluate")
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("--episodes", type=int, help="episodes; default: the recipe's")
+    parser.add_argument("--seed", type=int, help="seed of the first episode; default: the recipe's")
+    parser.add_argument("--out", type=Path, help="file to write; default: RUN/evaluation.json")
+    add_machine_options(parser)
+    options = parser.parse_args(arguments)
+    from .. import runner  # not at the top: help needs no PyTorch
+    from ..run import Run
+
+    run = Run.open(options.run)
+    recipe = override(
+        run.recipe,
+        evaluation_episodes=options.episodes,
+        evaluation_seed=options.seed,
+        device=options.device,
+        threads=options.threads,
+    )
+    if options.out is not None and not options.out.absolute().parent.is_dir():
+        fail(f"--out {options.out} cannot be written: there is no folder {options.out.parent}")
+    evaluation = runner.evaluate(run, recipe)
+    path = run.save_evaluation(evaluation, options.out)
+    print(f"{one_line(recipe, evaluation)}\nwritten to {path}")
+
+
+def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
+    """Returns an evaluation in one line."""
+    return (
+        f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
+        f"{evaluation['episodes']} episodes after {evaluation['steps']} steps"
+    )
+
+
+def render(arguments: list[str]) -> None:
+    """Films the agent of a run."""
+    parser = Parser(f"{program()} render")
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("--out", type=Path, required=True, help="new file: .gif or .mp4")
+    parser.add_argument("--episodes", type=int, default=1, help="episodes, or whole Atari games")
+    parser.add_argument(
+        "--seed", type=int, help="seed of the first episode; default: the evaluation's"
+    )
+    options = parser.parse_args(arguments)
+    from ..results.film import film  # not at the top: help needs no PyTorch
+    from ..run import Run
+
+    run = Run.open(options.run)
+    recipe = override(run.recipe, evaluation_seed=options.seed)
+    returns = film(recipe, run, options.out, options.episodes)
+    print(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")

@@ -1,0 +1,27 @@
+"""`list` and `show`: the named recipes."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+
+from ..recipe_json import recipe_to_json
+from ..registry import RECIPES, find_recipe
+from .arguments import Parser, fail, program
+
+
+def list_recipes(arguments: list[str]) -> None:
+    """Prints the names of recipes."""
+    parser = Parser(f"{program()} list")
+    parser.add_argument("pattern", nargs="?", default="", help="part of a name; * is any text")
+    pattern = parser.parse_args(arguments).pattern
+    names = [name for name in RECIPES if fnmatchcase(name, f"*{pattern.lower()}*")]
+    if not names:
+        fail(f"no recipe's name contains {pattern!r}: `{program()} list` prints all names")
+    print("\n".join(names))
+
+
+def show(arguments: list[str]) -> None:
+    """Prints a recipe as JSON."""
+    parser = Parser(f"{program()} show")
+    parser.add_argument("name", help="name of a recipe, or a JSON file")
+    print(recipe_to_json(find_recipe(parser.parse_args(arguments).name)), end="")

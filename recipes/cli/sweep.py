@@ -1,0 +1,100 @@
+"""`sweep` and `tune`: many runs at once."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from ..algorithm import make_algorithm
+from ..registry import find_recipe
+from ..sweeps.sweep import make_jobs, run_jobs
+from .arguments import Parser, fail, program
+
+
+def sweep(arguments: list[str]) -> None:
+    """Trains recipes with seeds."""
+    parser = Parser(f"{program()} sweep")
+    parser.add_argument(
+        "names",
+        nargs="+",
+        help="names of recipes, patterns such as 'ppo/*/mlp', or JSON files with a recipe",
+    )
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each recipe")
+    parser.add_argument(
+        "--workers",
+        type=int,
+        help="runs at a time, each in a process; default: 1, on Ray as many as it has room for",
+    )
+    parser.add_argument(
+        "--ray", metavar="ADDRESS", help="run on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT"
+    )
+    parser.add_argument("--out", type=Path, default=Path("runs/sweep"), help="folder of the runs")
+    options = parser.parse_args(arguments)
+    if options.workers is not None and options.workers < 1:
+        fail(f"--workers must be at least 1, not {options.workers}")
+    jobs = make_jobs(options.names, options.seeds, options.out)
+    try:
+        if options.ray is None:
+            failed = run_jobs(jobs, options.workers or 1)
+        else:
+            # Not at the top: Ray is an extra.
+            from ..sweeps.sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
+
+            connect(options.ray)
+            for note in find_unmet_needs(jobs):
+                print(f"note: {note}", file=sys.stderr)
+            failed = run_jobs(jobs, options.workers or len(jobs), RayWorker, count_begun)
+    except KeyboardInterrupt:
+        print("stopped; the same command resumes it", file=sys.stderr)
+        raise
+    if failed:
+        fail(
+            f"{len(failed)} of {len(jobs)} runs failed, see {', '.join(str(j.log) for j in failed)}"
+        )
+    print(f"{len(jobs)} runs are complete in {options.out}")
+
+
+def tune(arguments: list[str]) -> None:
+    """Searches for the best values of a recipe's fields."""
+    parser = Parser(f"{program()} tune")
+    parser.add_argument("name", help="name of a recipe, or a JSON file")
+    parser.add_argument("--space", type=Path, help="JSON file with the search space")
+    parser.add_argument("--trials", type=int, default=50, help="trials of the whole search")
+    parser.add_argument("--workers", type=int, default=1, help="trials at a time, each a process")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each trial")
+    parser.add_argument(
+        "--startup-trials", type=int, default=5, help="trials that run before any is pruned"
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the search")
+    options = parser.parse_args(arguments)
+    for name in ("trials", "workers", "startup_trials"):
+        if getattr(options, name) < 1:
+            fail(f"--{name.replace('_', '-')} must be at least 1, not {getattr(options, name)}")
+    try:
+        # Not at the top: Optuna is an extra.
+        from ..sweeps.search_space import load_space
+        from ..sweeps.tune import Search, Settings
+    except ModuleNotFoundError as error:
+        raise ValueError("tune needs Optuna: pip install 'torchrl-tit[tune]'") from error
+    recipe = find_recipe(options.name)
+    make_algorithm(recipe).check()
+    settings = Settings(
+        recipe,
+        load_space(options.space, recipe),
+        seeds=tuple(dict.fromkeys(options.seeds)),
+        startup_trials=options.startup_trials,
+    )
+    search = Search(options.out, settings)
+    try:
+        failed = search.run(options.trials, options.workers)
+    except KeyboardInterrupt:
+        print("stopped; the same command resumes it", file=sys.stderr)
+        raise
+    best = search.best()
+    if failed:
+        print(f"note: trials {failed} failed: see trial-N/*.log in {options.out}", file=sys.stderr)
+    if best is None:
+        fail(f"no trial in {options.out} is complete")
+    values = ", ".join(f"{field} {value}" for field, value in best.params.items())
+    print(f"best of {len(search.study.trials)} trials: {best.value:.1f} with {values}")
+    print(f"its recipe: {options.out / 'best.json'}")

@@ -1,0 +1,77 @@
+"""A run from start to end: training, evaluation, learning curve."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from pathlib import Path
+
+from .. import runner
+from ..algorithm import make_algorithm
+from ..recipe import Recipe
+from ..results.plot import plot_run
+from ..run import Run
+from .arguments import override, program
+from .evaluate import one_line
+
+
+def start(recipe: Recipe, folder: Path | None) -> None:
+    """Starts a run; nothing is written where its recipe cannot be run.
+
+    Args:
+        recipe: the recipe.
+        folder: the run folder to make; runs/NAME/seed-SEED-DATE where None.
+    """
+    make_algorithm(recipe).check()
+    _finish(Run.create(folder or _make_folder(recipe), recipe))
+
+
+def resume(folder: Path, device: str | None = None, threads: int | None = None) -> None:
+    """Resumes a run.
+
+    Args:
+        folder: the run folder.
+        device: where to compute, if not where the recipe says.
+        threads: PyTorch's threads, if not as many as the recipe says.
+    """
+    run = Run.open(folder)
+    run.recipe = override(run.recipe, device=device, threads=threads)
+    if changes := run.version_changes():
+        print(f"note: versions changed since the start: {'; '.join(changes)}", file=sys.stderr)
+    _finish(run)
+
+
+def _finish(run: Run) -> None:
+    """Does what is left to do of a run."""
+    recipe, folder = run.recipe, run.folder
+    with run:
+        if run.is_complete():
+            print(f"{folder} is complete: trained for {recipe.final_step} steps and evaluated")
+            return
+        try:
+            runner.train(recipe, run)
+            evaluation = runner.evaluate(run)
+        except KeyboardInterrupt:
+            command = f"{program()} train --resume {shlex.quote(str(folder))}"
+            print(f"stopped; to resume: {command}", file=sys.stderr)
+            raise
+        run.save_evaluation(evaluation)
+        plot_run(run)
+    print(one_line(recipe, evaluation))
+    print(f"run folder: {folder}\nlearning curve: {run.curve}")
+
+
+def _make_folder(recipe: Recipe) -> Path:
+    """Makes a new folder at once, so that runs that start in the same second get one each."""
+    name = recipe.name or recipe.algorithm
+    base = Path("runs", name, f"seed-{recipe.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
+    base.parent.mkdir(parents=True, exist_ok=True)
+    folder, number = base, 1
+    while True:
+        try:
+            folder.mkdir()
+            return folder
+        except FileExistsError:
+            number += 1
+            folder = base.with_name(f"{base.name}-{number}")

@@ -1,0 +1,70 @@
+"""`data collect`: data sets of a task, made the way D4RL's were."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import filelock
+import torch
+from gymnasium.spaces import Box, Discrete
+
+from torchrl_tit.datasets import task_spaces
+
+from .find_agent import find_agent
+from .output_folder import claim_folder
+from .set_maker import SetMaker
+from .settings import KINDS, Collection
+
+
+def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
+    """Makes data sets in a folder, except those that are there already.
+
+        settings.json             settings, recipe, versions and command
+        training/                 the agent's run folder, from which training resumes
+        random.hdf5, random-v0/   a data set in D4RL's layout, and the same as a Minari data set
+        mixed.hdf5, mixed-v0/ ...
+
+    What a killed process had finished is not repeated, and the data are those of one that was not
+    killed (for games, whose state cannot be saved, others of the same kind).
+
+    Args:
+        settings: what to make.
+        folder: where; made where missing.
+        command: the command line, which is recorded in the data.
+
+    Returns:
+        A line for each set.
+
+    Raises:
+        ValueError: if the settings are not possible, the folder holds sets with others, or a mark
+            is never reached. What was made before stays.
+        FileExistsError: if the folder holds anything else.
+        RuntimeError: if another process uses the folder.
+        OSError: if something cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> settings = Collection(env="CartPole-v1", sets=("random",), transitions=100)
+        >>> [line] = collect(settings, Path(tempfile.mkdtemp()))
+        >>> line.split(" transitions")[0]
+        'random: 1...'
+    """
+    torch.set_num_threads(settings.threads)
+    task = task_spaces(settings.env)
+    if not (isinstance(task.observation, Box) and isinstance(task.action, Box | Discrete)):
+        raise ValueError(
+            f"{settings.env} has observations {task.observation} and actions {task.action}, but "
+            "data can be collected of one array (Box) and of an array or one choice (Discrete)"
+        )
+    agent = find_agent(settings, folder / "training", task.action)
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with filelock.FileLock(folder / ".lock", timeout=0):
+            recipe = None if agent is None else agent.recipe
+            provenance = claim_folder(folder, settings, recipe, command)
+            maker = SetMaker(settings, folder, task, agent, provenance)
+            return [maker.make(kind) for kind in KINDS if kind in settings.sets]
+    except filelock.Timeout as error:
+        raise RuntimeError(
+            f"{folder} is in use by another process: wait for it, or stop it"
+        ) from error

@@ -1,0 +1,84 @@
+"""Which agent the settings name."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from gymnasium import Space
+
+from torchrl_tit.settings.networks import mlp
+
+from ..algorithm import make_algorithm
+from ..recipe import Recipe
+from ..registry import find_recipe
+from ..run import Run
+from ..sac import SAC
+from .agent import Agent, FinishedRun
+from .agent_in_training import AgentInTraining
+from .settings import Collection
+
+
+def find_agent(settings: Collection, folder: Path, action_space: Space) -> Agent | None:
+    """Finds the agent that the settings name, and checks that it fits the task.
+
+    Args:
+        settings: what is collected.
+        folder: where an agent is trained; not touched here.
+        action_space: the task's.
+
+    Returns:
+        The agent; None where no set needs one.
+
+    Raises:
+        ValueError: if there is none of that name, or it does not fit the task or the sets.
+        FileNotFoundError: if it is a run without a checkpoint, or a JSON file that does not exist.
+    """
+    if set(settings.sets) == {"random"}:
+        return None
+    if (Path(settings.agent) / "recipe.json").is_file():
+        run = Run.open(Path(settings.agent))
+        _check(run.recipe, settings.env)
+        return FinishedRun(run, settings)
+    recipe = _default_sac(settings) if settings.agent == "sac" else find_recipe(settings.agent)
+    _check(recipe, settings.env)
+    algorithm = make_algorithm(_adapted(recipe, settings))
+    algorithm.check()
+    return AgentInTraining(algorithm, settings, folder, action_space)
+
+
+def _default_sac(settings: Collection) -> SAC:
+    """SAC's defaults, with the networks of the agents whose data D4RL is made of."""
+    backbone = mlp(hidden_dim=256, activation="relu")
+    return SAC(name="sac", env=settings.env, backbone=backbone, total_steps=settings.total_steps)
+
+
+def _adapted(recipe: Recipe, settings: Collection) -> Recipe:
+    """The recipe with the collection's seed, threads and checkpoints, and a single collector."""
+    # The batches of several collectors do not continue one another.
+    single: dict[str, Any] = {"collectors": 1, "async_collection": False}
+    names = {field.name for field in fields(recipe)}
+    return replace(
+        recipe,
+        seed=settings.seed,
+        threads=settings.threads,
+        checkpoint_interval=settings.checkpoint_interval,
+        **{name: value for name, value in single.items() if name in names},
+    )
+
+
+def _check(recipe: Recipe, env: str) -> None:
+    """Raises ValueError where a recipe's data are not those of a task."""
+    problem = None
+    if recipe.offline:
+        problem = "is trained on a data set, not in its task"
+    elif recipe.env != env:
+        problem = f"is of the task {recipe.env}, not {env}"
+    elif getattr(recipe, "hide_velocities", False):
+        problem = "hides the velocities, which the data should have"
+    if problem:
+        name = recipe.name or f"of {recipe.algorithm}"
+        raise ValueError(
+            f"the recipe {name} {problem}: choose sac, or another ppo or sac recipe, with --agent"
+        )

@@ -1,0 +1,136 @@
+"""Settings of conservative Q-learning; the algorithms are in algorithm.py and discrete.py."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from torchrl_tit.settings.checks import check_at_least, check_at_most, check_positive
+
+from ..dataset_recipe import DatasetRecipe
+from ..recipe import Compile, Padding
+
+
+@dataclass(frozen=True, kw_only=True)
+class QRecipe(DatasetRecipe):
+    """Settings of every recipe that learns Q values from a data set."""
+
+    padding: Padding = "same"
+    """What fills a history before the first observation: that observation, or zeros."""
+    total_updates: int = 500_000
+    """Gradient steps to train for."""
+    batch_size: int = 256
+    """Transitions in one gradient step, sampled with replacement."""
+    gamma: float = 0.99
+    """Discount factor."""
+    tau: float = 0.005
+    """Step of the target networks towards the networks at each gradient step, from 0 to 1."""
+    conservative_weight: float = 5.0
+    """Weight of the conservative term."""
+    adam_eps: float = 1e-8
+    """Epsilon of Adam."""
+    time_limits: Literal["keep", "drop"] = "drop"
+    """Whether to keep the last transition of an episode that a time limit truncated. d3rlpy 1.1.1,
+    which the paper used, dropped it."""
+    terminal_observations: Literal["keep", "zero"] = "zero"
+    """Whether to keep terminal observations, or zero them as d3rlpy 1.1.1 did. No loss reads
+    them."""
+    unfinished: Literal["keep", "drop"] = "drop"
+    """Whether to keep an episode without an end, where the data stop."""
+    evaluation_interval: int = 1000
+    """Gradient steps between evaluations."""
+    evaluation_episodes: int = 10
+    """Number of episodes in an evaluation, played side by side."""
+    compile: Compile = "auto"
+    """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
+    at the start. "auto" compiles if the run is long enough to be worth it. On a CPU, continuous CQL
+    compiles only the policy, because compiling does not speed up the critics' matrix products.
+    Discrete CQL is compiled only on a GPU."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(
+            self,
+            total_updates=1,
+            gamma=0,
+            tau=0,
+            conservative_weight=0,
+            adam_eps=0,
+            evaluation_interval=1,
+        )
+        check_at_most(self, gamma=1, tau=1)
+        if self.backbone.carries_state:
+            raise ValueError(
+                f"{self.algorithm} draws single transitions, so its network cannot carry a state: "
+                "set backbone.num_frames to 2 or more, or use a ppo recipe"
+            )
+
+    @property
+    def final_step(self) -> int:
+        """Gradient steps of the whole run."""
+        return self.total_updates
+
+    def evaluation_due(self, step: int) -> bool:
+        """Returns whether to evaluate after a number of gradient steps."""
+        return step % self.evaluation_interval == 0 or step == self.total_updates
+
+
+@dataclass(frozen=True, kw_only=True)
+class CQL(QRecipe, algorithm="cql", builds=f"{__package__}.algorithm:CQLAlgorithm"):
+    """Conservative Q-learning (arXiv 2006.04779) on a data set with continuous actions.
+
+    The defaults are those of d3rlpy 1.1.1, with which arXiv 2212.14538 trained CQL_TIT.
+    """
+
+    actor_learning_rate: float = 1e-4
+    """Learning rate of Adam for the actor."""
+    critic_learning_rate: float = 3e-4
+    """Learning rate of Adam for the critics."""
+    temperature_learning_rate: float = 1e-4
+    """Learning rate of Adam for the temperature."""
+    temperature_init: float = 1.0
+    """Weight of the entropy at the start."""
+    action_samples: int = 10
+    """Actions sampled in each state from each of: uniform, the policy at s, the policy at s'."""
+    over_critics: Literal["mean", "sum"] = "mean"
+    """Whether the conservative term is the mean over the two critics, as in d3rlpy 1.1.1, or their
+    sum, as in d3rlpy since 2.5."""
+    critic: Literal["mlp", "backbone"] = "mlp"
+    """Whether the critics read the newest observation, or each has a backbone with the actor's
+    settings."""
+    critic_hidden: tuple[int, ...] = (256, 256, 256)
+    """Widths of the critics' hidden layers."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(
+            self,
+            actor_learning_rate=0,
+            critic_learning_rate=0,
+            temperature_learning_rate=0,
+            action_samples=1,
+        )
+        check_positive(self, "temperature_init")
+        if not self.critic_hidden or min(self.critic_hidden) < 1:
+            raise ValueError(
+                f"critic_hidden must be at least one width of at least 1, not {self.critic_hidden}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscreteCQL(
+    QRecipe, algorithm="discrete-cql", builds=f"{__package__}.discrete:DiscreteCQLAlgorithm"
+):
+    """Conservative Q-learning (arXiv 2006.04779) with a value for each action, on TorchRL's loss.
+
+    The squared error is halved, as in TorchRL. The paper ran no discrete task offline.
+    """
+
+    conservative_weight: float = 1.0
+    """Weight of the conservative term."""
+    learning_rate: float = 3e-4
+    """Learning rate of Adam."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(self, learning_rate=0)

@@ -1,0 +1,258 @@
+"""What Decision Transformer and Online Decision Transformer share: network, task and data."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, TypeVar
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import Bounded, Categorical
+from torchrl.envs import Compose, EnvBase, ObservationNorm, TargetReturn
+
+from torchrl_tit.datasets import Episodes, SequenceStorage, load_episodes
+from torchrl_tit.envs import make_env, time_limit
+from torchrl_tit.evaluation import evaluate
+from torchrl_tit.modules import DTHead, make_dt_actor
+from torchrl_tit.networks import HistoryNetwork, build_network
+from torchrl_tit.transforms import SequenceHistory
+
+from ..dataset_algorithm import DatasetAlgorithm
+from ..outcomes import Outcome
+from .settings import SequenceRecipe
+
+RecipeT = TypeVar("RecipeT", bound=SequenceRecipe)
+
+
+class Agent(nn.Module):
+    """Network and head, with the statistics that normalise observations.
+
+    Args:
+        network: predicts features.
+        head: makes actions of them.
+        observation_shape: shape of an observation.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self, network: HistoryNetwork, head: DTHead, observation_shape: Sequence[int]
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.head = head
+        self.register_buffer("mean", torch.zeros(observation_shape))
+        self.register_buffer("std", torch.ones(observation_shape))
+
+
+class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
+    """An algorithm that trains a Decision Transformer on windows of a data set.
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if the task does not fit the network.
+    """
+
+    action_padding = -10.0
+    """Value of the actions at padding; no loss reads it."""
+
+    def __init__(self, recipe: RecipeT) -> None:
+        super().__init__(recipe)
+        task = make_env(recipe.env, clip_actions=False)
+        spec = task.observation_spec["observation"]
+        shape = spec.shape[1:]
+        self.normalizes = spec.dtype.is_floating_point
+        """Whether observations are normalised; uint8 images, which networks divide by 255, are
+        not."""
+        self.action_dim = _check_task(recipe, task.action_spec_unbatched)
+        task.close()
+        network = build_network(recipe.backbone, shape, action_dim=self.action_dim, trunks="shared")
+        assert isinstance(network, HistoryNetwork)
+        head = DTHead(network.features_dim, self.action_dim, recipe.action_space)
+        self.agent = Agent(network, head, shape).to(self.device).eval()
+        self._policy = make_dt_actor(network, head)
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """A window of the last steps in, the newest step's action out."""
+        return self._policy
+
+    def networks(self) -> nn.Module:
+        """Network and head, with the statistics of the data."""
+        return self.agent
+
+    def make_env(
+        self,
+        num_envs: int,
+        seed: int | None = None,
+        *,
+        target_return: float | None = None,
+        **settings: Any,
+    ) -> EnvBase:
+        """Builds the task with all that the policy reads; actions go to it as they are.
+
+        Episodes of a task without a time limit are truncated after ``max_ep_len`` steps.
+
+        Args:
+            num_envs: environments that are stepped side by side.
+            seed: of the first environment.
+            target_return: the return that the network is asked for; the recipe's first one where
+                not given.
+            **settings: of the task.
+        """
+        recipe, agent = self.recipe, self.agent
+        if time_limit(recipe.env) is None:
+            settings = {"max_episode_steps": recipe.history.max_ep_len, **settings}
+        env = make_env(
+            recipe.env,
+            num_envs,
+            seed=seed,
+            clip_actions=False,
+            device=None if self.device.type == "cpu" else self.device,
+            **settings,
+        )
+        if target_return is None:
+            target_return = recipe.target_returns[0]
+        key = "observation"
+        transforms = [TargetReturn(target_return)]
+        if self.normalizes:
+            key = "normalized_observation"  # new data keep the observation as it is
+            normalization = ObservationNorm(
+                agent.mean,
+                agent.std,
+                in_keys=["observation"],
+                out_keys=[key],
+                standard_normal=True,
+            )
+            transforms.append(normalization)
+        history = SequenceHistory(
+            recipe.acting_num_frames or recipe.backbone.num_frames,
+            return_scale=recipe.return_scale,
+            observation_key=key,
+        )
+        return env.append_transform(Compose(*transforms, history))
+
+    def load_data(self) -> Episodes:
+        """Loads the data set and takes its statistics.
+
+        Raises:
+            ValueError: if its actions are of another kind, no episode is finished, or one is longer
+                than the network allows.
+            FileNotFoundError: if there are no such data.
+        """
+        recipe = self.recipe
+        episodes = load_episodes(recipe.dataset, **recipe.reading())
+        check_data(recipe, episodes)
+        warn_of_targets(recipe.target_returns, episodes)
+        if self.normalizes:
+            mean, std = episodes.observation_statistics()
+            self.agent.mean.copy_(mean)
+            self.agent.std.copy_(std)
+        return episodes.to(self.device)
+
+    def make_storage(self, episodes: Episodes) -> SequenceStorage:
+        """Cuts normalised windows out of episodes."""
+        recipe, agent = self.recipe, self.agent
+        return SequenceStorage(
+            episodes,
+            recipe.backbone.num_frames,
+            mean=agent.mean if self.normalizes else None,
+            std=agent.std if self.normalizes else None,
+            return_scale=recipe.return_scale,
+            action_padding=self.action_padding,
+        )
+
+    def play(self, step: int) -> list[Outcome]:
+        """Plays the evaluation's episodes for each target return, side by side."""
+        recipe = self.recipe
+        return [
+            Outcome(
+                step,
+                evaluate(
+                    partial(self.make_env, target_return=target),
+                    self.policy,
+                    recipe.evaluation_episodes,
+                    seed=recipe.evaluation_seed,
+                    shrink=True,
+                ).tolist(),
+                target,
+            )
+            for target in recipe.target_returns
+        ]
+
+
+def check_data(recipe: SequenceRecipe, episodes: Episodes) -> None:
+    """Checks that a network can be trained on episodes.
+
+    Raises:
+        ValueError: if their actions are of another kind, none is finished, or one is longer than
+            the network allows.
+    """
+    dataset, settings = recipe.dataset, recipe.history
+    continuous = episodes.rows["action"].is_floating_point()
+    if continuous == (recipe.action_space == "discrete"):
+        kind = "continuous" if continuous else "discrete"
+        raise ValueError(
+            f"the actions in {dataset} are {kind} ({episodes.rows['action'].dtype}), but the "
+            f"head's are {recipe.action_space}: set action_space to {kind!r}, or use other data "
+            "(discrete actions are integers)"
+        )
+    if not episodes.finished.any():
+        raise ValueError(f"no episode in {dataset} is finished, so their returns are not known")
+    longest = int(episodes.lengths[episodes.finished].max())  # the others are not trained on
+    if settings.timestep_embedding and longest > settings.max_ep_len:
+        raise ValueError(
+            f"episodes in {dataset} have up to {longest} steps, but max_ep_len is "
+            f"{settings.max_ep_len}: raise backbone.history.max_ep_len to {longest} or more"
+        )
+
+
+def warn_of_targets(target_returns: Sequence[float], episodes: Episodes) -> None:
+    """Warns of target returns that lie outside the returns of the data's episodes."""
+    returns = episodes.returns[episodes.finished.cpu()]
+    low, high = returns.min().item(), returns.max().item()
+    outside = [target for target in target_returns if not low <= target <= high]
+    if outside:
+        warnings.warn(
+            f"target_returns {', '.join(f'{target:g}' for target in outside)}: no episode in "
+            f"{episodes.source} has such a return; they range from {low:.1f} to {high:.1f}, with a "
+            f"mean of {returns.mean().item():.1f}",
+            stacklevel=2,
+        )
+
+
+def _check_task(recipe: SequenceRecipe, action_spec: Any) -> int:
+    """Returns the entries of a continuous action, or the number of discrete ones.
+
+    Raises:
+        ValueError: if the network cannot act in the task.
+    """
+    env, settings = recipe.env, recipe.history
+    limit = time_limit(env)
+    if settings.timestep_embedding and limit is not None and limit > settings.max_ep_len:
+        raise ValueError(
+            f"episodes of {env} have up to {limit} steps, but max_ep_len is "
+            f"{settings.max_ep_len}: raise backbone.history.max_ep_len to {limit} or more"
+        )
+    discrete = isinstance(action_spec, Categorical)
+    if discrete != (recipe.action_space == "discrete"):
+        kind = "discrete" if discrete else "continuous"
+        raise ValueError(
+            f"{env} has {kind} actions, but the head's are {recipe.action_space}: set action_space "
+            f"to {kind!r}, or use another task"
+        )
+    if isinstance(action_spec, Bounded):
+        bounds = [x.flatten().tolist() for x in (action_spec.low, action_spec.high)]
+        for low, high in zip(*bounds, strict=True):
+            if (low, high) != (-1, 1):
+                raise ValueError(
+                    f"actions of {env} range from {low:g} to {high:g}, but the head's from -1 to "
+                    "1: use a task in which all of them range from -1 to 1"
+                )
+    return action_spec.space.n if discrete else action_spec.shape[0]

@@ -1,1 +1,0 @@
-"""What recipes that train on a data set share: fields, the loop of gradient steps, its state."""

@@ -1,0 +1,362 @@
+"""PPO with any backbone: collect a batch, estimate advantages, update on minibatches."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.envs import EnvBase
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from torchrl_tit.envs import make_env
+from torchrl_tit.evaluation import evaluate, finished_returns
+from torchrl_tit.layers import init_orthogonal_
+from torchrl_tit.modules import Backbone, acting, make_actor, make_value, while_acting
+from torchrl_tit.networks import build_network, masked_predictions
+from torchrl_tit.objectives import contrastive_prediction_loss
+
+from ..algorithm import Algorithm, Stateful, check_finite, torch_device
+from ..compilation import STATIC_SHAPES, autocast_type, compile_and_time, should_compile
+from ..outcomes import Outcome
+from ..stateful import CollectorState
+from .settings import PPO
+
+TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
+"""What TorchRL's loss gives, of which a row of metrics has the means."""
+
+
+class Agent(nn.Module):
+    """Backbone, actor and critic; the heads read the features that the backbone writes.
+
+    Args:
+        recipe: the settings.
+        env: the task, for its shapes and its action space.
+    """
+
+    def __init__(self, recipe: PPO, env: EnvBase) -> None:
+        super().__init__()
+        shape = env.observation_spec["observation"].shape[env.batch_dims :]
+        separate = recipe.backbone.trunks == "separate"
+        keys = ["policy_features", "value_features"] if separate else ["features"]
+        self.backbone = Backbone(build_network(recipe.backbone, shape), out_keys=keys)
+        if recipe.initialization == "orthogonal":
+            init_orthogonal_(self.backbone)
+        features_dim = self.backbone.features_dim
+        self.actor = make_actor(features_dim, env.action_spec_unbatched, in_key=keys[0])
+        self.critic = make_value(features_dim, in_key=keys[-1])
+
+    def encode(self, samples: TensorDictBase) -> TensorDictBase:
+        """Writes the features of steps [N], or where a state is carried of sequences [N, time]."""
+        with set_recurrent_mode(self.backbone.is_recurrent):
+            return self.backbone(samples)
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """History in; features, action, its log-probability and the state's value out."""
+        return TensorDictSequential(self.backbone, self.actor, self.critic)
+
+
+class PPOAlgorithm(Algorithm[PPO]):
+    """PPO as Stable-Baselines3 has it, on TorchRL's loss and collectors.
+
+    Args:
+        recipe: the settings.
+    """
+
+    def __init__(self, recipe: PPO) -> None:
+        super().__init__(recipe)
+        task = make_task(recipe, 1)
+        self.agent = Agent(recipe, task).to(self.device)
+        task.close()
+        self.agent.backbone.autocast = autocast_type(recipe.precision, self.device)
+        contrastive = ["loss_contrastive"] if recipe.contrastive_coeff else []
+        self.terms = [*TERMS, *contrastive, "gradient_norm"]
+        self.columns = ["learning_rate", "feature_spread", *self.terms]
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """See :attr:`Agent.policy`."""
+        return self.agent.policy
+
+    def networks(self) -> nn.Module:
+        """Backbone, actor and critic."""
+        return self.agent
+
+    def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
+        """Builds the task, with histories, and the state where one is carried."""
+        return _with_state(make_task(self.recipe, num_envs, seed, **settings), self.agent.backbone)
+
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds loss, optimizer and collector."""
+        recipe, agent = self.recipe, self.agent.eval()
+        self.loss = ClipPPOLoss(
+            agent.actor,
+            agent.critic,
+            clip_epsilon=recipe.clip_epsilon,
+            entropy_coeff=recipe.entropy_coeff,
+            critic_coeff=recipe.critic_coeff,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+            log_explained_variance=False,
+            functional=False,
+        )
+        self.gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
+        self.parameters = list(agent.parameters())
+        self.optimizer = torch.optim.Adam(
+            self.parameters, lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
+        )
+        # How long a sequence is varies with where episodes begin, so those are not compiled.
+        compiled = not recipe.is_recurrent and should_compile(recipe.compile, recipe.gradient_steps)
+        self.objective: Callable[[TensorDict], tuple[Tensor, Tensor]] = self._objective
+        if compiled:
+            self.objective = compile_and_time(self._objective, "the loss")
+        if compiled and agent.backbone.keeps_frames:
+            agent.backbone.compile_parts(**STATIC_SHAPES)
+        self.collector = self._make_collector(step, compiled)
+        self.collector_state = CollectorState(self.collector, recipe.seed, step)
+
+    def state(self) -> Mapping[str, Stateful]:
+        """Optimizer, collector and environment."""
+        return {"optimizer": self.optimizer, "collector": self.collector_state}
+
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Yields what was collected, [envs, time]; frames are kept only while a batch is made."""
+        return while_acting(self.agent.policy, self.collector)
+
+    def size(self, batch: TensorDictBase) -> int:
+        """The number of environment steps."""
+        return batch.numel()
+
+    def returns(self, batch: TensorDictBase) -> Tensor:
+        """Returns of the episodes that ended in a batch."""
+        return finished_returns(batch)
+
+    def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
+        """Estimates advantages, then takes a gradient step on each minibatch of each epoch."""
+        recipe, agent = self.recipe, self.agent
+        learning_rate = recipe.learning_rate_at(step)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate
+        if recipe.decay_clip_epsilon:
+            self.loss.clip_epsilon.fill_(recipe.clip_epsilon * (1 - step / recipe.final_step))
+        reward = batch["next", "reward"]
+        reward = reward.sign() if recipe.clip_rewards else reward
+        batch["next", "reward"] = reward * recipe.reward_scale
+        with torch.no_grad():
+            add_advantages(batch, agent, self.gae, recipe.bootstrap_time_limit)
+        agent.train()
+        terms = []
+        for minibatch in minibatches(batch, agent, recipe):
+            terms.append(self._step(minibatch))
+        agent.eval()
+        # A step that was too long shows in the next forward pass only, not in its own losses.
+        self._check_agent(minibatch)
+        if recipe.collectors > 1:
+            self.collector.update_policy_weights_()
+        self.collector_state.step = step + batch.numel()
+        # Where this goes to 0, the features are the same in all states, and so is the policy.
+        features = batch[agent.backbone.features_keys[0]].flatten(0, -2)  # [steps, features]
+        return {
+            "learning_rate": learning_rate,
+            "feature_spread": features.std(0).mean(),
+            **dict(zip(self.terms, torch.stack(terms).mean(0), strict=True)),
+        }
+
+    def play(self, step: int) -> list[Outcome]:
+        """Plays full episodes, each with its own seed: the most likely action, raw rewards."""
+        seed, episodes = self.recipe.evaluation_seed, self.recipe.evaluation_episodes
+        returns = evaluate(self.make_env, self.policy, episodes, seed=seed)
+        return [Outcome(step, returns.tolist())]
+
+    def check(self) -> None:
+        """Lets the policy act once in the task."""
+        recipe = self.recipe
+        should_compile(recipe.compile, recipe.gradient_steps)
+        env = self.make_env(1, recipe.seed, vectorization_mode=recipe.vectorization_mode)
+        with closing(env), torch.no_grad():
+            self.policy(env.reset())
+
+    def close(self) -> None:
+        """Ends environments and processes."""
+        self.collector.shutdown()
+
+    def _step(self, minibatch: TensorDict) -> Tensor:
+        """Takes a gradient step; returns its terms, float [terms]."""
+        try:
+            total, values = self.objective(minibatch)
+        except RuntimeError:  # TorchRL draws samples where an entropy is not finite
+            self._check_agent(minibatch)
+            raise
+        self.optimizer.zero_grad()
+        total.backward()
+        norm = nn.utils.clip_grad_norm_(self.parameters, self.recipe.max_grad_norm)
+        self.optimizer.step()
+        terms = torch.cat([values, norm.unsqueeze(0)])
+        check_finite(self.terms, terms)
+        return terms
+
+    def _objective(self, minibatch: TensorDict) -> tuple[Tensor, Tensor]:
+        """What is minimised, float [], and its terms, float [terms]."""
+        self.agent.encode(minibatch)  # once; the heads read its features
+        terms = self.loss(minibatch)
+        total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
+        values = [terms[name].detach() for name in TERMS]
+        if self.recipe.contrastive_coeff:
+            contrast = self._contrastive_loss(minibatch["history"])
+            total = total + self.recipe.contrastive_coeff * contrast
+            values.append(contrast.detach())
+        return total, torch.stack(values)
+
+    def _contrastive_loss(self, history: Tensor) -> Tensor:
+        """CoBERL's contrastive loss, in a pass of its own: its transformer looks both ways."""
+        mask = torch.rand(history.shape[:2], device=history.device) < self.recipe.masked_fraction
+        network = self.agent.backbone.module
+        return contrastive_prediction_loss(*masked_predictions(network, history, mask), mask)
+
+    @torch.no_grad()
+    def _check_agent(self, samples: TensorDictBase) -> None:
+        """Checks that weights, and the values they give to samples, are finite."""
+        value = self.agent.critic(self.agent.encode(samples))["state_value"].mean()
+        weights = nn.utils.get_total_norm(self.parameters)
+        check_finite(["weights", "value"], torch.stack([weights, value]))
+
+    def _make_collector(self, step: int, compiled: bool) -> BaseCollector:
+        """Builds what collects batches [num_envs, time], in this process or in several.
+
+        Several share the environments, each with a copy of the policy. If they are asynchronous, a
+        batch is that of one of them.
+        """
+        recipe, policy = self.recipe, self.agent.policy
+        settings: dict[str, Any] = {
+            "frames_per_batch": recipe.steps_per_batch,
+            "device": self.device,
+            "trust_policy": True,  # ours is on the right device already
+            "auto_register_policy_transforms": False,
+        }
+        if recipe.collectors == 1:
+            mode = recipe.vectorization_mode
+            # What is kept of the frames just seen is decided between two parts, compiled apart.
+            whole = compiled and not self.agent.backbone.keeps_frames
+            return Collector(
+                self.make_env(recipe.num_envs, recipe.seed, vectorization_mode=mode),
+                policy,
+                total_frames=recipe.final_step,
+                compile_policy=STATIC_SHAPES if whole else None,
+                track_traj_ids=False,
+                **settings,
+            )
+        kind = MultiAsyncCollector if recipe.async_collection else MultiSyncCollector
+        together = {} if recipe.async_collection else {"cat_results": 0}
+        make_share = partial(_make_share, recipe, self.agent.backbone, step)
+        with acting(policy):  # their copies of the policy act for good
+            return kind(
+                [partial(make_share, index) for index in range(recipe.collectors)],
+                policy,
+                total_frames=recipe.final_step - step,
+                **together,
+                **settings,
+            )
+
+
+def make_task(recipe: PPO, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
+    """Builds a recipe's task, with histories.
+
+    Args:
+        recipe: the settings.
+        num_envs: environments that are stepped side by side.
+        seed: of the first environment.
+        **settings: of the task.
+    """
+    device = torch_device(recipe.device)
+    return make_env(
+        recipe.env,
+        num_envs,
+        seed=seed,
+        num_frames=recipe.backbone.num_frames,
+        padding=recipe.padding,
+        hide_velocities=recipe.hide_velocities,
+        device=None if device.type == "cpu" else device,
+        **settings,
+    )
+
+
+def _with_state(env: EnvBase, backbone: Backbone) -> EnvBase:
+    """Adds what carries the state of a recurrent network from step to step."""
+    return env.append_transform(backbone.make_transforms()) if backbone.is_recurrent else env
+
+
+def _make_share(recipe: PPO, backbone: Backbone, step: int, index: int) -> EnvBase:
+    """Builds the environments of one process, in it.
+
+    Random numbers follow from the run's seed and the step at which the process starts.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training process
+    torch.set_num_threads(recipe.threads)
+    share = recipe.num_envs // recipe.collectors
+    seeds = np.random.SeedSequence([recipe.seed, index, step])
+    torch.manual_seed(seeds.generate_state(1).item())
+    # From the start the environments have the seeds that they have in one process.
+    seed = recipe.seed + index * share if step == 0 else seeds.generate_state(2)[1].item() >> 1
+    task = make_task(recipe, share, seed, vectorization_mode=recipe.vectorization_mode)
+    return _with_state(task, backbone)
+
+
+def add_advantages(
+    batch: TensorDictBase, agent: Agent, gae: GAE, bootstrap_time_limit: bool
+) -> None:
+    """Writes ``advantage`` and ``value_target`` = advantage + value into a batch.
+
+    The value of the next state is the one that the collector computed a step later, except where
+    the episode or the batch ends: there the critic is asked about the true next observation.
+
+    Args:
+        batch: [envs, time], with the values of its states.
+        agent: the agent whose critic is asked.
+        gae: TorchRL's estimator, which stops at terminations and continues at time limits.
+        bootstrap_time_limit: if off, a time limit counts as a termination.
+    """
+    value = batch["state_value"]  # [envs, time, 1]
+    ends = batch["next", "done"].squeeze(-1).clone()
+    ends[:, -1] = True
+    next_value = value.roll(-1, dims=1)
+    last = batch["next"][ends].select(*agent.backbone.in_keys)
+    next_value[ends] = agent.critic(agent.backbone(last))["state_value"]
+    batch["next", "state_value"] = next_value
+    if not bootstrap_time_limit:
+        batch["next", "terminated"] = batch["next", "done"]
+    gae(batch)
+
+
+def minibatches(batch: TensorDictBase, agent: Agent, recipe: PPO) -> Iterator[TensorDict]:
+    """Yields shuffled minibatches of a batch, ``recipe.epochs`` times over.
+
+    Args:
+        batch: [envs, time].
+        agent: the agent, for what its backbone reads.
+        recipe: the settings.
+
+    Yields:
+        Single steps [N]; where a state is carried sequences of consecutive steps [N, time], each
+        with the state that the network had at its start.
+    """
+    keys = [*agent.backbone.in_keys, "action", "action_log_prob", "advantage", "value_target"]
+    length = recipe.sequence_length if recipe.is_recurrent else 1
+    steps = batch.select(*keys).reshape(-1)
+    samples = steps.reshape(-1, length) if recipe.is_recurrent else steps
+    for _ in range(recipe.epochs):
+        for index in torch.randperm(len(samples), device=samples.device).split(
+            recipe.minibatch_size // length
+        ):
+            yield samples[index]

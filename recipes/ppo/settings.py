@@ -1,0 +1,170 @@
+"""Settings of PPO; the algorithm is in algorithm.py."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from torchrl_tit.settings import CoBERL
+from torchrl_tit.settings.checks import check_at_least, check_at_most, check_positive
+
+from ..recipe import Compile, Padding, Precision, Recipe
+
+VectorizationMode = Literal["sync", "async"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm"):
+    """Proximal policy optimisation (arXiv 1707.06347) with Stable-Baselines3's settings.
+
+    The defaults are those of the paper's runs on arrays (arXiv 2212.14538, appendix).
+    """
+
+    padding: Padding = "same"
+    """What fills a history before the first observation: that observation, or zeros."""
+    hide_velocities: bool = False
+    """Whether observations lack the velocities, so that one observation is not enough."""
+    num_envs: int = 1
+    """Number of environments; they share the steps of a batch."""
+    vectorization_mode: VectorizationMode = "sync"
+    """Whether environments run in this process or in one process each, for slow tasks."""
+    total_steps: int = 100_000
+    """Environment steps to train for, rounded up to whole batches."""
+    steps_per_batch: int = 2048
+    """Environment steps collected before each update; must be a multiple of num_envs."""
+    minibatch_size: int = 64
+    """Steps in one gradient step."""
+    sequence_length: int = 16
+    """Length of the sequences on which recurrent networks train; must divide minibatch_size and an
+    environment's steps in a batch. Other networks train on single steps."""
+    epochs: int = 10
+    """Passes over each batch."""
+    learning_rate: float = 3e-4
+    """Learning rate of Adam, before it is scaled by warm-up and decay."""
+    decay_learning_rate: bool = False
+    """Whether the learning rate falls linearly to 0 over the run."""
+    warmup_steps: int = 0
+    """Environment steps over which the learning rate rises linearly from 0."""
+    adam_eps: float = 1e-5
+    """Epsilon of Adam."""
+    max_grad_norm: float = 0.5
+    """Gradients are scaled down to this norm."""
+    clip_epsilon: float = 0.2
+    """Clipping range of the probability ratio, before it decays."""
+    decay_clip_epsilon: bool = False
+    """Whether the clipping range falls linearly to 0 over the run."""
+    entropy_coeff: float = 0.0
+    """Weight of the entropy bonus."""
+    critic_coeff: float = 0.5
+    """Weight of the mean squared value error."""
+    contrastive_coeff: float = 0.0
+    """Weight of CoBERL's contrastive loss (arXiv 2107.05431 uses 1); 0 for other networks."""
+    masked_fraction: float = 0.15
+    """Share of the steps that the contrastive loss masks."""
+    clip_rewards: bool = False
+    """Whether to train on the signs of rewards; reported returns are always unclipped."""
+    reward_scale: float = 1.0
+    """Factor on the rewards for training. If policy and value share a backbone, values in the tens
+    or hundreds make its features the same in all states (docs/results/classic_control.md).
+    Reported returns are always unscaled."""
+    gamma: float = 0.99
+    """Discount factor."""
+    gae_lambda: float = 0.95
+    """Lambda of generalised advantage estimation (arXiv 1506.02438)."""
+    bootstrap_time_limit: bool = True
+    """Whether the value of the last state continues an episode that a time limit truncated. The
+    paper's runs (SB3 1.3.0) treated time limits as terminations."""
+    initialization: Literal["orthogonal", "own"] = "orthogonal"
+    """Initialisation of the backbone: orthogonal, as in Stable-Baselines3 and so in the paper's
+    online runs, or the network's own (TIT: normal with a standard deviation of 0.02)."""
+    checkpoint_interval: int = 10_240
+    """Environment steps between checkpoints."""
+    collectors: int = 1
+    """Number of processes that collect, each with its share of the environments; 1 collects in the
+    training process. Several are for slow environments. A run with several can be resumed, but then
+    draws other random numbers than an uninterrupted run."""
+    async_collection: bool = False
+    """Whether several collectors continue to collect during updates. A batch then comes from one of
+    them, and its policy is up to one update old."""
+    compile: Compile = "auto"
+    """Whether collection and update run through torch.compile, which needs a C++ compiler and about
+    a minute at the start. "auto" compiles if that works and the run is long enough to be worth it.
+    Recurrent networks are never compiled."""
+    precision: Precision = "auto"
+    """Dtype of the backbone's matrix products. "auto" is bfloat16 on a GPU that supports it, else
+    float32. Weights, heads and losses are float32."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(
+            self,
+            num_envs=1,
+            collectors=1,
+            total_steps=1,
+            sequence_length=1,
+            minibatch_size=2,  # an advantage alone has no standard deviation
+            epochs=1,
+            learning_rate=0,
+            warmup_steps=0,
+            contrastive_coeff=0,
+            masked_fraction=0,
+            adam_eps=0,
+            max_grad_norm=0,
+            clip_epsilon=0,
+            reward_scale=0,
+            gamma=0,
+            gae_lambda=0,
+        )
+        check_at_most(self, clip_epsilon=1, gamma=1, gae_lambda=1, masked_fraction=1)
+        check_positive(self, "critic_coeff")  # advantages need a critic that learns
+        if self.steps_per_batch < 2:
+            raise ValueError(f"steps_per_batch must be at least 2, not {self.steps_per_batch}")
+        _check_divides(self, "num_envs", "steps_per_batch", self.steps_per_batch)
+        _check_divides(self, "collectors", "num_envs", self.num_envs)
+        if self.contrastive_coeff and not isinstance(self.backbone.history, CoBERL):
+            raise ValueError(
+                "contrastive_coeff is the weight of a loss of coberl alone: set it to 0 for other "
+                "history encoders"
+            )
+        if self.is_recurrent:
+            steps = self.steps_per_batch // self.num_envs
+            _check_divides(self, "sequence_length", "minibatch_size", self.minibatch_size)
+            _check_divides(self, "sequence_length", "steps_per_batch / num_envs", steps)
+            if self.precision == "bfloat16":
+                raise ValueError(
+                    "precision is bfloat16, but a recurrent network computes in float32"
+                )
+        if self.async_collection and self.collectors == 1:
+            raise ValueError("async_collection is on, but there is one collector: set collectors")
+
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether the network carries a state from step to step."""
+        return self.backbone.carries_state
+
+    @property
+    def final_step(self) -> int:
+        """``total_steps``, rounded up to whole batches."""
+        return math.ceil(self.total_steps / self.steps_per_batch) * self.steps_per_batch
+
+    @property
+    def gradient_steps(self) -> int:
+        """Gradient steps of the whole run."""
+        batches = self.final_step // self.steps_per_batch
+        return batches * self.epochs * math.ceil(self.steps_per_batch / self.minibatch_size)
+
+    def learning_rate_at(self, step: int) -> float:
+        """The learning rate of the update on the batch that begins at a step."""
+        end = step + self.steps_per_batch
+        rise = min(1, end / self.warmup_steps) if self.warmup_steps else 1
+        fall = 1 - step / self.final_step if self.decay_learning_rate else 1
+        return self.learning_rate * rise * fall
+
+
+def _check_divides(recipe: PPO, field: str, name: str, value: int) -> None:
+    """Raises ValueError where a field does not divide something."""
+    if value % getattr(recipe, field):
+        raise ValueError(
+            f"{field} {getattr(recipe, field)} does not divide {name} {value}: change one of them"
+        )

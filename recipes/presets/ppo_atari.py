@@ -1,0 +1,91 @@
+"""The named recipes of Atari games (arXiv 2212.14538, tables 1 and 3)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from torchrl_tit.settings import Network
+from torchrl_tit.settings.networks import (
+    catformer,
+    coberl,
+    enhanced_tit,
+    nature_cnn,
+    resnet,
+    vanilla_tit,
+)
+
+from ..ppo import PPO
+
+_GAMES = {
+    "breakout": "ALE/Breakout-v5",
+    "mspacman": "ALE/MsPacman-v5",
+    "pong": "ALE/Pong-v5",
+    "spaceinvaders": "ALE/SpaceInvaders-v5",
+}
+# The paper leaves open which settings of TIT were used where, within two or four blocks, patch 6,
+# 12 or 42, width 64 or 128 and two or four heads.
+_HYPERPARAMETERS: dict[str, Any] = {
+    "patch_size": 12,
+    "embed_dim": 64,
+    "num_heads_inner": 4,
+    "num_heads_outer": 4,
+    "attention_dropout_inner": 0.1,
+    "attention_dropout_outer": 0.1,
+    "ffn_dropout_inner": 0.1,
+    "ffn_dropout_outer": 0.1,
+    "features_dim": 512,
+    "activation_head": "gelu",
+}
+_TIT: dict[str, Network] = {
+    "vanilla-tit": vanilla_tit(4, **_HYPERPARAMETERS),
+    "enhanced-tit": enhanced_tit(4, **_HYPERPARAMETERS),
+    "enhanced-tit-wo-dense": enhanced_tit(4, dense=False, **_HYPERPARAMETERS),
+    "enhanced-tit-wo-inner": enhanced_tit(4, inner=False, **_HYPERPARAMETERS),
+    "enhanced-tit-wo-outer": enhanced_tit(4, outer=False, **_HYPERPARAMETERS),
+}
+_BASELINES: dict[str, Network] = {
+    "nature-cnn": nature_cnn(4),
+    "resnet": resnet(4),
+    "catformer": catformer(4),
+    "coberl": coberl(4),
+}
+
+
+def _named(game: str) -> list[PPO]:
+    """All recipes of a game: the settings are those of rl-baselines3-zoo."""
+    base = PPO(
+        env=_GAMES[game],
+        padding="constant",
+        backbone=nature_cnn(4),
+        num_envs=8,
+        total_steps=10_000_000,
+        steps_per_batch=8 * 128,
+        minibatch_size=256,
+        epochs=4,
+        learning_rate=2.5e-4,
+        decay_learning_rate=True,
+        clip_epsilon=0.1,
+        decay_clip_epsilon=True,
+        entropy_coeff=0.01,
+        clip_rewards=True,
+        # Games cannot be saved: new ones begin at each checkpoint (docs/environments.md).
+        checkpoint_interval=500_000,
+    )
+    recipes = {name: replace(base, backbone=network) for name, network in _BASELINES.items()}
+    # The skills of the baselines' own papers (for CoBERL arXiv 2107.05431); how long the warm-up is
+    # and which of their other skills "+tuned" had, arXiv 2212.14538 does not say.
+    tuned = replace(base, warmup_steps=200_000, initialization="own")
+    recipes |= {
+        "catformer-tuned": replace(
+            tuned, backbone=catformer(4, attention_expansion=2, ffn_expansion=4)
+        ),
+        "coberl-tuned": replace(tuned, backbone=coberl(4, gate_bias=2.0), contrastive_coeff=1.0),
+    }
+    tit = replace(base, minibatch_size=64)
+    recipes |= {name: replace(tit, backbone=network) for name, network in _TIT.items()}
+    return [replace(recipe, name=f"ppo/{game}/{name}") for name, recipe in recipes.items()]
+
+
+ATARI_RECIPES: dict[str, PPO] = {recipe.name: recipe for game in _GAMES for recipe in _named(game)}
+"""The recipes by name."""

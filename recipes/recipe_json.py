@@ -1,0 +1,104 @@
+"""Recipes as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from torchrl_tit.settings import FrameSettings, HistorySettings, Network, Part
+from torchrl_tit.settings.checks import nearest
+
+from .recipe import Recipe, checked, field_types, get_recipe_class
+
+T = TypeVar("T")
+
+_ENCODER = "encoder"
+"""The entry that says which frame or history encoder the others are settings of."""
+
+
+def recipe_to_json(recipe: Recipe) -> str:
+    """Writes a recipe as JSON, from which :func:`recipe_from_json` makes it again."""
+    fields = {"algorithm": recipe.algorithm, **settings_to_dict(recipe)}
+    return json.dumps(fields, indent=2) + "\n"
+
+
+def settings_to_dict(settings: Any) -> dict[str, Any]:
+    """Turns nested settings into dictionaries, with the name of a part under "encoder"."""
+    fields = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
+    values = {
+        name: settings_to_dict(value) if dataclasses.is_dataclass(value) else value
+        for name, value in fields.items()
+    }
+    return {_ENCODER: settings.name, **values} if isinstance(settings, Part) else values
+
+
+def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
+    """Makes a recipe from JSON.
+
+    Args:
+        text: what :func:`recipe_to_json` wrote; fields that are missing take their defaults.
+        source: the file it came from, for messages.
+
+    Raises:
+        ValueError: if it is no JSON, a field is unknown or has the wrong type or value.
+    """
+    try:
+        fields = json.loads(text)
+        if not isinstance(fields, dict):
+            raise ValueError("expected an object with the recipe's fields")
+        return _convert(get_recipe_class(fields.pop("algorithm", None)), fields)
+    except (RecursionError, ValueError) as error:  # json.JSONDecodeError is one
+        raise ValueError(f"{source} is not a recipe: {error}") from error
+
+
+def _convert(kind: type[T], fields: Any, prefix: str = "") -> T:
+    """Builds settings from a dictionary, each field strictly of its type."""
+    if not isinstance(fields, dict):
+        raise ValueError(f"field {prefix[:-1]!r}: expected an object, not {fields!r}")
+    types = field_types(kind)
+    values = {}
+    for name, value in fields.items():
+        if name not in types:
+            raise ValueError(f"unknown field {prefix + name!r}: {nearest(name, types)}")
+        values[name] = _READERS.get(types[name], _convert_value)(types[name], value, prefix + name)
+    try:
+        return kind(**values)
+    except TypeError as error:  # a field without a default is missing
+        missing = str(error).rpartition(": ")[2] or str(error)
+        raise ValueError(f"{prefix[:-1] or 'it'} lacks the field {missing}") from error
+
+
+def _convert_value(kind: Any, value: Any, name: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return _convert(kind, value, f"{name}.")  # type: ignore[arg-type]
+    return checked(name, value, kind)
+
+
+def _convert_part(kind: type[Part], value: Any, name: str) -> Part:
+    if not isinstance(value, dict):
+        raise ValueError(f"field {name!r}: expected an object, not {value!r}")
+    fields = dict(value)
+    try:
+        part = kind.get(fields.pop(_ENCODER, None))
+    except ValueError as error:
+        raise ValueError(f"field {name + '.' + _ENCODER!r}: {error}") from error
+    return _convert(part, fields, f"{name}.")
+
+
+def _convert_network(kind: type[Network], value: Any, name: str) -> Network:
+    if isinstance(value, dict) and "network" in value:
+        raise ValueError(
+            f"field {name + '.network'!r} is from an older version of torchrl-tit: name a frame "
+            f"encoder in {name + '.frame'!r} and a history encoder in {name + '.history'!r}"
+        )
+    return _convert(kind, value, f"{name}.")
+
+
+_READERS: dict[Any, Callable[[Any, Any, str], Any]] = {
+    FrameSettings: _convert_part,
+    HistorySettings: _convert_part,
+    Network: _convert_network,
+}

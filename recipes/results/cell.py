@@ -1,0 +1,44 @@
+"""A cell of the paper's tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Cell:
+    """All runs of the same settings: one cell of a table.
+
+    A run's value is the mean return of its evaluation, or its best normalised score where it has
+    one (offline recipes).
+    """
+
+    table: str
+    """The paper's table that it belongs to."""
+    recipe: str
+    runs: int
+    steps: int
+    """Steps of training, the fewest of all runs."""
+    mean: float
+    """Mean of the runs' values."""
+    std: float
+    """Standard deviation of the runs' values (population)."""
+    std_episodes: float
+    """Standard deviation over the episodes of a run, as the paper's online tables seem to give it;
+    the mean over the runs."""
+    iqm: float
+    """Interquartile mean of the runs' values (arXiv 2108.13264)."""
+    low: float
+    """Lower end of its 95% confidence interval, by bootstrap over runs; NaN for a single run."""
+    high: float
+    """Upper end."""
+    paper_mean: float
+    """The paper's value; NaN where it has none. That of a tuned recipe is that of the plain one."""
+    paper_std: float
+    changes: str = ""
+    """Fields in which the runs differ from the recipe of that name, with the runs' values."""
+
+    @property
+    def label(self) -> str:
+        """The recipe's name, and the changed fields."""
+        return f"{self.recipe} ({self.changes})" if self.changes else self.recipe

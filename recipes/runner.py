@@ -1,0 +1,271 @@
+"""The only training loop: batches, updates, metrics, evaluations, checkpoints, resume."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchrl_tit.checkpoint import checkpoint_steps, global_rng_state, set_global_rng_state
+
+from .algorithm import Algorithm, NotFiniteError, Stateful, check_finite, make_algorithm
+from .callback import Callback
+from .interrupt import Interrupt
+from .outcomes import Outcome, summarize
+from .recipe import Recipe
+from .run import Run
+
+
+def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
+    """Trains a recipe in a run folder, from its newest checkpoint if there is one.
+
+    A run that is killed at any moment and resumed reaches the same weights, bit for bit, as an
+    uninterrupted one.
+
+    Args:
+        recipe: the settings.
+        run: an open run folder.
+        callbacks: hooks on batches, updates and checkpoints; they can end training.
+
+    Raises:
+        FloatingPointError: if a loss, a gradient or a weight is not finite.
+        KeyboardInterrupt: after Ctrl-C, once a checkpoint is saved.
+    """
+    torch.set_num_threads(recipe.threads)
+    random.seed(recipe.seed)
+    np.random.seed(recipe.seed)
+    torch.manual_seed(recipe.seed)
+    algorithm = make_algorithm(recipe)
+    step = saved_step = max(checkpoint_steps(run.checkpoints), default=0)
+    algorithm.prepare(step, run.folder)
+    record = Record(recipe, algorithm)
+    parts = {"networks": algorithm.networks(), **algorithm.state(), "record": record}
+    _load(run, parts)
+    unit = "updates" if recipe.offline else "steps"
+    progress = tqdm(
+        total=recipe.final_step, initial=step, unit=f" {unit}", desc=recipe.name, smoothing=0.05
+    )
+    metrics = run.metrics(record.columns, last_step=step)
+    with closing(algorithm), closing(metrics), progress, Interrupt() as interrupt:
+        batches = iter(algorithm.batches())
+        while step < recipe.final_step:
+            batch = next(batches)
+            before, step = step, step + algorithm.size(batch)
+            for callback in callbacks:
+                callback.collected(step, batch)
+            with _naming(step, saved_step):
+                record.add(algorithm.returns(batch), algorithm.update(batch, before))
+            progress.update(step - before)
+
+            evaluation_due = recipe.evaluation_due(step)
+            # Intervals count from the start, so a resumed run logs and saves at the same steps.
+            if evaluation_due or step // recipe.log_interval > before // recipe.log_interval:
+                with _naming(step, saved_step):
+                    record.check()
+                if evaluation_due:
+                    record.outcomes += algorithm.play(step)
+                row = record.take_row(step)
+                metrics.log(step, **row)
+                if not math.isnan(row["return_mean"]):
+                    progress.set_postfix_str(f"return {row['return_mean']:.1f}")
+
+            enough = any([callback.updated(step, algorithm.policy) for callback in callbacks])
+            interval = recipe.checkpoint_interval
+            due = step // interval > before // interval or step >= recipe.final_step
+            if due or evaluation_due or enough or interrupt.requested:
+                with _naming(step, saved_step):
+                    record.check()
+                for callback in callbacks:
+                    callback.saving(step)
+                _save(run, step, parts)
+                saved_step = step
+            if interrupt.requested:
+                raise KeyboardInterrupt
+            if enough:
+                break
+
+
+class Record:
+    """The measurements since the last row of metrics, and all evaluations so far.
+
+    Args:
+        recipe: the settings.
+        algorithm: the algorithm.
+    """
+
+    def __init__(self, recipe: Recipe, algorithm: Algorithm[Any]) -> None:
+        self.outcomes: list[Outcome] = []
+        """Of all evaluations so far."""
+        self._recipe = recipe
+        self._names = list(algorithm.columns)
+        self._required = [name not in algorithm.optional_columns for name in self._names]
+        self._sums: Tensor | None = None
+        self._count = 0
+        self._returns: list[float] = []
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of the numbers in a row of metrics, besides step and time."""
+        targets = self._recipe.target_columns.values()
+        episodes = [] if self._recipe.offline else ["episodes"]
+        return ["return_mean", *targets, *episodes, *self._names]
+
+    def add(self, returns: Tensor | None, values: Mapping[str, Tensor | float]) -> None:
+        """Adds the returns of a batch and the numbers of its update, without waiting for a GPU."""
+        if returns is not None:
+            self._returns += returns.flatten().tolist()
+        device = next((x.device for x in values.values() if isinstance(x, Tensor)), None)
+        terms = torch.stack(
+            [
+                torch.as_tensor(values[name], dtype=torch.float64, device=device)
+                for name in self._names
+            ]
+        )
+        self._sums = terms if self._sums is None else self._sums.to(terms.device) + terms
+        self._count += 1
+
+    def check(self) -> None:
+        """Raises NotFiniteError if a sum is not finite."""
+        if self._sums is not None:
+            required = torch.tensor(self._required, device=self._sums.device)
+            names = [n for n, needed in zip(self._names, self._required, strict=True) if needed]
+            check_finite(names, self._sums[required])
+
+    def take_row(self, step: int) -> dict[str, float]:
+        """Returns a row of metrics: means since the last one, and the step's evaluation."""
+        assert self._sums is not None
+        means = (self._sums / self._count).tolist()
+        now = [outcome for outcome in self.outcomes if outcome.step == step]
+        means_of_now = [outcome.mean for outcome in now]
+        if self._recipe.offline:
+            row = {"return_mean": max(means_of_now, default=math.nan)}
+        else:
+            episodes = len(self._returns)
+            mean = sum(self._returns) / episodes if episodes else math.nan  # if none has ended
+            row = {"return_mean": mean, "episodes": episodes}
+        for target, column in self._recipe.target_columns.items():
+            row[column] = next((o.mean for o in now if o.target_return == target), math.nan)
+        self._sums, self._count, self._returns = None, 0, []
+        return row | dict(zip(self._names, means, strict=True))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns the state that the next row and the next evaluation need."""
+        return {
+            "outcomes": [asdict(outcome) for outcome in self.outcomes],
+            "evaluation_seed": self._recipe.evaluation_seed,
+            "sums": [] if self._sums is None else self._sums.tolist(),
+            "count": self._count,
+            "returns": self._returns,
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
+        """Restores a state."""
+        self.outcomes = [Outcome(**outcome) for outcome in state_dict["outcomes"]]
+        sums = state_dict["sums"]
+        self._sums = torch.tensor(sums, dtype=torch.float64) if sums else None
+        self._count = state_dict["count"]
+        self._returns = list(state_dict["returns"])
+
+
+def load_trained(run: Run, recipe: Recipe | None = None) -> tuple[int, Algorithm[Any], Any]:
+    """Loads the networks of a run's newest checkpoint.
+
+    Args:
+        run: a run folder with a checkpoint.
+        recipe: the run's recipe, where some of its settings are overridden.
+
+    Returns:
+        The steps that it was trained for, the algorithm with its weights, and all that the
+        checkpoint holds.
+
+    Raises:
+        FileNotFoundError: if there is no checkpoint.
+    """
+    recipe = recipe or run.recipe
+    step, state = run.load_trained()
+    torch.set_num_threads(recipe.threads)
+    algorithm = make_algorithm(recipe)
+    with run.restoring(step):
+        algorithm.networks().load_state_dict(state["networks"])
+    algorithm.policy.eval()  # without dropout
+    return step, algorithm, state
+
+
+def evaluate(run: Run, recipe: Recipe | None = None) -> dict[str, Any]:
+    """Evaluates a run's newest checkpoint: full episodes, the most likely action, raw rewards.
+
+    Episodes that were played with these weights and seeds already are not played again.
+
+    Args:
+        run: a run folder with a checkpoint.
+        recipe: the run's recipe, where some of its settings are overridden.
+
+    Returns:
+        See :func:`~recipes.outcomes.summarize`, and the "seed" of the first episode.
+
+    Raises:
+        FileNotFoundError: if there is no checkpoint.
+    """
+    recipe = recipe or run.recipe
+    step, algorithm, state = load_trained(run, recipe)
+    with run.restoring(step):
+        record = state["record"]
+        outcomes = [Outcome(**outcome) for outcome in record["outcomes"]]
+        same_seed = record["evaluation_seed"] == recipe.evaluation_seed
+    targets: list[float | None] = [*recipe.target_columns] or [None]
+    now = [
+        outcome
+        for outcome in outcomes
+        if outcome.step == step
+        and same_seed
+        and len(outcome.returns) == recipe.evaluation_episodes
+        and outcome.target_return in targets
+    ]
+    if len(now) < len(targets):
+        now = algorithm.play(step)
+    return {**summarize(now, outcomes, recipe), "seed": recipe.evaluation_seed}
+
+
+@contextmanager
+def _naming(step: int, saved_step: int) -> Iterator[None]:
+    """Adds the step and the last good checkpoint to the message of a NotFiniteError."""
+    try:
+        yield
+    except NotFiniteError as error:
+        saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
+        raise NotFiniteError(f"{error} in the update at step {step}; {saved}") from error
+
+
+def _save(run: Run, step: int, parts: Mapping[str, Stateful]) -> None:
+    state = {name: part.state_dict() for name, part in parts.items()}
+    run.save(step, {**state, "rng": global_rng_state()})
+
+
+def _load(run: Run, parts: Mapping[str, Stateful]) -> None:
+    """Loads the newest checkpoint if there is one."""
+    loaded = run.load()
+    if loaded is None:
+        return
+    step, state = loaded
+    with run.restoring(step):
+        for name, part in parts.items():
+            _load_part(part, state[name])
+        rng = state["rng"]
+    set_global_rng_state(rng)
+
+
+def _load_part(part: Stateful, state: dict[str, Any]) -> None:
+    if isinstance(part, torch.optim.Optimizer):
+        # Its settings are the recipe's, also where those were changed since; not so its counters.
+        groups = zip(state["param_groups"], part.state_dict()["param_groups"], strict=True)
+        kept = [{**own, **{k: saved[k] for k in saved if k == "step"}} for saved, own in groups]
+        state = {**state, "param_groups": kept}
+    part.load_state_dict(state)

@@ -1,0 +1,125 @@
+"""Networks that are put together on the command line."""
+
+import json
+from dataclasses import fields, replace
+
+import pytest
+
+from recipes.cli import main
+from recipes.cli.backbone_options import choose_network
+from recipes.registry import get_recipe
+from tests.recipes.cli.test_cli import SHORT, fails
+from torchrl_tit.settings import (
+    NETWORKS,
+    Flat,
+    FrameSettings,
+    HistorySettings,
+    Inner,
+    Outer,
+    PairedOuter,
+    ResNetFrames,
+)
+from torchrl_tit.settings.networks import catformer, enhanced_tit
+
+PONG = get_recipe("ppo/pong/enhanced-tit")
+CARTPOLE = get_recipe("ppo/cartpole/enhanced-tit")
+
+
+def test_a_pair_takes_over_what_the_recipe_chose():
+    chosen = ["--backbone.frame", "resnet", "--backbone.history=outer", "--num-envs", "4"]
+    recipe = choose_network(PONG, chosen)
+    assert recipe.backbone.frame == ResNetFrames(embed_dim=64)
+    paired = PONG.backbone.history
+    assert isinstance(paired, PairedOuter)
+    shared = {field.name: getattr(paired, field.name) for field in fields(paired)}
+    assert recipe.backbone.history == Outer(**shared)
+    assert recipe.backbone.head == PONG.backbone.head
+    assert recipe.backbone.num_frames == 4
+    assert replace(recipe, backbone=PONG.backbone) == PONG  # the rest is read later
+
+
+def test_defaults_and_fields_of_another_type_are_not_taken_over():
+    lstm = get_recipe("ppo/cartpole-no-velocity/lstm")  # a tanh layer of 64
+    assert choose_network(lstm, ["--backbone.frame", "inner"]).backbone.frame == Inner(embed_dim=64)
+    mlp = get_recipe("ppo/cartpole/mlp")
+    assert choose_network(mlp, ["--backbone.history", "outer"]).backbone.history == Outer()
+
+
+def test_the_same_encoder_stays_as_it_is():
+    recipe = choose_network(
+        PONG, ["--backbone.frame", "inner", "--backbone.history", "paired-outer"]
+    )
+    assert recipe == PONG
+
+
+def test_a_network_by_name_reads_as_many_frames_as_before():
+    assert choose_network(PONG, ["--backbone.network", "catformer"]).backbone == catformer(4)
+    both = ["--backbone.frame", "flat", "--backbone.network", "catformer"]  # in any order
+    assert choose_network(PONG, both).backbone == replace(catformer(4), frame=Flat())
+
+
+def test_every_name_is_a_choice():
+    for name in NETWORKS:
+        assert choose_network(PONG, ["--backbone.network", name]).backbone.num_frames == 4
+    for name, part in FrameSettings.registered.items():
+        assert type(choose_network(PONG, ["--backbone.frame", name]).backbone.frame) is part
+    for name, part in HistorySettings.registered.items():
+        assert type(choose_network(PONG, ["--backbone.history", name]).backbone.history) is part
+
+
+def test_a_pair_trains_and_resumes(tmp_path, capsys):
+    words = ["ppo/cartpole/mlp", "--out", str(tmp_path / "run"), "--backbone.num-frames", "3"]
+    pair = ["--backbone.frame", "linear", "--backbone.frame.embed-dim", "8"]
+    pair += ["--backbone.history", "outer", "--backbone.history.num-blocks", "1"]
+    main(["train", *words, *pair, *SHORT])
+    backbone = json.loads((tmp_path / "run" / "recipe.json").read_text())["backbone"]
+    assert (backbone["frame"]["encoder"], backbone["frame"]["embed_dim"]) == ("linear", 8)
+    assert (backbone["history"]["encoder"], backbone["history"]["num_blocks"]) == ("outer", 1)
+    assert backbone["num_frames"] == 3
+    main(["evaluate", str(tmp_path / "run")])
+    assert "after 64 steps" in capsys.readouterr().out
+
+
+def test_what_only_fits_with_a_later_option(tmp_path, monkeypatch, capsys):
+    """CoBERL needs several frames, and only CoBERL has a contrastive loss."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("recipes.cli.training.start", lambda recipe, folder: print(recipe.backbone))
+    coberl = ["--backbone.network", "coberl", "--backbone.num-frames", "2"]
+    main(["train", "ppo/cartpole/mlp", *coberl])
+    assert "CoBERL(" in capsys.readouterr().out
+    words = ["train", "ppo/pong/coberl-tuned", "--backbone.history", "outer"]
+    assert "contrastive_coeff is the weight" in fails(capsys, *words)
+    main([*words, "--contrastive-coeff", "0"])
+    assert "Outer(" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["frame", "resnt"], "--backbone.frame has no choice 'resnt': did you mean resnet"),
+        (["history", "out"], "did you mean outer"),
+        (["network", "enhanced"], "did you mean enhanced-tit"),
+        (["history"], "--backbone.history needs a name: choose from outer, paired-outer"),
+        (["history", "--num-envs"], "--backbone.history needs a name"),
+        (["frame", "resnet"], "for arrays take inner or linear frames"),  # CartPole has no images
+        (["history", "catformer"], "num_frames is 1: set it to 2 or more"),
+        (["frame", "linear", "--backbone.frame.num-blocks", "2"], "--backbone.frame.num-blocks"),
+        (["history", "decision-transformer"], "use a dt or odt recipe"),
+    ],
+)
+def test_what_cannot_work_is_one_line(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = [f"--backbone.{words[0]}", *words[1:]]
+    assert message in fails(capsys, "train", CARTPOLE.name, *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_names_the_choices_and_the_fields_of_the_chosen_part(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", "ppo/pong/enhanced-tit", "--backbone.history", "catformer", "--help"])
+    assert exit_.value.code == 0
+    out = capsys.readouterr().out
+    for text in ("--backbone.network", "--backbone.frame {", "resnet", "--backbone.history {"):
+        assert text in out
+    assert "--backbone.history.attention-expansion" in out
+    assert enhanced_tit().history.name in out

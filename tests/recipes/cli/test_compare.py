@@ -1,0 +1,80 @@
+"""Which runs `compare` draws as one curve."""
+
+from dataclasses import replace
+
+import pytest
+
+from recipes.cli import main
+from recipes.registry import get_recipe
+from recipes.run import Run
+
+NAME = "ppo/cartpole/mlp"
+
+
+@pytest.fixture
+def begun(tmp_path, monkeypatch):
+    """Begins runs, in each of which an episode has ended."""
+    monkeypatch.chdir(tmp_path)
+
+    def begin(folder, recipe=NAME, **fields):
+        Run.create(tmp_path / folder, replace(get_recipe(recipe), **fields))
+        (tmp_path / folder / "metrics.csv").write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
+        return folder
+
+    return begin
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Runs by the name of their curve, after `compare`."""
+
+    def compare(*folders):
+        found = {}
+        monkeypatch.setattr(
+            "recipes.cli.compare.plot_comparison",
+            lambda curves, picture, **options: found.update(curves),
+        )
+        main(["compare", *folders])
+        return {name: [str(path.parent) for path in paths] for name, paths in found.items()}
+
+    return compare
+
+
+def test_seeds_of_a_recipe_are_one_curve(begun, drawn):
+    begun("a"), begun("b", seed=1), begun("c", "ppo/cartpole/d2rl")
+    assert drawn("a", "b", "c", "./a") == {NAME: ["a", "b"], "ppo/cartpole/d2rl": ["c"]}
+
+
+def test_other_settings_under_one_name_are_another_curve(begun, drawn):
+    begun("a"), begun("b", learning_rate=1e-3), begun("c", seed=2)
+    assert drawn("a", "b", "c") == {f"{NAME} a": ["a", "c"], f"{NAME} b": ["b"]}
+
+
+def test_runs_without_a_name_are_called_as_their_folder(begun, drawn):
+    begun("a", name=""), begun("b", name="", learning_rate=1e-3)
+    assert drawn("a") == {"a": ["a"]}
+    assert drawn("a", "b") == {"a": ["a"], "b": ["b"]}
+
+
+def test_gradient_steps_and_environment_steps_are_not_compared(begun, capsys):
+    begun("a"), begun("b", "cql/hopper-medium-v0/mlp")
+    with pytest.raises(SystemExit):
+        main(["compare", "a", "b"])
+    assert "environment steps and gradient steps do not share an axis" in capsys.readouterr().err
+
+
+def test_runs_in_which_no_episode_has_ended(begun, tmp_path, capsys):
+    begun("a")
+    (tmp_path / "a" / "metrics.csv").write_text("step,time,return_mean\n1,0,nan\n")
+    Run.create(tmp_path / "b", get_recipe("ppo/cartpole/d2rl"))
+    with pytest.raises(SystemExit):
+        main(["compare", "a", "b"])
+    assert "no episode has ended in a, b" in capsys.readouterr().err
+    assert not (tmp_path / "comparison.png").exists()
+
+
+def test_a_picture_is_called_what_it_is(begun, capsys):
+    begun("a")
+    with pytest.raises(SystemExit):
+        main(["compare", "a", "--out", "curves.pdf"])
+    assert "--out curves.pdf must end in .png" in capsys.readouterr().err

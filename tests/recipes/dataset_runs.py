@@ -1,0 +1,68 @@
+"""Small runs on data sets, and what a resumed run is compared with."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from recipes import runner
+from recipes.metrics import read_metrics
+from recipes.recipe import Recipe
+from recipes.run import Run
+from tests.datasets.rollouts import roll, write
+from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
+
+
+def make_data(folder: Path) -> Path:
+    return write(folder / "hopper.hdf5", roll())
+
+
+def train(recipe: Recipe, folder: Path) -> Run:
+    with Run.create(folder, recipe) as run:
+        runner.train(recipe, run)
+    return run
+
+
+def assert_resumes_bit_for_bit(recipe: Recipe, folder: Path) -> None:
+    """Resumes from the last checkpoint but one, which lies within an interval of metrics."""
+    whole = train(recipe, folder / "whole")
+    shutil.copytree(whole.folder, folder / "cut")
+    with Run.open(folder / "cut") as run:
+        *_, before, last = checkpoint_steps(run.checkpoints)
+        assert last == recipe.final_step
+        assert before % recipe.log_interval
+        shutil.rmtree(run.checkpoints / f"{last:012d}")
+        torch.manual_seed(123)  # the resuming process may be in any state
+        runner.train(recipe, run)
+    assert_same_run(run, whole)
+
+
+def assert_same_run(run: Run, other: Run) -> None:
+    """Compares everything in the newest checkpoints, and all metrics but the time."""
+    assert_same(load_checkpoint(run.checkpoints), load_checkpoint(other.checkpoints))
+    rows, expected = (
+        [
+            {name: str(value) for name, value in row.items() if name != "time"}
+            for row in read_metrics(one.folder / "metrics.csv")
+        ]
+        for one in (run, other)
+    )
+    assert rows == expected
+
+
+def assert_same(left: Any, right: Any) -> None:
+    assert type(left) is type(right)
+    if isinstance(left, dict):
+        assert left.keys() == right.keys()
+        for key in left:
+            assert_same(left[key], right[key])
+    elif isinstance(left, list | tuple):
+        for a, b in zip(left, right, strict=True):
+            assert_same(a, b)
+    elif isinstance(left, torch.Tensor):
+        assert torch.equal(left, right)
+    elif isinstance(left, int | float | str):
+        assert left == right or (left != left and right != right)  # NaN

@@ -1,0 +1,294 @@
+"""SAC: its gradient steps, its networks, and runs that are stopped and resumed."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.modules import MLP, TanhNormal
+
+from recipes.algorithm import make_algorithm
+from recipes.callback import Callback
+from recipes.metrics import read_metrics
+from recipes.recipe_json import recipe_from_json, recipe_to_json
+from recipes.registry import RECIPES
+from recipes.run import Run
+from recipes.runner import evaluate, train
+from recipes.sac import SAC
+from recipes.sac.algorithm import SACAlgorithm
+from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
+from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
+
+SMALL = SAC(
+    name="sac/pendulum/small",
+    env="Pendulum-v1",
+    backbone=mlp(hidden_dim=8, activation="relu"),
+    critic_hidden=(16, 16),
+    batch_size=8,
+    random_steps=20,
+    steps_per_batch=10,
+    total_steps=60,
+    updates_per_step=0.2,
+    log_interval=20,
+    checkpoint_interval=30,
+    evaluation_episodes=1,
+)
+TIT = enhanced_tit(
+    num_frames=2, patch_size=1, embed_dim=8, num_blocks=1, features_dim=8, ffn_dropout_inner=0.1
+)
+
+
+class Batches(Callback):
+    """Keeps the policy's actions, and may fail or end the training at a step."""
+
+    def __init__(self, last: int | None = None, fail: int | None = None) -> None:
+        self.last = last
+        self.fail = fail
+        self.actions: list[Tensor] = []
+
+    def collected(self, step: int, batch: Any) -> None:
+        self.actions.append(batch["action"].clone())
+
+    def updated(self, step: int, policy: Any) -> bool:
+        if step == self.fail:
+            raise KeyError("killed")
+        return step == self.last
+
+
+def make(recipe: SAC) -> SACAlgorithm:
+    algorithm = make_algorithm(recipe)
+    assert isinstance(algorithm, SACAlgorithm)
+    return algorithm
+
+
+def trained(folder: Path) -> tuple[int, dict[str, Any]]:
+    return load_checkpoint(folder / "checkpoints")
+
+
+def assert_same(left: Any, right: Any) -> None:
+    assert type(left) is type(right)
+    if isinstance(left, dict):
+        assert left.keys() == right.keys()
+        for key in left:
+            assert_same(left[key], right[key])
+    elif isinstance(left, list | tuple):
+        for a, b in zip(left, right, strict=True):
+            assert_same(a, b)
+    elif isinstance(left, Tensor):
+        assert torch.equal(left, right)
+
+
+@pytest.mark.parametrize("critic", ["mlp", "backbone"])
+@pytest.mark.parametrize("backbone", [SMALL.backbone, replace(SMALL.backbone, num_frames=2), TIT])
+def test_resumed_is_bit_for_bit_the_same(backbone: Any, critic: Any, tmp_path: Path) -> None:
+    """Stopped before the first checkpoint, between two of them, and at one."""
+    recipe = replace(SMALL, backbone=backbone, critic=critic)
+    with Run.create(tmp_path / "whole", recipe) as run:
+        train(recipe, run)
+    with Run.create(tmp_path / "stopped", recipe) as run:
+        for stop in (Batches(fail=20), Batches(fail=50), Batches(last=40), Batches(fail=50)):
+            if stop.last:
+                train(recipe, run, [stop])
+            else:
+                with pytest.raises(KeyError, match="killed"):
+                    train(recipe, run, [stop])
+        train(recipe, run)
+    (step, state), (expected_step, expected) = trained(run.folder), trained(tmp_path / "whole")
+    assert step == expected_step == 60
+    assert checkpoint_steps(run.folder / "replay") == [30, 40, 60]
+    assert checkpoint_steps(tmp_path / "whole" / "replay") == [30, 60]
+    for name in ("networks", "optimizer", "collector", "rng"):
+        assert_same(state[name], expected[name])
+    rows, expected_rows = (
+        [{name: str(value) for name, value in row.items() if name != "time"} for row in metrics]
+        for metrics in (
+            read_metrics(folder / "metrics.csv") for folder in (run.folder, tmp_path / "whole")
+        )
+    )
+    assert rows == expected_rows
+    assert [row["step"] for row in rows] == ["20.0", "40.0", "60.0"]
+
+
+def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
+    with Run.create(tmp_path / "run", SMALL) as run:
+        train(SMALL, run, [Batches(last=30)])
+        algorithm = make(SMALL)
+        algorithm.prepare(0, run.folder)
+        for number in (45, 60):  # of a process that was killed before its checkpoint
+            wrong = TensorDict({"history": torch.full((number, 1, 3), torch.nan)}, [number])
+            algorithm.buffer_state.buffer.empty()
+            algorithm.buffer.extend(wrong)
+            algorithm.buffer_state.state_dict()
+        algorithm.close()
+        train(SMALL, run)
+        assert trained(run.folder)[1]["buffer"] == {"parts": [30, 60]}
+        algorithm = make(SMALL)
+        algorithm.prepare(60, run.folder)
+        algorithm.buffer_state.load_state_dict({"parts": [30, 60]})
+        algorithm.close()
+    stored = algorithm.buffer[:]
+    assert len(stored) == 60
+    # The transitions of one environment, in order.
+    going_on = ~stored["next", "done"][:-1, 0]
+    histories, following = stored["history"][1:], stored["next", "history"][:-1]
+    assert torch.equal(histories[going_on], following[going_on])
+
+
+def test_random_steps_are_uniform_and_learn_nothing(tmp_path: Path) -> None:
+    recipe = replace(SMALL, random_steps=200, total_steps=220, steps_per_batch=20)
+    batches = Batches(last=200)
+    with Run.create(tmp_path / "run", recipe) as run:
+        train(recipe, run, [batches])
+        _, before = trained(run.folder)
+        train(recipe, run)
+        _, after = trained(run.folder)
+    actions = torch.cat([action.flatten() for action in batches.actions])
+    quartiles = actions.quantile(torch.tensor([0.25, 0.5, 0.75]))
+    torch.testing.assert_close(quartiles, torch.tensor([-1.0, 0.0, 1.0]), atol=0.35, rtol=0)
+    assert before["optimizer"]["state"] == {}
+    # round(20 * 0.2) gradient steps after the batch that follows.
+    assert {state["step"].item() for state in after["optimizer"]["state"].values()} == {4}
+    assert read_metrics(run.folder / "metrics.csv")[-1]["alpha"] < 1
+
+
+def double(recipe: SAC, folder: Path) -> tuple[SACAlgorithm, TensorDict]:
+    """An algorithm in float64, ready for gradient steps, and transitions of Pendulum's shapes."""
+    algorithm = make(recipe)
+    algorithm.prepare(0, folder)
+    algorithm.loss.double()
+    frames, size = recipe.backbone.num_frames, 16
+    histories = torch.randn(2, size, frames, 3, dtype=torch.float64)
+    flag = torch.zeros(size, 1, dtype=torch.bool)
+    outcome = {
+        "history": histories[1],
+        "reward": torch.randn(size, 1, dtype=torch.float64),
+        "terminated": flag,
+        "done": flag.clone(),
+    }
+    actions = torch.rand(size, 1, dtype=torch.float64)
+    return algorithm, TensorDict(
+        {"history": histories[0], "action": actions, "next": outcome}, [size]
+    )
+
+
+def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
+    """Critics read the newest observation; targets are the rewards; both errors are squared."""
+    algorithm, batch = double(replace(SMALL, backbone=mlp(2, hidden_dim=8)), tmp_path)
+    batch["next", "terminated"][:] = True
+    batch["next", "done"][:] = True
+    critics = algorithm.loss.qvalue_network_params["module", "0", "module"]
+    x = torch.cat([batch["history"][:, -1], batch["action"]], -1)
+    expected = torch.zeros((), dtype=torch.float64)
+    for critic in critics.unbind(0):
+        hidden = x
+        for layer in ("0", "2"):
+            hidden = nn.functional.linear(hidden, critic[layer, "weight"], critic[layer, "bias"])
+            hidden = hidden.relu()
+        q = nn.functional.linear(hidden, critic["4", "weight"], critic["4", "bias"])
+        expected += (q - batch["next", "reward"]).square().mean()
+    terms = dict(zip(algorithm.columns, algorithm._step(batch), strict=True))
+    algorithm.close()
+    torch.testing.assert_close(terms["loss_qvalue"], expected.detach())
+    assert terms["alpha"] == 1
+
+
+def test_a_gradient_step_moves_weights_and_targets(tmp_path: Path) -> None:
+    recipe = replace(SMALL, learning_rate=1e-3, tau=0.1, gamma=0.5)
+    algorithm, batch = double(recipe, tmp_path)
+    before = {name: value.clone() for name, value in algorithm.loss.state_dict().items()}
+    algorithm._step(batch)
+    algorithm.close()
+    after = algorithm.loss.state_dict()
+    for name, value in after.items():
+        if name.startswith("target_"):
+            source = after[name.removeprefix("target_")]
+            torch.testing.assert_close(value, 0.9 * before[name] + 0.1 * source)
+        elif name.startswith(("actor_", "qvalue_", "log_alpha")):
+            # Adam's first step is the learning rate, wherever there is a gradient.
+            moved = (value - before[name]).abs()
+            assert moved.max() == pytest.approx(1e-3, rel=1e-2)
+    assert algorithm.loss.value_estimator.gamma == 0.5
+    assert algorithm.loss.target_entropy == -1
+
+
+def test_the_policy_is_a_squashed_gaussian_on_the_backbone() -> None:
+    algorithm = make(replace(SMALL, env="Hopper-v5", backbone=TIT)).policy.eval()
+    td = algorithm(TensorDict({"history": torch.randn(5, 2, 11)}, [5]))
+    assert td["features"].shape == (5, 8)
+    assert td["action"].shape == td["loc"].shape == td["scale"].shape == (5, 3)
+    distribution = algorithm.get_dist(td)
+    assert isinstance(distribution, TanhNormal)
+    assert td["action"].abs().max() <= 1
+    torch.testing.assert_close(td["action_log_prob"], distribution.log_prob(td["action"]))
+
+
+def test_critics_start_as_they_were_built(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a single one, TorchRL's loss makes a copy whose weights it draws anew."""
+    built: list[dict[str, Tensor]] = []
+
+    def make_mlp(*sizes: int, **layers: Any) -> MLP:
+        network = MLP(*sizes, **layers)
+        built.append({name: weight.clone() for name, weight in network.state_dict().items()})
+        return network
+
+    monkeypatch.setattr("recipes.critics.MLP", make_mlp)
+    loss = make(SMALL).loss
+    stacked = loss.qvalue_network_params["module", "0", "module"].flatten_keys(".")
+    assert len(built) == 2
+    for name, weights in stacked.items():
+        assert torch.equal(weights, torch.stack([critic[name] for critic in built]))
+        assert not torch.equal(*weights)
+
+
+def test_evaluation_plays_the_most_likely_actions(tmp_path: Path) -> None:
+    with Run.create(tmp_path / "run", replace(SMALL, total_steps=10)) as run:
+        train(run.recipe, run)
+        first, again = evaluate(run), evaluate(run)
+    assert first == again
+    assert first["steps"] == 10
+    assert first["episodes"] == 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"random_steps": 25}, "random_steps 25 must be a multiple of steps_per_batch 10"),
+        ({"num_envs": 3}, "steps_per_batch 10 must be a multiple of num_envs 3"),
+        ({"gamma": 1.5}, "gamma must be at most 1"),
+        ({"tau": -1.0}, "tau must be at least 0"),
+        ({"batch_size": 0}, "batch_size must be at least 1"),
+        ({"critic_hidden": ()}, "critic_hidden must be at least one width"),
+        ({"critic": "none"}, "field 'critic' is 'none'"),
+        ({"backbone": lstm()}, "sac draws single transitions.*or use a ppo recipe"),
+    ],
+)
+def test_impossible_settings(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as error:
+        replace(SMALL, **fields)
+    assert "\n" not in str(error.value)
+
+
+def test_impossible_tasks() -> None:
+    message = "sac needs continuous actions within bounds, but CartPole-v1 has .*: use a ppo recipe"
+    with pytest.raises(ValueError, match=message) as error:
+        make_algorithm(replace(SMALL, env="CartPole-v1"))
+    assert "\n" not in str(error.value)
+
+
+def test_an_lstm_that_reads_several_frames_is_no_exception(tmp_path: Path) -> None:
+    backbone = lstm(2, embed_dim=4, hidden_dim=4, features_dim=4)
+    recipe = replace(SMALL, backbone=backbone, total_steps=30, num_envs=2)
+    with Run.create(tmp_path / "run", recipe) as run:
+        train(recipe, run)
+    assert trained(run.folder)[0] == 30
+
+
+def test_named_recipes() -> None:
+    for name in ("sac/hopper/mlp", "sac/hopper/enhanced-tit"):
+        recipe = RECIPES[name]
+        assert recipe.final_step == 1_000_000
+        assert recipe_from_json(recipe_to_json(recipe), name) == recipe
+        make_algorithm(recipe).check()

@@ -1,0 +1,309 @@
+"""The training loop, around an algorithm of one weight."""
+
+from __future__ import annotations
+
+import math
+import os
+import random
+import shutil
+import signal
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from recipes.algorithm import Algorithm, NotFiniteError, check_finite
+from recipes.callback import Callback
+from recipes.metrics import read_metrics
+from recipes.outcomes import Outcome
+from recipes.recipe import Recipe
+from recipes.run import Run
+from recipes.runner import evaluate, load_trained, train
+from tests.recipes.dataset_runs import assert_same, assert_same_run
+from torchrl_tit.checkpoint import CheckpointError, checkpoint_steps, load_checkpoint
+from torchrl_tit.settings.networks import mlp
+
+
+@dataclass(frozen=True, kw_only=True)
+class Toy(Recipe):
+    algorithm: ClassVar[str] = "toy"
+    builds: ClassVar[str] = f"{__name__}:ToyAlgorithm"
+
+    total_steps: int = 24
+    batch: int = 1
+    learning_rate: float = 0.1
+    bad_step: int = 0
+    bad_value: float = math.nan
+    evaluation_interval: int = 10
+
+    @property
+    def final_step(self) -> int:
+        return self.total_steps
+
+    def evaluation_due(self, step: int) -> bool:
+        return step % self.evaluation_interval == 0
+
+
+class ToyAlgorithm(Algorithm[Toy]):
+    """Adds noise of every generator to one weight; a batch is the number of its first step."""
+
+    columns = ("weight", "rare")
+    optional_columns = ("rare",)
+    log: ClassVar[list[Any]] = []
+
+    def __init__(self, recipe: Toy) -> None:
+        super().__init__(recipe)
+        self.weight = nn.Linear(1, 1, bias=False)
+
+    @property
+    def policy(self) -> Any:
+        return self.weight
+
+    def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> Any:
+        raise NotImplementedError
+
+    def networks(self) -> nn.Module:
+        return self.weight
+
+    def prepare(self, step: int, folder: Path) -> None:
+        self.optimizer = torch.optim.Adam(self.weight.parameters(), lr=self.recipe.learning_rate)
+        self.log.append(("prepare", step, folder))
+
+    def batches(self) -> Any:
+        return count()
+
+    def size(self, batch: int) -> int:
+        return self.recipe.batch
+
+    def returns(self, batch: int) -> torch.Tensor:
+        return torch.arange(batch % 3, dtype=torch.float32)  # of 0, 1 or 2 episodes
+
+    def update(self, batch: int, step: int) -> dict[str, Any]:
+        self.log.append(("update", step))
+        noise = torch.rand(1, 1) + random.random() + float(np.random.rand())
+        self.optimizer.zero_grad()
+        self.weight(noise).sum().backward()
+        self.optimizer.step()
+        value = self.weight.weight.detach().squeeze()
+        if step == self.recipe.bad_step and step:
+            if self.recipe.bad_value == math.inf:  # found at once
+                check_finite(["weight"], torch.tensor([math.inf]))
+            value = torch.tensor(self.recipe.bad_value)  # left to the loop
+        return {"rare": math.nan, "weight": value}
+
+    def state(self) -> dict[str, Any]:
+        return {"optimizer": self.optimizer}
+
+    def play(self, step: int) -> list[Outcome]:
+        self.log.append(("play", step))
+        return [Outcome(step, [float(step + i) for i in range(self.recipe.evaluation_episodes)])]
+
+    def close(self) -> None:
+        self.log.append(("close",))
+
+
+SMALL = Toy(
+    name="toy",
+    env="CartPole-v1",
+    backbone=mlp(),
+    log_interval=5,
+    checkpoint_interval=4,
+    evaluation_episodes=2,
+)
+
+
+@pytest.fixture(autouse=True)
+def log():
+    ToyAlgorithm.log.clear()
+    return ToyAlgorithm.log
+
+
+def start(recipe: Toy, folder: Path, *callbacks: Callback) -> Run:
+    run = Run(folder, recipe) if folder.exists() else Run.create(folder, recipe)
+    with run:
+        train(recipe, run, callbacks)
+    return run
+
+
+def steps_of(run: Run) -> list[int]:
+    return [int(row["step"]) for row in read_metrics(run.folder / "metrics.csv")]
+
+
+class Steps(Callback):
+    """Which steps it was shown; acts when it has seen some step's update."""
+
+    def __init__(self, at: int = 0, act: Any = lambda: False) -> None:
+        self.at, self.act = at, act
+        self.seen: list[tuple[str, int]] = []
+
+    def collected(self, step: int, batch: Any) -> None:
+        self.seen.append(("collected", step))
+
+    def updated(self, step: int, policy: Any) -> bool:
+        self.seen.append(("updated", step))
+        return step == self.at and bool(self.act())
+
+
+@pytest.mark.parametrize(
+    ("batch", "rows", "saved"),
+    [
+        (1, [5, 10, 15, 20], [4, 8, 10, 12, 16, 20, 24]),
+        # Steps come in threes: what falls within a batch is done at its end.
+        (3, [6, 12, 15, 21], [6, 9, 12, 18, 21, 24]),
+    ],
+)
+def test_rows_evaluations_and_checkpoints_come_at_their_steps(tmp_path, batch, rows, saved, log):
+    saves = []
+    save = Run.save
+
+    def record(run, step, state):
+        saves.append(step)
+        save(run, step, state)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Run, "save", record)
+        callback = Steps()
+        run = start(replace(SMALL, batch=batch), tmp_path / "run", callback)
+    assert steps_of(run) == rows
+    assert saves == saved
+    ends = range(batch, 25, batch)
+    assert callback.seen == [(name, end) for end in ends for name in ("collected", "updated")]
+    played = [step for step in ends if step % 10 == 0]
+    assert [entry[1] for entry in log if entry[0] == "play"] == played
+    assert [entry[1] for entry in log if entry[0] == "update"] == [end - batch for end in ends]
+    assert log[0] == ("prepare", 0, tmp_path / "run")
+    assert log[-1] == ("close",)
+
+
+def test_rows_hold_means_and_episodes_since_the_last(tmp_path):
+    rows = read_metrics(start(SMALL, tmp_path / "run").folder / "metrics.csv")
+    assert list(rows[0]) == ["step", "time", "return_mean", "episodes", *ToyAlgorithm.columns]
+    # Batches 0 to 4 end with 0, 1, 2, 0, 1 episodes, which return 0; 0, 1; 0.
+    assert (rows[0]["episodes"], rows[0]["return_mean"]) == (4, 0.25)
+    assert all(math.isnan(row["rare"]) for row in rows)
+
+
+@pytest.mark.parametrize("stop", [3, 7, 10, 20])
+def test_a_run_that_was_interrupted_resumes_bit_for_bit(tmp_path, stop):
+    whole = start(SMALL, tmp_path / "whole")
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        start(
+            SMALL,
+            tmp_path / "run",
+            Steps(stop, lambda: os.kill(os.getpid(), signal.SIGINT)),
+        )
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert ToyAlgorithm.log[-1] == ("close",)
+    assert checkpoint_steps(tmp_path / "run" / "checkpoints")[-1] == stop
+    torch.manual_seed(123)  # the resuming process may be in any state
+    random.seed(123)
+    np.random.seed(123)
+    ToyAlgorithm.log.clear()
+    resumed = start(SMALL, tmp_path / "run")
+    assert ToyAlgorithm.log[:2] == [("prepare", stop, tmp_path / "run"), ("update", stop)]
+    state, expected = (load_checkpoint(run.checkpoints)[1] for run in (resumed, whole))
+    for name in ("networks", "optimizer", "rng"):
+        assert_same(state[name], expected[name])
+    weights = [
+        [str(row["weight"]) for row in read_metrics(run.folder / "metrics.csv")]
+        for run in (resumed, whole)
+    ]
+    assert weights[0] == weights[1]
+
+
+def test_a_run_that_was_killed_resumes_from_its_newest_checkpoint(tmp_path):
+    """Rows that were written after it are written again, with the same numbers."""
+    recipe = replace(SMALL, batch=2)
+    whole = start(recipe, tmp_path / "whole")
+    shutil.copytree(tmp_path / "whole", tmp_path / "run")
+    *_, before, last = checkpoint_steps(whole.checkpoints)
+    assert (before, last) == (20, 24)
+    shutil.rmtree(tmp_path / "run" / "checkpoints" / f"{last:012d}")
+    torch.manual_seed(123)
+    run = start(recipe, tmp_path / "run")
+    assert load_checkpoint(run.checkpoints)[0] == 24
+    assert steps_of(run) == steps_of(whole)
+    assert_same(*(load_trained(r)[1].networks().state_dict() for r in (run, whole)))
+
+
+def test_a_run_that_is_trained_is_not_trained_further(tmp_path):
+    whole = start(SMALL, tmp_path / "run")
+    ToyAlgorithm.log.clear()
+    again = start(SMALL, tmp_path / "run")
+    assert [entry[0] for entry in ToyAlgorithm.log] == ["prepare", "close"]
+    assert_same_run(again, whole)
+
+
+def test_a_resumed_optimizer_has_the_recipes_settings_and_its_own_counters(tmp_path):
+    start(SMALL, tmp_path / "run")
+    longer = replace(SMALL, total_steps=25, learning_rate=0.03)
+    state = load_checkpoint(start(longer, tmp_path / "run").checkpoints)[1]["optimizer"]
+    assert state["param_groups"][0]["lr"] == 0.03
+    assert state["state"][0]["step"].item() == 25
+
+
+def test_a_callback_ends_the_training_at_a_checkpoint(tmp_path):
+    run = start(SMALL, tmp_path / "run", Steps(7, lambda: True), Steps())
+    assert checkpoint_steps(run.checkpoints)[-1] == 7
+    assert ToyAlgorithm.log[-1] == ("close",)
+
+
+@pytest.mark.parametrize("value", [math.inf, math.nan])
+@pytest.mark.parametrize(
+    ("bad_step", "found", "saved"), [(1, 4, 0), (6, 8, 4), (9, 10, 8), (13, 15, 12), (23, 24, 20)]
+)
+def test_what_is_not_finite_is_neither_logged_nor_saved(tmp_path, value, bad_step, found, saved):
+    """Found by the update itself, or by the loop before the next row and the next checkpoint."""
+    recipe = replace(SMALL, bad_step=bad_step, bad_value=value)
+    at = bad_step + 1 if value == math.inf else found
+    good = f"the checkpoint of step {saved} is good" if saved else "none was saved"
+    message = rf"^weight became {value} in the update at step {at}; {good}$"
+    with pytest.raises(NotFiniteError, match=message):
+        start(recipe, tmp_path / "run")
+    run = Run(tmp_path / "run", recipe)
+    assert ([0, *checkpoint_steps(run.checkpoints)])[-1] == saved
+    assert all(step <= bad_step for step in steps_of(run))
+    assert ToyAlgorithm.log[-1] == ("close",)
+
+
+def test_evaluations_are_played_once(tmp_path):
+    run = start(replace(SMALL, total_steps=20), tmp_path / "run")
+    log = ToyAlgorithm.log
+    log.clear()
+    result = evaluate(run)
+    assert log == []
+    assert (result["returns"], result["steps"], result["seed"]) == ([20, 21], 20, 1_000_000)
+    assert (result["mean"], result["episodes"]) == (20.5, 2)
+    evaluate(run, replace(run.recipe, evaluation_seed=1))
+    assert evaluate(run, replace(run.recipe, evaluation_episodes=3))["returns"] == [20, 21, 22]
+    assert log == [("play", 20)] * 2
+
+
+def test_evaluations_of_other_weights_do_not_count(tmp_path):
+    run = start(SMALL, tmp_path / "run")
+    ToyAlgorithm.log.clear()
+    assert evaluate(run)["returns"] == [24, 25]
+    assert ToyAlgorithm.log == [("play", 24)]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda state: {"agent": state["networks"]}, "is from an older version of torchrl-tit"),
+        (lambda state: {**state, "networks": {}}, r"the checkpoint of step 25 in .* does not fit"),
+    ],
+)
+def test_checkpoints_that_do_not_fit(tmp_path, damage, message):
+    run = start(SMALL, tmp_path / "run")
+    step, state = load_checkpoint(run.checkpoints)
+    with run:
+        run.save(step + 1, damage(state))
+    for use in (lambda: start(replace(SMALL, total_steps=30), run.folder), lambda: evaluate(run)):
+        with pytest.raises((ValueError, CheckpointError), match=message):
+            use()
