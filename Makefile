@@ -17,22 +17,28 @@ ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
 .DELETE_ON_ERROR:
 # The tests come last, also under `make -j`: their closing line ends the log.
 .NOTPARALLEL:
-.PHONY: help demo test lint types unit bench format hooks clean
+.PHONY: help demo test lint types numerics unit bench format hooks clean
 
 help:  ## List the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-8s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: $(VENV)/installed-run  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 5 minutes) into runs/
 	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit-tuned --out $(OUT) $(ARGS)
 
-test: lint types unit  ## Check style, types and behaviour: all that must pass
+test: lint types numerics unit  ## Check style, types and behaviour: all that must pass
 
-lint: $(VENV)/installed-test  ## Check style and formatting
+lint: $(VENV)/installed-test  ## Check style, formatting and which modules import which
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
 
 types: $(VENV)/installed-test  ## Check types
 	$(BIN)/mypy
+
+# Processors differ in the order in which they add numbers up; this is the order of the plainest.
+numerics: $(VENV)/installed-test  ## Compare numbers once more as a processor of another kind makes them
+	ATEN_CPU_CAPABILITY=default $(ONE_THREAD) $(BIN)/python -m pytest tests -n $(WORKERS) \
+	  --dist worksteal -m "numerics and not slow" -k "not compile and not export"
 
 unit: $(VENV)/installed-test  ## Run the tests and the examples in docstrings (ARGS="-k history" for some)
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)

@@ -47,7 +47,11 @@ def metadata(wheel: Path) -> Message:
 def test_wheel_holds_every_module_once_and_nothing_beside_the_library(wheel: Path) -> None:
     with ZipFile(wheel) as archive:
         names = {n for n in archive.namelist() if ".dist-info/" not in n}
-    library = {p.relative_to(ROOT).as_posix() for p in (ROOT / "torchrl_tit").rglob("*.py")}
+    library = {
+        p.relative_to(ROOT).as_posix()
+        for p in (ROOT / "torchrl_tit").rglob("*")
+        if p.suffix in (".py", ".pyi")
+    }
     recipes = {
         p.relative_to(ROOT).as_posix()
         for p in (ROOT / "recipes").rglob("*")
