@@ -21,9 +21,9 @@ BENCHMARKS = [
 
 
 def main() -> None:
-    """Runs the benchmarks, prints their Markdown, and writes it with the numbers as JSON.
+    """Runs benchmarks, prints their Markdown, and writes it and the numbers as JSON.
 
-    All of them together are gathered in benchmarks.md and benchmarks.json too.
+    If all benchmarks run, benchmarks.md and benchmarks.json gather their results.
     """
     parser = argparse.ArgumentParser("python -m benchmarks")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(BENCHMARKS)}")
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def gather(out: Path) -> None:
-    """Puts what the benchmarks in a folder have written together: benchmarks.md and .json."""
+    """Joins the results of all benchmarks in a folder: benchmarks.md and benchmarks.json."""
     texts = [(out / f"{name}.md").read_text(encoding="utf-8") for name in BENCHMARKS]
     numbers = {name: json.loads((out / f"{name}.json").read_bytes()) for name in BENCHMARKS}
     write_text_atomic(out / "benchmarks.md", "\n".join(texts))

@@ -1,10 +1,10 @@
-"""A step of acting: the backbone with kept tokens, against the whole window encoded each time.
+"""A step of acting: the backbone with cached tokens, against encoding the whole window each time.
 
-Windows move on by one observation a step, as environments hand them over; every 25 steps one
-environment starts anew. Ours is the ``Backbone`` in acting mode, checks of frames and weights
-included, as it is and with its two parts compiled; the other is the straightforward network on the
-same windows. Milliseconds a step: of one thread's processor time on a CPU, where what else runs on
-the machine then counts for little.
+Windows move by one observation a step, as in an environment; every 25 steps, one environment begins
+a new episode. Ours is the ``Backbone`` in acting mode, including its checks of frames and weights,
+both eager and with its two parts compiled. The peer is the straightforward network on the same
+windows. Times are milliseconds a step; on a CPU, they are the processor time of one thread, which
+other programs on the machine hardly change.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ from .straightforward_ratios import HEADER, cells, record
 
 STEPS, REPEATS = 20, 7
 CASES = [
-    *(Case("Enhanced", "arrays", history, 8) for history in (1, 4, 16, 64)),
-    *(Case("Vanilla", "arrays", history, 8) for history in (1, 4, 16, 64)),
-    *(Case("Enhanced", "images", history, 8) for history in (1, 4, 16, 64)),
-    *(Case("Vanilla", "images", history, 8) for history in (1, 4, 16, 64)),
+    *(Case("Enhanced", "arrays", num_frames, 8) for num_frames in (1, 4, 16, 64)),
+    *(Case("Vanilla", "arrays", num_frames, 8) for num_frames in (1, 4, 16, 64)),
+    *(Case("Enhanced", "images", num_frames, 8) for num_frames in (1, 4, 16, 64)),
+    *(Case("Vanilla", "images", num_frames, 8) for num_frames in (1, 4, 16, 64)),
 ]
 COMPILED = [  # each takes a minute to compile
-    *(Case("Enhanced", "images", history, 8) for history in (4, 16, 64)),
-    *(Case("Vanilla", "images", history, 8) for history in (4, 64)),
+    *(Case("Enhanced", "images", num_frames, 8) for num_frames in (4, 16, 64)),
+    *(Case("Vanilla", "images", num_frames, 8) for num_frames in (4, 64)),
 ]
 
 
 def make_windows(case: Case, steps: int, device: str = "cpu") -> list[Tensor]:
-    """Windows [batch, K, *observation_shape] of so many steps."""
-    frames = case.frames(steps + case.history - 1)
-    windows = [frames[:, step : step + case.history].clone() for step in range(steps)]
-    for start in range(10, steps, 25):  # the first environment starts anew, with copies
-        for step in range(start, min(steps, start + case.history)):
-            windows[step][0, : case.history - 1 - (step - start)] = frames[
-                0, start + case.history - 1
+    """Makes the windows of consecutive steps, [batch, K, *observation_shape] each."""
+    frames = case.frames(steps + case.num_frames - 1)
+    windows = [frames[:, step : step + case.num_frames].clone() for step in range(steps)]
+    for start in range(10, steps, 25):  # an episode begins: the first frame is repeated
+        for step in range(start, min(steps, start + case.num_frames)):
+            windows[step][0, : case.num_frames - 1 - (step - start)] = frames[
+                0, start + case.num_frames - 1
             ]
     return [window.to(device) for window in windows]
 
 
 def milliseconds(act: Callable[[Tensor], Any], windows: list[Tensor]) -> float:
-    """Milliseconds a step."""
+    """Returns the milliseconds that a step takes."""
     clock = time.perf_counter if windows[0].is_cuda else time.thread_time
     synchronize(windows[0])
     start = clock()
@@ -71,7 +71,7 @@ def synchronize(tensor: Tensor) -> None:
 def our_step(
     case: Case, stack: ExitStack, *, compiled: bool, device: str
 ) -> Callable[[Tensor], object]:
-    """Our backbone in acting mode, for as long as the stack is open."""
+    """Returns our backbone in acting mode, which ends when the stack is closed."""
     backbone = Backbone(case.ours()).eval().to(device)
     if compiled:
         backbone.compile_parts(dynamic=False)
@@ -83,7 +83,7 @@ def our_step(
 def measure(
     case: Case, steps: int, repeats: int, *, compiled: bool = False, device: str = "cpu"
 ) -> dict[str, Any]:
-    """Measures ours, ours compiled, and the straightforward network, alternating."""
+    """Measures ours, ours compiled and the straightforward network, alternating."""
     torch.manual_seed(0)
     other = case.straightforward().eval().to(device)
     with ExitStack() as stack:
@@ -95,7 +95,7 @@ def measure(
         for _ in range(repeats):
             windows = make_windows(case, steps + 2, device)
             for name, act in acts.items():
-                milliseconds(act, windows[:2])  # fills what is kept
+                milliseconds(act, windows[:2])  # fills the cache
                 times[name].append(milliseconds(act, windows[2:]))
     return {**case.record(), "dtype": "float32", **record(times)}
 
@@ -104,8 +104,8 @@ def measure(
 def growth(
     case: Case, steps: int, repeats: int, *, compiled: bool = False, device: str = "cpu"
 ) -> list[float]:
-    """How much longer our step takes with K = 64 than in a case, alternating."""
-    cases = [case, replace(case, history=64)]
+    """Measures how much longer our step takes with K = 64 than in a case, alternating."""
+    cases = [case, replace(case, num_frames=64)]
     ratios = []
     with ExitStack() as stack:
         acts = [our_step(each, stack, compiled=compiled, device=device) for each in cases]
@@ -135,7 +135,7 @@ def main(out: Path | None) -> None:
             case, STEPS, REPEATS, compiled=compiled, device=device
         )
         for case in CASES
-        if case.history == 4
+        if case.num_frames == 4
         for compiled in ((False, True) if case in COMPILED else (False,))
     }
     markdown = (

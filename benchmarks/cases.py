@@ -1,4 +1,4 @@
-"""The networks that are measured: ours, and the same one written straightforwardly."""
+"""The networks that the benchmarks measure: ours, and the same ones written straightforwardly."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ import torch
 from torch import nn
 
 from torchrl_tit import EnhancedTIT, VanillaTIT
-from torchrl_tit.networks import EnhancedTITConfig, HistoryNetwork, VanillaTITConfig
+from torchrl_tit.networks import HistoryNetwork
 
 from .straightforward import StraightforwardTIT
 
 
 @dataclass(frozen=True)
 class Case:
-    """A network and what it is given; the defaults of images are those of the paper's Atari."""
+    """A network and its inputs; the sizes for images are those of the paper's Atari runs."""
 
     variant: Literal["Enhanced", "Vanilla"]
     inputs: Literal["arrays", "images"]
-    history: int
+    num_frames: int
     batch: int
 
     @property
@@ -37,9 +37,11 @@ class Case:
 
     def ours(self) -> HistoryNetwork:
         """Our network, without dropout."""
-        kind = EnhancedTITConfig if self.variant == "Enhanced" else VanillaTITConfig
+        build = EnhancedTIT if self.variant == "Enhanced" else VanillaTIT
         sizes = self.sizes
-        config: Any = kind(
+        return build(
+            self.observation_shape,
+            self.num_frames,
             patch_size=sizes["patch"],
             embed_dim=sizes["width"],
             num_heads_inner=sizes["heads"],
@@ -48,8 +50,6 @@ class Case:
             features_dim=sizes["features"],
             activation_head="tanh" if self.inputs == "arrays" else "gelu",
         )
-        build: Any = EnhancedTIT if self.variant == "Enhanced" else VanillaTIT
-        return build(self.observation_shape, self.history, config)
 
     def straightforward(self) -> StraightforwardTIT:
         """The same network on ``nn.MultiheadAttention``."""
@@ -73,12 +73,12 @@ class Case:
         return torch.randn(shape)
 
     def columns(self) -> list[object]:
-        """What a row of a table says of it."""
+        """The case as the first cells of a table row."""
         sizes = [self.sizes[name] for name in ("patch", "width", "heads", "blocks")]
-        return [self.variant, self.inputs, self.history, *sizes, self.batch]
+        return [self.variant, self.inputs, self.num_frames, *sizes, self.batch]
 
     def record(self) -> dict[str, Any]:
-        """The same for JSON."""
+        """The case for JSON."""
         return {**asdict(self), **self.sizes}
 
 
@@ -86,7 +86,7 @@ COLUMNS = ["variant", "inputs", "K", "patch", "width", "heads", "blocks", "batch
 
 
 def same_number_of_weights(case: Case) -> bool:
-    """Whether both networks of a case are the same size."""
+    """Whether both networks of a case have equally many weights."""
     counts = [
         sum(p.numel() for p in network.parameters())
         for network in (case.ours(), case.straightforward())

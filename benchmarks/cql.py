@@ -1,12 +1,12 @@
-"""One update of CQL_TIT: ours against d3rlpy's with the same networks, on the same batches.
+"""One update of CQL_TIT: this library against d3rlpy, with the same networks and batches.
 
 The networks are those of the paper's hopper-medium-replay: batch 256, two critics of three layers
-of 256, 30 actions in each state, an Enhanced_TIT of width 128 as actor, K = 1. Both update all of
-it once: temperature, critics, actor, targets. The floor is what the critics' matrix products take
-alone, each as one product in PyTorch.
+of 256, 30 actions in each state, an Enhanced_TIT of width 128 as actor, K = 1. Both update
+everything once: temperature, critics, actor, targets. The floor is the time of the critics' matrix
+products alone, each as one product in PyTorch.
 
-d3rlpy wants another version of Gymnasium than this project, for environments that are not needed
-here. Install it beside: ``pip install --no-deps -r benchmarks/d3rlpy.txt``.
+d3rlpy pins another version of Gymnasium than this project, for environments that are not needed
+here. Install it without its requirements: ``pip install --no-deps -r benchmarks/d3rlpy.txt``.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ from d3rlpy.models.encoders import EncoderFactory, VectorEncoderFactory
 from d3rlpy.torch_utility import TorchMiniBatch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
 
-from recipes.compilation import Compile
 from recipes.cql import CQL
-from recipes.cql.agent import CQLAgent
+from recipes.cql.algorithm import CQLAlgorithm
+from recipes.recipe import Compile
 from recipes.registry import RECIPES
-from torchrl_tit.networks import EnhancedTIT, EnhancedTITConfig
+from torchrl_tit.networks import build_network
 
 from .report import publish, spread, table
 
@@ -43,7 +44,7 @@ class TITEncoderFactory(EncoderFactory):
 
     def create(self, observation_shape: Any) -> nn.Module:
         """Builds the network."""
-        return _Newest(EnhancedTIT((OBSERVATION,), 1, tit_config()))
+        return _Newest(build_network(get_recipe().backbone, (OBSERVATION,)))
 
     @staticmethod
     def get_type() -> str:
@@ -67,13 +68,6 @@ def get_recipe() -> CQL:
     recipe = RECIPES["cql/hopper-medium-replay-v0/enhanced-tit"]
     assert isinstance(recipe, CQL)
     return recipe
-
-
-def tit_config() -> EnhancedTITConfig:
-    """The actor's settings."""
-    config = get_recipe().backbone
-    assert isinstance(config, EnhancedTITConfig)
-    return config
 
 
 def make_batch() -> TensorDictBase:
@@ -101,13 +95,20 @@ def make_batch() -> TensorDictBase:
 
 def make_ours(compiled: Compile) -> Callable[[TensorDictBase], Any]:
     """Our update."""
-    recipe = replace(get_recipe(), compile=compiled)
-    update, _ = recipe.make_update(CQLAgent(recipe))
-    return lambda batch: update(batch, 0, 0)
+    algorithm = _WithoutData(replace(get_recipe(), compile=compiled))
+    algorithm.prepare(0, Path())
+    return lambda batch: algorithm.update(batch, 0)
+
+
+class _WithoutData(CQLAlgorithm):
+    """The algorithm without the data set: batches are made here."""
+
+    def make_buffer(self) -> ReplayBuffer:
+        return ReplayBuffer()
 
 
 def make_theirs() -> Callable[[TensorDictBase], Any]:
-    """d3rlpy's, which takes its weight of the conservative term for each critic."""
+    """The update of d3rlpy, whose weight of the conservative term is that of each critic."""
     recipe = get_recipe()
     algorithm = CQLConfig(
         actor_learning_rate=recipe.actor_learning_rate,
@@ -169,12 +170,12 @@ def make_floor() -> Callable[[TensorDictBase], Any]:
 
 
 def ratios(one: Sequence[float], other: Sequence[float]) -> list[float]:
-    """How many times the other each is."""
+    """Element-wise quotients."""
     return [a / b for a, b in zip(one, other, strict=True)]
 
 
 def differences(one: Sequence[float], other: Sequence[float]) -> list[float]:
-    """What each is more than the other."""
+    """Element-wise differences."""
     return [a - b for a, b in zip(one, other, strict=True)]
 
 
@@ -195,7 +196,7 @@ def main(out: Path | None) -> None:
         update(batches[0])
     for _ in range(ROUNDS):
         for name, update in updates.items():
-            start = time.process_time()  # what runs beside on the machine does not count
+            start = time.process_time()  # other processes on the machine do not count
             for batch in batches:
                 update(batch)
             times[name].append((time.process_time() - start) / STEPS)

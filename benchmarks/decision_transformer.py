@@ -27,15 +27,15 @@ from torchrl.objectives import DTLoss
 from torchrl_tit.datasets import SequenceStorage, episodes_from_arrays, make_replay_buffer
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.modules import acting, make_dt_actor, make_dt_predictor
-from torchrl_tit.networks import DecisionTransformer
+from torchrl_tit.modules import DTHead, acting, make_dt_actor, make_dt_predictor
+from torchrl_tit.networks import DTTIT, DecisionTransformer, HistoryNetwork
 from torchrl_tit.objectives import MaskedDTLoss
 from torchrl_tit.transforms import SequenceHistory
 
 from .report import publish, spread, table
 
 ROUNDS, STEPS, EPISODES = 10, 4, 100
-ENCODERS: dict[str, Any] = {"DT": "linear", "DT_TIT": "inner_transformer"}
+NETWORKS = {"DT": DecisionTransformer, "DT_TIT": DTTIT}
 TASKS = {"HalfCheetah-v5": 30, "Hopper-v5": 200}  # with the longest episode
 
 
@@ -50,9 +50,10 @@ def make_buffer() -> ReplayBuffer:
     return make_replay_buffer(SequenceStorage(episodes, 20), 64)
 
 
-def make_network(encoder: str) -> DecisionTransformer:
-    """The protocol's network."""
-    return DecisionTransformer((11,), 3, state_encoder=encoder)
+def make_network(name: str, size: int = 11, action_dim: int = 3) -> tuple[HistoryNetwork, DTHead]:
+    """The protocol's network and its head."""
+    network = NETWORKS[name]((size,), action_dim=action_dim)
+    return network, DTHead(network.features_dim, action_dim)
 
 
 def make_peer() -> DTLoss:
@@ -96,7 +97,7 @@ def make_step(loss: nn.Module, buffer: ReplayBuffer) -> Callable[[], None]:
 
 
 def seconds(function: Callable[[], Any], repeats: int = 1) -> float:
-    """Seconds of processor time of one call: what runs beside on the machine does not count."""
+    """Seconds of processor time of one call, which other processes do not change."""
     start = time.process_time()
     for _ in range(repeats):
         function()
@@ -111,19 +112,16 @@ def matrix_rate() -> float:
 
 def count_operations(buffer: ReplayBuffer) -> int:
     """Floating point operations in the matrix products of DT's gradient step."""
-    network, batch = make_network("linear"), buffer.sample()
-    entries = ("observation", "action", "return_to_go", "timestep", "mask")
+    predictor, batch = make_dt_predictor(*make_network("DT")), buffer.sample()
     with FlopCounterMode(display=False) as counter:
-        network(*(batch[entry] for entry in entries)).sum().backward()
+        predictor(batch)["action"].sum().backward()
     return counter.get_total_flops()
 
 
 def measure_training() -> tuple[list[list[object]], dict[str, Any]]:
     """A row for each network, and the numbers."""
     buffer = make_buffer()
-    losses = {
-        name: MaskedDTLoss(make_dt_predictor(make_network(e))) for name, e in ENCODERS.items()
-    }
+    losses = {name: MaskedDTLoss(make_dt_predictor(*make_network(name))) for name in NETWORKS}
     steps = {"TorchRL": make_step(make_peer(), buffer)}
     steps |= {name: make_step(loss, buffer) for name, loss in losses.items()}
     operations = count_operations(buffer)
@@ -138,11 +136,11 @@ def measure_training() -> tuple[list[list[object]], dict[str, Any]]:
     for name, taken in times.items():
         ratios = [peer / own for peer, own in zip(times["TorchRL"], taken, strict=True)]
         ratio = "" if name == "TorchRL" else spread(ratios, 2)
-        rows.append([NAMES[name], spread([1000 * t for t in taken]), ratio])
+        rows.append([TITLES[name], spread([1000 * t for t in taken]), ratio])
     return rows, {"seconds": times, "floor_operations": operations, "operations_per_second": rates}
 
 
-NAMES = {
+TITLES = {
     "TorchRL": "`DTActor` in `DTLoss`",
     "DT": "DT of this library",
     "DT_TIT": "DT_TIT of this library",
@@ -155,12 +153,12 @@ def measure_evaluation() -> tuple[list[list[object]], dict[str, Any]]:
     rows: list[list[object]] = []
     numbers: dict[str, Any] = {}
     for task, longest in TASKS.items():
-        for name, encoder in ENCODERS.items():
+        for name in NETWORKS:
             torch.manual_seed(0)
             single = make_evaluation_env(task, longest, 1)
-            shape = single.observation_spec["observation"].shape[1:]
-            size = single.action_spec_unbatched.shape[0]
-            actor = make_dt_actor(DecisionTransformer(shape, size, state_encoder=encoder))
+            (size,) = single.observation_spec["observation"].shape[1:]
+            action_dim = single.action_spec_unbatched.shape[0]
+            actor = make_dt_actor(*make_network(name, size, action_dim))
             many = make_evaluation_env(task, longest, EPISODES)
             with acting(actor):
                 apart = seconds(partial(evaluate, single, actor, EPISODES))

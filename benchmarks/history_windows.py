@@ -1,8 +1,8 @@
-"""Windows a second out of a stored stream: HistoryStorage against CatFrames' own replay buffer.
+"""Histories sampled a second: HistoryStorage against a replay buffer with CatFrames.
 
-Both draw batches of 256 transitions with the history of the observation and of the next one, from
-the same episodes, in memory, one thread, alternating. CatFrames' sampler draws whole slices of K
-transitions and stacks within them, so that it never starts a window near an episode's beginning.
+Both sample batches of 256 transitions, with the histories of the observation and of the next one,
+from the same episodes in memory, on one thread, alternating. CatFrames' sampler draws whole slices
+of K transitions and stacks within them, so it never samples the first K - 1 steps of an episode.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CASES = {  # observation shape, dtype, transitions, K
 
 
 def make_stream(shape: tuple[int, ...], dtype: torch.dtype, steps: int) -> dict[str, torch.Tensor]:
-    """Random transitions in episodes of 200 to 400 steps."""
+    """Makes random transitions in episodes of 200 to 400 steps."""
     frames = torch.randint(0, 256, (steps + 1, *shape)).to(dtype)
     ends = torch.zeros(steps, dtype=torch.bool)
     ends[torch.randint(200, 400, (steps,)).cumsum(0).clamp(max=steps) - 1] = True
@@ -45,13 +45,13 @@ def make_stream(shape: tuple[int, ...], dtype: torch.dtype, steps: int) -> dict[
 
 
 def make_ours(stream: dict[str, torch.Tensor], num_frames: int) -> ReplayBuffer:
-    """Our buffer over the stream."""
+    """Makes our buffer of the stream."""
     episodes = episodes_from_arrays(**stream)
     return make_replay_buffer(HistoryStorage(episodes, num_frames), BATCH)
 
 
 def make_catframes(stream: dict[str, torch.Tensor], num_frames: int) -> ReplayBuffer:
-    """TorchRL's buffer over the same stream."""
+    """Makes TorchRL's buffer of the same stream."""
     ends = stream["terminals"].unsqueeze(-1)
     data = TensorDict(
         {
@@ -92,7 +92,7 @@ def make_catframes(stream: dict[str, torch.Tensor], num_frames: int) -> ReplayBu
 
 
 def windows_per_second(sample: Callable[[], Any]) -> float:
-    """Transitions drawn a second."""
+    """Measures the transitions sampled a second."""
     batches, start = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - start) < SECONDS:
         assert len(sample()) == BATCH
@@ -124,7 +124,7 @@ def main(out: Path | None) -> None:
             "median_ratio": statistics.median(ratios),
         }
     markdown = (
-        "# Histories cut out of stored episodes\n\n"
+        "# Histories cut from stored episodes\n\n"
         f"Batches of {BATCH} transitions with both histories; {REPEATS} rounds of {SECONDS:.0f} "
         "second each, alternating: median (range).\n\n"
         + table(["", "HistoryStorage", "CatFrames in a replay buffer", "ratio, pair by pair"], rows)

@@ -1,7 +1,7 @@
-"""Bytes for each stored transition: frames stored once, against stacked histories.
+"""Bytes of each stored transition: frames stored once, against stacked histories.
 
-``HistoryStorage`` keeps each observation once and cuts histories out when they are sampled. A
-buffer of stacked frames keeps the history of the observation and that of the next one.
+``HistoryStorage`` stores each observation once and cuts histories when they are sampled. A buffer
+of stacked frames stores the history of the observation and that of the next one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CASES = {
 
 
 def bytes_of(data: TensorDict) -> int:
-    """Bytes of all tensors, each memory counted once."""
+    """Counts the bytes of all tensors; shared memory counts once."""
     storages = {
         value.untyped_storage().data_ptr(): value.untyped_storage().nbytes()
         for value in data.values(include_nested=True, leaves_only=True)
@@ -33,10 +33,10 @@ def bytes_of(data: TensorDict) -> int:
     return sum(storages.values())
 
 
-def stacked_bytes(stream: dict[str, torch.Tensor], history: int) -> float:
-    """Bytes a transition of a buffer that holds stacked frames."""
+def stacked_bytes(stream: dict[str, torch.Tensor], num_frames: int) -> float:
+    """Measures the bytes of a transition in a buffer of stacked frames."""
     steps = len(stream["rewards"])
-    index = (torch.arange(steps).unsqueeze(1) - torch.arange(history - 1, -1, -1)).clamp(min=0)
+    index = (torch.arange(steps).unsqueeze(1) - torch.arange(num_frames - 1, -1, -1)).clamp(min=0)
     ends = stream["terminals"].unsqueeze(-1)
     data = TensorDict(
         {
@@ -56,10 +56,10 @@ def stacked_bytes(stream: dict[str, torch.Tensor], history: int) -> float:
     return bytes_of(storage._storage) / steps
 
 
-def our_bytes(stream: dict[str, torch.Tensor], history: int) -> float:
-    """Bytes a transition of ours, with what finds the windows."""
+def our_bytes(stream: dict[str, torch.Tensor], num_frames: int) -> float:
+    """Measures the bytes of a transition in ours, including the index of windows."""
     episodes = episodes_from_arrays(**stream)
-    storage = HistoryStorage(episodes, history)
+    storage = HistoryStorage(episodes, num_frames)
     tensors = [value for value in vars(storage).values() if isinstance(value, torch.Tensor)]
     index = sum(tensor.untyped_storage().nbytes() for tensor in tensors)
     return (bytes_of(episodes.rows) + index) / len(stream["rewards"])
@@ -70,11 +70,12 @@ def main(out: Path | None) -> None:
     rows, numbers = [], {}
     for name, (shape, dtype) in CASES.items():
         stream = make_stream(shape, dtype, STEPS)
-        for history in (1, 4, 16, 64):
-            ours, stacked = our_bytes(stream, history), stacked_bytes(stream, history)
-            rows.append([name, history, f"{ours:.0f}", f"{stacked:.0f}", f"{stacked / ours:.1f}"])
-            numbers[f"{name}, K = {history}"] = {"ours": ours, "stacked": stacked}
-    markdown = f"# Memory\n\nBytes for each of {STEPS} stored transitions.\n\n" + table(
+        for num_frames in (1, 4, 16, 64):
+            ours, stacked = our_bytes(stream, num_frames), stacked_bytes(stream, num_frames)
+            ratio = f"{stacked / ours:.1f}"
+            rows.append([name, num_frames, f"{ours:.0f}", f"{stacked:.0f}", ratio])
+            numbers[f"{name}, K = {num_frames}"] = {"ours": ours, "stacked": stacked}
+    markdown = f"# Memory\n\nBytes of each of {STEPS} stored transitions.\n\n" + table(
         ["", "K", "HistoryStorage", "stacked frames", "ratio"], rows
     )
     publish("memory", markdown, numbers, out)

@@ -1,8 +1,9 @@
 """PPO on CartPole end to end: our recipe against Stable-Baselines3 with the same network.
 
-Both: Enhanced_TIT with K 1, width 32, 2 blocks, 1 head, features 64; 8 environments, 2048 steps a
-batch, minibatches of 64, 10 epochs, one thread. Environment steps a second over whole batches,
-collecting and updating; the first batch, in which libraries warm up and compile, is left out.
+Both: Enhanced_TIT with K = 1, width 32, 2 blocks, 1 head and 64 features; 8 environments, 2048
+steps a batch, minibatches of 64, 10 epochs, one thread. Speed is environment steps a second over
+whole batches, collection and update together, without the first batch, in which libraries warm up
+and compile.
 """
 
 from __future__ import annotations
@@ -27,17 +28,20 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
-from recipes import ppo
-from recipes.compilation import Compile
-from recipes.metrics import Metrics, read_metrics
-from recipes.ppo import training
-from recipes.ppo.agent import Agent
+from recipes import ppo, runner
+from recipes.algorithm import make_algorithm
+from recipes.callback import Callback
+from recipes.metrics import read_metrics
+from recipes.ppo import algorithm
+from recipes.ppo.algorithm import PPOAlgorithm
+from recipes.recipe import Compile
 from recipes.registry import get_recipe
 from recipes.run import Run
-from torchrl_tit.envs import GymVectorEnv
+from torchrl_tit.envs import TransformedVectorEnv
 from torchrl_tit.files import write_bytes_atomic
 from torchrl_tit.modules import Backbone
 
@@ -49,28 +53,29 @@ BATCHES, STEPS, ENVS, REPEATS = 5, 2048, 8, 5
 
 @dataclass
 class Outcome:
-    """What a run shows."""
+    """Speed and return of a run."""
 
     laps: list[tuple[float, float]]
-    """At the end of each batch: seconds on the wall, and of this process."""
+    """Wall time and processor time at the end of each batch, in seconds."""
     first_batch: float
-    """Seconds on the wall."""
+    """Wall time of the first batch, in seconds."""
     training_return: float
     """Mean return of the episodes that ended in the last batch."""
     parameters: int
 
     def speed(self, clock: int = 0) -> float:
-        """Environment steps a second on the wall (0) or of this process (1)."""
+        """Environment steps a second of wall time (0) or processor time (1)."""
         seconds = self.laps[-1][clock] - self.laps[0][clock]
         return (len(self.laps) - 1) * STEPS / seconds
 
 
 def lap() -> tuple[float, float]:
+    """Wall time and processor time now, in seconds."""
     return time.perf_counter(), time.process_time()
 
 
 class Extractor(BaseFeaturesExtractor):
-    """The straightforward network in Stable-Baselines3's terms: observations without history."""
+    """The straightforward network for Stable-Baselines3: observations without a time axis."""
 
     def __init__(self, space: Any) -> None:
         super().__init__(space, 64)
@@ -81,7 +86,7 @@ class Extractor(BaseFeaturesExtractor):
 
 
 class Batches(BaseCallback):
-    """Notes when each batch ends, its update included, and the returns of the last one."""
+    """Records when each batch and its update end, and the returns of the last batch."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -102,7 +107,7 @@ class Batches(BaseCallback):
 
 
 def run_sb3(seed: int) -> Outcome:
-    """Stable-Baselines3 with the straightforward network."""
+    """Trains Stable-Baselines3 with the straightforward network."""
     agent = PPO(
         "MlpPolicy",
         make_vec_env("CartPole-v1", ENVS, seed=seed),
@@ -122,7 +127,7 @@ def run_sb3(seed: int) -> Outcome:
 
 
 def run_ours(seed: int, compile: Compile, timers: Timers | None = None) -> Outcome:
-    """The recipe as the command line runs it, with its checkpoints and metrics."""
+    """Trains the recipe as the command line does, with checkpoints and metrics."""
     named = get_recipe("ppo/cartpole/enhanced-tit")
     assert isinstance(named, ppo.PPO)
     recipe = replace(
@@ -133,26 +138,29 @@ def run_ours(seed: int, compile: Compile, timers: Timers | None = None) -> Outco
         seed=seed,
         compile=compile,
     )
-    laps: list[tuple[float, float]] = []
-    log = Metrics.log
-
-    def log_lap(metrics: Metrics, step: int, **values: float) -> None:
-        log(metrics, step, **values)
-        laps.append(lap())
-        if timers is not None and len(laps) == 1:
-            timers.seconds.clear()
-
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        Run.create(Path(folder, "run"), recipe) as run,
-        patch.object(Metrics, "log", log_lap),
-    ):
+    laps = Laps(timers)
+    with tempfile.TemporaryDirectory() as folder, Run.create(Path(folder, "run"), recipe) as run:
         start, _ = lap()
-        recipe.train(run)
+        runner.train(recipe, run, [laps])
         last = read_metrics(run.folder / "metrics.csv")[-1]
-    agent = Agent(recipe, recipe.make_env(1, seed))
-    parameters = sum(parameter.numel() for parameter in agent.parameters())
-    return Outcome(laps, laps[0][0] - start, last["return_mean"], parameters)
+    networks = make_algorithm(recipe).networks()
+    assert isinstance(networks, nn.Module)
+    parameters = sum(parameter.numel() for parameter in networks.parameters())
+    return Outcome(laps.laps, laps.laps[0][0] - start, last["return_mean"], parameters)
+
+
+class Laps(Callback):
+    """Records when each update ends; timers start after the first one."""
+
+    def __init__(self, timers: Timers | None) -> None:
+        self.laps: list[tuple[float, float]] = []
+        self.timers = timers
+
+    def updated(self, step: int, policy: TensorDictModuleBase) -> bool:
+        self.laps.append(lap())
+        if self.timers is not None and len(self.laps) == 1:
+            self.timers.seconds.clear()
+        return False
 
 
 class Timers:
@@ -167,7 +175,7 @@ class Timers:
             try:
                 return function(*args, **kwargs)
             finally:
-                # The backbone serves both; only the update has gradients.
+                # The backbone runs in both; only the update has gradients.
                 key = part.format("update" if torch.is_grad_enabled() else "collect")
                 self.seconds[key] += time.perf_counter() - start
 
@@ -175,30 +183,29 @@ class Timers:
 
 
 def profile(compile: Compile) -> dict[str, float]:
-    """Where our time goes: the share of each part, without the first batch."""
+    """Measures the share of each part in our time, without the first batch."""
     timers = Timers()
-    make_objective = training.make_objective
+    prepare = PPOAlgorithm.prepare
+
+    def prepare_timed(self: PPOAlgorithm, *args: Any) -> None:
+        prepare(self, *args)
+        self.objective = timers.around(self.objective, "update: forward")
+
     parts: list[tuple[Any, str, str]] = [
         (Collector, "rollout", "collect"),
-        (GymVectorEnv, "step_and_maybe_reset", "collect: environments"),
-        (training, "add_advantages", "advantages"),
+        (TransformedVectorEnv, "step_and_maybe_reset", "collect: environments"),
+        (algorithm, "add_advantages", "advantages"),
         (Tensor, "backward", "update: backward"),
         (nn.utils, "clip_grad_norm_", "update: gradient norm"),
         (torch.optim.Adam, "step", "update: optimizer"),
     ]
-    if compile == "off":  # inside what is compiled there is nothing to time
+    if compile == "off":  # compiled code cannot be timed part by part
         parts.append((Backbone, "forward", "{}: backbone"))
     with ExitStack() as stack:
         for owner, name, part in parts:
             function = timers.around(getattr(owner, name), part)
             stack.enter_context(patch.object(owner, name, function))
-        stack.enter_context(
-            patch.object(
-                training,
-                "make_objective",
-                lambda *args, **kw: timers.around(make_objective(*args, **kw), "update: forward"),
-            )
-        )
+        stack.enter_context(patch.object(PPOAlgorithm, "prepare", prepare_timed))
         laps = run_ours(0, compile, timers).laps
     seconds = dict(timers.seconds)
     acting = seconds.get("collect: backbone", 0)
@@ -213,7 +220,7 @@ def profile(compile: Compile) -> dict[str, float]:
 
 
 def draw(shares: dict[str, dict[str, float]], picture: Path) -> None:
-    """Draws where the time of a PPO step goes, a bar for each way of running."""
+    """Draws the shares of the parts in the time of a PPO step, one bar for each mode."""
     figure = Figure(figsize=(8, 3.2), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -232,7 +239,7 @@ def draw(shares: dict[str, dict[str, float]], picture: Path) -> None:
 
 
 def main(out: Path | None) -> None:
-    """Measures on one thread, with an empty cache of compiled code."""
+    """Measures on one thread, with an empty compile cache."""
     torch.set_num_threads(1)
     with (
         tempfile.TemporaryDirectory() as cache,
@@ -266,11 +273,11 @@ def measure(out: Path | None) -> None:
             ],
         )
         + "\nThe return is that of the episodes that ended in the last batch, after "
-        f"{(BATCHES - 1) * STEPS} steps of\ntraining: the same algorithm learns the same. "
+        f"{(BATCHES - 1) * STEPS} steps of\ntraining: both implementations learn alike. "
         f"Compiling took {runs['compiled'][0].first_batch:.0f} seconds the first time, with "
-        "nothing\ncached on the disk, in the batch that is left out. It is on by default in runs "
+        "nothing\ncached on the disk, in the first batch. It is on by default in runs "
         "of 10,000 gradient\nsteps or more (100k steps have 15,680), where there is a C++ "
-        "compiler.\n\nWhere our time goes (runs of their own, with the timers in them):\n\n"
+        "compiler.\n\nWhere our time goes (separate runs, with timers):\n\n"
         + table(
             ["part", "compiled", "`--compile off`"],
             [
@@ -282,7 +289,7 @@ def measure(out: Path | None) -> None:
                 for part in shares["ours"]
             ],
         )
-        + "\nWhere it is compiled, the backbone is part of *the rest* and of *heads and loss*.\n"
+        + "\nIn compiled runs, the backbone is part of *the rest* and of *heads and loss*.\n"
     )
     numbers: dict[str, Any] = {
         name: {
@@ -299,7 +306,7 @@ def measure(out: Path | None) -> None:
 
 
 def row(name: str, runs: list[Outcome], peers: list[Outcome]) -> list[str]:
-    """A row of the table: speed, its ratios to a peer's, and what was learnt."""
+    """Makes a row of the table: speed, its ratios to a peer's, and the return."""
     ratios = (
         [run.speed(clock) / peer.speed(clock) for run, peer in zip(runs, peers, strict=True)]
         for clock in (0, 1)

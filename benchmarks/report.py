@@ -20,19 +20,19 @@ _BESIDE = ["d3rlpy"]
 
 
 def spread(values: Sequence[float], digits: int = 0) -> str:
-    """Median and range of repeats, as in ``300 (280 to 310)``."""
+    """Formats the median and the range of repeats, as ``300 (280 to 310)``."""
     low, middle, high = min(values), statistics.median(values), max(values)
     return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A Markdown table."""
+    """Makes a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
 
 
 def conditions() -> dict[str, Any]:
-    """Where and with what something was measured."""
+    """Returns the date, the machine and the versions of a measurement."""
     return {
         "date": datetime.date.today().isoformat(),
         "python": platform.python_version(),
@@ -47,7 +47,7 @@ def conditions() -> dict[str, Any]:
 
 
 def publish(name: str, markdown: str, numbers: dict[str, Any], out: Path | None) -> None:
-    """Prints the Markdown and writes both where a folder is given."""
+    """Prints the Markdown; writes Markdown and numbers if a folder is given."""
     facts = conditions()
     command = f"python -m benchmarks {name}"
     listed = ", ".join(f"{key} {value}" for key, value in facts.items())

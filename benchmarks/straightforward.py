@@ -1,6 +1,6 @@
-"""Both TITs as one would write them first: nn.MultiheadAttention, everything computed.
+"""Both TITs as one would write them first, on nn.MultiheadAttention.
 
-Every block runs over every token of every frame of the window, for each query anew.
+Every block computes every token of every frame of the window.
 """
 
 from __future__ import annotations

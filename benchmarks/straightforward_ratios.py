@@ -1,4 +1,4 @@
-"""Times of ours, ours compiled, and the straightforward network: as a record and as cells."""
+"""Times of ours, ours compiled and the straightforward network, as a record and as table cells."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def record(times: Mapping[str, list[float]]) -> dict[str, Any]:
 
 
 def cells(row: dict[str, Any], *, ms_digits: int, ratio_digits: int) -> list[str]:
-    """What a row of the table says under ``HEADER``."""
+    """Makes the cells of a table row under ``HEADER``."""
     compiled = "compiled_ms" in row
     return [
         row["dtype"],

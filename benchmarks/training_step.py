@@ -1,8 +1,8 @@
-"""A training step: forward, backward, and Adam, against the straightforward network.
+"""A training step: forward, backward and Adam, against the straightforward network.
 
-Both train on the same minibatch with the same loss and the same fused Adam. Ours is measured as it
-is, and compiled; in bfloat16 the straightforward network runs under the same autocast.
-Milliseconds a step.
+Both train on the same minibatch with the same loss and the same fused Adam. Ours is measured eager
+and compiled. In bfloat16 on a CPU, the straightforward network runs under the same autocast. Times
+are milliseconds a step.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from .report import publish, table
 from .straightforward_ratios import HEADER, cells, record
 
 CASES = [
-    *(Case("Enhanced", "arrays", history, 64) for history in (1, 4, 16, 64)),
-    *(Case("Vanilla", "arrays", history, 64) for history in (1, 4, 16, 64)),
-    *(Case("Enhanced", "images", history, 64) for history in (1, 4, 16, 64)),
-    *(Case("Vanilla", "images", history, 64) for history in (1, 4, 16, 64)),
+    *(Case("Enhanced", "arrays", num_frames, 64) for num_frames in (1, 4, 16, 64)),
+    *(Case("Vanilla", "arrays", num_frames, 64) for num_frames in (1, 4, 16, 64)),
+    *(Case("Enhanced", "images", num_frames, 64) for num_frames in (1, 4, 16, 64)),
+    *(Case("Vanilla", "images", num_frames, 64) for num_frames in (1, 4, 16, 64)),
 ]
 COMPILED = [  # each takes a minute to compile
     Case("Enhanced", "arrays", 1, 64),
@@ -44,7 +44,7 @@ REPEATS, SECONDS = 7, 0.5
 def make_step(
     network: nn.Module, history: Tensor, autocast: torch.dtype | None, compiled: bool
 ) -> Callable[[], None]:
-    """A function that takes one training step."""
+    """Returns a function that takes one training step."""
     optimizer = torch.optim.Adam(network.parameters(), fused=True)
 
     def loss_of(history: Tensor) -> Tensor:
@@ -62,7 +62,7 @@ def make_step(
 
 
 def milliseconds(step: Callable[[], None], history: Tensor, seconds: float) -> float:
-    """Milliseconds a step, over about so many seconds."""
+    """Returns the milliseconds that a step takes, measured over about ``seconds``."""
     synchronize(history)
     steps, start = 0, time.perf_counter()
     while steps == 0 or time.perf_counter() - start < seconds:
@@ -81,13 +81,13 @@ def measure(
     bfloat16: bool = False,
     device: str = "cpu",
 ) -> dict[str, Any]:
-    """Measures ours, ours compiled, and the straightforward network, alternating."""
+    """Measures ours, ours compiled and the straightforward network, alternating."""
     torch.manual_seed(0)
-    history = case.frames(case.history).to(device)
+    history = case.frames(case.num_frames).to(device)
     autocast = torch.bfloat16 if bfloat16 else None
     steps = {
         "ours": make_step(case.ours().to(device), history, autocast, compiled=False),
-        # On a GPU what is compared with is float32: that is how one would write it first.
+        # On a GPU, the peer is float32: that is how one would write it first.
         "straightforward": make_step(
             case.straightforward().to(device),
             history,
@@ -122,7 +122,7 @@ def measure(
 
 
 def main(out: Path | None) -> None:
-    """Measures with an empty cache of compiled code, so that compiling is timed too."""
+    """Measures with an empty compile cache, so that compile times are measured too."""
     with (
         tempfile.TemporaryDirectory() as cache,
         patch.dict(os.environ, TORCHINDUCTOR_CACHE_DIR=cache),

@@ -11,6 +11,7 @@ from benchmarks.__main__ import BENCHMARKS, gather
 from benchmarks.cases import Case, same_number_of_weights
 from benchmarks.matrix_peak import count_flops, peak_flops
 from benchmarks.straightforward_ratios import HEADER, cells
+from tests.numerics import assert_near
 from torchrl_tit.modules import Backbone
 
 CASES = [
@@ -50,7 +51,7 @@ def test_windows_move_on_and_start_anew():
     with torch.no_grad(), backbone.acting():
         for window in windows:
             features = backbone._call_module([window])
-            torch.testing.assert_close(features, backbone.module(window), rtol=0, atol=1e-5)
+            assert_near(features, backbone.module(window))
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
