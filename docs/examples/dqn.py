@@ -20,7 +20,7 @@ def main(steps: int = 2_000, dropout: float = 0.0) -> DQNLoss:
     env = TransformedEnv(
         GymEnv("CartPole-v1", categorical_action_encoding=True), History(num_frames=4)
     )
-    tit = EnhancedTIT((4,), history=4, ffn_dropout_inner=dropout)
+    tit = EnhancedTIT((4,), num_frames=4, ffn_dropout_inner=dropout)
     q_network = TensorDictSequential(
         Backbone(tit),
         TensorDictModule(nn.Linear(tit.features_dim, 2), ["features"], ["action_value"]),

@@ -22,7 +22,7 @@ def main(updates: int = 200, dropout: float = 0.0) -> IQLLoss:
     buffer.extend(env.rollout(400, break_when_any_done=False))
 
     def backbone(out_key: str) -> tuple[Backbone, int]:
-        tit = EnhancedTIT((3,), history=2, ffn_dropout_inner=dropout)
+        tit = EnhancedTIT((3,), num_frames=2, ffn_dropout_inner=dropout)
         return Backbone(tit, out_keys=[out_key]), tit.features_dim
 
     actor_backbone, width = backbone("actor_features")

@@ -17,7 +17,7 @@ def main(steps: int = 8_192, dropout: float = 0.0) -> tuple[Backbone, ClipPPOLos
     """Trains for some environment steps and returns the backbone, and the loss with its heads."""
     torch.manual_seed(0)
     env = TransformedEnv(GymEnv("CartPole-v1"), History(num_frames=4))
-    tit = EnhancedTIT((4,), history=4, ffn_dropout_inner=dropout)
+    tit = EnhancedTIT((4,), num_frames=4, ffn_dropout_inner=dropout)
     backbone = Backbone(tit)
     actor, critic = make_actor(tit.features_dim, env.action_spec), make_value(tit.features_dim)
     policy = TensorDictSequential(backbone, actor)

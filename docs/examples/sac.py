@@ -31,7 +31,7 @@ def main(steps: int = 1_000, dropout: float = 0.0) -> SACLoss:
     """Trains for some environment steps and returns the loss with its networks."""
     torch.manual_seed(0)
     env = TransformedEnv(GymEnv("Pendulum-v1"), History(num_frames=2))
-    actor_tit = EnhancedTIT((3,), history=2, ffn_dropout_inner=dropout)
+    actor_tit = EnhancedTIT((3,), num_frames=2, ffn_dropout_inner=dropout)
     actor = ProbabilisticActor(
         TensorDictSequential(
             Backbone(actor_tit),
@@ -46,12 +46,12 @@ def main(steps: int = 1_000, dropout: float = 0.0) -> SACLoss:
         distribution_class=TanhNormal,
         distribution_kwargs={"low": env.action_spec.space.low, "high": env.action_spec.space.high},
     )
-    # Critics have a backbone of their own: SAC stacks the parameters of its critics and runs them
-    # in one vmap, and an actor's update must not move what the critics see. Two are given, since
-    # copies of a single one would start with other weights than a TIT is built with.
+    # Critics have backbones of their own: SAC stacks the parameters of its critics and runs them in
+    # one vmap, and the actor's update must not change the critics' features. Two critics are given
+    # because TorchRL would initialise copies of a single one differently from a TIT.
     critics = []
     for _ in range(2):
-        critic_tit = EnhancedTIT((3,), history=2, ffn_dropout_inner=dropout)
+        critic_tit = EnhancedTIT((3,), num_frames=2, ffn_dropout_inner=dropout)
         head = ValueOperator(
             QHead(critic_tit.features_dim, 1),
             in_keys=["critic_features", "action"],

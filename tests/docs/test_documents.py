@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from recipes.recipe import recipe_from_json
+from recipes.recipe_json import recipe_from_json
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
