@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict
 from typing import Any
 
@@ -46,15 +46,17 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     algorithm = make_algorithm(recipe)
     step = saved_step = max(checkpoint_steps(run.checkpoints), default=0)
     algorithm.prepare(step, run.folder)
-    record = Record(recipe, algorithm)
-    parts = {"networks": algorithm.networks(), **algorithm.state(), "record": record}
-    _load(run, parts)
-    unit = "updates" if recipe.offline else "steps"
-    progress = tqdm(
-        total=recipe.final_step, initial=step, unit=f" {unit}", desc=recipe.name, smoothing=0.05
-    )
-    metrics = run.metrics(record.columns, last_step=step)
-    with closing(algorithm), closing(metrics), progress, Interrupt() as interrupt:
+    with ExitStack() as stack:
+        stack.enter_context(closing(algorithm))
+        record = Record(recipe, algorithm)
+        parts = {"networks": algorithm.networks(), **algorithm.state(), "record": record}
+        _load(run, parts)
+        metrics = stack.enter_context(closing(run.metrics(record.columns, last_step=step)))
+        unit = " updates" if recipe.offline else " steps"
+        progress = stack.enter_context(
+            tqdm(total=recipe.final_step, initial=step, unit=unit, desc=recipe.name, smoothing=0.05)
+        )
+        interrupt = stack.enter_context(Interrupt())
         batches = iter(algorithm.batches())
         while step < recipe.final_step:
             batch = next(batches)
@@ -103,7 +105,7 @@ class Record:
 
     def __init__(self, recipe: Recipe, algorithm: Algorithm[Any]) -> None:
         self.outcomes: list[Outcome] = []
-        """Of all evaluations so far."""
+        """The results of all evaluations so far."""
         self._recipe = recipe
         self._names = list(algorithm.columns)
         self._required = [name not in algorithm.optional_columns for name in self._names]
@@ -180,11 +182,10 @@ def load_trained(run: Run, recipe: Recipe | None = None) -> tuple[int, Algorithm
 
     Args:
         run: a run folder with a checkpoint.
-        recipe: the run's recipe, where some of its settings are overridden.
+        recipe: the run's recipe, if some of its settings are overridden.
 
     Returns:
-        The steps that it was trained for, the algorithm with its weights, and all that the
-        checkpoint holds.
+        The steps that it was trained for, the algorithm with its weights, and the whole checkpoint.
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
@@ -202,11 +203,11 @@ def load_trained(run: Run, recipe: Recipe | None = None) -> tuple[int, Algorithm
 def evaluate(run: Run, recipe: Recipe | None = None) -> dict[str, Any]:
     """Evaluates a run's newest checkpoint: full episodes, the most likely action, raw rewards.
 
-    Episodes that were played with these weights and seeds already are not played again.
+    Episodes already played with these weights and seeds are not played again.
 
     Args:
         run: a run folder with a checkpoint.
-        recipe: the run's recipe, where some of its settings are overridden.
+        recipe: the run's recipe, if some of its settings are overridden.
 
     Returns:
         See :func:`~recipes.outcomes.summarize`, and the "seed" of the first episode.
@@ -264,7 +265,7 @@ def _load(run: Run, parts: Mapping[str, Stateful]) -> None:
 
 def _load_part(part: Stateful, state: dict[str, Any]) -> None:
     if isinstance(part, torch.optim.Optimizer):
-        # Its settings are the recipe's, also where those were changed since; not so its counters.
+        # Hyperparameters come from the recipe, which may have changed; only counters are restored.
         groups = zip(state["param_groups"], part.state_dict()["param_groups"], strict=True)
         kept = [{**own, **{k: saved[k] for k in saved if k == "step"}} for saved, own in groups]
         state = {**state, "param_groups": kept}
