@@ -31,8 +31,8 @@ def should_compile(setting: Compile, gradient_steps: int) -> bool:
     """Decides whether an update runs through ``torch.compile``.
 
     Args:
-        setting: "on" and "off" are obeyed; "auto" is on for runs long enough to earn the minute
-            that compiling takes, where it works.
+        setting: "on" and "off" are final; "auto" compiles, if that works, in runs long enough to
+            make up for the minute it takes.
         gradient_steps: how many the whole run has.
 
     Raises:
@@ -80,9 +80,9 @@ def autocast_type(precision: Precision, device: torch.device) -> torch.dtype | N
     """Returns the dtype of matrix products for autocast; None is the dtype of the weights.
 
     Args:
-        precision: "auto" is bfloat16 on a GPU that has it, where it is several times as fast.
-            Processors gain from it only where they have instructions for it.
-        device: where the networks are.
+        precision: "auto" is bfloat16 on a GPU that supports it, which makes them several times as
+            fast. CPUs gain from it only if they have instructions for it.
+        device: the device of the networks.
 
     Example:
         >>> autocast_type("auto", torch.device("cpu")) is None

@@ -26,7 +26,7 @@ def make_critic(
         observation_shape: shape of an observation.
         action_dim: number A of entries of an action.
         hidden: widths of the MLP's hidden layers.
-        network: settings of the backbone; without any, the MLP reads the newest observation.
+        network: settings of the backbone; if None, the MLP reads the newest observation.
 
     Returns:
         A module that reads "observation" [..., *obs], or "history" [..., K, *obs], and "action"

@@ -1,4 +1,4 @@
-"""What every algorithm that trains on a data set has."""
+"""The base class of algorithms that train on a data set."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class DatasetAlgorithm(Algorithm[RecipeT]):
 
         Raises:
             FileNotFoundError: if there are no such data.
-            DatasetError: if they cannot be used, or are of another task.
+            DatasetError: if they cannot be used, or belong to another task.
             ValueError: if they do not fit the networks.
         """
 

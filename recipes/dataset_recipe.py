@@ -1,4 +1,4 @@
-"""What every recipe that trains on a data set has."""
+"""The base class of recipes that train on a data set."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class DatasetRecipe(Recipe):
     max_episode_steps: int | None = None
     """Time limit of the task, for data files that do not record it; see docs/datasets.md."""
     gaps: Gaps = "error"
-    """What to do where the next observation of a step in a data file is not the observation that
+    """What to do if the next observation of a step in a data file is not the observation that
     follows: "error" refuses the data, "cut" ends the episode there."""
     batch_size: int = 64
     """Batch size of a gradient step."""

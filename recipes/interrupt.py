@@ -13,8 +13,8 @@ class Interrupt:
     """Turns the first Ctrl-C (or SIGTERM) into a request that the training loop reads.
 
     The loop completes its batch, saves a checkpoint and stops. A second Ctrl-C stops at once, with
-    the last checkpoint kept. So does an error in the batch: the same Ctrl-C also stops a C++
-    compiler that works for it.
+    the last checkpoint kept. A RuntimeError in the batch also stops at once: the first Ctrl-C
+    interrupts a C++ compiler that the batch runs.
 
     Example:
         >>> with Interrupt() as interrupt:
@@ -49,7 +49,7 @@ class Interrupt:
 def raise_on_signals() -> Iterator[None]:
     """Lets SIGTERM raise KeyboardInterrupt as Ctrl-C does, so that workers are stopped too.
 
-    So does SIGINT, which a shell ignores for a process that it starts in the background.
+    SIGINT raises it too, even if the process started in the background, ignoring SIGINT.
 
     Example:
         >>> with raise_on_signals():

@@ -1,4 +1,4 @@
-"""Results of evaluations, and what ``evaluation.json`` holds of them."""
+"""Results of evaluations, and the contents of ``evaluation.json``."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def summarize(
 
     Returns:
         ``mean``, ``std`` (population), ``episodes`` and ``returns`` of the better target return,
-        ``env``, and the ``steps`` that the networks were trained for. Of a run on a data set also
+        ``env``, and the ``steps`` that the networks were trained for. For a run on a data set also
         the ``dataset`` and the ``score``, normalised as D4RL does: ``last``, of the better target,
-        and ``best``, over all steps and targets (returns as they are where there is no reference).
-        Where returns are asked for, ``target_return`` is the better one, and ``targets`` holds the
+        and ``best``, over all steps and targets (raw returns if there is no reference).
+        With target returns, ``target_return`` is the better one, and ``targets`` holds the
         same for each.
     """
     best = max(outcomes, key=lambda outcome: outcome.mean)

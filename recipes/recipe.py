@@ -1,4 +1,4 @@
-"""What every recipe has: the settings of an experiment, without its code."""
+"""The base class of recipes: the settings of an experiment, without its code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MAX_SEED = 2**31
 class Recipe:
     """Settings that every experiment has.
 
-    The recipes of an algorithm are a subclass, which registers itself by its definition:
+    The recipes of an algorithm are a subclass, which is registered when it is defined:
     ``algorithm`` is the name that JSON and the command line use, ``builds`` the
     :class:`~recipes.algorithm.Algorithm` that they drive, as "module:Class".
     """
@@ -35,9 +35,9 @@ class Recipe:
     registered: ClassVar[dict[str, type[Recipe]]] = {}
     """Recipes by the name of their algorithm."""
     offline: ClassVar[bool] = False
-    """Whether steps are gradient steps, and returns those of evaluations."""
+    """Whether it trains offline: steps are gradient steps, and returns are from evaluations."""
     supplies_actions: ClassVar[bool] = False
-    """Whether networks are given past actions and returns to go beside observations."""
+    """Whether networks read past actions and returns to go in addition to observations."""
 
     name: Annotated[str, tyro.conf.Suppress] = ""
     """The recipe's name, such as ppo/cartpole/enhanced-tit."""
@@ -62,7 +62,7 @@ class Recipe:
 
     def __init_subclass__(cls, *, algorithm: str | None = None, builds: str | None = None) -> None:
         super().__init_subclass__()
-        if algorithm is not None and builds is not None:  # not what several recipes share
+        if algorithm is not None and builds is not None:  # skips base classes of several algorithms
             cls.algorithm, cls.builds = algorithm, builds
             Recipe.registered[algorithm] = cls
 
@@ -109,7 +109,7 @@ class Recipe:
 
 
 def check_types(settings: object, prefix: str = "") -> None:
-    """Raises ValueError where a field of settings, or of settings within, has a wrong type.
+    """Raises ValueError if a field of settings, or of nested settings, has a wrong type.
 
     Example:
         >>> from torchrl_tit.settings import Inner
@@ -143,7 +143,7 @@ def _field_types(kind: type) -> dict[str, Any]:
 
 
 def checked(name: str, value: object, kind: Any) -> Any:
-    """Returns a value as its type, or raises ValueError where it is of another."""
+    """Returns a value converted to a type, or raises ValueError if it has another type."""
     if isinstance(kind, type) and issubclass(kind, Part | Network):
         raise ValueError(f"field {name!r} must be settings of a {kind.__name__}, not {value!r}")
     try:

@@ -16,11 +16,11 @@ from .recipe import Recipe, checked, field_types, get_recipe_class
 T = TypeVar("T")
 
 _ENCODER = "encoder"
-"""The entry that says which frame or history encoder the others are settings of."""
+"""The entry that names the frame or history encoder; the others are its settings."""
 
 
 def recipe_to_json(recipe: Recipe) -> str:
-    """Writes a recipe as JSON, from which :func:`recipe_from_json` makes it again."""
+    """Writes a recipe as JSON, which :func:`recipe_from_json` reads back."""
     fields = {"algorithm": recipe.algorithm, **settings_to_dict(recipe)}
     return json.dumps(fields, indent=2) + "\n"
 
@@ -43,7 +43,7 @@ def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
         source: the file it came from, for messages.
 
     Raises:
-        ValueError: if it is no JSON, a field is unknown or has the wrong type or value.
+        ValueError: if it is not JSON, a field is unknown or has the wrong type or value.
     """
     try:
         fields = json.loads(text)

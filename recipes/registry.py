@@ -27,10 +27,10 @@ RECIPES: dict[str, Recipe] = {
 
 
 def get_recipe(name: str) -> Recipe:
-    """Looks a recipe up.
+    """Looks up a recipe.
 
     Raises:
-        ValueError: if there is none of that name; the message names the nearest ones.
+        ValueError: if no recipe has that name; the message suggests similar names.
 
     Example:
         >>> get_recipe("ppo/cartpole/enhanced-tit").env
@@ -42,10 +42,10 @@ def get_recipe(name: str) -> Recipe:
 
 
 def find_recipe(name: str) -> Recipe:
-    """Looks a recipe up by name, or reads it from a JSON file such as a run's ``recipe.json``.
+    """Looks up a recipe by name, or reads it from a JSON file such as a run's ``recipe.json``.
 
     Raises:
-        ValueError: if there is none of that name, or the file holds none, or it is a folder.
+        ValueError: if no recipe has that name, the file holds no recipe, or it is a folder.
         FileNotFoundError: if there is no such file.
 
     Example:

@@ -43,7 +43,7 @@ class Run:
 
     Args:
         folder: the folder.
-        recipe: what is run.
+        recipe: the settings.
     """
 
     def __init__(self, folder: Path, recipe: Recipe) -> None:
@@ -66,7 +66,7 @@ class Run:
 
     @staticmethod
     def check_new(folder: Path) -> None:
-        """Raises FileExistsError where :meth:`create` would."""
+        """Raises FileExistsError if :meth:`create` would."""
         # recipe.json is written last: without it, what a killed process left here is not a run.
         if folder.exists() and (
             not folder.is_dir()
@@ -143,7 +143,7 @@ class Run:
 
     @contextmanager
     def restoring(self, step: int) -> Iterator[None]:
-        """Raises ValueError where a checkpoint's state does not fit what the recipe builds."""
+        """Raises ValueError if a checkpoint's state does not fit what the recipe builds."""
         try:
             yield
         except (LookupError, RuntimeError, TypeError, ValueError) as error:

@@ -12,13 +12,13 @@ from torchrl_tit.checkpoint import collector_state, reset_unsavable_env, set_col
 class CollectorState:
     """The state of a run's collector and of its environment.
 
-    A collector with processes of its own starts anew after a stop: what happens in those is not
-    saved. Environments that cannot be saved begin new episodes at each checkpoint.
+    A collector with its own processes starts anew when resumed, because their state is not saved.
+    Environments that cannot be saved begin new episodes at each checkpoint.
 
     Args:
         collector: the collector.
         seed: the run's seed.
-        step: environment steps so far; to be kept up to date.
+        step: environment steps so far; the caller keeps it up to date.
     """
 
     def __init__(self, collector: BaseCollector, seed: int, step: int) -> None:

@@ -29,7 +29,7 @@ def add_machine_options(parser: argparse.ArgumentParser) -> None:
 
 
 def override(recipe: Recipe, **fields: Any) -> Recipe:
-    """Returns the recipe with the given fields replaced; None leaves a field as it is."""
+    """Returns the recipe with the given fields replaced; None leaves a field unchanged."""
     return replace(recipe, **{key: value for key, value in fields.items() if value is not None})
 
 
@@ -44,7 +44,7 @@ def parse_fields(
         command: the command, for the help.
         description: the text at the start of the help.
     """
-    import tyro  # takes half a second, which commands without such fields save
+    import tyro  # takes half a second; other commands do not need it
 
     settings = make_dataclass("settings", fields)
     errors = io.StringIO()

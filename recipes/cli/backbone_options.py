@@ -34,15 +34,15 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
 
     ``--backbone.network`` replaces the network by one of the paper's, with as many frames as
     before. ``--backbone.frame`` and ``--backbone.history`` then replace an encoder. A new encoder
-    takes over what the recipe chose for the old one (what differs from that one's defaults) in
-    fields that both have; the others have their defaults.
+    inherits the old one's non-default values in fields that both have; its other fields have their
+    defaults.
 
     The result is not checked: arguments that are read later may be needed for it to be valid, such
     as ``--backbone.num-frames``.
 
     Args:
         recipe: the recipe.
-        arguments: all arguments of the command; those that are not about this are ignored.
+        arguments: all arguments of the command; unrelated ones are ignored.
 
     Raises:
         ValueError: if a name is missing or unknown; the message suggests the nearest ones.
@@ -74,7 +74,7 @@ def check_recipe(recipe: RecipeT) -> RecipeT:
     """Returns the recipe after all checks of its fields, which :func:`choose_network` leaves out.
 
     Raises:
-        ValueError: if a field has a value that is not possible.
+        ValueError: if a field has an invalid value.
     """
     backbone = recipe.backbone
     frame, history = replace(backbone.frame), replace(backbone.history)

@@ -44,7 +44,7 @@ def describe(episodes: Episodes) -> str:
         episodes: The data.
 
     Returns:
-        Transitions, episodes, returns, normalised scores where there are any, shapes and dtypes.
+        Transitions, episodes, returns, normalised scores (if any), shapes and dtypes.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -101,8 +101,8 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
     Args:
         episodes: The data.
         target: A file ending in ".hdf5" or ".h5", or a folder or name for Minari.
-        env_name: The Gymnasium task that the data are from, for Minari; by default what the data
-            themselves say, where Gymnasium knows it.
+        env_name: The Gymnasium task that the data are from, for Minari; by default the recorded
+            one, if Gymnasium knows it.
 
     Returns:
         What was written, and what was not.

@@ -1,4 +1,4 @@
-"""Which commands there are. Each is imported only when it is called, so that all start quickly."""
+"""The commands. Each is imported only when it is called, so that all start quickly."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COMMANDS = {
 USAGE = """\
 usage: {program} COMMAND ...
 
-  list [PATTERN]              list the named recipes, those whose name contains PATTERN
+  list [PATTERN]              list the named recipes whose name contains PATTERN
   show NAME                   print a recipe's settings as JSON
   train NAME [--FIELD VALUE]  train a named recipe, or one in a JSON file;
                               `train NAME --help` explains every field
@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Runs the command line.
 
     Args:
-        arguments: the arguments after the program's name; those of this process where None.
+        arguments: the arguments after the program's name; those of this process if None.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help"):

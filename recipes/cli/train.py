@@ -33,7 +33,7 @@ def train(arguments: list[str]) -> None:
 
 def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Path | None]:
     """Overrides a recipe's fields, its network's included, and reads --out."""
-    out = tyro.conf.arg(help="Run folder to make; runs/NAME/seed-SEED-DATE where missing.")
+    out = tyro.conf.arg(help="Run folder to make; runs/NAME/seed-SEED-DATE if missing.")
     recipe = choose_network(recipe, arguments)
     parsed = parse_fields(
         [

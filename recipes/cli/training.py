@@ -17,11 +17,11 @@ from .evaluate import one_line
 
 
 def start(recipe: Recipe, folder: Path | None) -> None:
-    """Starts a run; nothing is written where its recipe cannot be run.
+    """Starts a run; writes nothing if its recipe cannot be run.
 
     Args:
         recipe: the recipe.
-        folder: the run folder to make; runs/NAME/seed-SEED-DATE where None.
+        folder: the run folder to make; runs/NAME/seed-SEED-DATE if None.
     """
     make_algorithm(recipe).check()
     _finish(Run.create(folder or _make_folder(recipe), recipe))
@@ -32,8 +32,8 @@ def resume(folder: Path, device: str | None = None, threads: int | None = None) 
 
     Args:
         folder: the run folder.
-        device: where to compute, if not where the recipe says.
-        threads: PyTorch's threads, if not as many as the recipe says.
+        device: the device to use; the recipe's if None.
+        threads: the number of PyTorch's threads; the recipe's if None.
     """
     run = Run.open(folder)
     run.recipe = override(run.recipe, device=device, threads=threads)
@@ -43,7 +43,7 @@ def resume(folder: Path, device: str | None = None, threads: int | None = None) 
 
 
 def _finish(run: Run) -> None:
-    """Does what is left to do of a run."""
+    """Finishes a run: trains, evaluates and plots what is left."""
     recipe, folder = run.recipe, run.folder
     with run:
         if run.is_complete():
@@ -63,7 +63,7 @@ def _finish(run: Run) -> None:
 
 
 def _make_folder(recipe: Recipe) -> Path:
-    """Makes a new folder at once, so that runs that start in the same second get one each."""
+    """Creates a folder at once, so that runs started in the same second get different ones."""
     name = recipe.name or recipe.algorithm
     base = Path("runs", name, f"seed-{recipe.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
     base.parent.mkdir(parents=True, exist_ok=True)

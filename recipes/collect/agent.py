@@ -37,7 +37,7 @@ class Agent(ABC):
 
     Args:
         algorithm: the recipe's algorithm.
-        settings: what is collected.
+        settings: the settings of the collection.
     """
 
     def __init__(self, algorithm: Algorithm[Any], settings: Collection) -> None:
@@ -51,7 +51,7 @@ class Agent(ABC):
 
         Args:
             name: the mark's name, for messages.
-            mark: a mean return; the end of the training where None.
+            mark: a mean return; the end of the training if None.
 
         Returns:
             The first score that reached it.
@@ -81,7 +81,7 @@ class FinishedRun(Agent):
 
     Args:
         run: the run.
-        settings: what is collected.
+        settings: the settings of the collection.
 
     Raises:
         ValueError: if a mixed set is requested, or the checkpoint does not fit the recipe.

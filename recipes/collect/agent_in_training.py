@@ -27,7 +27,7 @@ from .agent import Agent, Score
 from .episodes import as_fields
 from .settings import Collection
 
-# Environment steps to a file of transitions; a checkpoint ends the file too.
+# Environment steps per file of transitions; a checkpoint also ends a file.
 _STEPS_PER_PART = 1000
 
 
@@ -40,12 +40,12 @@ class AgentInTraining(Agent, Callback):
         seen/                            all transitions, in parts
 
     It is the callback of its own training: it keeps the transitions, evaluates the policy, and ends
-    the training where a mark is reached for the first time.
+    the training when a mark is reached for the first time.
 
     Args:
         algorithm: the recipe's algorithm, for environments and policies.
-        settings: what is collected.
-        folder: the folder; made where missing.
+        settings: the settings of the collection.
+        folder: the folder; created if missing.
         action_space: the task's.
     """
 
@@ -69,7 +69,7 @@ class AgentInTraining(Agent, Callback):
         return TransitionParts(self._folder / "seen")
 
     def reach(self, name: str, mark: float | None) -> Score:
-        """Trains until the mark is reached, from the newest checkpoint, unless it was before."""
+        """Trains from the newest checkpoint until the mark is reached, unless it already was."""
         self._load()
         while (score := self._first(mark)) is None:
             if self._step >= self.final_step:
@@ -95,7 +95,7 @@ class AgentInTraining(Agent, Callback):
             self.saving(step)
 
     def saving(self, step: int) -> None:
-        """Writes the transitions that a checkpoint comes after."""
+        """Writes the transitions that were seen before a checkpoint."""
         if self._pending:
             names = self._pending[0]
             fields = {n: torch.cat([part[n] for part in self._pending], 1) for n in names}
@@ -103,7 +103,7 @@ class AgentInTraining(Agent, Callback):
             self._pending = []
 
     def updated(self, step: int, policy: TensorDictModuleBase) -> bool:
-        """Evaluates the policy where due; returns whether it reaches a mark for the first time."""
+        """Evaluates the policy if due; returns whether it reaches a mark for the first time."""
         before, self._step = self._step, step
         interval = self.settings.evaluation_interval
         ends = step >= self.final_step
@@ -115,12 +115,12 @@ class AgentInTraining(Agent, Callback):
         write_text_atomic(self._folder / "evaluations.json", scores)
         if not ends and all(self._first(mark) is not score for mark in self._marks):
             return False
-        # All are kept: no more than one for each mark, and for each end that was put off.
+        # All are kept: at most one for each mark, and one for each final step that was set.
         save_checkpoint(self._folder / "agents", step, policy.state_dict(), keep=step)
         return True
 
     def _first(self, mark: float | None) -> Score | None:
-        """The first score that reached a mark, or that of the end."""
+        """The first score that reached a mark, or the one at the end of training."""
         if mark is None:
             reached = (score for score in self._scores if score.step >= self.final_step)
         else:
@@ -146,5 +146,5 @@ class AgentInTraining(Agent, Callback):
         return (
             f"{name} {mark:g} was never reached in {self._step} steps: the best of "
             f"{len(self._scores)} evaluations had a mean return of {best:.1f}. Raise total_steps, "
-            "with which the same command resumes, or choose another mark and another folder"
+            "and the same command resumes; or choose another mark and another folder"
         )

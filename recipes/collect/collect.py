@@ -24,20 +24,20 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
         random.hdf5, random-v0/   a data set in D4RL's layout, and the same as a Minari data set
         mixed.hdf5, mixed-v0/ ...
 
-    What a killed process had finished is not repeated, and the data are those of one that was not
-    killed (for games, whose state cannot be saved, others of the same kind).
+    Work that a killed process finished is not repeated, and the data are the same as without the
+    interruption (except for games, whose state cannot be saved).
 
     Args:
         settings: what to make.
-        folder: where; made where missing.
+        folder: the output folder; created if missing.
         command: the command line, which is recorded in the data.
 
     Returns:
         A line for each set.
 
     Raises:
-        ValueError: if the settings are not possible, the folder holds sets with others, or a mark
-            is never reached. What was made before stays.
+        ValueError: if the settings are invalid, the folder holds sets with other settings, or a
+            mark is never reached. What was made before stays.
         FileExistsError: if the folder holds anything else.
         RuntimeError: if another process uses the folder.
         OSError: if something cannot be written.

@@ -1,4 +1,4 @@
-"""Which agent the settings name."""
+"""The choice of the agent for `data collect`."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ def find_agent(settings: Collection, folder: Path, action_space: Space) -> Agent
     """Finds the agent that the settings name, and checks that it fits the task.
 
     Args:
-        settings: what is collected.
+        settings: the settings of the collection.
         folder: where an agent is trained; not touched here.
         action_space: the task's.
 
     Returns:
-        The agent; None where no set needs one.
+        The agent; None if no set needs one.
 
     Raises:
-        ValueError: if there is none of that name, or it does not fit the task or the sets.
+        ValueError: if there is no such agent, or it does not fit the task or the sets.
         FileNotFoundError: if it is a run without a checkpoint, or a JSON file that does not exist.
     """
     if set(settings.sets) == {"random"}:
@@ -49,14 +49,14 @@ def find_agent(settings: Collection, folder: Path, action_space: Space) -> Agent
 
 
 def _default_sac(settings: Collection) -> SAC:
-    """SAC's defaults, with the networks of the agents whose data D4RL is made of."""
+    """SAC's defaults, with the networks of the agents that made D4RL's data."""
     backbone = mlp(hidden_dim=256, activation="relu")
     return SAC(name="sac", env=settings.env, backbone=backbone, total_steps=settings.total_steps)
 
 
 def _adapted(recipe: Recipe, settings: Collection) -> Recipe:
     """The recipe with the collection's seed, threads and checkpoints, and a single collector."""
-    # The batches of several collectors do not continue one another.
+    # With several collectors, batches do not continue one another.
     single: dict[str, Any] = {"collectors": 1, "async_collection": False}
     names = {field.name for field in fields(recipe)}
     return replace(
@@ -69,7 +69,7 @@ def _adapted(recipe: Recipe, settings: Collection) -> Recipe:
 
 
 def _check(recipe: Recipe, env: str) -> None:
-    """Raises ValueError where a recipe's data are not those of a task."""
+    """Raises ValueError if a recipe does not make the data of a task."""
     problem = None
     if recipe.offline:
         problem = "is trained on a data set, not in its task"

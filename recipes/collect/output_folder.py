@@ -1,4 +1,4 @@
-"""The folder of `data collect`: whose it is, and the provenance of the data in it."""
+"""The folder of `data collect`: the settings that it belongs to, and the provenance of its data."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .settings import KINDS, Collection, Kind
 def claim_folder(
     folder: Path, settings: Collection, recipe: Recipe | None, command: str
 ) -> dict[str, Any]:
-    """Records in a folder what is made there, or checks that it is the same.
+    """Records the settings in a folder, or checks that they match those recorded there.
 
     Args:
         folder: the folder.
@@ -75,7 +75,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _check(folder: Path, before: dict[str, Any], now: dict[str, Any], settings: Collection) -> None:
-    """Raises ValueError where a folder holds data that these settings would not give."""
+    """Raises ValueError if a folder holds data that these settings would not produce."""
     old, new = dict(before["settings"]), dict(now["settings"])
     steps = old.get("total_steps", 0)
     for values in (old, new):

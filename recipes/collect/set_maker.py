@@ -36,9 +36,9 @@ class SetMaker:
 
     Args:
         settings: what to make.
-        folder: where.
+        folder: the output folder.
         task: the task's spaces.
-        agent: the agent; None where only random actions are needed.
+        agent: the agent; None if only random actions are needed.
         provenance: what every set records.
     """
 
@@ -87,7 +87,7 @@ class SetMaker:
         return self._with_provenance(episodes, "random", "uniform actions")
 
     def _of_agent(self, kind: Kind, folder: Path) -> Episodes:
-        """What the agent saw until it reached the set's mark, or what it does from then on."""
+        """The transitions of training up to the set's mark, or episodes played at the mark."""
         agent = self._agent
         assert agent is not None
         score = agent.reach(*self._settings.mark(kind))
@@ -124,7 +124,7 @@ class SetMaker:
     def _with_provenance(
         self, episodes: Episodes, kind: Kind, algorithm: str, score: Score | None = None
     ) -> Episodes:
-        """The episodes with what they record of their origin."""
+        """The episodes, with their provenance as attributes."""
         attributes: dict[str, Any] = {
             "kind": kind,
             "algorithm": algorithm,
@@ -135,7 +135,7 @@ class SetMaker:
             **self._provenance,
         }
         if score is None:
-            attributes.pop("recipe", None)  # that of the other sets
+            attributes.pop("recipe", None)  # the agent's, which made the other sets
         else:
             name, mark = self._settings.mark(kind)
             attributes |= {

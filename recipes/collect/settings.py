@@ -28,9 +28,9 @@ class Collection:
     env: Annotated[str, tyro.conf.Positional]
     """Name of the Gymnasium task, such as Hopper-v5, CartPole-v1 or ALE/Pong-v5."""
     agent: str = "sac"
-    """The agent: sac, which is SAC's defaults with an MLP, for continuous actions; any ppo or sac
-    recipe, by name or as a JSON file; or the folder of a finished run of one, which gives a medium
-    or an expert set."""
+    """The agent: sac (SAC's defaults with an MLP, for continuous actions); any ppo or sac recipe,
+    by name or as a JSON file; or the folder of a finished ppo or sac run, for a medium or an expert
+    set."""
     sets: tuple[Kind, ...] = ("random", "mixed", "medium", "expert")
     """Which sets to make. More sets can be added to the same folder later."""
     transitions: int = 100_000

@@ -49,7 +49,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
         if not isinstance(spec, Bounded) or spec.ndim != 1:
             raise ValueError(
                 f"cql needs continuous actions within bounds, but those of {recipe.env} are "
-                f"{describe(spec)}: use a discrete-cql recipe where they are discrete"
+                f"{describe(spec)}: use a discrete-cql recipe if they are discrete"
             )
         backbone = self.make_backbone()
         head = make_squashed_actor(backbone.features_dim, spec)
@@ -98,7 +98,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
             self.actor_loss = compile_and_time(loss.actor_loss, "the actor's loss")
 
     def state(self) -> Mapping[str, Stateful]:
-        """Optimizers, and where the replay buffer is in its draws."""
+        """Optimizers, and the sampling state of the replay buffer."""
         return {
             "temperature_optimizer": self.temperature_optimizer,
             "critic_optimizer": self.critic_optimizer,
@@ -128,7 +128,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
     def _critic_gradients(
         self, batch: TensorDictBase, samples: PolicySamples
     ) -> tuple[Tensor, Tensor]:
-        """Adds them to the critics' weights; returns squared error and conservative term."""
+        """Adds the critics' gradients; returns their squared error and conservative term."""
         if self.chunk_size is not None:
             return self.loss.critic_gradients(batch, samples, self.chunk_size)
         loss_qvalue, loss_cql = self.critic_losses(batch, samples)

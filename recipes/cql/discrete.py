@@ -41,7 +41,7 @@ class DiscreteCQLAlgorithm(QAlgorithm[DiscreteCQL]):
         if not isinstance(spec, Categorical):
             raise ValueError(
                 f"discrete-cql needs a few discrete actions, but those of {recipe.env} are "
-                f"{describe(spec)}: use a cql recipe where they are continuous"
+                f"{describe(spec)}: use a cql recipe if they are continuous"
             )
         backbone = self.make_backbone()
         values = nn.Linear(backbone.features_dim, spec.space.n)
@@ -67,7 +67,7 @@ class DiscreteCQLAlgorithm(QAlgorithm[DiscreteCQL]):
             self.objective = compile_and_time(loss.forward, "the loss")
 
     def state(self) -> Mapping[str, Stateful]:
-        """Optimizer, and where the replay buffer is in its draws."""
+        """Optimizer, and the sampling state of the replay buffer."""
         return {"optimizer": self.optimizer, "buffer": self.buffer}
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:

@@ -1,4 +1,4 @@
-"""What conservative Q-learning with continuous and with discrete actions share."""
+"""Shared by conservative Q-learning with continuous and with discrete actions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class QAlgorithm(DatasetAlgorithm[RecipeT]):
     continuous: ClassVar[bool]
     """Whether actions are continuous."""
     compiles_on: ClassVar[tuple[str, ...]]
-    """Types of device on which compiling pays."""
+    """Types of device on which compiling pays off."""
 
     loss: LossModule
     """The losses, with all weights."""
@@ -104,9 +104,9 @@ class QAlgorithm(DatasetAlgorithm[RecipeT]):
         return pays and should_compile(setting, self.recipe.total_updates)
 
     def named(self, terms: Tensor) -> Mapping[str, Tensor]:
-        """Checks and names what an update gives, float [columns].
+        """Checks and names the terms of an update, float [columns].
 
-        A GPU would have to be waited for: there the runner checks, less often.
+        Checking on a GPU would mean waiting for it, so there the runner checks, less often.
         """
         if terms.device.type == "cpu":
             check_finite(self.columns, terms)
@@ -119,7 +119,7 @@ class QAlgorithm(DatasetAlgorithm[RecipeT]):
         return [Outcome(step, returns.tolist())]
 
     def check(self) -> None:
-        """As :meth:`DatasetAlgorithm.check`; also that what is to be compiled can be."""
+        """As :meth:`DatasetAlgorithm.check`; also checks that compiling works if requested."""
         self.should_compile()
         super().check()
 

@@ -36,7 +36,7 @@ class QRecipe(DatasetRecipe):
     """Whether to keep terminal observations, or zero them as d3rlpy 1.1.1 did. No loss reads
     them."""
     unfinished: Literal["keep", "drop"] = "drop"
-    """Whether to keep an episode without an end, where the data stop."""
+    """Whether to keep the last episode if the data stop before it ends."""
     evaluation_interval: int = 1000
     """Gradient steps between evaluations."""
     evaluation_episodes: int = 10

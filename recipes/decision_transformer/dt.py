@@ -49,7 +49,7 @@ class DTAlgorithm(SequenceAlgorithm[DT]):
         return make_replay_buffer(storage, self.recipe.batch_size, seed=self.recipe.seed)
 
     def state(self) -> Mapping[str, Stateful]:
-        """Optimizer, and the position of the replay buffer in its draws."""
+        """Optimizer, and the sampling state of the replay buffer."""
         return {"optimizer": self.optimizer, "buffer": self.buffer}
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor | float]:

@@ -34,7 +34,7 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
     """
 
     columns = (*_TERMS, "gradient_norm", "online_return", "learning_rate")
-    optional_columns = ("online_return",)  # the newest episodes', which pre-training has none of
+    optional_columns = ("online_return",)  # of the newest episodes; pre-training plays none
     action_padding = 0.0
 
     buffer: OnlineData
@@ -79,7 +79,7 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
         }
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Yields windows [B]; plays new episodes where a round begins."""
+        """Yields windows [B]; plays new episodes when a round begins."""
         while True:
             if self.recipe.round_begins(self.step):
                 self.buffer.add(self.explore(self.buffer.rounds))
@@ -108,7 +108,7 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
         """Plays a round's episodes side by side, with actions that are drawn, without dropout.
 
         Args:
-            number: of the round, from which its seeds follow together with the recipe's.
+            number: number of the round, which together with the recipe's seed sets its seeds.
         """
         recipe = self.recipe
         seed = int(np.random.SeedSequence([recipe.seed, number]).generate_state(1)[0]) % 2**31
@@ -123,7 +123,7 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
 
 
 def make_lamb(parameters: list[nn.Parameter], learning_rate: float, weight_decay: float) -> Lamb:
-    """Builds LAMB (arXiv 1904.00962) as the release of Online Decision Transformer has it.
+    """Builds LAMB (arXiv 1904.00962) as in the release of Online Decision Transformer.
 
     Weight decay is part of the update whose norm is compared with that of the weights. The latter
     norm is not clipped at 10, which wide layers reach, and the step is not divided by a bias

@@ -33,7 +33,7 @@ class OnlineData:
         make_storage: cuts windows out of episodes.
         batch_size: windows in a batch.
         capacity: episodes in the store.
-        seed: of the draws.
+        seed: seed for sampling.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class OnlineData:
         self._buffer = self._make_buffer()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the episodes of the store, without the data set, and the state of the draws."""
+        """Returns the episodes of the store, without the data set, and the sampling state."""
         state: dict[str, Any] = {"rounds": self.rounds, "buffer": self._buffer.state_dict()}
         if self.rounds:
             state["newest_return"] = self.newest_return
@@ -88,7 +88,7 @@ class OnlineData:
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
-        """Takes a state over."""
+        """Restores a state."""
         self.rounds = state_dict["rounds"]
         if self.rounds:
             self.newest_return = state_dict["newest_return"]

@@ -1,4 +1,4 @@
-"""What Decision Transformer and Online Decision Transformer share: network, task and data."""
+"""Shared by Decision Transformer and Online Decision Transformer: network, task and data."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Agent(nn.Module):
 
     Args:
         network: predicts features.
-        head: makes actions of them.
+        head: maps features to actions.
         observation_shape: shape of an observation.
     """
 
@@ -95,16 +95,15 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         target_return: float | None = None,
         **settings: Any,
     ) -> EnvBase:
-        """Builds the task with all that the policy reads; actions go to it as they are.
+        """Builds the task with everything that the policy reads; actions are passed on unchanged.
 
         Episodes of a task without a time limit are truncated after ``max_ep_len`` steps.
 
         Args:
             num_envs: environments that are stepped side by side.
-            seed: of the first environment.
-            target_return: the return that the network is asked for; the recipe's first one where
-                not given.
-            **settings: of the task.
+            seed: seed of the first environment.
+            target_return: the return that the network aims for; the recipe's first one if None.
+            **settings: further settings of the task.
         """
         recipe, agent = self.recipe, self.agent
         if time_limit(recipe.env) is None:
@@ -139,7 +138,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         return env.append_transform(Compose(*transforms, history))
 
     def load_data(self) -> Episodes:
-        """Loads the data set and takes its statistics.
+        """Loads the data set and computes its statistics.
 
         Raises:
             ValueError: if its actions are of another kind, no episode is finished, or one is longer

@@ -33,7 +33,7 @@ class SequenceRecipe(DatasetRecipe):
     return_scale: float = 1000.0
     """Divisor of the returns-to-go."""
     acting_num_frames: int | None = None
-    """Number of steps that the network reads when it acts: at most, and by default, those of a
+    """Number of steps that the network reads when it acts; at most, and by default, the length of a
     training window."""
     batch_size: int = 64
     """Windows in one gradient step."""
@@ -137,8 +137,8 @@ class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorit
     action_space: ActionSpace = "gaussian"
     """How actions are predicted; always "gaussian" here."""
     acting_num_frames: int | None = 5
-    """Number of steps that the network reads when it acts: at most those of a training window,
-    which null also means."""
+    """Number of steps that the network reads when it acts; at most, and if null, the length of a
+    training window."""
     batch_size: int = 256
     """Windows in one gradient step."""
     learning_rate: float = 1e-4

@@ -34,7 +34,7 @@ from ..stateful import CollectorState
 from .settings import PPO
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
-"""What TorchRL's loss gives, of which a row of metrics has the means."""
+"""The terms of TorchRL's loss, whose means are in each row of metrics."""
 
 
 class Agent(nn.Module):
@@ -58,7 +58,7 @@ class Agent(nn.Module):
         self.critic = make_value(features_dim, in_key=keys[-1])
 
     def encode(self, samples: TensorDictBase) -> TensorDictBase:
-        """Writes the features of steps [N], or where a state is carried of sequences [N, time]."""
+        """Writes the features of steps [N], or of sequences [N, time] if recurrent."""
         with set_recurrent_mode(self.backbone.is_recurrent):
             return self.backbone(samples)
 
@@ -69,7 +69,7 @@ class Agent(nn.Module):
 
 
 class PPOAlgorithm(Algorithm[PPO]):
-    """PPO as Stable-Baselines3 has it, on TorchRL's loss and collectors.
+    """PPO as in Stable-Baselines3, on TorchRL's loss and collectors.
 
     Args:
         recipe: the settings.
@@ -95,7 +95,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         return self.agent
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
-        """Builds the task, with histories, and the state where one is carried."""
+        """Builds the task, with histories, and with the state of a recurrent network."""
         return _with_state(make_task(self.recipe, num_envs, seed, **settings), self.agent.backbone)
 
     def prepare(self, step: int, folder: Path) -> None:
@@ -117,7 +117,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         self.optimizer = torch.optim.Adam(
             self.parameters, lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
         )
-        # How long a sequence is varies with where episodes begin, so those are not compiled.
+        # The length of sequences depends on where episodes begin, so those are not compiled.
         compiled = not recipe.is_recurrent and should_compile(recipe.compile, recipe.gradient_steps)
         self.objective: Callable[[TensorDict], tuple[Tensor, Tensor]] = self._objective
         if compiled:
@@ -132,7 +132,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         return {"optimizer": self.optimizer, "collector": self.collector_state}
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Yields what was collected, [envs, time]; frames are kept only while a batch is made."""
+        """Yields collected batches, [envs, time]; tokens are kept only while one is collected."""
         return while_acting(self.agent.policy, self.collector)
 
     def size(self, batch: TensorDictBase) -> int:
@@ -166,7 +166,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         if recipe.collectors > 1:
             self.collector.update_policy_weights_()
         self.collector_state.step = step + batch.numel()
-        # Where this goes to 0, the features are the same in all states, and so is the policy.
+        # If this goes to 0, the features are the same in all states, and so is the policy.
         features = batch[agent.backbone.features_keys[0]].flatten(0, -2)  # [steps, features]
         return {
             "learning_rate": learning_rate,
@@ -208,7 +208,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         return terms
 
     def _objective(self, minibatch: TensorDict) -> tuple[Tensor, Tensor]:
-        """What is minimised, float [], and its terms, float [terms]."""
+        """The loss, float [], and its terms, float [terms]."""
         self.agent.encode(minibatch)  # once; the heads read its features
         terms = self.loss(minibatch)
         total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
@@ -233,10 +233,10 @@ class PPOAlgorithm(Algorithm[PPO]):
         check_finite(["weights", "value"], torch.stack([weights, value]))
 
     def _make_collector(self, step: int, compiled: bool) -> BaseCollector:
-        """Builds what collects batches [num_envs, time], in this process or in several.
+        """Builds the collector of batches [num_envs, time], in this process or in several.
 
         Several share the environments, each with a copy of the policy. If they are asynchronous, a
-        batch is that of one of them.
+        batch comes from one of them.
         """
         recipe, policy = self.recipe, self.agent.policy
         settings: dict[str, Any] = {
@@ -247,7 +247,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         }
         if recipe.collectors == 1:
             mode = recipe.vectorization_mode
-            # What is kept of the frames just seen is decided between two parts, compiled apart.
+            # Which tokens are reused is decided between two parts that are compiled separately.
             whole = compiled and not self.agent.backbone.keeps_frames
             return Collector(
                 self.make_env(recipe.num_envs, recipe.seed, vectorization_mode=mode),
@@ -260,7 +260,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         kind = MultiAsyncCollector if recipe.async_collection else MultiSyncCollector
         together = {} if recipe.async_collection else {"cat_results": 0}
         make_share = partial(_make_share, recipe, self.agent.backbone, step)
-        with acting(policy):  # their copies of the policy act for good
+        with acting(policy):  # their copies of the policy stay in acting mode
             return kind(
                 [partial(make_share, index) for index in range(recipe.collectors)],
                 policy,
@@ -293,12 +293,12 @@ def make_task(recipe: PPO, num_envs: int, seed: int | None = None, **settings: A
 
 
 def _with_state(env: EnvBase, backbone: Backbone) -> EnvBase:
-    """Adds what carries the state of a recurrent network from step to step."""
+    """Adds transforms that carry the state of a recurrent network from step to step."""
     return env.append_transform(backbone.make_transforms()) if backbone.is_recurrent else env
 
 
 def _make_share(recipe: PPO, backbone: Backbone, step: int, index: int) -> EnvBase:
-    """Builds the environments of one process, in it.
+    """Builds the environments of one process; called in that process.
 
     Random numbers follow from the run's seed and the step at which the process starts.
     """
@@ -307,7 +307,7 @@ def _make_share(recipe: PPO, backbone: Backbone, step: int, index: int) -> EnvBa
     share = recipe.num_envs // recipe.collectors
     seeds = np.random.SeedSequence([recipe.seed, index, step])
     torch.manual_seed(seeds.generate_state(1).item())
-    # From the start the environments have the seeds that they have in one process.
+    # At the start, the environments have the same seeds as in one process.
     seed = recipe.seed + index * share if step == 0 else seeds.generate_state(2)[1].item() >> 1
     task = make_task(recipe, share, seed, vectorization_mode=recipe.vectorization_mode)
     return _with_state(task, backbone)
@@ -319,11 +319,11 @@ def add_advantages(
     """Writes ``advantage`` and ``value_target`` = advantage + value into a batch.
 
     The value of the next state is the one that the collector computed a step later, except where
-    the episode or the batch ends: there the critic is asked about the true next observation.
+    the episode or the batch ends: there the critic evaluates the true next observation.
 
     Args:
         batch: [envs, time], with the values of its states.
-        agent: the agent whose critic is asked.
+        agent: the agent whose critic is used.
         gae: TorchRL's estimator, which stops at terminations and continues at time limits.
         bootstrap_time_limit: if off, a time limit counts as a termination.
     """
@@ -348,8 +348,8 @@ def minibatches(batch: TensorDictBase, agent: Agent, recipe: PPO) -> Iterator[Te
         recipe: the settings.
 
     Yields:
-        Single steps [N]; where a state is carried sequences of consecutive steps [N, time], each
-        with the state that the network had at its start.
+        Single steps [N]; for recurrent networks sequences of consecutive steps [N, time], each with
+        the state that the network had at its start.
     """
     keys = [*agent.backbone.in_keys, "action", "action_log_prob", "advantage", "value_target"]
     length = recipe.sequence_length if recipe.is_recurrent else 1

@@ -124,8 +124,8 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
         _check_divides(self, "collectors", "num_envs", self.num_envs)
         if self.contrastive_coeff and not isinstance(self.backbone.history, CoBERL):
             raise ValueError(
-                "contrastive_coeff is the weight of a loss of coberl alone: set it to 0 for other "
-                "history encoders"
+                "contrastive_coeff is the weight of a loss that only coberl has: set it to 0 for "
+                "other history encoders"
             )
         if self.is_recurrent:
             steps = self.steps_per_batch // self.num_envs
@@ -163,7 +163,7 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
 
 
 def _check_divides(recipe: PPO, field: str, name: str, value: int) -> None:
-    """Raises ValueError where a field does not divide something."""
+    """Raises ValueError if a field does not divide something."""
     if value % getattr(recipe, field):
         raise ValueError(
             f"{field} {getattr(recipe, field)} does not divide {name} {value}: change one of them"

@@ -1,7 +1,7 @@
 """The named recipes of tasks without velocities, which need a history.
 
 The paper's runs on arrays see one observation (K = 1), which does not test the outer transformer.
-All networks train with the same settings. ``-tuned`` takes the whole observation for one patch and
+All networks train with the same settings. ``-tuned`` takes the whole observation as one patch and
 tells time steps apart, which docs/results/cartpole_no_velocity.md found to matter.
 """
 
@@ -15,7 +15,7 @@ from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 from ..ppo import PPO
 from .ppo_tuned import TUNED_TIT
 
-# Beyond the protocol's settings those that TIT needs, for all networks alike.
+# What TIT needs in addition to the protocol's settings, for all networks alike.
 _SETTINGS: dict[str, dict[str, Any]] = {
     "cartpole": {"env": "CartPole-v1", "total_steps": 100_000},
     "acrobot": {"env": "Acrobot-v1", "total_steps": 100_000},

@@ -7,7 +7,7 @@ from typing import Any
 
 from torchrl_tit.settings import Activation, Inner, Network
 
-# docs/results/classic_control.md says why. Environments side by side are for speed.
+# docs/results/classic_control.md says why. Several environments are for speed.
 FOR_SPARSE_GOALS: dict[str, Any] = {
     "num_envs": 16,
     "steps_per_batch": 1024,
@@ -16,7 +16,7 @@ FOR_SPARSE_GOALS: dict[str, Any] = {
     "entropy_coeff": 0.01,
     "reward_scale": 0.1,
 }
-"""Fields of the recipe that learn to reach a goal that is seldom found."""
+"""Fields of the recipe for tasks whose goal is seldom reached."""
 
 # docs/results/hopper.md says why.
 _FOR_LOCOMOTION: dict[str, Any] = {
@@ -34,7 +34,7 @@ class Tuned:
     fields: dict[str, Any]
     """Fields of the recipe."""
     patch_size: int | None = 1
-    """Entries of a patch; the whole observation where None."""
+    """Entries of a patch; the whole observation if None."""
     activation_head: Activation = "tanh"
     """Activation of the head."""
 

@@ -1,1 +1,1 @@
-"""What is made of finished runs: the paper's tables, learning curves, films."""
+"""Results of finished runs: the paper's tables, learning curves, films."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 class Cell:
     """All runs of the same settings: one cell of a table.
 
-    A run's value is the mean return of its evaluation, or its best normalised score where it has
-    one (offline recipes).
+    A run's value is the mean return of its evaluation, or its best normalised score if it has one
+    (offline recipes).
     """
 
     table: str
@@ -33,7 +33,8 @@ class Cell:
     high: float
     """Upper end."""
     paper_mean: float
-    """The paper's value; NaN where it has none. That of a tuned recipe is that of the plain one."""
+    """The paper's value; NaN if it has none. A tuned recipe is compared with the plain one's
+    value."""
     paper_std: float
     changes: str = ""
     """Fields in which the runs differ from the recipe of that name, with the runs' values."""

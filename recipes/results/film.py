@@ -26,7 +26,7 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
     Args:
         recipe: The run's recipe; episode i begins from its ``evaluation_seed + i``.
         run: A run folder with a checkpoint.
-        video: The GIF or MP4 file to write, where none is yet.
+        video: The GIF or MP4 file to write, which must not exist yet.
         episodes: Number of episodes, one after the other in one film.
 
     Returns:
@@ -35,8 +35,8 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
     Raises:
         FileExistsError: If there is such a file already.
         FileNotFoundError: If there is no checkpoint.
-        ValueError: If the file is of another kind, ``episodes`` is less than 1, or what the
-            pictures or the film need is missing: a package, or OpenGL for a task of MuJoCo.
+        ValueError: If the file is of another kind, ``episodes`` is less than 1, or something that
+            rendering needs is missing: a package, or OpenGL for a MuJoCo task.
     """
     if video.suffix not in _SUFFIXES:
         raise ValueError(f"a film is one of {', '.join(_SUFFIXES)}, not {video.name!r}")
@@ -47,7 +47,7 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
     try:
         with (
             whole_or_not_at_all(video) as hidden,
-            # The writer goes by the name's ending, which the hidden name has not.
+            # The writer chooses the format by the suffix, which the hidden name lacks.
             TemporaryDirectory(prefix=".", dir=video.absolute().parent) as folder,
         ):
             reel = Path(folder, video.name)
@@ -67,7 +67,7 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
 def _picture(env: Any, run: Run) -> Any:
     try:
         return env.render()[0]
-    except Exception as error:  # each task draws in its own way, and so do its errors differ
+    except Exception as error:  # each task renders in its own way and has its own errors
         raise ValueError(
             f"{run.folder} cannot be rendered: {error}; for MuJoCo without a screen, set the "
             "environment variable MUJOCO_GL to egl or osmesa"

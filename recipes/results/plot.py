@@ -18,7 +18,7 @@ from ..metrics import read_metrics
 from ..run import Run
 from .cell import Cell
 
-# The longest name, in letters, of which two fit side by side below a figure.
+# The longest name, in letters, for which two fit side by side below a figure.
 _WIDEST_OF_TWO = 40
 # Letters of a line beside a panel.
 _WIDEST_LABEL = 26
@@ -46,7 +46,7 @@ def plot_learning_curve(
         picture: the PNG file to write.
         title: title of the figure.
         window: batches over which the bold line is averaged.
-        offline: whether it is of evaluation episodes over gradient steps instead.
+        offline: whether to draw evaluation episodes over gradient steps instead.
     """
     steps, returns = _curve(metrics)
     smooth = np.array([returns[max(0, i - window + 1) : i + 1].mean() for i in range(len(returns))])
@@ -69,8 +69,8 @@ def plot_comparison(
     """Draws learning curves of several groups of runs: mean over the runs, band of one deviation.
 
     Args:
-        curves: ``metrics.csv`` files of the runs (seeds) of each group, by the group's name; what
-            the names begin with in common, up to a "/", stands in the title alone.
+        curves: ``metrics.csv`` files of the runs (seeds) of each group, by the group's name; their
+            common prefix, up to a "/", appears only in the title.
         picture: the PNG file to write.
         title: title of the figure, instead of the common part of the names.
         points: steps at which the runs are compared; between batches, returns are interpolated.
@@ -105,7 +105,7 @@ def plot_comparison(
 
 
 def plot_table(cells: Sequence[Cell], picture: Path) -> None:
-    """Draws cells beside the paper's values, a panel a task.
+    """Draws cells beside the paper's values, one panel per task.
 
     Args:
         cells: what :func:`~recipes.results.table.make_table` returns.
@@ -163,7 +163,7 @@ def _curve(metrics: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _break(label: str) -> str:
-    """Breaks a label into lines that leave a panel its room."""
+    """Breaks a label into lines that leave room for the panel."""
     return "\n".join(wrap(label, _WIDEST_LABEL))
 
 

@@ -27,7 +27,7 @@ OTHER = "not in the paper"
 
 @dataclass(frozen=True)
 class Result:
-    """What the paper's tables say of an experiment."""
+    """The result of an experiment in the paper's tables."""
 
     table: str
     mean: float
@@ -71,7 +71,7 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         raise ValueError(
             f"no evaluated run in {', '.join(map(str, folders))}" + "".join(f"; {n}" for n in notes)
         )
-    named = dict(RECIPES)  # with names that are not ours, for the first settings found of each
+    named = dict(RECIPES)  # and each unknown name's first settings
     cells = [
         _cell(settings, named.setdefault(settings.name, settings), runs)
         for settings, runs in groups.items()
@@ -91,8 +91,8 @@ def paper_results() -> dict[str, Result]:
     """What the paper reports, by the recipe's name.
 
     arXiv 2212.14538, tables of section 4 and the ablation; the standard deviations of Decision
-    Transformer are taken from the curves that its authors published, since the paper's were put
-    through the score's offset.
+    Transformer are taken from the curves that its authors published, since the paper applied the
+    score's offset to them.
 
     Example:
         >>> paper_results()["ppo/mountaincar/enhanced-tit"].mean
@@ -121,7 +121,7 @@ def to_markdown(cells: Sequence[Cell]) -> str:
 
 
 def to_csv(cells: Sequence[Cell]) -> str:
-    """Writes cells as CSV, one row each; what is not known is empty."""
+    """Writes cells as CSV, one row each; unknown values are empty."""
     buffer = io.StringIO()
     names = [field.name for field in fields(Cell)]
     writer = csv.DictWriter(buffer, names, lineterminator="\n")
@@ -196,12 +196,12 @@ def _paper_result(recipe: Recipe) -> Result | None:
 
 
 def _stem(dataset: str) -> str:
-    """A data set's name, also where D4RL's file of it is given: "hopper_medium-v2.hdf5"."""
+    """A data set's name, also if given as D4RL's file: "hopper_medium-v2.hdf5"."""
     return Path(dataset).name.removesuffix(".hdf5").replace("_", "-")
 
 
 def _plain(name: str) -> str:
-    """The recipe that a tuned one stands beside, or the name itself."""
+    """The plain recipe that a tuned one belongs to, or the name itself."""
     return name if name in paper_results() else name.removesuffix("-tuned")
 
 
@@ -213,7 +213,7 @@ def _changes(named: Recipe, settings: Recipe) -> str:
 
 
 def _fields(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Puts the fields of settings, and of those within, in one dictionary by their full names."""
+    """Flattens settings and nested settings into one dictionary, by the full names of fields."""
     fields: dict[str, Any] = {}
     for name, value in settings.items():
         nested = isinstance(value, dict)
@@ -232,5 +232,5 @@ def _row(cell: Cell) -> str:
 
 
 def _number(value: float) -> str:
-    """Whole numbers from 100 on, one digit behind the point below."""
+    """Formats a number: whole from 100 on, with one decimal below."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"

@@ -70,8 +70,8 @@ class SACAlgorithm(Algorithm[SAC]):
         self._policy = _make_actor(backbone, action_spec).to(self.device)
         size = action_spec.shape[0]
         network = recipe.backbone if recipe.critic == "backbone" else None
-        # Two critics start as they were built; of a single one TorchRL makes a copy that it draws
-        # anew.
+        # Two critics keep their initial weights; TorchRL would copy a single one and initialise the
+        # copy anew.
         critics = [
             make_critic(shape, size, recipe.critic_hidden, network).to(self.device)
             for _ in range(2)
@@ -89,7 +89,7 @@ class SACAlgorithm(Algorithm[SAC]):
         return self.loss
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
-        """Builds the task, with histories; actions are sent as they are."""
+        """Builds the task, with histories; actions are passed on unchanged."""
         recipe = self.recipe
         return make_env(
             recipe.env,
@@ -138,7 +138,7 @@ class SACAlgorithm(Algorithm[SAC]):
         }
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Yields what was collected, [envs, time]."""
+        """Yields collected batches, [envs, time]."""
         return while_acting(self.policy, self.collector)
 
     def size(self, batch: TensorDictBase) -> int:
@@ -150,7 +150,7 @@ class SACAlgorithm(Algorithm[SAC]):
         return finished_returns(batch)
 
     def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
-        """Stores a batch, then takes gradient steps on samples of all that was stored."""
+        """Stores a batch, then takes gradient steps on samples of all stored transitions."""
         recipe = self.recipe
         self.buffer.extend(batch.select(*_STORED).reshape(-1))
         self.collector_state.step = step + batch.numel()
@@ -204,12 +204,12 @@ def _make_actor(backbone: Backbone, action_spec: Bounded) -> ProbabilisticActor:
 class ReplayBufferState:
     """The state of a replay buffer that never overwrites, as parts on the disk.
 
-    Each checkpoint writes the transitions that were added since the one before, and names the parts
-    that hold its own. A checkpoint that held all transitions itself would grow with the run.
+    Each checkpoint writes the transitions that were added since the one before, and lists all parts
+    that belong to it. A checkpoint that held all transitions itself would grow with the run.
 
     Args:
         buffer: the replay buffer, with room for all transitions of the run.
-        folder: where the parts are, each numbered by how many transitions there are at its end.
+        folder: folder of the parts, each numbered by the total number of transitions at its end.
     """
 
     def __init__(self, buffer: ReplayBuffer, folder: Path) -> None:
@@ -226,7 +226,7 @@ class ReplayBufferState:
         return {"parts": list(self._parts)}
 
     def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
-        """Reads a checkpoint's parts. Others are of work that was lost, and will be replaced."""
+        """Reads a checkpoint's parts. Other parts belong to lost work and will be replaced."""
         self._parts = list(state_dict["parts"])
         for number in self._parts:
             _, transitions = load_checkpoint(self.folder, number)

@@ -1,4 +1,4 @@
-"""Search spaces as data: which fields of a recipe are searched, and where."""
+"""Search spaces as data: which fields of a recipe are searched, and in which ranges."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..recipe_json import recipe_from_json, recipe_to_json
 
 Number = float | int
 
-# What the search is about, not what it varies. A search has seeds of its own.
+# Fields that define the search, so it cannot vary them. A search has its own seeds.
 _FIXED = {"algorithm", "name", "seed", "backbone.frame.encoder", "backbone.history.encoder"}
 
 
@@ -67,7 +67,7 @@ class Int(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="int"):
     def __post_init__(self) -> None:
         _check_bounds(self.low, self.high, self.log)
         if self.log and self.step != 1:
-            raise ValueError("log goes with a step of 1 only")
+            raise ValueError("log requires a step of 1")
 
     def suggest(self, trial: optuna.Trial, field: str) -> Any:
         """Asks Optuna for a value."""
@@ -91,7 +91,8 @@ def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
         recipe: the recipe whose fields are searched.
 
     Raises:
-        ValueError: if it is no search space, or names a field or a value that the recipe refuses.
+        ValueError: if it is not a search space, or names a field or a value that the recipe
+            refuses.
     """
     if source is None:
         text = resources.files(__package__).joinpath("search_spaces.json").read_bytes()

@@ -24,7 +24,7 @@ from ..registry import RECIPES, find_recipe
 from ..run import Run
 
 PROGRAM = str(__package__).rpartition(".")[0]
-"""What ``python -m`` runs: ``recipes``, or ``torchrl_tit.recipes`` where it is installed."""
+"""What ``python -m`` runs: ``recipes``, or ``torchrl_tit.recipes`` if it is installed."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Job:
     recipe: Recipe
     folder: Path
     source: str = ""
-    """A JSON file that holds the recipe; where this is empty, it is a named one."""
+    """A JSON file that holds the recipe; empty for a named recipe."""
 
     @property
     def log(self) -> Path:
@@ -69,7 +69,7 @@ class Job:
             return True
 
     def check(self) -> None:
-        """Raises ValueError where the folder holds a run with other settings."""
+        """Raises ValueError if the folder holds a run with other settings."""
         if self._exists() and Run.open(self.folder).recipe != self.recipe:
             raise ValueError(
                 f"{self.folder} holds a run of {self.recipe.name} with other settings: name "
@@ -86,13 +86,13 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
     Args:
         patterns: names of recipes, patterns such as ``ppo/*/mlp``, or JSON files that hold a
             recipe, such as ``tune``'s ``best.json``.
-        seeds: seeds, each of which every recipe is run with.
+        seeds: seeds to run every recipe with.
         out: folder of the sweep; a run's folder is ``out/NAME/seed-SEED``.
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if a pattern fits no recipe, a file holds no recipe or one without a name, two
-            recipes have the same name and different settings, a recipe cannot be built, or a
+        ValueError: if a pattern matches no recipe, a file holds no recipe or one without a name,
+            two recipes have the same name and different settings, a recipe cannot be built, or a
             folder holds a run with other settings.
 
     Example:
@@ -139,7 +139,7 @@ class Worker(Protocol):
     """A run in its own process, which may be on another machine."""
 
     def poll(self) -> int | None:
-        """Returns the exit code, which is 0 where the run is complete; None before the end."""
+        """Returns the exit code, which is 0 if the run is complete; None before the end."""
 
     def send_signal(self, number: int, /) -> None:
         """Sends the process a signal; SIGINT lets it save a checkpoint and stop."""
@@ -209,8 +209,8 @@ def run_jobs(
                     if code is None:
                         continue
                     del running[job]
-                    # Code 2: refused, as another process began the run a moment before. Where a
-                    # worker on Ray is lost (code 1), the process that it left may still use it.
+                    # Code 2: refused, because another process has just begun the run. If a worker
+                    # on Ray is lost (code 1), the process that it left may still use the run.
                     if code == 2 and job.is_in_use():
                         waiting.append(job)
                         continue

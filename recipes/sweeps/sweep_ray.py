@@ -38,7 +38,7 @@ def connect(address: str) -> None:
         import ray
     except ImportError as error:
         raise ValueError("sweep --ray needs Ray: pip install 'torchrl-tit[ray]'") from error
-    # Ray itself waits for ten minutes and more where no cluster answers.
+    # Ray itself waits for ten minutes or more if no cluster answers.
     program = "import sys, ray; ray.init(sys.argv[1], log_to_driver=False)"
     try:
         subprocess.run(
@@ -76,7 +76,7 @@ def find_unmet_needs(jobs: Iterable[Job]) -> list[str]:
 class RayWorker:
     """A run on a machine of the cluster; it waits in Ray's queue until one has room for it.
 
-    It takes as many CPUs as the recipe has threads, and a GPU where the recipe's device is "cuda",
+    It takes as many CPUs as the recipe has threads, and a GPU if the recipe's device is "cuda",
     or "auto" and the cluster has GPUs.
 
     Args:
@@ -99,7 +99,7 @@ class RayWorker:
         self._answer = self._actor.poll.remote()
 
     def poll(self) -> int | None:
-        """Returns the exit code, which is 0 where the run is complete; None before the end."""
+        """Returns the exit code, which is 0 if the run is complete; None before the end."""
         import ray
 
         if self._code is None and ray.wait([self._answer], timeout=0)[0]:

@@ -28,7 +28,7 @@ from ..recipe_json import recipe_to_json
 from .search_space import SearchSpace, with_values
 from .sweep import Job, start
 
-_WINDOW = 5  # batches over which a trial's return is averaged where trials are compared
+_WINDOW = 5  # batches over which a trial's return is averaged when trials are compared
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         for seed in self.seeds:
-            replace(self.recipe, seed=seed)  # raises ValueError where it cannot be one
+            replace(self.recipe, seed=seed)  # raises ValueError if the seed is invalid
 
 
 class Search:
@@ -60,7 +60,7 @@ class Search:
 
     Trials are drawn by Optuna's tree-structured Parzen estimator and stopped early by its median
     pruner, on returns of training episodes. A trial's value is the mean of its evaluations. Its
-    recipe is called as the searched one, followed by ``/trial-N``.
+    recipe is named after the searched one, followed by ``/trial-N``.
 
     Args:
         folder: the folder.
@@ -184,7 +184,7 @@ class _Trial:
             self.folder.mkdir(exist_ok=True)
             write_text_atomic(self.folder / "error.log", f"error: {error}\n")
             return
-        if recipe.name:  # it belongs to other settings
+        if recipe.name:  # a name belongs to the settings of its recipe
             recipe = replace(recipe, name=f"{recipe.name}/trial-{self.number}")
         write_text_atomic(self.file, recipe_to_json(recipe))
         self.jobs = [

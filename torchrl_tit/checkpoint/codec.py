@@ -107,7 +107,7 @@ def _encode(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
     if isinstance(value, Tensor) and value.layout is torch.strided and _has_data(value):
         return _encode_tensor(value, path, tensors)
     if kind is np.ndarray and _is_plain(value.dtype):
-        # The copy is in C order and writeable, as torch wants it.
+        # The copy is in C order and writeable, as torch requires.
         tensors[path] = torch.from_numpy(np.array(value, order="C").reshape(-1).view(np.uint8))
         return {"$array": path, "dtype": value.dtype.str, "shape": list(value.shape)}
     if isinstance(value, np.generic) and _is_plain(value.dtype):

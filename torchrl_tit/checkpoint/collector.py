@@ -55,7 +55,7 @@ def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
         state: What :func:`collector_state` returned.
 
     Raises:
-        ValueError: The state is of another kind of environment, or only one of the two collectors
+        ValueError: The state is from another kind of environment, or only one of the two collectors
             tracks trajectories.
 
     Example:

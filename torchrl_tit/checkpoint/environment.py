@@ -85,7 +85,7 @@ def set_env_state(env: EnvBase, state: dict[str, Any]) -> None:
 
     Raises:
         TypeError: The environment cannot be saved.
-        ValueError: The state is of another kind of environment.
+        ValueError: The state is from another kind of environment.
 
     Example:
         >>> from torchrl.envs import GymEnv
@@ -127,7 +127,7 @@ def _unwrap(env: EnvBase) -> tuple[list[nn.Module], EnvBase]:
 
 
 def _obstacle(env: EnvBase) -> str | None:
-    """Return the name of the class because of which an environment cannot be saved, if any."""
+    """Return the name of the class that keeps an environment from being saved, if any."""
     _, base = _unwrap(env)
     if type(base) not in (GymVectorEnv, GymWrapper, GymEnv):
         return class_name(base)

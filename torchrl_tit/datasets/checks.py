@@ -27,14 +27,14 @@ def check_finite(
     """Checks that there is no NaN and no infinity, even after conversion.
 
     Args:
-        source: What the data came from, for messages.
+        source: Where the data came from, for messages.
         field: Name of the field.
         values: Some rows of it.
-        first_row: The number of the first of them.
+        first_row: Index of the first of these rows.
         kept_as: The dtype that they are converted to, whose range may be smaller.
 
     Raises:
-        DatasetError: If there is one; the message names the first such row.
+        DatasetError: If a value is not finite; the message names the first such row.
 
     Example:
         >>> check_finite("a.hdf5", "rewards", np.array([0.0, np.nan]), first_row=100)
@@ -59,10 +59,10 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
     """Checks that actions lie in the action space.
 
     Args:
-        source: What the data came from, for messages.
+        source: Where the data came from, for messages.
         values: Some rows of the actions.
         space: A `Box` or `Discrete` action space; others are not checked.
-        first_row: The number of the first of the rows.
+        first_row: Index of the first of these rows.
 
     Raises:
         DatasetError: If one lies outside; the message names the first.
@@ -97,7 +97,7 @@ def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | N
     """Returns the dtype in which a field is kept.
 
     Args:
-        source: What the data came from, for messages.
+        source: Where the data came from, for messages.
         field: Name of the field.
         dtype: The dtype it has in the source.
         floats: The dtype for floats; None keeps that of the source.

@@ -102,7 +102,8 @@ def _returns_to_go(episodes: Episodes) -> Tensor:
     """Sum of the rewards from each row to its episode's end; float64 [R]."""
     rewards = episodes.rows["reward"].squeeze(-1).cpu().double().numpy()
     total = np.cumsum(rewards[::-1])[::-1]
-    # The row of an episode's final observation has no reward: the sum there is of later episodes.
+    # The row of an episode's final observation has no reward: the sum there belongs to later
+    # episodes.
     later = torch.from_numpy(total.copy()).to(episodes.lengths.device)
     after = later[episodes.last_rows + 1]
     return later - after.repeat_interleave(episodes.lengths + 1)

@@ -37,13 +37,12 @@ def load_episodes(
         source: An HDF5 file in D4RL's layout (".hdf5" or ".h5"); a folder with a Minari data set;
             D4RL's name of a data set, such as "hopper-medium-replay-v0"; or Minari's, such as
             "mujoco/hopper/medium-v0". Named data sets are downloaded once.
-        task: The task whose shapes and action bounds the data must have, and whose name, if they
-            record one: a name registered with Gymnasium, such as "Hopper-v5", or the spaces. Not
-            checked if None.
+        task: The task that the data must match in shapes, action bounds and (if recorded) name: a
+            name registered with Gymnasium, such as "Hopper-v5", or the spaces. Not checked if None.
         max_episode_steps: The time limit of an HDF5 file without "timeouts": see
             :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
         gaps: What to do where "next_observations" of an HDF5 file is not the observation of the
-            next row: see there too.
+            next row: see the same function.
         dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
         directory: A folder on a disk with room for the rows, where no files remain; by default the
             system's folder for temporary files.
@@ -68,7 +67,7 @@ def load_episodes(
     name = os.fspath(source)
     path = Path(source)
     if name in D4RL_DATASETS and not path.exists():
-        if spaces is not None and has_reference(name):  # such names begin with that of the task
+        if spaces is not None and has_reference(name):  # such names begin with the task's
             check_task_name(name, name.split("-")[0], spaces)
         path = download_d4rl(name, cache_dir)
     if path.is_file() or path.suffix in HDF5_SUFFIXES:

@@ -65,7 +65,7 @@ def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
     otherwise.
 
     Args:
-        source: What the data came from, for messages.
+        source: Where the data came from, for messages.
         recorded: The recorded name of the task; anything but a string if there is none.
         task: The requested task. The versions may differ. Nothing is checked if its name does not
             have Gymnasium's form.
@@ -100,7 +100,7 @@ def check_shape(
     """Checks that observations or actions have the shape of the task's.
 
     Args:
-        source: What the data came from, for messages.
+        source: Where the data came from, for messages.
         field: Name of the field.
         shape: Shape of one row.
         space: The space of that field.

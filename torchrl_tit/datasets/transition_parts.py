@@ -119,8 +119,8 @@ class TransitionParts:
     def episodes(self, last: int | None = None, **settings: Any) -> Episodes:
         """Joins the parts, one stream after the other, without reading them all at once.
 
-        An episode that is unfinished at the end of a stream, or where the next part begins with
-        another observation than the last part ended with, is truncated there.
+        An unfinished episode is truncated at the end of its stream, and where the next part begins
+        with another observation than the part before ended with.
 
         Args:
             last: Number of the last part to join; all by default.

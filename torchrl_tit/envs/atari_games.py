@@ -38,7 +38,7 @@ class AtariGames(VectorEnv):
     Args:
         game: The name of ale-py's ROM file, such as "ms_pacman".
         num_envs: N, the number of games.
-        noop_max: Maximal number of no-op frames at the start of a game; 0 for none.
+        noop_max: Maximum number of no-op frames at the start of a game; 0 for none.
         max_num_frames_per_episode: Number of frames (4 for each action) after which a game is
             truncated, not counting the no-op frames at its start.
         render_mode: ``"rgb_array"`` emulates each game a second time, for images in full size.
@@ -147,7 +147,7 @@ class AtariGames(VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Plays 4 frames of every game, and the frames between two lives where one is lost.
+        """Plays 4 frames of every game, and the frames between two lives if one is lost.
 
         Args:
             actions: int [N].

@@ -68,10 +68,10 @@ def make_env(
         clip_actions: Whether continuous actions are clipped on their way to the task: see
             :class:`~torchrl_tit.envs.GymVectorEnv`.
         vectorization_mode: ``"sync"`` steps the copies one after the other in this process,
-            ``"async"`` side by side in a process each, with the same numbers, which pays for slow
-            tasks. Atari games always run side by side, in threads.
+            ``"async"`` side by side in one process each, with the same results, which pays off for
+            slow tasks. Atari games always run side by side, in threads.
         device: Device of the tensors; by default they stay on the CPU and the device is None.
-        **kwargs: Passed to `gymnasium.make`, as ``max_episode_steps=200``, or to
+        **kwargs: Passed to `gymnasium.make`, such as ``max_episode_steps=200``, or to
             :class:`~torchrl_tit.envs.AtariGames`.
 
     Returns:
@@ -80,7 +80,7 @@ def make_env(
 
     Raises:
         ValueError: If the name or the mode is unknown, a package that the task needs is missing,
-            ``num_envs``, ``num_frames`` or the padding is not possible, Atari games are to run in
+            ``num_envs``, ``num_frames`` or the padding is invalid, Atari games are to run in
             processes, or it is not known which observations are velocities.
         TypeError: If the task's observations or actions are of a kind that is not supported.
 
@@ -121,7 +121,7 @@ def make_env(
 
 
 def is_atari(name: str) -> bool:
-    """Tells whether a name is that of an Atari game, which all begin with "ALE/".
+    """Returns whether a name is that of an Atari game, which begins with "ALE/".
 
     Args:
         name: A name that Gymnasium may have registered.
@@ -184,7 +184,7 @@ def _tasks(
     spec = gymnasium.registry.get(name)
     if spec is not None and str(spec.entry_point).startswith("ale_py"):
         raise ValueError(
-            f"Task {name!r} is an Atari game without the preprocessing; name it as in "
+            f"Task {name!r} is an Atari game without the preprocessing; use a name such as "
             "'ALE/Pong-v5'."
         )
     # GymVectorEnv copies what the vector environment returns, which need not copy it before.
@@ -226,7 +226,7 @@ def _unknown(name: str) -> ValueError:
     hint = (
         f"did you mean one of {', '.join(map(repr, nearest))}"
         if nearest
-        else "is its package imported, or is it an Atari game, whose name is one as 'ALE/Pong-v5'"
+        else "is its package imported, or is it an Atari game, with a name such as 'ALE/Pong-v5'"
     )
     return ValueError(
         f"Unknown task {name!r}; {hint}? `gymnasium.pprint_registry()` lists all names."

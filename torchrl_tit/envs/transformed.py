@@ -8,15 +8,15 @@ from torchrl.envs.transforms import Transform
 class TransformedVectorEnv(TransformedEnv):
     """A `TransformedEnv` around :class:`~torchrl_tit.envs.GymVectorEnv` with faster steps.
 
-    It does what TorchRL's does. Most of the time of TorchRL's step goes into copying the
+    It behaves like TorchRL's. Most of the time of TorchRL's step goes into copying the
     tensordict for inverse transforms and into checking what the environment wrote. Where no
     transform has an inverse, neither is needed: the environment reads only the action and writes
     every entry in the shape of its spec. A step of eight CartPoles then takes about a fifth less
-    time. Anything else takes TorchRL's way: a transform with an inverse (of actions, say), or a
-    tensordict with entries under "next" or on another device.
+    time. Everything else takes TorchRL's code path: a transform with an inverse (of actions, say),
+    or a tensordict with entries under "next" or on another device.
 
     Add transforms with ``append_transform``; a second `TransformedEnv` around this one works, but
-    takes TorchRL's way.
+    takes TorchRL's code path.
 
     Args:
         base_env: The environment.
@@ -57,7 +57,7 @@ class TransformedVectorEnv(TransformedEnv):
 
 def _only_writes(transform: Transform) -> bool:
     """Returns whether transforms only add to what the environment wrote."""
-    # Asked in every step, since transforms can be added at any time; it takes microseconds.
+    # Checked in every step, since transforms can be added at any time; it takes microseconds.
     return type(transform) is Compose and all(
         not part.in_keys_inv
         and all(getattr(type(part), hook) is getattr(Transform, hook) for hook in _HOOKS)
@@ -66,4 +66,4 @@ def _only_writes(transform: Transform) -> bool:
 
 
 _HOOKS = ("_inv_call", "inv", "_post_step_mdp_hooks", "transform_env_device")
-"""What a transform can do in a step beside `_step` and `_call`."""
+"""What a transform can do in a step besides `_step` and `_call`."""

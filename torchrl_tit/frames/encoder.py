@@ -40,7 +40,7 @@ class FrameEncoder(nn.Module):
         """Encodes observations.
 
         Args:
-            observation: [..., *observation_shape], float, or uint8 which stands for 0..1.
+            observation: [..., *observation_shape], float, or uint8, which is scaled to 0..1.
 
         Returns:
             float [..., L, D].
@@ -56,7 +56,7 @@ def check_observation_shape(shape: Sequence[int]) -> tuple[int, ...]:
     """Returns the shape of an observation as a tuple.
 
     Raises:
-        ValueError: if it is neither that of an array nor of an image.
+        ValueError: if it is neither the shape of an array nor that of an image.
     """
     if not isinstance(shape, Sequence) or len(shape) not in (1, 2, 3) or min(shape) < 1:
         raise ValueError(
@@ -70,7 +70,7 @@ def check_image_shape(shape: Sequence[int], smallest: int) -> tuple[int, ...]:
     """Returns the shape of an image as a tuple.
 
     Raises:
-        ValueError: if it is that of an array, or has fewer than ``smallest`` pixels a side.
+        ValueError: if it is the shape of an array, or has fewer than ``smallest`` pixels a side.
     """
     shape = check_observation_shape(shape)
     if len(shape) == 1:

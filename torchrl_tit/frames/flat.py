@@ -12,12 +12,12 @@ from torchrl_tit.frames.encoder import FrameEncoder, check_observation_shape
 
 
 class Flat(FrameEncoder):
-    """Puts the entries of an observation in a row: one token as wide as the observation is large.
+    """Flattens an observation into a single token that holds all of its entries.
 
-    For history encoders that stack frames. Bytes stay bytes.
+    For history encoders that stack frames. Images stay uint8.
 
     Args:
-        settings: the settings, which are empty.
+        settings: the settings, which have no fields.
         observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
 
     Example:

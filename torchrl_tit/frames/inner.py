@@ -18,8 +18,8 @@ class InnerTransformer(FrameEncoder):
     """Reads the patches of one observation (arXiv 2212.14538, section "The Inner Transformer").
 
     Class token and patch tokens, plus position encodings, go through L blocks. The outputs are
-    the class token: after every block (Enhanced_TIT) or after the last one (Vanilla_TIT). Of the
-    last block nothing else is read, so nothing else is computed.
+    the class token: after every block (Enhanced_TIT) or after the last one (Vanilla_TIT). The last
+    block computes only the class token, because nothing else is read.
 
     Args:
         settings: patch size, width, blocks and outputs.
@@ -27,7 +27,7 @@ class InnerTransformer(FrameEncoder):
         num_frames: number of observations that are stacked as channels.
 
     Raises:
-        ValueError: if the patch does not fit the observation, or the heads not the width.
+        ValueError: if the patch does not fit the observation, or the heads do not divide the width.
 
     Example:
         >>> inner = InnerTransformer(settings.Inner(patch_size=12, num_heads=4), (84, 84))

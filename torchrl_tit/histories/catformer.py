@@ -41,7 +41,7 @@ class CatformerAttention(nn.Module):
         return self.attention(self.norm(self.projection(x)), read)
 
     def attention_weights(self, x: Tensor) -> Tensor:
-        """Returns the weights with which this layer attends, float [N, heads, K, K]."""
+        """Returns the attention weights of this layer, float [N, heads, K, K]."""
         return self.attention.weights(self.norm(self.projection(x)))
 
 
@@ -51,8 +51,8 @@ class Catformer(HistoryEncoder):
     Davis et al., "Catformer: Designing Stable Transformers via Sensitivity Analysis", ICML 2021, as
     built for the baseline of arXiv 2212.14538. Attention and FFN take turns, without residuals:
     each layer after the first reads the concatenation of the outputs of all layers before it (not
-    of the tokens themselves). The weights start as PyTorch's layers do. Where frames have several
-    tokens, a linear layer makes one of them.
+    of the tokens themselves). The weights have PyTorch's default initialisation. If frames have
+    several tokens, a linear layer merges them into one.
 
     Args:
         settings: blocks, heads and expansions.
@@ -76,7 +76,7 @@ class Catformer(HistoryEncoder):
         self.attentions = nn.ModuleList()
         self.ffns = nn.ModuleList()
         for index in range(settings.num_blocks):
-            # The first layer reads the tokens as they are, unless it is to be wider.
+            # The first layer reads the tokens without a projection, unless attention is wider.
             project = index > 0 or settings.attention_expansion > 1
             earlier = width * max(2 * index, 1)
             self.attentions.append(CatformerAttention(earlier, width, settings, project=project))
@@ -101,7 +101,7 @@ class Catformer(HistoryEncoder):
         outputs: list[Tensor] = []  # of all layers so far, [N, K, D] each
         for index, (attention, ffn) in enumerate(zip(self.attentions, self.ffns, strict=True)):
             x = torch.cat(outputs, dim=-1) if outputs else x
-            if index == len(self.ffns) - 1:  # of the last two layers only the newest frame is read
+            if index == len(self.ffns) - 1:  # the last two layers compute only the newest frame
                 outputs = [output[:, -1:] for output in outputs]
                 outputs.append(attention(x, read="last"))
             else:

@@ -18,8 +18,9 @@ class CoBERL(HistoryEncoder):
 
     Banino et al., "CoBERL: Contrastive BERT for Reinforcement Learning", arXiv 2107.05431, figure
     1; a baseline of arXiv 2212.14538. The gate lets the LSTM read the tokens themselves until the
-    transformer is worth reading. The LSTM starts at zero with the history. The weights start as
-    PyTorch's layers do. Where frames have several tokens, a linear layer makes one of them.
+    transformer is worth reading. The LSTM starts each history with a state of zeros. The weights
+    have PyTorch's default initialisation. If frames have several tokens, a linear layer merges them
+    into one.
 
     Args:
         settings: blocks, heads, gates and the size of the LSTM's state.
@@ -67,8 +68,8 @@ class CoBERL(HistoryEncoder):
     def predict_masked(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Predicts every frame's encoding from both sides, with the masked frames hidden.
 
-        What the contrastive loss compares at the masked frames (arXiv 2107.05431, section 2.1): the
-        transformer sees past and future there, and neither gate nor LSTM take part.
+        The contrastive loss compares the two at the masked frames (arXiv 2107.05431, section 2.1).
+        The transformer sees past and future here; gate and LSTM are not used.
 
         Args:
             tokens: float [..., K, L, D].

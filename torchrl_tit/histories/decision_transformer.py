@@ -60,7 +60,7 @@ class DecisionTransformer(HistoryEncoder):
             raise ValueError(
                 "Decision Transformer reads actions and returns beside observations: give "
                 "action_dim (the entries of a continuous action, or the number of discrete ones), "
-                "or choose another history encoder where there are only observations"
+                "or choose another history encoder if there are only observations"
             )
         if shape.action_dim < 1:
             raise ValueError(f"action_dim must be at least 1, not {shape.action_dim}")
@@ -104,8 +104,8 @@ class DecisionTransformer(HistoryEncoder):
                 or one-hot [..., K, A]. The action of the last step is not read.
             return_to_go: float [..., K, 1].
             timestep: int64 [..., K], from 0 to below ``max_ep_len``.
-            mask: [..., K], 0 or False at padding (finite, but otherwise of any content), which no
-                other step sees; None where there is no padding.
+            mask: [..., K], 0 or False at padding, which no other step sees (its values are ignored,
+                but must be finite); None if there is no padding.
 
         Returns:
             float [..., D].
@@ -174,7 +174,7 @@ class DecisionTransformer(HistoryEncoder):
         return self.norm(x).reshape(*leading, x.shape[1], width)
 
     def _as_vectors(self, action: Tensor, steps_shape: tuple[int, ...]) -> Tensor:
-        """Turns discrete actions [..., K] into one-hot vectors; leaves others as they are."""
+        """Turns discrete actions [..., K] into one-hot vectors; leaves others unchanged."""
         if action.is_floating_point() or action.ndim != len(steps_shape):
             return action
         classes = torch.arange(self.action_dim, device=action.device)

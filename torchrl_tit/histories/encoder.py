@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 @dataclass(frozen=True)
 class HistoryShape:
-    """What a history encoder is given to read."""
+    """The input of a history encoder."""
 
     num_frames: int
     """Number K of frames."""
@@ -20,9 +20,9 @@ class HistoryShape:
     width: int
     """Width D of a token."""
     frame_shape: tuple[int, ...] | None = None
-    """Where a token is the observation itself: the observation's shape."""
+    """The observation's shape, if a token is the observation itself."""
     action_dim: int | None = None
-    """Entries of a continuous action, or number of discrete ones, where the task is known."""
+    """Entries of a continuous action, or number of discrete ones, if the task is known."""
 
     def require_frames(self, reader: str) -> tuple[int, ...]:
         """Returns the observation's shape, for history encoders that read the frames themselves.
@@ -57,11 +57,11 @@ class HistoryEncoder(nn.Module):
 
     reads_frames: ClassVar[bool] = False
     """Whether it needs the frames themselves (see :class:`~torchrl_tit.frames.flat.Flat`), and
-    takes bytes as they are."""
+    reads uint8 directly."""
     context: ClassVar[tuple[str, ...]] = ()
     """Names of its inputs besides the tokens, one argument of ``forward`` each."""
     reads_any_length: ClassVar[bool] = False
-    """Whether it takes histories of any number of frames, not of ``num_frames`` only."""
+    """Whether it takes histories of any length, not only of ``num_frames``."""
     encodes_every_frame: ClassVar[bool] = False
     """Whether ``every_frame`` is implemented."""
     is_recurrent: ClassVar[bool] = False
@@ -104,9 +104,8 @@ class HistoryEncoder(nn.Module):
 class RecurrentEncoder(HistoryEncoder):
     """A history encoder with a state.
 
-    Where it reads one frame (K = 1), :class:`~torchrl_tit.modules.Backbone` carries the state from
-    step to step in the tensordict. Where it reads several, each history starts with a state of
-    zeros.
+    If it reads one frame (K = 1), :class:`~torchrl_tit.modules.Backbone` carries the state from
+    step to step in the tensordict. If it reads several, each history starts with a state of zeros.
     """
 
     is_recurrent = True
@@ -120,8 +119,8 @@ class RecurrentEncoder(HistoryEncoder):
 
         Args:
             tokens: float [*B, L, D]; in recurrent mode the last dimension of B is time.
-            state: the state before each step, [*B, *state_shape] each; of a sequence only that of
-                its first step is read, and of each step where an episode begins.
+            state: the state before each step, [*B, *state_shape] each; in a sequence, it is read
+                only at the first step and wherever an episode begins.
             is_init: bool [*B, 1], True where an episode begins.
 
         Returns:
@@ -131,7 +130,7 @@ class RecurrentEncoder(HistoryEncoder):
 
 
 class OneToken(nn.Module):
-    """Makes one token of the L tokens of a frame: nothing to do where L = 1, else a linear layer.
+    """Merges the L tokens of a frame into one with a linear layer; does nothing if L = 1.
 
     Args:
         shape: what the history encoder reads.

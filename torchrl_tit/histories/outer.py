@@ -13,7 +13,7 @@ from torchrl_tit.layers.block import TransformerBlock
 
 
 class OuterTransformer(HistoryEncoder):
-    """What both outer transformers share: causal blocks over the frames, read at the newest one.
+    """The base of both outer transformers: causal blocks over the frames, read at the newest one.
 
     The paper gives the outer transformer no position encoding: the newest frame then sees the past
     as a set. Temporal positions are an option that tells the frames apart.
@@ -105,9 +105,10 @@ class PairedOuterTransformer(OuterTransformer):
 class StackedOuterTransformer(OuterTransformer):
     """The outer transformer of Vanilla_TIT (arXiv 2212.14538, section "The Outer Transformer").
 
-    Causal blocks, each on the output of the one before, over one token a frame. The output is that
-    of the last block for the newest frame, or with dense connections (the ablation without inner
-    blocks) those of all blocks. If frames have several tokens, a linear layer makes one of them.
+    Causal blocks, each on the output of the one before, over one token a frame. The output is the
+    last block's output for the newest frame or, with dense connections (the ablation without inner
+    blocks), the outputs of all blocks. If frames have several tokens, a linear layer merges them
+    into one.
 
     Args:
         settings: blocks, heads, FFN, dropout and temporal positions.

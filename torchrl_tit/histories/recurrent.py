@@ -17,8 +17,8 @@ class LSTM(RecurrentEncoder):
     """An LSTM over frames.
 
     With one frame (K = 1) the state is its memory, which :class:`~torchrl_tit.modules.Backbone`
-    carries through an episode with TorchRL's `LSTMModule`. With more it reads these, from a state
-    of zeros.
+    carries through an episode with TorchRL's `LSTMModule`. With more, it reads them from a state of
+    zeros.
 
     Args:
         settings: size of the state.
@@ -38,7 +38,7 @@ class LSTM(RecurrentEncoder):
             settings.hidden_dim,
             in_keys=["token", *_STATE],
             out_keys=["memory", *(("next", key) for key in _STATE)],
-            python_based=shape.num_frames > 1,  # PyTorch's own is faster, but is no graph
+            python_based=shape.num_frames > 1,  # PyTorch's own is faster, but cannot be traced into one graph
         )
         self.state_shapes = {key: torch.Size([1, settings.hidden_dim]) for key in _STATE}
         self.reset_parameters()

@@ -21,7 +21,7 @@ class StackedInnerTransformer(HistoryEncoder):
 
     Raises:
         ValueError: if it is given tokens instead, the patch does not fit the observation, or the
-            heads not the width.
+            heads do not divide the width.
 
     Example:
         >>> import torch

@@ -20,7 +20,7 @@ class ActionPredictor(nn.Module):
 
     Args:
         network: predicts features.
-        head: makes actions of them.
+        head: maps features to actions.
     """
 
     def __init__(self, network: HistoryNetwork, head: DTHead) -> None:

@@ -26,33 +26,33 @@ _BUILDERS: dict[str, Callable[[Mapping[str, Any], Mapping[str, Tensor]], nn.Modu
 def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Module:
     """Builds a network of this library from one of the authors' release.
 
-    The network computes what the authors' computes from the same input, to float precision.
+    For the same input, its output equals that of the authors' network, to float precision.
 
     Args:
-        config: what the network is. Its entry ``kind`` is one of
+        config: describes the network. Its entry ``kind`` is one of
 
             - ``"tit"``, with ``variant`` ("vanilla" or "enhanced"), ``observation`` ("array" or
               "image"), ``observation_shape`` ((D,) or (K, H, W)), ``patch_size``, ``num_blocks``,
               ``features_dim``, ``embed_dim``, ``num_heads_inner``, ``num_heads_outer``,
               ``activation_inner``, ``activation_outer``, ``activation_head``,
               ``ffn_expansion_inner``, ``ffn_expansion_outer``, ``position_encoding``, and dropout
-              probabilities where there are any (``attention_dropout_inner``, ...); the
-              parameters show whether blocks are shared;
+              probabilities if any (``attention_dropout_inner``, ...); the parameters show whether
+              blocks are shared;
             - ``"resnet"`` and ``"catformer"``, with ``observation_shape`` (K, H, W), and for
               Catformer ``num_heads`` if not 5;
             - ``"ofenet"`` and ``"d2rl"``;
             - ``"dt"`` and ``"dt_tit"``, with ``n_head`` (and ``num_heads_inner``) if not 1,
               ``activation`` if not relu, and ``context``, the number K of steps.
 
-            Sizes that the parameters tell (``features_dim``, ``hidden_dim``, ``embed_dim``,
-            ``n_layer``, ``n_inner``, ``max_ep_len``, ...) can be left out where the kind is not
-            "tit"; where they are given they are checked.
+            Sizes that follow from the parameters (``features_dim``, ``hidden_dim``, ``embed_dim``,
+            ``n_layer``, ``n_inner``, ``max_ep_len``, ...) can be left out unless the kind is "tit";
+            if given, they are checked.
         params: the parameters under the authors' names, those of ``state_dict()``; with or without
             a prefix such as ``features_extractor.pure_transformer_backbone.``.
 
     Returns:
-        A module that takes what the authors' takes: arrays [B, D] without a history axis, images
-        [B, K, H, W]; floats are taken as they are (the authors divide images by 255 before the
+        A module with the same inputs as the authors': arrays [B, D] without a history axis, images
+        [B, K, H, W]; floats are used as they are (the authors divide images by 255 before the
         network), only uint8 is divided by 255. ``"ofenet"`` and ``"d2rl"`` return features for
         policy and value. The ``"dt"`` kinds are called with states, actions, returns_to_go,
         timesteps and attention_mask, and return the actions.

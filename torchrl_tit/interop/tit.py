@@ -35,7 +35,7 @@ _RENAMING = [
     (r"obs_patch_embed\.weight", "frame_encoders.observation.patch_embedding.weight"),
     (r"class_token_encoding", "frame_encoders.observation.class_token"),
     (r"obs_patch_pos_encoding", "frame_encoders.observation.positions"),
-    # Enhanced_TIT keeps pairs of blocks (one pair where they are shared), Vanilla_TIT two lists.
+    # Enhanced_TIT keeps pairs of blocks (one pair if they are shared), Vanilla_TIT two lists.
     (r"blocks\.(\d+)\.inner_Transformer_block\.(.*)", r"frame_encoders.observation.blocks.\1.\2"),
     (r"blocks\.(\d+)\.outer_Transformer_block\.(.*)", r"history_encoder.blocks.\1.\2"),
     (r"block\.inner_Transformer_block\.(.*)", r"frame_encoders.observation.blocks.0.\1"),

@@ -1,4 +1,4 @@
-"""Moving weights between names."""
+"""Loads weights under new names."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Renaming = Sequence[tuple[str, str]]
 
 
 def load_renamed(network: nn.Module, params: Mapping[str, Tensor], renaming: Renaming) -> None:
-    r"""Loads parameters of other names into a network, all of them and nothing else.
+    r"""Loads parameters with other names into a network; names must match one to one.
 
     Args:
         network: the network, changed in place.
@@ -48,7 +48,7 @@ def load_renamed(network: nn.Module, params: Mapping[str, Tensor], renaming: Ren
 
 
 def strip_prefix(params: Mapping[str, Tensor], marker: str) -> dict[str, Tensor]:
-    """Drops the prefix that one parameter's name has, and whatever else lies outside it.
+    """Strips the prefix of one parameter from all names; drops parameters without the prefix.
 
     Args:
         params: parameters by name.
@@ -65,7 +65,7 @@ def strip_prefix(params: Mapping[str, Tensor], marker: str) -> dict[str, Tensor]
     """
     names = [name for name in params if name == marker or name.endswith(f".{marker}")]
     if not names:
-        raise ValueError(f"there is no parameter {marker!r}: these are not of the authors' network")
+        raise ValueError(f"there is no parameter {marker!r}: these are not the authors' parameters")
     prefix = names[0].removesuffix(marker)
     return {n.removeprefix(prefix): p for n, p in params.items() if n.startswith(prefix)}
 
@@ -88,7 +88,7 @@ def size_of(params: Mapping[str, Tensor], name: str, axis: int = 0) -> int:
         ValueError: if there is no such parameter.
     """
     if name not in params:
-        raise ValueError(f"there is no parameter {name!r}: these are not of the authors' network")
+        raise ValueError(f"there is no parameter {name!r}: these are not the authors' parameters")
     return params[name].shape[axis]
 
 
@@ -96,4 +96,4 @@ def _rename(name: str, renaming: Renaming) -> str:
     for pattern, replacement in renaming:
         if re.fullmatch(pattern, name):
             return re.sub(pattern, replacement, name)
-    raise ValueError(f"unknown parameter {name!r}: it is none of the authors' network")
+    raise ValueError(f"unknown parameter {name!r}: it is not one of the authors' parameters")

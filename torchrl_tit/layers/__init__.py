@@ -1,4 +1,4 @@
-"""Layers: what frame and history encoders are both built of."""
+"""Layers shared by frame and history encoders."""
 
 from torchrl_tit.layers.attention import SelfAttention
 from torchrl_tit.layers.block import TransformerBlock

@@ -25,8 +25,8 @@ class SelfAttention(nn.Module):
     """Multi-head scaled dot-product self-attention (arXiv 2212.14538, section "Inner Transformer").
 
     Same parameters, names and results as :class:`torch.nn.MultiheadAttention` with
-    ``batch_first=True``, so that state dicts can be exchanged. Different in that queries are
-    computed only for the positions that are read.
+    ``batch_first=True``, so that state dicts can be exchanged. Unlike there, queries are computed
+    only for the positions that are read.
 
     Args:
         embed_dim: width D of a token.
@@ -83,7 +83,7 @@ class SelfAttention(nn.Module):
             x: tokens, float [N, S, D].
             read: which positions to return, by name or as a slice of S.
             mask: bool [..., S, S], to be broadcast to [N, heads, S, S]: True where a position (row)
-                sees another (column). Each must see one. Instead of the causal mask, if any.
+                sees another (column). Each must see at least one. Replaces the causal mask, if any.
 
         Returns:
             float [N, positions read, D].
@@ -100,7 +100,7 @@ class SelfAttention(nn.Module):
         return self.out_proj(mixed)  # [N, positions, out_dim]
 
     def read_first(self, first: Tensor, rest: Tensor) -> Tensor:
-        """Reads the first position where it is the same in all sequences: it is projected once.
+        """Reads the first position, which must be the same in all sequences: it is projected once.
 
         The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")`` of
         attention that is not causal.
@@ -113,8 +113,9 @@ class SelfAttention(nn.Module):
             float [N, 1, D].
         """
         count, width = rest.shape[0], first.shape[-1]
-        # One query for all: instead of all keys, it is projected, q (K x) = (q K) x. The keys' bias
-        # adds the same to all scores of a head, so the softmax does not see it.
+        # All sequences share one query, so it is projected instead of the keys:
+        # q (K x) = (q K) x. The keys' bias adds the same to all scores of a head, so the softmax
+        # ignores it.
         query = self._project(first, 0, 1).reshape(self.num_heads, 1, -1)
         keys = self.in_proj_weight[width : 2 * width].unflatten(0, (self.num_heads, -1))
         probe = (query @ keys).squeeze(1).t() / math.sqrt(keys.shape[1])  # [D, heads]
@@ -132,7 +133,7 @@ class SelfAttention(nn.Module):
         return self._weights(query, key, self._past(x) if self.causal else None)
 
     def extra_repr(self) -> str:
-        """Names what the parameters' shapes do not show."""
+        """Shows what the parameters' shapes do not."""
         return f"num_heads={self.num_heads}, causal={self.causal}"
 
     def _project(self, x: Tensor, start: int, stop: int) -> Tensor:
@@ -141,7 +142,7 @@ class SelfAttention(nn.Module):
         return F.linear(x, self.in_proj_weight[rows], self.in_proj_bias[rows])
 
     def _attend(self, x: Tensor, positions: slice, mask: Tensor | None, causal: bool) -> Tensor:
-        """What the positions take from all that they see, float [N, positions, D]."""
+        """The output of attention at these positions, float [N, positions, D]."""
         query, key, value = self._heads(x, positions)  # [N, heads, positions or S, D / heads]
         fused = causal and positions == READ_SLICES["all"] and not self._drops
         if causal and not fused:
@@ -165,7 +166,7 @@ class SelfAttention(nn.Module):
     def _attend_one(self, x: Tensor, position: slice) -> Tensor:
         """As ``_attend``, for one position that sees all others, float [N, 1, D].
 
-        Nobody's key or value is computed, because projections are linear:
+        No keys or values are computed, because projections are linear:
 
             q . (W x_i + b) = (W^T q) . x_i + q . b,  and the softmax ignores what all i share,
             sum_i a_i (W x_i + b) = W (sum_i a_i x_i) + b,  as the a_i sum to 1.
@@ -181,7 +182,7 @@ class SelfAttention(nn.Module):
         one = x[:, position].transpose(0, 1).expand(self.num_heads, -1, -1)  # [heads, N, D]
         query = torch.baddbmm(query_bias, one, query_weight.mT)  # [heads, N, D / heads]
         scale = query.shape[-1] ** -0.5
-        # The heads stand where positions usually do: all read the same tokens.
+        # The heads take the place of the positions: all read the same tokens.
         query = torch.bmm(query, key_weight).transpose(0, 1).unsqueeze(1)  # [N, 1, heads, D]
         tokens = x.unsqueeze(1)
         mixed = F.scaled_dot_product_attention(query, tokens, tokens, scale=scale).squeeze(1)

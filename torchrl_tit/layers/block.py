@@ -1,4 +1,4 @@
-"""The transformer block of which inner and outer transformers are made."""
+"""The transformer block of the inner and outer transformers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class TransformerBlock(nn.Module):
     """Pre-LayerNorm transformer block: ``x + MSA(LN(x))``, then ``x + FFN(LN(x))``.
 
     The paper's FFN equation adds the block's input again (arXiv 2212.14538, eq. of step 5); its
-    released code adds the residual of the attention output, as everyone does, and so do we.
+    released code adds the residual of the attention output, as is usual, and so does this block.
 
     Args:
         embed_dim: width D of a token.
@@ -90,9 +90,10 @@ class TransformerBlock(nn.Module):
         return x + self.ffn(self.norm2(x))
 
     def read_first(self, first: Tensor, rest: Tensor) -> Tensor:
-        """Reads the first token where it is the same in all sequences, as before the first block.
+        """Reads the first token, which must be the same in all sequences.
 
-        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")``.
+        This holds before the first block. The result is that of
+        ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")``.
 
         Args:
             first: float [1, 1, D].
@@ -105,5 +106,5 @@ class TransformerBlock(nn.Module):
         return x + self.ffn(self.norm2(x))
 
     def attention_weights(self, x: Tensor) -> Tensor:
-        """Returns the weights with which this block attends, float [N, heads, S, S]."""
+        """Returns the attention weights of this block, float [N, heads, S, S]."""
         return self.attention.weights(self.norm1(x))

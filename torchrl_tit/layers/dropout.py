@@ -9,15 +9,15 @@ from torch import Tensor, nn
 
 _INT64 = torch.iinfo(torch.int64)
 _LEVELS = 2**16
-"""Numbers that 16 random bits can be, and the shares of entries that can be dropped."""
+"""Number of values of 16 random bits; p is rounded to a multiple of its inverse."""
 
 
 class Dropout(nn.Dropout):
     """Dropout (Srivastava et al. 2014), with the distribution of :class:`torch.nn.Dropout`.
 
     On a CPU, ``nn.Dropout`` draws a number for each entry, one after another, which took a sixth of
-    a training step of Decision Transformer. This draws one of 64 bits for each four entries, in a
-    fifth of that time. Elsewhere this is ``nn.Dropout``, whose kernels are fused.
+    a training step of Decision Transformer. This draws one 64-bit number for every four entries, in
+    a fifth of that time. Elsewhere this is ``nn.Dropout``, whose kernels are fused.
 
     Args:
         p: probability of a zero; on a CPU to the nearest 1/65536, by which the rest is scaled too.

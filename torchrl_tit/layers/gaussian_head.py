@@ -48,8 +48,8 @@ class ClampedGaussianHead(nn.Module):
     """Mean and standard deviation of each entry of an action, before a tanh squashes it.
 
     Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905, and their
-    code: two linear layers, which start as PyTorch's do; the logarithm of the standard deviation is
-    cut off at -20 and 2.
+    code: two linear layers with PyTorch's default initialisation; the logarithm of the standard
+    deviation is clamped to -20..2.
 
     Args:
         in_features: size F of the features.

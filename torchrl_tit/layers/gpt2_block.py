@@ -11,7 +11,7 @@ from torchrl_tit.settings import Activation
 
 
 class GPT2Block(nn.Module):
-    """Pre-LayerNorm block with dropout on both residuals, under a mask of the caller.
+    """Pre-LayerNorm block with dropout on both residuals, with the caller's mask.
 
     Radford et al., "Language Models are Unsupervised Multitask Learners" (2019). Weights start
     normal with a standard deviation of 0.02 and biases 0, as there.
@@ -67,7 +67,7 @@ class GPT2Block(nn.Module):
         Args:
             x: tokens, float [N, S, D].
             mask: bool [S, S] or [N, 1, S, S], True where a position (row) sees another (column);
-                each must see one.
+                each must see at least one.
             read: which positions to compute and return; by default all.
 
         Returns:

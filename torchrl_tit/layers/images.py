@@ -1,4 +1,4 @@
-"""What the convolutional networks share: bytes as input, frames as a batch or as channels."""
+"""Shared by the convolutional networks: uint8 input, and frames as a batch or as channels."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ImageConv2d(nn.Conv2d):
 
 
 def as_images(x: Tensor, ndim: int) -> tuple[Tensor, tuple[int, ...]]:
-    """Makes one image of the last ``ndim`` axes, all but the last two of them its channels.
+    """Reshapes the last ``ndim`` axes into one image; all but the last two become its channels.
 
     Args:
         x: [..., *channels, H, W].
@@ -61,7 +61,7 @@ def stacked_shape(
 
 
 def convolved_size(size: int, kernels: Sequence[tuple[int, int]]) -> int:
-    """Returns the side that is left of ``size`` pixels after (kernel, stride) convolutions.
+    """Returns the side length left of ``size`` pixels after (kernel, stride) convolutions.
 
     Example:
         >>> convolved_size(84, [(8, 4), (4, 2), (3, 1)])

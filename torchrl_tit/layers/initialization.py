@@ -13,8 +13,8 @@ def init_normal_(module: nn.Module, std: float = 0.02) -> None:
     """Initialises as the authors' networks do: linear and embedding weights normal, biases 0.
 
     LayerNorms become 1 and 0. Convolutions, patch embeddings and the input projections of
-    attention keep PyTorch's defaults, class tokens and position encodings are set by their owners.
-    (The authors call a truncated normal, whose bounds are absolute and cut nothing at 0.02.)
+    attention keep PyTorch's defaults; class tokens and position encodings are initialised by their
+    modules. (The authors use a truncated normal, whose absolute bounds do not matter at 0.02.)
 
     Args:
         module: the network, changed in place.
@@ -40,7 +40,7 @@ def init_orthogonal_(module: nn.Module, gain: float = math.sqrt(2)) -> None:
 
     Every linear layer (output projections of attention included) and 2-d convolution (image patch
     embeddings included) becomes orthogonal, its bias 0. The array patch embedding, a 1-d
-    convolution there, and the input projections of attention keep what they have.
+    convolution there, and the input projections of attention are left unchanged.
 
     Args:
         module: the network, changed in place.

@@ -41,14 +41,14 @@ class ArrayPatchEmbedding(nn.Module):
         nn.init.kaiming_uniform_(self.weight, a=math.sqrt(5))
 
     def extra_repr(self) -> str:
-        """Names the shape of the weight: width, channels, P."""
+        """Shows the shape of the weight: width, channels, P."""
         return f"{', '.join(map(str, self.weight.shape))}, padding={self.padding}"
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, channels, D] of any float type or uint8 -> tokens [N, ceil(D / P), embed_dim]."""
         if self.padding:
             x = F.pad(x, (self.padding, self.padding))
-        x = x[..., : self.num_patches * self.patch_size]  # padding both ends may leave a rest
+        x = x[..., : self.num_patches * self.patch_size]  # padding both ends may leave a remainder
         x = x.unflatten(-1, (self.num_patches, self.patch_size))  # [N, C, patches, P]
         return embed(x.transpose(1, 2).flatten(2), self.weight)
 
@@ -102,7 +102,7 @@ class ImagePatchEmbedding(nn.Module):
         nn.init.kaiming_uniform_(self.weight, a=math.sqrt(5))
 
     def extra_repr(self) -> str:
-        """Names the shape of the weight: width, C, P, P."""
+        """Shows the shape of the weight: width, C, P, P."""
         return f"{', '.join(map(str, self.weight.shape))}, grid={self.grid}"
 
     def forward(self, x: Tensor) -> Tensor:

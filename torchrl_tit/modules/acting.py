@@ -16,7 +16,7 @@ class HasActingMode(Protocol):
     """A module that can reuse what it computed a step ago, such as a backbone."""
 
     def acting(self) -> AbstractContextManager[None]:
-        """The context within which it does."""
+        """Returns the context within which it does so."""
 
 
 @contextmanager
@@ -25,7 +25,7 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
 
     Args:
         policy: a module that contains any number of backbones, or of other modules with a method
-            ``acting`` (see :meth:`Backbone.acting`). Nothing happens to any other function.
+            ``acting`` (see :meth:`Backbone.acting`). Other functions are left unchanged.
 
     Example:
         >>> from tensordict.nn import TensorDictSequential

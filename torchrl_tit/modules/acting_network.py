@@ -43,7 +43,7 @@ class ActingNetwork:
         Which tokens can be reused is decided in between, in plain Python.
 
         Args:
-            **options: of ``torch.compile``.
+            **options: passed to ``torch.compile``.
         """
         self._encode_history = torch.compile(self.network.encode_history, **options)
         self._compiled_encoders = {
@@ -51,7 +51,7 @@ class ActingNetwork:
         }
 
     def fresh(self) -> ActingNetwork:
-        """Returns one that keeps nothing yet and shares what is compiled."""
+        """Returns a copy without kept tokens that shares the compiled parts."""
         other = ActingNetwork(self.network)
         other._encode_history = self._encode_history
         other._compiled_encoders = self._compiled_encoders
@@ -73,7 +73,7 @@ class ActingNetwork:
         self._caches.clear()
 
     def _cache(self, index: int, encoder: FrameEncoder) -> FrameCache:
-        """The cache of an observation; a new one where its encoder has been replaced."""
+        """The cache of an observation; a new one if its encoder has been replaced."""
         cache = self._caches.get(index)
         if cache is None or cache.encoder is not encoder:
             compiled = self._compiled_encoders.get(encoder)

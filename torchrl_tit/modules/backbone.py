@@ -28,7 +28,7 @@ class Backbone(TensorDictModule):
     frame is encoded at each step, and the features are the same.
 
     A recurrent network (an LSTM with one frame) reads its state from the tensordict, and writes the
-    next state beside the features:
+    next state along with the features:
 
     ==========================================  ==================  ================================
     key                                         shape               what it is
@@ -62,7 +62,7 @@ class Backbone(TensorDictModule):
             share a network.
 
     Raises:
-        ValueError: if the number of keys is not that of the network's inputs and outputs, or
+        ValueError: if the number of keys does not match the network's inputs and outputs, or
             ``every_frame`` is set for a history encoder that encodes the newest frame only.
         KeyError: in ``forward``, if the tensordict lacks one of the entries.
 
@@ -140,13 +140,13 @@ class Backbone(TensorDictModule):
 
     @property
     def keeps_frames(self) -> bool:
-        """Whether acting mode saves anything: histories of several frames that are encoded."""
+        """Whether acting mode saves work: frames are encoded, and histories have several."""
         if self.every_frame:
             return False
         return any(trunk.keeps_frames for trunk in trunks_of(self.module).values())
 
     def make_transforms(self) -> Compose:
-        """Builds the transforms by which an environment carries the recurrent state.
+        """Builds the transforms that carry the recurrent state through an environment.
 
         Returns:
             TorchRL's `InitTracker`, which marks the first step of each episode, and
@@ -163,15 +163,16 @@ class Backbone(TensorDictModule):
         """Keeps the tokens of the last frames, so that only the newest is encoded at each step.
 
         For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses. The
-        features are those of the network, whatever the input (see
-        :class:`~torchrl_tit.modules.FrameCache`): another batch, a reset or changed weights only
-        take time. Has no effect on networks that encode no frames or read a single one.
+        features equal the network's for any input (see :class:`~torchrl_tit.modules.FrameCache`):
+        another batch, a reset or changed weights only cost time. Has no effect on networks that
+        encode no frames or read a single one.
 
         The cache (copies of one batch of histories, of its tokens, and of the frame encoder's
         weights) is discarded at the end, and whenever a state dict is taken: a run then continues
         exactly like one that is resumed from that state. A nested ``acting`` starts with an empty
-        cache and leaves that of the outer one alone. A copy made within, for a collector in another
-        process for example, always acts, and starts with an empty cache.
+        cache and leaves that of the outer one alone. A copy made within the context, for a
+        collector in another process for example, stays in acting mode and starts with an empty
+        cache.
 
         Example:
             >>> from tensordict import TensorDict
@@ -189,14 +190,14 @@ class Backbone(TensorDictModule):
             self._acting = outer
 
     def compile_parts(self, **options: Any) -> None:
-        """Compiles what acting mode runs: encoding the newest frames, and all that follows.
+        """Compiles what acting mode runs: the encoding of the newest frames, and all later layers.
 
         Which tokens can be reused is decided between the two, in plain Python. Do not compile the
         whole policy instead: a compiled backbone keeps no tokens. Copies of the backbone are not
         compiled.
 
         Args:
-            **options: of ``torch.compile``.
+            **options: passed to ``torch.compile``.
         """
         if self.keeps_frames:
             self._compiled = [ActingNetwork(trunk) for trunk in trunks_of(self.module).values()]
@@ -280,7 +281,7 @@ class Backbone(TensorDictModule):
 
 
 def trunks_of(network: nn.Module) -> dict[str, HistoryNetwork]:
-    """Returns the trunks of a network by the prefix of their state's keys; none of other modules.
+    """Returns the trunks of a network by the key prefix of their state; empty for other modules.
 
     Example:
         >>> from torchrl_tit.networks import MLP
@@ -316,7 +317,7 @@ def _check_keys(
     in_keys: Sequence[NestedKey],
     out_keys: Sequence[NestedKey],
 ) -> None:
-    """Raises ValueError if the number of keys is not that of the network's inputs and outputs."""
+    """Raises ValueError if the number of keys does not match the network's inputs and outputs."""
     reads, writes = max(1, len(in_keys)), max(1, len(out_keys))
     for trunk in trunks.values():
         reads = len(trunk.frames) + len(trunk.history_encoder.context)

@@ -68,7 +68,7 @@ class DTHead(nn.Module):
         Args:
             features: float [..., F].
             action: the actions that the network read, to check that they are of this head's kind;
-                not checked where not given.
+                not checked if None.
 
         Returns:
             float [..., A]: actions, or logits; of a Gaussian, its mean and standard deviation.
@@ -92,7 +92,7 @@ def make_dt_backbone(
     Args:
         network: a Decision Transformer of one observation.
         group: the key under which "observation", "action", "return_to_go", "timestep" and "mask"
-            are, as of :class:`~torchrl_tit.transforms.SequenceHistory`; None for the top level, as
+            are, as in :class:`~torchrl_tit.transforms.SequenceHistory`; None for the top level, as
             in batches of :class:`~torchrl_tit.datasets.SequenceStorage`.
         every_frame: write the features of all steps, [..., K, F], not of the newest one, [..., F].
 

@@ -132,7 +132,7 @@ class FrameCache:
     def _encode_unknown(
         self, frames: Tensor, words: Tensor, newest: Tensor, kept: _Kept | None
     ) -> Tensor:
-        """Encodes what is not known; newest [N, 1, *token_shape] -> [N, K, *token_shape]."""
+        """Encodes the unknown frames; newest [N, 1, *token_shape] -> [N, K, *token_shape]."""
         repeated = same_frames(words[:, :-1], words[:, 1:])  # equal to the next frame, [N, K - 1]
         if kept is None:
             known = torch.zeros_like(repeated)

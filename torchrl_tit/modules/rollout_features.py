@@ -101,7 +101,7 @@ def _frame_ndims(
     """The number of dimensions of an observation under each of the backbone's keys."""
     if trunks:
         return [len(encoder.observation_shape) for encoder in trunks[0].frames]
-    # Of another module's histories only the rollout's own dimensions are known.
+    # For other modules, only the rollout's own dimensions are known.
     return [rollout.get(key).ndim - rollout.batch_dims - 1 for key in backbone.history_keys]
 
 
@@ -132,7 +132,7 @@ def _sources(words: Tensor, end_words: Tensor, ends: Tensor) -> Tensor:
 
     source = index.clone()
     older, newer = source[..., :-1], index[..., 1:]  # frame k of a history, and frame k + 1
-    # A frame's source is the next one of its history, or better the one that it was a step ago.
+    # A frame's source is the next frame of its history or, better, the same frame a step ago.
     repeated = same_frames(words[..., :-1, :], words[..., 1:, :])
     older[repeated] = newer[repeated]
     moved = same_frames(words[:, 1:, :-1], words[:, :-1, 1:])

@@ -12,7 +12,7 @@ def as_words(frames: Tensor) -> Tensor:
     """Views the bytes of frames as the widest integers that fit.
 
     Two frames are equal as integers if and only if they have the same bytes: NaN equals itself, and
-    0.0 differs from -0.0. Comparing images is several times as fast as byte by byte.
+    0.0 differs from -0.0. This compares images several times as fast as byte by byte.
 
     Args:
         frames: [..., entries] of any dtype; copied only if not contiguous or not aligned.

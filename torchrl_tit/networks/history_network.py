@@ -16,7 +16,7 @@ from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.initialization import init_normal_
 
 ObservationShape = Sequence[int] | Mapping[str, Sequence[int]]
-"""Shape of an observation, or of each of several by key."""
+"""Shape of an observation, or shapes by key if there are several."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class AttentionMaps:
 
     Attributes:
         inner: of each inner block, float [..., K, heads, S, S] with S = 1 + patches and the class
-            token at position 0 (without K where frames are stacked as channels).
+            token at position 0 (without K if frames are stacked as channels).
         outer: of each outer block, float [..., heads, K, K], lower triangular.
     """
 
@@ -44,9 +44,9 @@ class HistoryNetwork(nn.Module):
     Nothing flows from the history encoder back into the frame encoder, so the tokens of a frame
     depend on that frame alone (arXiv 2212.14538, appendix on information flow: "T-S" is 0).
 
-    Several observations (pixels and a state, say) have a frame encoder each, and their tokens stand
-    side by side: ``observation_shape`` is then a mapping, and ``frame`` one too, or settings that
-    all share.
+    If there are several observations (pixels and a state, say), each has its own frame encoder, and
+    their tokens are concatenated. ``observation_shape`` is then a mapping; ``frame`` is a mapping
+    too, or settings that all share.
 
     Args:
         frame: settings of the frame encoder.
@@ -54,12 +54,13 @@ class HistoryNetwork(nn.Module):
         observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
         num_frames: number K >= 1 of observations.
         head: settings of the head.
-        initialization: "normal" starts the weights as the authors of TIT do
-            (:func:`~torchrl_tit.layers.init_normal_`), "default" as each layer does by itself.
+        initialization: "normal" initialises the weights as the authors of TIT do
+            (:func:`~torchrl_tit.layers.init_normal_`), "default" keeps each layer's own
+            initialisation.
         action_dim: entries of an action, for history encoders that read actions.
 
     Raises:
-        ValueError: if a setting is not possible, the two encoders do not fit each other, or a
+        ValueError: if a setting is invalid, the two encoders do not fit each other, or a
             history of another shape is given to ``forward``.
         TypeError: if a history of another dtype is given to ``forward``.
 
@@ -106,8 +107,8 @@ class HistoryNetwork(nn.Module):
 
         Args:
             *inputs: a history [..., K, *observation_shape] for each observation, the oldest frame
-                first; uint8 (which stands for 0..1) or of the network's own float type (taken as
-                it is). Then what the history encoder reads beside (``history_encoder.context``).
+                first; uint8 (scaled to 0..1) or the network's own float type (used as is). Then the
+                other inputs of the history encoder (``history_encoder.context``).
 
         Returns:
             float [..., F].
@@ -122,7 +123,7 @@ class HistoryNetwork(nn.Module):
         return self.join_tokens(tokens)
 
     def join_tokens(self, tokens: Sequence[Tensor]) -> Tensor:
-        """Puts the tokens of several observations side by side, [..., L_i, D] each."""
+        """Concatenates the tokens of several observations, [..., L_i, D] each."""
         if len(tokens) == 1:
             return tokens[0]
         return torch.cat([self.as_floats(x) for x in tokens], dim=-2)
@@ -132,9 +133,9 @@ class HistoryNetwork(nn.Module):
         return self.head(self.history_encoder(self.as_floats(tokens), *context))
 
     def every_frame(self, *inputs: Tensor) -> Tensor:
-        """Maps histories to features of every frame, from itself and the frames before it.
+        """Maps histories to features of every frame, each from that frame and the ones before it.
 
-        Only where ``history_encoder.encodes_every_frame``.
+        Only available if ``history_encoder.encodes_every_frame``.
 
         Args:
             *inputs: as in ``forward``.
@@ -149,7 +150,7 @@ class HistoryNetwork(nn.Module):
     def step(
         self, histories: Sequence[Tensor], state: dict[str, Tensor], is_init: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Reads the newest frame and the state before it, where the network carries a state.
+        """Reads the newest frame and the state before it, if the network is recurrent.
 
         Args:
             histories: [*B, 1, *observation_shape] each.
@@ -165,7 +166,7 @@ class HistoryNetwork(nn.Module):
         return self.head(outputs), state
 
     def as_floats(self, tokens: Tensor) -> Tensor:
-        """Makes floats of flat frames of bytes, for history encoders that read tokens."""
+        """Converts flat uint8 frames to floats, for history encoders that read tokens."""
         if tokens.dtype == torch.uint8 and not self.history_encoder.reads_frames:
             return tokens.to(weights_dtype(self)) / 255
         return tokens
@@ -173,7 +174,7 @@ class HistoryNetwork(nn.Module):
     def attention_maps(self, *histories: Tensor) -> AttentionMaps:
         """Returns the attention weights of every inner and outer block.
 
-        A pass of its own: the usual one computes neither these nor what is not read.
+        This is a separate pass, because the usual one does not compute all attention weights.
 
         Args:
             *histories: as in ``forward``.
@@ -187,7 +188,7 @@ class HistoryNetwork(nn.Module):
         return AttentionMaps(inner, outer)
 
     def check(self, *histories: Tensor) -> None:
-        """Raises ValueError or TypeError where histories do not fit this network."""
+        """Raises ValueError or TypeError if histories do not fit this network."""
         if len(histories) != len(self.frame_encoders):
             raise ValueError(
                 f"this network reads {len(self.frame_encoders)} histories "
@@ -203,7 +204,7 @@ class HistoryNetwork(nn.Module):
 
     @property
     def keeps_frames(self) -> bool:
-        """Whether keeping tokens saves work: frames are encoded, and there are earlier ones."""
+        """Whether keeping tokens saves work: frames are encoded, and histories have several."""
         encodes = not all(isinstance(encoder, Flat) for encoder in self.frames)
         return encodes and self.num_frames > 1
 
@@ -219,7 +220,7 @@ class HistoryNetwork(nn.Module):
 
 
 class TwoTrunks(nn.Module):
-    """Two networks of the same observations that share nothing: one for the policy, one for values.
+    """Two separate networks on the same observations: one for the policy, one for values.
 
     Args:
         policy: the policy's network.
@@ -254,10 +255,10 @@ def build_network(
 
     Args:
         network: the settings.
-        observation_shape: shape of an observation, or of each of several by key.
+        observation_shape: shape of an observation, or shapes by key if there are several.
         action_dim: entries of an action, for history encoders that read actions.
-        trunks: "shared" builds one network where the settings say two: an actor's, say, whose
-            critics are apart.
+        trunks: "shared" builds one network even if the settings say two: for an actor with separate
+            critics, say.
 
     Raises:
         ValueError: if the two encoders do not fit each other or the observation.
@@ -276,11 +277,11 @@ def build_network(
 def build_trunk(
     network: settings.Network, observation_shape: ObservationShape, action_dim: int | None = None
 ) -> HistoryNetwork:
-    """Builds one network of the settings, whether policy and value share it or not.
+    """Builds a single network, whether or not the settings share it between policy and value.
 
     Args:
         network: the settings.
-        observation_shape: shape of an observation, or of each of several by key.
+        observation_shape: shape of an observation, or shapes by key if there are several.
         action_dim: entries of an action, for history encoders that read actions.
     """
     return HistoryNetwork(
@@ -297,10 +298,10 @@ def build_trunk(
 def weights_dtype(network: nn.Module) -> torch.dtype:
     """Returns the float type of a network's weights.
 
-    Not that of ``parameters()``, which is empty where TorchRL's losses have put plain tensors
-    (target weights, a stack of critics) in their places.
+    It does not use ``parameters()``, which is empty if TorchRL's losses have replaced parameters
+    with plain tensors (target weights, a stack of critics).
     """
-    names = ("weight", "weight_ih_l0")  # the latter of LSTMs, which may be the only layer
+    names = ("weight", "weight_ih_l0")  # the second is an LSTM's, which may be the only layer
     weights = (getattr(module, name, None) for module in network.modules() for name in names)
     return next(weight.dtype for weight in weights if isinstance(weight, Tensor))
 
@@ -308,10 +309,10 @@ def weights_dtype(network: nn.Module) -> torch.dtype:
 def check_history(
     history: Tensor, num_frames: int, observation_shape: tuple[int, ...], dtype: torch.dtype
 ) -> None:
-    """Raises ValueError or TypeError where a history does not fit a network.
+    """Raises ValueError or TypeError if a history does not fit a network.
 
     Args:
-        history: what the network is given.
+        history: the input.
         num_frames: number K of observations that it reads.
         observation_shape: shape of one of them.
         dtype: type of the network's weights.
@@ -324,7 +325,7 @@ def check_history(
             f"{observation_shape}, oldest first (torchrl_tit.History stacks them)"
         )
     device = history.device.type
-    # "meta", say, has no autocast to ask about.
+    # Some devices, such as "meta", have no autocast.
     autocast = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
     # Autocast converts every float type but double.
     fits = history.dtype == dtype or (
@@ -357,7 +358,7 @@ def _build_frames(
 def _history_shape(
     frames: Sequence[FrameEncoder], num_frames: int, action_dim: int | None
 ) -> HistoryShape:
-    """What the history encoder reads, if the tokens of all frame encoders fit side by side."""
+    """Returns the input shape of the history encoder; raises if the token widths differ."""
     widths = {encoder.width for encoder in frames}
     if len(widths) > 1:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""What the contrastive loss of CoBERL reads of a network."""
+"""The inputs of CoBERL's contrastive loss."""
 
 from __future__ import annotations
 

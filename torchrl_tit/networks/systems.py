@@ -19,16 +19,16 @@ from torchrl_tit.settings import networks as systems
 
 
 class System(HistoryNetwork):
-    """A network by name: what a function of :mod:`torchrl_tit.settings.networks` describes.
+    """A named network, described by a function of :mod:`torchrl_tit.settings.networks`.
 
     Args:
         observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images, or a mapping of those.
-        num_frames: number K of observations; where not given, the default of the function.
+        num_frames: number K of observations; if not given, the default of the function.
         action_dim: entries of an action, for history encoders that read actions.
         **hyperparameters: further arguments of the function.
 
     Raises:
-        ValueError: if a hyperparameter is not possible; the message names it.
+        ValueError: if a hyperparameter is invalid; the message names it.
         TypeError: if there is no such hyperparameter.
     """
 
@@ -68,7 +68,7 @@ class VanillaTIT(System):
         **hyperparameters: those of :func:`~torchrl_tit.settings.networks.vanilla_tit`.
 
     Raises:
-        ValueError: if a hyperparameter is not possible; the message names it.
+        ValueError: if a hyperparameter is invalid; the message names it.
         TypeError: if there is no such hyperparameter.
 
     Example:
@@ -93,7 +93,7 @@ class EnhancedTIT(System):
         **hyperparameters: those of :func:`~torchrl_tit.settings.networks.enhanced_tit`.
 
     Raises:
-        ValueError: if a hyperparameter is not possible; the message names it.
+        ValueError: if a hyperparameter is invalid; the message names it.
         TypeError: if there is no such hyperparameter.
 
     Example:

@@ -33,7 +33,7 @@ def contrastive_prediction_loss(
         temperature: divides the similarities.
 
     Returns:
-        The mean over the masked steps, float []; 0 where none is masked.
+        The mean over the masked steps, float []; 0 if none is masked.
 
     Example:
         >>> encodings, mask = torch.eye(6).view(2, 3, 6), torch.tensor([[True, False, False]] * 2)

@@ -20,7 +20,7 @@ OverCritics = Literal["mean", "sum"]
 
 
 class ContinuousCQLLoss(CQLLoss):
-    """Replaces TorchRL's `CQLLoss`, whose formulas are not those of the paper's agents.
+    """Replaces TorchRL's `CQLLoss`, whose formulas differ from those of the paper's agents.
 
     Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning", arXiv 2006.04779,
     equation 4 (CQL(H)) and appendix F, as in d3rlpy 1.1.1, which arXiv 2212.14538 trained with.
@@ -49,15 +49,15 @@ class ContinuousCQLLoss(CQLLoss):
             :func:`~torchrl_tit.modules.make_squashed_actor`.
         qvalue_network: reads any keys (those under "next" for the target) and the action, and
             writes "state_action_value", float [..., 1]. Either two critics, which keep their
-            initial weights, or one, of which TorchRL makes two and draws new weights.
+            initial weights, or one, which TorchRL duplicates and initialises anew.
         action_spec: bounds of an action, a ``Bounded`` spec of shape [A].
         min_q_weight: weight w of the conservative term.
         num_random: number m of samples of each kind.
         over_critics: whether the conservative term is the mean over the critics, as in d3rlpy
             1.1.1, or their sum, as in d3rlpy since 2.5.
         alpha_init: initial temperature.
-        target_entropy: target of the temperature; minus the number of entries of an action where
-            "auto".
+        target_entropy: target of the temperature; "auto" is minus the number of entries of an
+            action.
         loss_function: distance to the target; "l2" is the square.
         deactivate_vmap: whether to run the critics one after the other, for networks that vmap
             does not support.
@@ -184,7 +184,7 @@ class ContinuousCQLLoss(CQLLoss):
 
         Args:
             tensordict: a batch [B].
-            samples: of :meth:`sample_policy`; sampled here where not given.
+            samples: from :meth:`sample_policy`; sampled here if not given.
         """
         batch = self._critic_batch(tensordict, samples or self.sample_policy(tensordict))
         values = self._values(batch.inputs, self.qvalue_network_params)
@@ -239,7 +239,7 @@ class ContinuousCQLLoss(CQLLoss):
 
         Args:
             tensordict: a batch [B].
-            samples: of :meth:`sample_policy`; sampled here where not given.
+            samples: from :meth:`sample_policy`; sampled here if not given.
         """
         samples = samples or self.sample_policy(tensordict)
         inputs = self._inputs(tensordict, samples.action.unsqueeze(1))
@@ -277,7 +277,7 @@ class ContinuousCQLLoss(CQLLoss):
             return self.value_estimator.value_estimate(batch).squeeze(-1)
 
     def _inputs(self, tensordict: TensorDictBase, actions: Tensor) -> TensorDictBase:
-        """What critics read in each state, and m actions there, [B, m, A]."""
+        """The critics' inputs: each state, with m actions, [B, m, A]."""
         keys = [key for key in self.qvalue_network.in_keys if key != self.tensor_keys.action]
         return tensordict.select(*keys).set(self.tensor_keys.action, actions)
 

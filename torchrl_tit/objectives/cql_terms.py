@@ -1,4 +1,4 @@
-"""What the terms of continuous CQL are computed from."""
+"""The inputs of the terms of continuous CQL."""
 
 from __future__ import annotations
 

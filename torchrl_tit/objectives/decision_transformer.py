@@ -1,4 +1,4 @@
-"""Decision Transformer's loss: it leaves padding out and takes discrete actions."""
+"""Decision Transformer's loss, which ignores padding and supports discrete actions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class MaskedDTLoss(DTLoss):
         loss_function: "l2", "l1" or "smooth_l1" between continuous actions [..., K, A], or
             "cross_entropy" between logits and discrete ones, integers [..., K] or one-hot.
         mask_key: Key of the mask, bool [..., K], False at padding.
-        **settings: Of `DTLoss`: ``reduction``.
+        **settings: Passed to `DTLoss`: ``reduction``.
 
     Returns:
         In ``forward``, a tensordict with "loss", float [].
@@ -71,7 +71,7 @@ class MaskedDTLoss(DTLoss):
         self.loss_mask_key = mask_key
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes the loss of a batch [...], which is left as it is."""
+        """Computes the loss of a batch [...], which is left unchanged."""
         target = tensordict[self.tensor_keys.action_target]
         discrete = self.loss_function == "cross_entropy"
         if discrete == target.is_floating_point():

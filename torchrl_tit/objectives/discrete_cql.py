@@ -20,13 +20,13 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         loss_cql     mean over s of [logsumexp_b Q(s, b) - Q(s, a)]
 
     `DiscreteCQLLoss` of TorchRL 0.14.1 has target parameters Q', but passes them to its value
-    estimator as ``params``, which that does not read, so its target is computed with Q. Beside what
-    `DiscreteCQLLoss` writes into the batch, this loss writes the value at s'.
+    estimator as ``params``, which the estimator ignores, so its target is computed with Q. In
+    addition to what `DiscreteCQLLoss` writes into the batch, this loss writes the value at s'.
 
     Args:
         value_network: writes "action_value", float [..., n], and "chosen_action_value", float
             [..., 1].
-        **settings: of `DiscreteCQLLoss`: ``action_space``, ``loss_function``, ``reduction``.
+        **settings: passed to `DiscreteCQLLoss`: ``action_space``, ``loss_function``, ``reduction``.
 
     Example:
         >>> from tensordict import TensorDict

@@ -1,8 +1,8 @@
-"""Settings: dataclasses of values and checks, which import neither torch nor what they describe.
+"""Settings: dataclasses with checks that import neither torch nor the modules they build.
 
-Listing recipes and printing help need names, defaults and docstrings only, so settings stand apart
-from the modules that they build. Each part names its implementation, which is imported when it is
-built (:meth:`~torchrl_tit.settings.parts.Part.build`).
+Listing recipes and printing help only needs names, defaults and docstrings, so settings are kept
+apart from modules. Each part names its implementation, which is imported when the part is built
+(:meth:`~torchrl_tit.settings.parts.Part.build`).
 """
 
 from torchrl_tit.settings.frames import (

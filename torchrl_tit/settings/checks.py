@@ -1,4 +1,4 @@
-"""Checks that several settings share: each raises ValueError that names the field and its value."""
+"""Checks shared by several settings: each raises ValueError naming the field and its value."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 
 def check_at_least(settings: object, **minima: float) -> None:
-    """Raises ValueError where a field is below its minimum or not a number.
+    """Raises ValueError if a field is below its minimum or not a number.
 
     Example:
         >>> from types import SimpleNamespace
@@ -23,7 +23,7 @@ def check_at_least(settings: object, **minima: float) -> None:
 
 
 def check_at_most(settings: object, **maxima: float) -> None:
-    """Raises ValueError where a field is above its maximum or not a number."""
+    """Raises ValueError if a field is above its maximum or not a number."""
     for field, maximum in maxima.items():
         value = getattr(settings, field)
         if not value <= maximum:
@@ -31,21 +31,21 @@ def check_at_most(settings: object, **maxima: float) -> None:
 
 
 def check_positive(settings: object, *fields: str) -> None:
-    """Raises ValueError where a field is not above 0."""
+    """Raises ValueError if a field is not above 0."""
     for field in fields:
         if not getattr(settings, field) > 0:
             raise ValueError(f"{field} must be positive, not {getattr(settings, field)}")
 
 
 def check_probability(settings: object, *fields: str) -> None:
-    """Raises ValueError where a field is not in [0, 1)."""
+    """Raises ValueError if a field is not in [0, 1)."""
     for field in fields:
         if not 0 <= getattr(settings, field) < 1:
             raise ValueError(f"{field} is a probability in [0, 1), not {getattr(settings, field)}")
 
 
 def check_choice(settings: object, field: str, choices: Iterable[object]) -> None:
-    """Raises ValueError where a field is none of the choices."""
+    """Raises ValueError if a field is not one of the choices."""
     if getattr(settings, field) not in choices:
         raise ValueError(
             f"unknown {field} {getattr(settings, field)!r}: choose one of {tuple(choices)}"

@@ -18,7 +18,7 @@ class FrameSettings(Part, kind="frame encoder"):
 
 @dataclass(frozen=True, kw_only=True)
 class Flat(FrameSettings, name="flat", builds="torchrl_tit.frames.flat:Flat"):
-    """The observation as it is: one token of all its entries, for encoders that stack frames."""
+    """The raw observation as a single token, for encoders that stack frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ class TransformerSettings:
     ffn_dropout: float = 0.0
     """Dropout on the FFN outputs."""
     share_blocks: bool = False
-    """Whether all blocks are one and the same."""
+    """Whether all blocks share their weights."""
 
     def __post_init__(self) -> None:
         check_at_least(self, num_heads=1, ffn_expansion=1)
@@ -64,7 +64,7 @@ class PatchTransformerSettings(TransformerSettings):
 
     patch_size: int | None = 1
     """Entries of an array's patch, or pixels along a side of an image's; the whole observation
-    (of an image, which must be square) where not given."""
+    (of an image, which must be square) if not given."""
     embed_dim: int = 32
     """Width D of a token."""
     num_blocks: int = 2

@@ -15,12 +15,12 @@ class HistorySettings(Part, kind="history encoder"):
     """Settings of a history encoder: tokens [..., K, L, D] -> outputs [..., E]."""
 
     reads_actions: ClassVar[bool] = False
-    """Whether it reads past actions and returns to go beside the tokens."""
+    """Whether it reads past actions and returns to go in addition to the tokens."""
     is_recurrent: ClassVar[bool] = False
-    """Whether it carries a state from step to step where it reads one frame."""
+    """Whether it carries a state from step to step when it reads one frame."""
 
     def check_num_frames(self, num_frames: int) -> None:
-        """Raises ValueError where the encoder cannot read so many frames."""
+        """Raises ValueError if the encoder cannot read that many frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class OuterSettings(TransformerSettings, HistorySettings):
     """Whether the K frames get a learned position encoding (not in the paper)."""
 
     def check_num_frames(self, num_frames: int) -> None:
-        """Raises ValueError where there is one frame and a position encoding."""
+        """Raises ValueError if there is a position encoding but only one frame."""
         if self.temporal_position_encoding and num_frames == 1:
             raise ValueError(
                 "temporal_position_encoding tells frames apart, but num_frames is 1: raise it, or "
@@ -132,7 +132,7 @@ class Catformer(
     num_heads: int = 5
     """Attention heads; must divide ``attention_expansion`` x the width."""
     attention_expansion: int = 1
-    """Width at which attention works as a multiple of the width (2 in its paper's tuning)."""
+    """Width inside attention, as a multiple of the width (2 in its paper's tuning)."""
     ffn_expansion: int = 4
     """Hidden width of an FFN as a multiple of the width."""
 
@@ -140,7 +140,7 @@ class Catformer(
         check_at_least(self, num_blocks=1, num_heads=1, attention_expansion=1, ffn_expansion=1)
 
     def check_num_frames(self, num_frames: int) -> None:
-        """Raises ValueError where there is one frame."""
+        """Raises ValueError if there is only one frame."""
         _check_several_frames(self.name, num_frames)
 
 
@@ -163,13 +163,13 @@ class CoBERL(HistorySettings, name="coberl", builds="torchrl_tit.histories.cober
         check_at_least(self, num_blocks=1, num_heads=1, ffn_expansion=1, hidden_dim=1)
 
     def check_num_frames(self, num_frames: int) -> None:
-        """Raises ValueError where there is one frame."""
+        """Raises ValueError if there is only one frame."""
         _check_several_frames(self.name, num_frames)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LSTM(HistorySettings, name="lstm", builds="torchrl_tit.histories.recurrent:LSTM"):
-    """An LSTM. With one frame it carries its state through the episode; with more it reads them."""
+    """An LSTM. It carries its state through the episode if it reads one frame, else starts at 0."""
 
     is_recurrent = True
 
@@ -188,7 +188,7 @@ class DecisionTransformer(
 ):
     """Decision Transformer, by default as in arXiv 2106.01345 for MuJoCo.
 
-    It reads returns to go, actions and time steps beside the tokens of the frames.
+    It reads returns to go, actions and time steps in addition to the tokens of the frames.
     """
 
     reads_actions = True
@@ -198,13 +198,13 @@ class DecisionTransformer(
     num_heads: int = 1
     """Attention heads of a block; must divide the width."""
     ffn_dim: int | None = None
-    """Hidden width of a block's FFN; four times the width where not given."""
+    """Hidden width of a block's FFN; four times the width if not given."""
     activation: Activation = "relu"
     """Activation in a block's FFN."""
     dropout: float = 0.1
     """Dropout on the tokens, on attention weights, and on the outputs of attention and FFN."""
     max_ep_len: int = 1000
-    """Number of time steps that the timestep embedding knows, from 0."""
+    """Number of time steps in the timestep embedding, counted from 0."""
     timestep_embedding: bool = True
     """Whether tokens get a learned embedding of their time step (Online DT has none)."""
 
@@ -215,7 +215,7 @@ class DecisionTransformer(
         check_probability(self, "dropout")
 
     def check_num_frames(self, num_frames: int) -> None:
-        """Raises ValueError where a window is longer than the longest episode."""
+        """Raises ValueError if a window is longer than the longest episode."""
         if num_frames > self.max_ep_len:
             raise ValueError(
                 f"num_frames {num_frames} is more than max_ep_len {self.max_ep_len}: lower it, or "

@@ -36,11 +36,11 @@ class Head:
     """The layers between the history encoder and the features."""
 
     features_dim: int | None = 64
-    """Size F of the features; where not given, the history encoder's output is the features."""
+    """Size F of the features; if not given, the history encoder's output is the features."""
     activation: Activation = "tanh"
     """Activation after the linear layer."""
     norm: bool = True
-    """Whether a LayerNorm stands before the linear layer and another one after the activation."""
+    """Whether to add a LayerNorm before the linear layer and another one after the activation."""
 
     def __post_init__(self) -> None:
         if self.features_dim is not None:
@@ -62,8 +62,8 @@ class Network:
     trunks: Literal["shared", "separate"] = "shared"
     """Whether policy and value share the network, or have one each."""
     initialization: Literal["normal", "default"] = "default"
-    """How the weights start: normal with a standard deviation of 0.02, as the authors of TIT have
-    it, or as each layer does by itself."""
+    """Initialisation of the weights: normal with a standard deviation of 0.02, as in the authors'
+    code, or the default of each layer."""
 
     def __post_init__(self) -> None:
         check_at_least(self, num_frames=1)
@@ -106,7 +106,7 @@ def vanilla_tit(
     Args:
         num_frames: number K of observations.
         patch_size: entries of an array's patch, or pixels along a side of an image's; the whole
-            observation where None.
+            observation if None.
         embed_dim: width D of a token.
         num_blocks: number L of inner blocks and of outer blocks.
         num_heads_inner: attention heads of an inner block; must divide the width.
@@ -121,7 +121,7 @@ def vanilla_tit(
         ffn_dropout_outer: dropout on the FFN outputs of outer blocks.
         position_encoding: whether patches and class token get a learned position encoding.
         temporal_position_encoding: whether the K frames get one (not in the paper).
-        share_blocks: whether all inner blocks are one block, and all outer blocks too.
+        share_blocks: whether all inner blocks share weights, and all outer blocks too.
         features_dim: size of the features.
         activation_head: activation of the head.
     """
@@ -175,7 +175,7 @@ def enhanced_tit(
         **hyperparameters: those of :func:`vanilla_tit`.
 
     Raises:
-        ValueError: if nothing would be left, or a hyperparameter is not possible.
+        ValueError: if ``inner`` and ``outer`` are both off, or a hyperparameter is invalid.
 
     Example:
         >>> enhanced_tit(4, inner=False).frame
@@ -266,7 +266,7 @@ def coberl(
 
 
 def mlp(num_frames: int = 1, **hyperparameters: Any) -> Network:
-    """MLP: two tanh layers of 64 on all entries of K arrays, apart for policy and value.
+    """MLP: two tanh layers of 64 on all entries of K arrays, separate for policy and value.
 
     The baseline of arXiv 2212.14538 for arrays.
 
@@ -278,7 +278,7 @@ def mlp(num_frames: int = 1, **hyperparameters: Any) -> Network:
 
 
 def ofenet(num_frames: int = 1, **hyperparameters: Any) -> Network:
-    """OFENet: an MLP with dense connections, apart for policy and value.
+    """OFENet: an MLP with dense connections, separate for policy and value.
 
     Ota et al., "Can Increasing Input Dimensionality Improve Deep Reinforcement Learning?", ICML
     2020, as built for the baseline of arXiv 2212.14538: without its auxiliary loss.
@@ -291,7 +291,7 @@ def ofenet(num_frames: int = 1, **hyperparameters: Any) -> Network:
 
 
 def d2rl(num_frames: int = 1, **hyperparameters: Any) -> Network:
-    """D2RL: an MLP whose layers are all given the observation, apart for policy and value.
+    """D2RL: an MLP whose layers all read the observation, separate for policy and value.
 
     Sinha et al., "D2RL: Deep Dense Architectures in Reinforcement Learning", arXiv 2010.09163, as
     built for the baseline of arXiv 2212.14538: the output includes the observation.
@@ -306,13 +306,13 @@ def d2rl(num_frames: int = 1, **hyperparameters: Any) -> Network:
 def lstm(
     num_frames: int = 1, *, embed_dim: int = 64, hidden_dim: int = 64, features_dim: int = 64
 ) -> Network:
-    """LSTM: a tanh layer on the observation, TorchRL's LSTM, and a head as TIT has it.
+    """LSTM: a tanh layer on the observation, TorchRL's LSTM, and TIT's head.
 
-    Small observations, of positions say, hardly move the state; the head's LayerNorm makes that
-    readable.
+    Small observations (positions, say) hardly change the state; the head's LayerNorm makes these
+    changes readable.
 
     Args:
-        num_frames: 1, and the state is carried through the episode; more, and it reads those.
+        num_frames: if 1, the state is carried through the episode; if more, it starts at 0.
         embed_dim: width of the tanh layer.
         hidden_dim: size of the state.
         features_dim: size of the features.
@@ -365,7 +365,7 @@ def dt_tit(
     Args:
         num_frames: steps K of a window.
         embed_dim: width of a token.
-        patch_size: patch of the inner transformer; the whole observation where None.
+        patch_size: patch of the inner transformer; the whole observation if None.
         num_blocks_inner: number of inner blocks.
         num_heads_inner: attention heads of an inner block.
         ffn_expansion_inner: hidden width of an inner block's FFN as a multiple of the width.
@@ -406,7 +406,7 @@ NETWORKS: dict[str, Callable[..., Network]] = {
 
 
 def _separate(num_frames: int, history: HistorySettings) -> Network:
-    """Layers on the entries of K observations, without a head, apart for policy and value."""
+    """Layers on the entries of K observations, without a head, separate for policy and value."""
     return Network(
         frame=Flat(),
         history=history,

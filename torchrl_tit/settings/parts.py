@@ -1,4 +1,4 @@
-"""What the settings of all parts have: a registered name, and the module that they build."""
+"""The base class of part settings: a registered name, and the module that they build."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchrl_tit.settings.checks import nearest
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """Settings of an exchangeable part. A subclass registers itself by its definition.
+    """Settings of an exchangeable part. A subclass is registered when it is defined.
 
     A kind of part is a subclass with ``kind``; a part is a subclass of that with ``name``, the name
     that recipes and the command line use, and ``builds``, its implementation as "module:Class",
@@ -55,10 +55,10 @@ class Part:
 
     @classmethod
     def get(cls, name: str) -> type[Self]:
-        """Looks a part of this kind up.
+        """Looks up a part of this kind.
 
         Raises:
-            ValueError: if there is none of that name; the message names the nearest ones.
+            ValueError: if no part has that name; the message suggests similar names.
         """
         if name not in cls.registered:
             raise ValueError(f"unknown {cls.kind} {name!r}: {nearest(str(name), cls.registered)}")

@@ -1,4 +1,4 @@
-"""TorchRL transforms: the last K observations for a network, and observations with gaps."""
+"""TorchRL transforms: the last K observations, and observations with hidden entries."""
 
 from torchrl_tit.transforms.hide_velocities import VELOCITIES, HideEntries, HideVelocities
 from torchrl_tit.transforms.history import History

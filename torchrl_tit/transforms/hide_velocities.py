@@ -45,7 +45,7 @@ class HideEntries(ObservationTransform):
         self, hidden: Sequence[int], in_keys: Sequence[NestedKey] = ("observation",)
     ) -> None:
         if len(set(hidden)) < len(hidden):
-            raise ValueError(f"Each entry is hidden once, but hidden is {list(hidden)}.")
+            raise ValueError(f"Each entry can be hidden only once, but hidden is {list(hidden)}.")
         super().__init__(in_keys=list(in_keys), out_keys=list(in_keys))
         self._hidden = list(hidden)
 

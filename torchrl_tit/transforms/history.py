@@ -106,7 +106,7 @@ class History(CatFrames):
 
     def _make_buffer(self, name: str, zeros: Tensor) -> None:
         present = self._buffers.get(name)
-        # A transform that joins the same environment once more keeps what it has.
+        # A transform that joins the same environment again keeps its buffers.
         if present is None or present.shape != zeros.shape:
             self.register_buffer(name, zeros)
 
@@ -126,7 +126,7 @@ class History(CatFrames):
         Args:
             buffer: The last histories, [..., K, *obs].
             newest: [..., 1, *obs].
-            reset: Where an episode begins, bool [...]; the other histories stay as they are. None
+            reset: Where an episode begins, bool [...]; the other histories stay unchanged. None
                 in a step.
 
         Returns:
@@ -189,7 +189,7 @@ class History(CatFrames):
         out when steps are stored, and made when they are sampled.
 
         Args:
-            batch_size: Of the sampler.
+            batch_size: The sampler's batch size.
             **sampler_kwargs: Passed to `SliceSampler`.
 
         Returns:
@@ -223,7 +223,7 @@ class History(CatFrames):
         return UnsqueezeTransform(self.dim, in_keys=in_keys, out_keys=out_keys)
 
     def _frames(self, keys: Sequence[NestedKey]) -> CatFrames:
-        """TorchRL's own, for observations that already have the new axis."""
+        """Builds TorchRL's `CatFrames`, for observations that already have the new axis."""
         return CatFrames(self.N, self.dim, in_keys=keys, padding=self.padding, reset_key="_reset")
 
     def _check_observation(self, key: NestedKey, specs: Composite) -> None:

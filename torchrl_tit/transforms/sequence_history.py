@@ -123,7 +123,7 @@ class SequenceHistory(Transform):
         }
 
     def _first(self, tensordict: TensorDictBase) -> TensorDict:
-        """The sequence of an episode's first step, behind padding."""
+        """The sequence at an episode's first step, after padding."""
         self._check_keys(tensordict)
         axis = tensordict.ndim
         step = self._newest(tensordict, axis)
