@@ -38,7 +38,7 @@ class LSTM(RecurrentEncoder):
             settings.hidden_dim,
             in_keys=["token", *_STATE],
             out_keys=["memory", *(("next", key) for key in _STATE)],
-            python_based=shape.num_frames > 1,  # PyTorch's own is faster, but cannot be traced into one graph
+            python_based=shape.num_frames > 1,  # PyTorch's own is faster but not traceable
         )
         self.state_shapes = {key: torch.Size([1, settings.hidden_dim]) for key in _STATE}
         self.reset_parameters()
