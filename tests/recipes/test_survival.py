@@ -230,6 +230,9 @@ def test_run_folder_holds_what_it_says(tmp_path):
 
 def test_every_named_recipe_builds_its_agent():
     for name, recipe in RECIPES.items():
+        # Recipes of Atari games differ in the game alone (tests/recipes/ppo/test_atari.py).
+        if recipe.env.startswith("ALE/") and "pong" not in name and "nature-cnn" not in name:
+            continue
         if name.startswith("discrete-cql/"):  # on data that its user collects
             with pytest.raises(FileNotFoundError, match=r"no data file data/.*create it first"):
                 make_algorithm(recipe).check()
