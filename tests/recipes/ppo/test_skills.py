@@ -115,7 +115,7 @@ def test_a_run_with_the_contrastive_loss_logs_it(tmp_path):
 
 @pytest.mark.parametrize("network", [nature_cnn(), enhanced_tit(), mlp()])
 def test_other_networks_have_no_contrastive_loss(network):
-    with pytest.raises(ValueError, match="a loss of coberl alone"):
+    with pytest.raises(ValueError, match="only coberl has"):
         replace(SMALL, backbone=network, contrastive_coeff=1.0)
 
 
