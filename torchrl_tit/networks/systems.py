@@ -185,7 +185,7 @@ class DecisionTransformer(System):
         super().__init__(observation_shape, num_frames, action_dim=action_dim, **hyperparameters)
 
 
-class DTTIT(System):
+class DTTIT(DecisionTransformer):
     """DT_TIT: see :func:`~torchrl_tit.settings.networks.dt_tit`.
 
     Example:
@@ -197,15 +197,6 @@ class DTTIT(System):
     """
 
     system = staticmethod(systems.dt_tit)
-
-    def __init__(
-        self,
-        observation_shape: ObservationShape,
-        action_dim: int,
-        num_frames: int | None = None,
-        **hyperparameters: Any,
-    ) -> None:
-        super().__init__(observation_shape, num_frames, action_dim=action_dim, **hyperparameters)
 
 
 class TwoTrunkSystem(TwoTrunks):
