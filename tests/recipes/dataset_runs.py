@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -13,6 +12,7 @@ from recipes.metrics import read_metrics
 from recipes.recipe import Recipe
 from recipes.run import Run
 from tests.datasets.rollouts import roll, write
+from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 
 
@@ -51,18 +51,3 @@ def assert_same_run(run: Run, other: Run) -> None:
         for one in (run, other)
     )
     assert rows == expected
-
-
-def assert_same(left: Any, right: Any) -> None:
-    assert type(left) is type(right)
-    if isinstance(left, dict):
-        assert left.keys() == right.keys()
-        for key in left:
-            assert_same(left[key], right[key])
-    elif isinstance(left, list | tuple):
-        for a, b in zip(left, right, strict=True):
-            assert_same(a, b)
-    elif isinstance(left, torch.Tensor):
-        assert torch.equal(left, right)
-    elif isinstance(left, int | float | str):
-        assert left == right or (left != left and right != right)  # NaN

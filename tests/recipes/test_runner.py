@@ -24,7 +24,8 @@ from recipes.outcomes import Outcome
 from recipes.recipe import Recipe
 from recipes.run import Run
 from recipes.runner import evaluate, load_trained, train
-from tests.recipes.dataset_runs import assert_same, assert_same_run
+from tests.recipes.dataset_runs import assert_same_run
+from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import CheckpointError, checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import mlp
 

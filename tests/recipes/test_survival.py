@@ -9,7 +9,6 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -23,6 +22,7 @@ from recipes.recipe_json import recipe_to_json
 from recipes.registry import RECIPES
 from recipes.results.plot import plot_run
 from recipes.run import Run
+from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import CheckpointError, latest_step, load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit
 
@@ -63,19 +63,6 @@ def wait_for_step(process: subprocess.Popen, run: Path, step: int) -> None:
 
 def final(run: Path) -> tuple[int, dict]:
     return load_checkpoint(run / "checkpoints")
-
-
-def assert_same(left: Any, right: Any) -> None:
-    assert type(left) is type(right)
-    if isinstance(left, dict):
-        assert left.keys() == right.keys()
-        for key in left:
-            assert_same(left[key], right[key])
-    elif isinstance(left, list | tuple):
-        for a, b in zip(left, right, strict=True):
-            assert_same(a, b)
-    elif isinstance(left, torch.Tensor):
-        assert torch.equal(left, right)
 
 
 @pytest.mark.slow
