@@ -1,7 +1,7 @@
 """The last K observations of an environment, under a key of their own."""
 
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -11,7 +11,7 @@ from torchrl.data import Composite, SliceSampler, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import CatFrames, Transform, UnsqueezeTransform
 
-Padding = Literal["same", "constant"]
+from torchrl_tit.windows import Padding
 
 
 class History(CatFrames):

@@ -1,0 +1,55 @@
+"""Windows hold the frames that a plain walk backwards finds."""
+
+import pytest
+import torch
+
+from torchrl_tit.windows import Windows, find_windows
+
+
+def by_walking(frames, newest, oldest, num_frames, padding, stride):
+    """The window of one step: from the newest frame backwards, then padding."""
+    window: list[torch.Tensor] = []
+    row = newest
+    while len(window) < num_frames:
+        if row >= oldest:
+            window.append(frames[row])
+        else:
+            window.append(frames[oldest] if padding == "same" else torch.zeros_like(frames[0]))
+        row -= stride
+    return torch.stack(window[::-1])
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("num_frames", [1, 2, 5])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.int64, torch.bool])
+def test_windows_of_rows(num_frames, padding, stride, dtype):
+    torch.manual_seed(0)
+    frames = torch.randint(1, 250, (40, 2, 3)).to(dtype)
+    oldest = torch.randint(0, 10, (4, 6))
+    newest = oldest + stride * torch.randint(0, 30 // stride, (4, 6))
+    windows = find_windows(newest, oldest, num_frames, padding, stride)
+    gathered = windows.gather(frames)
+    assert gathered.shape == (4, 6, num_frames, 2, 3)
+    assert gathered.dtype == dtype
+    for i in range(4):
+        for j in range(6):
+            step = newest[i, j].item(), oldest[i, j].item()
+            expected = by_walking(frames, *step, num_frames, padding, stride)
+            assert torch.equal(gathered[i, j], expected)
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+def test_used_rows_make_the_same_windows(padding):
+    frames = torch.rand(50, 3)
+    newest = torch.tensor([[40, 41], [7, 8]])
+    windows = find_windows(newest, newest - 2, 4, padding)
+    rows, renumbered = windows.used()
+    assert rows.tolist() == [5, 6, 7, 8, 38, 39, 40, 41]
+    assert torch.equal(renumbered.gather(frames[rows]), windows.gather(frames))
+
+
+def test_gathering_copies():
+    frames = torch.zeros(3, 2)
+    Windows(torch.tensor([0, 1]), None).gather(frames).fill_(1)
+    assert not frames.any()
