@@ -91,5 +91,5 @@ def encoder_of(network):
 def cache_of(backbone):
     """What a backbone in acting mode keeps of its single observation; None if nothing."""
     (network,) = backbone._acting
-    caches = list(network._caches.values())
-    return caches[0]._kept if caches else None
+    (cache,) = network._caches
+    return cache._kept

@@ -24,6 +24,7 @@ from tests.modules.frames import (
 from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.modules import FrameCache, acting
+from torchrl_tit.modules.acting import clear_caches
 from torchrl_tit.networks import MLP, NatureCNN, TwoTrunks
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
@@ -56,6 +57,7 @@ def test_features_are_those_of_the_full_pass_whatever_comes(name, padding):
                     streams.windows[1, 2] = streams.windows[0, 3]
                 case 4:
                     next(encoder_of(network).parameters()).mul_(1.01)
+                    backbone.clear_cache()
                 case _:
                     pass
             assert_exact(backbone, streams.step(torch.rand(5) < 0.2))
@@ -91,7 +93,7 @@ def test_only_new_frames_are_encoded(name):
     streams = Streams(4, 6, shape, "constant", dtype)
     with backbone.acting():
         features(backbone, streams.windows)
-        assert frames.take() == 8  # and the zeros before it
+        assert frames.take() == 5  # and the zeros before it
         features(backbone, streams.step(nobody))
         assert frames.take() == 4
         features(backbone, streams.step(one))
@@ -208,6 +210,15 @@ def test_one_changed_byte_is_seen_at_any_size_and_offset(size, dtype):
             cache(stream[:, :4])
 
 
+def test_the_same_bytes_of_another_type_are_another_frame():
+    encoder = nn.Linear(3, 4)
+    cache = FrameCache(WithDoubles(encoder), observation_ndim=1)
+    stream = torch.randint(128, 256, (2, 5, 3), dtype=torch.uint8)
+    cache(stream[:, :4])
+    negative = stream[:, 1:].view(torch.int8)
+    assert_near(cache(negative), encoder(negative.double()))
+
+
 def test_histories_that_are_written_in_place():
     backbone, _, shape = make()
     history = torch.randn(5, 4, *shape)
@@ -271,35 +282,48 @@ def copies():
 
 
 @pytest.mark.parametrize("copied", copies())
-def test_copies_act_with_nothing_kept(copied):
+def test_copies_are_not_in_acting_mode(copied):
     backbone, network, shape = make()
     stream = torch.randn(5, 6, *shape)
     with backbone.acting():
         features(backbone, stream[:, :4])
         twin = copied(backbone)
-        assert cache_of(twin) is None
-        frames, original = CountedFrames(twin.module), CountedFrames(network)
-        assert_exact(twin, stream[:, 1:5])
-        assert frames.take() == 20 + 20  # the backbone and the network encode all of them
+        assert twin._acting is None
         next(encoder_of(twin.module).parameters()).add_(1)
-        assert_exact(twin, stream[:, 2:6])
-        assert original.take() == 0
-    assert copied(backbone)._acting is None
+        assert_exact(twin, stream[:, 1:5])
+        frames = CountedFrames(network)
+        features(backbone, stream[:, 1:5])
+        assert frames.take() == 5
+    with twin.acting():
+        assert_exact(twin, stream[:, :4])
 
 
-def test_a_state_dict_is_the_networks_and_empties_the_cache():
+def test_a_state_dict_is_the_networks():
+    backbone, network, _ = make()
+    with backbone.acting():
+        assert list(backbone.state_dict()) == [f"module.{name}" for name in network.state_dict()]
+
+
+@pytest.mark.parametrize(
+    "clear",
+    [
+        Backbone.clear_cache,
+        clear_caches,
+        Backbone.state_dict,
+        lambda backbone: nn.Sequential(backbone).state_dict(),
+        lambda backbone: nn.Sequential(backbone).to(torch.float64),
+    ],
+    ids=["clear_cache", "clear_caches", "state_dict", "state_dict around it", "to"],
+)
+def test_the_cache_is_emptied(clear):
     backbone, network, shape = make()
-    names = set(backbone.state_dict())
     frames = CountedFrames(network)
     stream = torch.randn(5, 6, *shape)
     with backbone.acting():
         features(backbone, stream[:, :4])
-        assert set(nn.Sequential(backbone).state_dict()) == {f"0.{name}" for name in names}
+        clear(backbone)
         frames.take()
         features(backbone, stream[:, 1:5])
-        assert frames.take() == 20
-        backbone.clear_cache()
-        features(backbone, stream[:, 2:6])
         assert frames.take() == 20
 
 

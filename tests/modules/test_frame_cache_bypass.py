@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch._subclasses import FakeTensorMode
 from torch.autograd import forward_ad
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
@@ -20,6 +21,7 @@ from tests.modules.frames import (
 )
 from tests.numerics import ROUNDING, assert_near
 from torchrl_tit import Backbone, EnhancedTIT
+from torchrl_tit.modules import FrameCache
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -63,19 +65,16 @@ def test_gradients_of_the_history_alone():
         assert history.grad[:, 0].any()
 
 
-def test_a_frozen_frame_encoder_keeps_tokens_and_the_rest_gets_gradients():
-    backbone, network, shape = make()
-    encoder_of(network).requires_grad_(False)
-    frames = CountedFrames(network)
+def test_tokens_of_inference_mode_are_used_in_inference_mode_only():
+    backbone, _, shape = make()
     stream = torch.randn(5, 8, *shape)
     with backbone.acting():
         with torch.inference_mode():
             features(backbone, stream[:, :4])
-        features(backbone, stream[:, 1:5]).sum().backward()  # tokens of inference mode would raise
-        frames.take()
-        features(backbone, stream[:, 2:6]).sum().backward()
-        assert frames.take() == 5
-    assert all(p.grad is not None for p in network.history_encoder.parameters())
+        with torch.no_grad():  # tokens of inference mode cannot be written
+            for start in (1, 2):
+                assert_exact(backbone, stream[:, start : start + 4])
+                assert not cache_of(backbone).tokens.entries.is_inference()
 
 
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
@@ -204,6 +203,18 @@ def test_a_compiled_backbone_is_the_whole_network():
 
 
 @torch.no_grad()
+def test_a_cache_of_its_own_that_is_compiled_or_reads_fake_tensors():
+    _, network, shape = make()
+    cache = FrameCache(encoder_of(network), len(shape))
+    window = torch.randn(5, 4, *shape)
+    compiled = torch.compile(lambda x: cache(x), backend="aot_eager", fullgraph=True)
+    assert_near(compiled(window), encoder_of(network)(window))
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        assert cache(mode.from_tensor(window)).shape == (5, 4, 2, 16)
+    assert cache._kept is None
+
+
+@torch.no_grad()
 def test_traced_by_jit_and_shaped_without_values():
     backbone, network, shape = make()
     network.requires_grad_(False)
@@ -250,6 +261,7 @@ def test_compiled_parts(name):
             if start == 3:
                 encoder_of(network).requires_grad_()
                 next(encoder_of(network).parameters()).mul_(1.1)
+                backbone.clear_cache()
             if start == 4:
                 stream[2, :] = torch.randn_like(stream[2])
             assert_exact(backbone, stream[:, start : start + 4])

@@ -18,6 +18,9 @@ class HasActingMode(Protocol):
     def acting(self) -> AbstractContextManager[None]:
         """Returns the context within which it does so."""
 
+    def clear_cache(self) -> None:
+        """Discards what it keeps."""
+
 
 @contextmanager
 def acting(policy: Callable[..., Any]) -> Iterator[None]:
@@ -25,7 +28,8 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
 
     Args:
         policy: a module that contains any number of backbones, or of other modules with a method
-            ``acting`` (see :meth:`Backbone.acting`). Other functions are left unchanged.
+            ``acting`` (see :meth:`Backbone.acting`). Other functions are left unchanged. Its
+            weights must not change within the context, unless :func:`clear_caches` follows.
 
     Example:
         >>> from tensordict.nn import TensorDictSequential
@@ -39,16 +43,31 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
         ...     steps = make_env("CartPole-v1", 2, num_frames=8).rollout(10, policy)
     """
     with ExitStack() as stack:
-        for module in policy.modules() if isinstance(policy, nn.Module) else ():
-            if isinstance(module, HasActingMode):
-                stack.enter_context(module.acting())
+        for module in _within(policy):
+            stack.enter_context(module.acting())
         yield
+
+
+def clear_caches(policy: Callable[..., Any]) -> None:
+    """Discards what the backbones of a policy keep, after a change of weights within ``acting``.
+
+    Args:
+        policy: as that of :func:`acting`.
+    """
+    for module in _within(policy):
+        module.clear_cache()
+
+
+def _within(policy: Callable[..., Any]) -> list[HasActingMode]:
+    modules = policy.modules() if isinstance(policy, nn.Module) else ()
+    return [module for module in modules if isinstance(module, HasActingMode)]
 
 
 def while_acting(policy: Callable[..., Any], batches: Iterable[T]) -> Iterator[T]:
     """Iterates over a collector, with its policy in acting mode only while it collects.
 
-    Between two batches, when the policy is trained and saved, no tokens are kept.
+    Between two batches, when the policy is trained and saved, no tokens are kept. Policies of other
+    processes are not reached: give their collector ``collector_class=ActingCollector``.
 
     Args:
         policy: the collector's policy, or a module that contains its backbones.

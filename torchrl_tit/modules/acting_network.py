@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_tit.frames import FrameEncoder
 from torchrl_tit.modules.frame_cache import Encode, FrameCache
 from torchrl_tit.networks import HistoryNetwork
 
@@ -15,10 +14,8 @@ from torchrl_tit.networks import HistoryNetwork
 class ActingNetwork:
     """Maps histories to features, and keeps the tokens of the frames for the next call.
 
-    Copies and pickles keep nothing, and run uncompiled.
-
     Args:
-        network: the network.
+        network: the network, which must not change between two calls (see :meth:`clear`).
 
     Example:
         >>> from torchrl_tit import EnhancedTIT
@@ -34,8 +31,8 @@ class ActingNetwork:
     def __init__(self, network: HistoryNetwork) -> None:
         self.network = network
         self._encode_history = network.encode_history
-        self._compiled_encoders: dict[FrameEncoder, Encode] = {}
-        self._caches: dict[int, FrameCache] = {}  # by the index of the observation
+        self._encode_newest: list[Encode] = list(network.frames)
+        self.clear()
 
     def compile(self, **options: Any) -> None:
         """Compiles the encoding of the newest frames, and everything after the frame encoders.
@@ -46,43 +43,23 @@ class ActingNetwork:
             **options: passed to ``torch.compile``.
         """
         self._encode_history = torch.compile(self.network.encode_history, **options)
-        self._compiled_encoders = {
-            encoder: torch.compile(encoder, **options) for encoder in self.network.frames
-        }
-
-    def fresh(self) -> ActingNetwork:
-        """Returns a copy without kept tokens that shares the compiled parts."""
-        other = ActingNetwork(self.network)
-        other._encode_history = self._encode_history
-        other._compiled_encoders = self._compiled_encoders
-        return other
+        self._encode_newest = [torch.compile(frame, **options) for frame in self.network.frames]
+        self.clear()
 
     def __call__(self, *inputs: Tensor) -> Tensor:
         """Maps histories to features; see :meth:`HistoryNetwork.forward`."""
-        encoders = self.network.frames
-        histories, context = inputs[: len(encoders)], inputs[len(encoders) :]
+        caches = self._caches
+        histories, context = inputs[: len(caches)], inputs[len(caches) :]
         self.network.check(*histories)
-        tokens = [
-            self._cache(index, encoder)(history)
-            for index, (encoder, history) in enumerate(zip(encoders, histories, strict=True))
-        ]
+        tokens = [cache(history) for cache, history in zip(caches, histories, strict=True)]
         return self._encode_history(self.network.join_tokens(tokens), *context)
 
     def clear(self) -> None:
-        """Discards the tokens, so that the next histories are encoded like the first ones."""
-        self._caches.clear()
+        """Discards the tokens, so that the next histories are encoded like the first ones.
 
-    def _cache(self, index: int, encoder: FrameEncoder) -> FrameCache:
-        """The cache of an observation; a new one if its encoder has been replaced."""
-        cache = self._caches.get(index)
-        if cache is None or cache.encoder is not encoder:
-            compiled = self._compiled_encoders.get(encoder)
-            cache = FrameCache(encoder, len(encoder.observation_shape), compiled)
-            self._caches[index] = cache
-        return cache
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {"network": self.network}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state)  # type: ignore[misc]
+        Can be called from another thread: what a call then still computes is not kept.
+        """
+        self._caches = [
+            FrameCache(encoder, len(encoder.observation_shape), encode_newest)
+            for encoder, encode_newest in zip(self.network.frames, self._encode_newest, strict=True)
+        ]
