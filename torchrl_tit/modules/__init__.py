@@ -1,6 +1,7 @@
 """TensorDictModules: backbones around networks, and heads on their features."""
 
 from torchrl_tit.modules.acting import acting, while_acting
+from torchrl_tit.modules.acting_collector import ActingCollector
 from torchrl_tit.modules.backbone import Backbone
 from torchrl_tit.modules.decision_transformer import (
     DTHead,
@@ -11,16 +12,15 @@ from torchrl_tit.modules.decision_transformer import (
 from torchrl_tit.modules.frame_cache import FrameCache
 from torchrl_tit.modules.heads import make_actor, make_value
 from torchrl_tit.modules.many_actions import ManyActions
-from torchrl_tit.modules.rollout_features import add_rollout_features
 from torchrl_tit.modules.squashed_actor import make_squashed_actor
 
 __all__ = [
+    "ActingCollector",
     "Backbone",
     "DTHead",
     "FrameCache",
     "ManyActions",
     "acting",
-    "add_rollout_features",
     "make_actor",
     "make_dt_actor",
     "make_dt_backbone",

@@ -15,7 +15,9 @@ from torchrl.envs import Compose, InitTracker, TensorDictPrimer
 
 from torchrl_tit.histories.encoder import RecurrentEncoder
 from torchrl_tit.modules.acting_network import ActingNetwork
+from torchrl_tit.modules.sequences import SequenceKeys, default_observation_keys
 from torchrl_tit.networks import HistoryNetwork, TwoTrunks
+from torchrl_tit.windows import Padding, Windows
 
 
 class Backbone(TensorDictModule):
@@ -41,10 +43,35 @@ class Backbone(TensorDictModule):
     ``("next", "recurrent_state_h")``, ...      [..., 1, H]         written: the state after it
     ==========================================  ==================  ================================
 
-    The transforms of :meth:`make_transforms` supply the state and ``is_init``. By default the
-    backbone reads single steps. Within ``torchrl.modules.set_recurrent_mode(True)`` it reads
-    sequences: the last batch dimension is time, and the state is read at the first step of each
-    sequence only. With two trunks, the keys of the states begin with ``policy_`` and ``value_``.
+    The transforms of :meth:`make_transforms` supply the state and ``is_init``. With two trunks, the
+    keys of the states begin with ``policy_`` and ``value_``.
+
+    **Sequences.** By default a backbone reads single steps. Within TorchRL's recurrent mode
+    (``torchrl.modules.set_recurrent_mode(True)``, which TorchRL's losses switch on) it reads
+    sequences, if the tensordict has ``is_init``: the last batch dimension is time, and each frame
+    is encoded once, not once for each of the K windows that it is part of. The features are those
+    of single steps. A recurrent network reads its state at the first step of each sequence only;
+    any other reads:
+
+    ==================  =====================  =====================================================
+    key                 shape                  what it is
+    ==================  =====================  =====================================================
+    ``history``         [*B, T, K, *obs]       optional; read where a sequence begins, at t = 0,
+                                               at ``is_init`` and after a step that is done (as
+                                               TorchRL's `SliceSampler` marks the end of a slice);
+                                               elsewhere the window is the last one, moved by one
+    ``observation``     [*B, T, *obs]          the newest frame of each step
+    ``is_init``         [*B, T, 1]             bool, first step of an episode
+    ``features``        [*B, T, F]             written
+    ``features_valid``  [*B, T, 1]             written without ``history``: bool, False at the first
+                                               K - 1 steps of a sequence that begins inside an
+                                               episode, whose windows would begin before it
+    ==================  =====================  =====================================================
+
+    Shuffled single steps are no sequences: leave ``is_init`` out of those, or call the backbone
+    within ``set_recurrent_mode(False)``. `SliceSampler` sets ``is_init`` at the beginning of each
+    slice, which is right with histories; without them, give it ``init_key=None``. Dropout in the
+    frame encoder is drawn once a frame.
 
     Args:
         network: a :class:`~torchrl_tit.networks.HistoryNetwork`, which maps histories to features
@@ -60,10 +87,19 @@ class Backbone(TensorDictModule):
         every_frame: write the features of all K frames, [..., K, F], for losses on whole windows,
             instead of those of the newest one. Two backbones, one to train and one to act, can
             share a network.
+        padding: what precedes an ``is_init`` in a sequence, as in
+            :class:`~torchrl_tit.transforms.History`: its observation ("same") or zeros
+            ("constant"). Then only the histories at t = 0 are read, all shapes are static (for
+            ``torch.compile`` and ``vmap``), and padding is encoded once. If None, the histories at
+            the starts of sequences are read; without histories, "same" is used.
+        observation_keys: keys of the observations, one for each history; by default a history's
+            key with "history" replaced by "observation". If these or ``padding`` are given, they
+            and ``is_init`` are among the ``in_keys``, for losses that select these.
 
     Raises:
-        ValueError: if the number of keys does not match the network's inputs and outputs, or
-            ``every_frame`` is set for a history encoder that encodes the newest frame only.
+        ValueError: if the number of keys does not match the network's inputs and outputs,
+            ``every_frame`` is set for a history encoder that encodes the newest frame only, or the
+            padding is unknown.
         KeyError: in ``forward``, if the tensordict lacks one of the entries.
 
     Example:
@@ -82,6 +118,8 @@ class Backbone(TensorDictModule):
         out_keys: Sequence[NestedKey] | str = ("features",),
         autocast: torch.dtype | None = None,
         every_frame: bool = False,
+        padding: Padding | None = None,
+        observation_keys: Sequence[NestedKey] | str | None = None,
     ) -> None:
         in_keys, out_keys = (
             [keys] if isinstance(keys, str) else list(keys) for keys in (in_keys, out_keys)
@@ -95,11 +133,17 @@ class Backbone(TensorDictModule):
             for prefix, trunk in trunks.items()
             for key, shape in _state_shapes(trunk).items()
         }
+        sequence_keys = _sequence_keys(trunks, in_keys, observation_keys, padding)
+        step_keys = [*in_keys, *state_shapes, *(["is_init"] if state_shapes else [])]
+        declared = [*sequence_keys.observations, "is_init"] if padding or observation_keys else []
         super().__init__(
             network,
-            in_keys=[*in_keys, *state_shapes, *(["is_init"] if state_shapes else [])],
+            in_keys=[*step_keys, *(key for key in declared if key not in step_keys)],
             out_keys=[*out_keys, *(("next", key) for key in state_shapes)],
         )
+        self._step_keys = step_keys  # what a single step is read from
+        self.sequence_keys = sequence_keys
+        """Keys of what is read of sequences."""
         self.history_keys = in_keys
         """Keys of the histories, and of the history encoder's further inputs."""
         self.features_keys = out_keys
@@ -109,20 +153,22 @@ class Backbone(TensorDictModule):
         self.autocast = autocast
         self.every_frame = every_frame
         self._acting: list[ActingNetwork] | None = None  # one for each trunk, in acting mode
-        self._compiled: list[ActingNetwork] | None = None  # what acting mode starts with
+        self._compiled: list[ActingNetwork] | None = None  # what acting mode runs, if any
 
     def forward(
         self, tensordict: TensorDictBase, *args: object, **kwargs: object
     ) -> TensorDictBase:
         """Writes the features of the histories into the tensordict and returns it."""
-        is_tensordict = isinstance(tensordict, TensorDictBase)
-        if is_tensordict:
-            self._check_entries(tensordict)
-        special = args or kwargs or skip_existing() or not is_tensordict
-        if self._acting is None or special or torch.compiler.is_compiling():
+        if args or kwargs or not isinstance(tensordict, TensorDictBase):
             return super().forward(tensordict, *args, **kwargs)
+        if skip_existing() and all(key in tensordict.keys(True) for key in self.out_keys):
+            return tensordict
+        # A recurrent network reads sequences itself.
+        if not self.is_recurrent and self.sequence_keys.in_sequence(tensordict):
+            return self._read_sequences(tensordict)
         # Skips the 0.1 ms overhead of TensorDictModule, which matters at each step of acting.
-        outputs = self._call_module([tensordict.get(key) for key in self.in_keys])
+        self._check_entries(tensordict)
+        outputs = self._call_module([tensordict.get(key) for key in self._step_keys])
         outputs = (outputs,) if isinstance(outputs, Tensor) else outputs
         for key, output in zip(self.out_keys_source, outputs, strict=True):
             tensordict.set(key, output)
@@ -163,16 +209,21 @@ class Backbone(TensorDictModule):
         """Keeps the tokens of the last frames, so that only the newest is encoded at each step.
 
         For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses. The
-        features equal the network's for any input (see :class:`~torchrl_tit.modules.FrameCache`):
-        another batch, a reset or changed weights only cost time. Has no effect on networks that
-        encode no frames or read a single one.
+        histories can be any: after a reset, or with another batch, whatever is new is encoded (see
+        :class:`~torchrl_tit.modules.FrameCache`). Has no effect while gradients are enabled, and on
+        networks that encode no frames or read a single one.
 
-        The cache (copies of one batch of histories, of its tokens, and of the frame encoder's
-        weights) is discarded at the end, and whenever a state dict is taken: a run then continues
-        exactly like one that is resumed from that state. A nested ``acting`` starts with an empty
-        cache and leaves that of the outer one alone. A copy made within the context, for a
-        collector in another process for example, stays in acting mode and starts with an empty
-        cache.
+        **The network must not change within the context**: its weights are not compared. Optimizers
+        step between two collections, each of which enters the context anew, as
+        :func:`~torchrl_tit.modules.while_acting` and
+        :class:`~torchrl_tit.modules.ActingCollector` do. If you change weights within it, call
+        :meth:`clear_cache` afterwards; otherwise, the frames of the next K - 1 steps that were seen
+        before the change keep the tokens of the old weights.
+
+        The cache (copies of one batch of histories and of its tokens) is empty at the beginning and
+        discarded at the end, and whenever a state dict of the backbone or of a module around it is
+        taken or loaded, and these are moved or cast. So a run continues exactly like one that is
+        resumed from its state dict. Copies and pickles are not in acting mode.
 
         Example:
             >>> from tensordict import TensorDict
@@ -184,9 +235,11 @@ class Backbone(TensorDictModule):
             ...         td = backbone(TensorDict({"history": frames[:, step : step + 8]}, [5]))
         """
         outer, self._acting = self._acting, self._make_acting()
+        self.clear_cache()
         try:
             yield
         finally:
+            self.clear_cache()
             self._acting = outer
 
     def compile_parts(self, **options: Any) -> None:
@@ -200,7 +253,7 @@ class Backbone(TensorDictModule):
             **options: passed to ``torch.compile``.
         """
         if self.keeps_frames:
-            self._compiled = [ActingNetwork(trunk) for trunk in trunks_of(self.module).values()]
+            self._compiled = list(map(ActingNetwork, trunks_of(self.module).values()))
             for network in self._compiled:
                 network.compile(**options)
 
@@ -214,6 +267,14 @@ class Backbone(TensorDictModule):
         self.clear_cache()
         return super().state_dict(*args, **kwargs)
 
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self.clear_cache()  # called for modules around this one, too
+        super()._load_from_state_dict(*args, **kwargs)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Any:
+        self.clear_cache()  # moved or cast
+        return super()._apply(*args, **kwargs)
+
     def computing(self, device: torch.device) -> AbstractContextManager[object]:
         """Returns the context in which matrix products have the dtype ``autocast``."""
         if self.autocast is None:
@@ -223,12 +284,51 @@ class Backbone(TensorDictModule):
     def _make_acting(self) -> list[ActingNetwork] | None:
         if not self.keeps_frames:
             return None
-        if self._compiled is not None:
-            return [network.fresh() for network in self._compiled]
-        return [ActingNetwork(trunk) for trunk in trunks_of(self.module).values()]
+        # Within `acting` of its own, a compiled network starts anew.
+        return self._compiled or list(map(ActingNetwork, trunks_of(self.module).values()))
+
+    def encode_windows(
+        self, frames: Sequence[Tensor], windows: Windows, *context: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Maps windows on a table of frames to features; each frame is encoded once.
+
+        Args:
+            frames: of each observation, [R, *observation_shape].
+            windows: the rows of each window, [..., K].
+            *context: further inputs of the history encoder, [..., K, *entry] each.
+
+        Returns:
+            One tensor for each of ``features_keys``, float [..., F], or [..., K, F] if
+            ``every_frame``.
+        """
+        trunks = trunks_of(self.module).values()
+        with self.computing(windows.rows.device):
+            if trunks:
+                outputs = [
+                    trunk.encode_windows(frames, windows, *context, every_frame=self.every_frame)
+                    for trunk in trunks
+                ]
+            else:
+                result = self.module(*(windows.gather(table) for table in frames), *context)
+                outputs = [result] if isinstance(result, Tensor) else list(result)
+        # Heads and losses need full precision.
+        return tuple(x.float() if self.autocast is not None else x for x in outputs)
+
+    def _read_sequences(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the features of sequences into the tensordict and returns it."""
+        trunks = list(trunks_of(self.module).values())
+        table, context = self.sequence_keys.lay_out(tensordict, trunks)
+        outputs = self.encode_windows(table.frames, table.windows, *context)
+        shape = tensordict.batch_size
+        for key, output in zip(self.features_keys, outputs, strict=True):
+            tensordict.set(key, output.reshape(*shape, *output.shape[2:]))
+        if table.valid is not None:
+            tensordict.set("features_valid", table.valid.reshape(*shape, 1))
+        return tensordict
 
     def _call_module(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
         """Calls the network; overrides the method of TensorDictModule that does."""
+        tensors = tensors[: len(self._step_keys)]
         if self.autocast is None:
             return self._encode(tensors, **kwargs)
         with self.computing(tensors[0].device):
@@ -263,7 +363,7 @@ class Backbone(TensorDictModule):
         return (*features, *(after[key] for key in self.state_shapes))
 
     def _check_entries(self, tensordict: TensorDictBase) -> None:
-        for key in self.in_keys:
+        for key in self._step_keys:
             if tensordict.get(key, None) is None:
                 hint = (
                     "add torchrl_tit.History to the environment (SequenceHistory for Decision "
@@ -277,7 +377,8 @@ class Backbone(TensorDictModule):
                 )
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_compiled": None}  # compiled code cannot be copied
+        # Compiled code cannot be copied, and nobody clears what a copy keeps.
+        return {**super().__getstate__(), "_compiled": None, "_acting": None}
 
 
 def trunks_of(network: nn.Module) -> dict[str, HistoryNetwork]:
@@ -291,6 +392,20 @@ def trunks_of(network: nn.Module) -> dict[str, HistoryNetwork]:
     if isinstance(network, TwoTrunks):
         return {"policy_": network.policy, "value_": network.value}
     return {"": network} if isinstance(network, HistoryNetwork) else {}
+
+
+def _sequence_keys(
+    trunks: dict[str, HistoryNetwork],
+    in_keys: list[NestedKey],
+    observation_keys: Sequence[NestedKey] | str | None,
+    padding: Padding | None,
+) -> SequenceKeys:
+    """Keys of what a backbone reads of sequences."""
+    count = max((len(trunk.frames) for trunk in trunks.values()), default=len(in_keys))
+    histories, context = in_keys[:count], in_keys[count:]
+    keys = default_observation_keys(histories) if observation_keys is None else observation_keys
+    observations: list[NestedKey] = [keys] if isinstance(keys, str) else list(keys)
+    return SequenceKeys(histories, observations, context, padding)
 
 
 def _state_shapes(network: HistoryNetwork) -> dict[str, torch.Size]:

@@ -57,6 +57,8 @@ class ManyActions(TensorDictModuleBase):
         first = next(i for i, m in enumerate(modules) if self.action_key in m.in_keys)
         for module in modules[:first]:
             states = module(states)
+        later = [key for module in modules[first:] for key in module.in_keys]
+        states = states.select(*later, strict=False)  # expanding copies, and histories are large
         shape = (*tensordict.shape, action.shape[-2])
         # One batch dimension: linear layers return views of flat products for several, and autograd
         # copies a view that is written in place, as by an in-place ReLU.

@@ -14,6 +14,7 @@ from torchrl_tit.frames.flat import Flat
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, RecurrentEncoder
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.initialization import init_normal_
+from torchrl_tit.windows import Windows
 
 ObservationShape = Sequence[int] | Mapping[str, Sequence[int]]
 """Shape of an observation, or shapes by key if there are several."""
@@ -132,6 +133,49 @@ class HistoryNetwork(nn.Module):
         """Maps the tokens of K frames to features, float [..., K, L, D] -> [..., F]."""
         return self.head(self.history_encoder(self.as_floats(tokens), *context))
 
+    def encode_windows(
+        self,
+        frames: Sequence[Tensor],
+        windows: Windows,
+        *context: Tensor,
+        every_frame: bool = False,
+    ) -> Tensor:
+        """Maps windows on a table of frames to features, and encodes each frame of it once.
+
+        The features and gradients are those of ``forward(*(windows.gather(x) for x in frames))``,
+        up to rounding, at a cost that hardly grows with K. Dropout in the frame encoder is drawn
+        once a frame, not once for each window that the frame is part of.
+
+        Args:
+            frames: of each observation, [R, *observation_shape].
+            windows: the rows of each window, [..., K].
+            *context: further inputs of the history encoder, [..., K, *entry] each.
+            every_frame: return the features of every frame of a window (see ``every_frame``).
+
+        Returns:
+            float [..., F], or [..., K, F] of every frame.
+
+        Example:
+            >>> from torchrl_tit import EnhancedTIT
+            >>> from torchrl_tit.windows import find_windows
+            >>> tit, frames = EnhancedTIT((4,), num_frames=8), torch.randn(39, 4)
+            >>> newest = torch.arange(7, 39)
+            >>> windows = find_windows(newest, newest - 7, num_frames=8, padding="same")
+            >>> tit.encode_windows([frames], windows).shape
+            torch.Size([32, 64])
+        """
+        self.check_frames(*frames)
+        if windows.missing is not None:  # what stands for a missing frame is encoded like any other
+            last = frames[0].shape[0]
+            frames = [torch.cat([x, torch.zeros_like(x[:1])]) for x in frames]
+            windows = Windows(windows.rows.masked_fill(windows.missing, last), None)
+        tokens = [encoder(x) for encoder, x in zip(self.frames, frames, strict=True)]
+        gathered = windows.gather(self.join_tokens(tokens))
+        if every_frame:
+            encoded = self.history_encoder.every_frame(self.as_floats(gathered), *context)
+            return self.head(encoded)
+        return self.encode_history(gathered, *context)
+
     def every_frame(self, *inputs: Tensor) -> Tensor:
         """Maps histories to features of every frame, each from that frame and the ones before it.
 
@@ -189,11 +233,7 @@ class HistoryNetwork(nn.Module):
 
     def check(self, *histories: Tensor) -> None:
         """Raises ValueError or TypeError if histories do not fit this network."""
-        if len(histories) != len(self.frame_encoders):
-            raise ValueError(
-                f"this network reads {len(self.frame_encoders)} histories "
-                f"({', '.join(self.frame_encoders)}), not {len(histories)}"
-            )
+        self._check_count(histories)
         dtype = weights_dtype(self)
         for encoder, history in zip(self.frames, histories, strict=True):
             ndim = len(encoder.observation_shape) + 1
@@ -201,6 +241,25 @@ class HistoryNetwork(nn.Module):
             if self.history_encoder.reads_any_length and history.ndim >= ndim:
                 num_frames = history.shape[-ndim]
             check_history(history, num_frames, encoder.observation_shape, dtype)
+
+    def check_frames(self, *frames: Tensor) -> None:
+        """Raises ValueError or TypeError if tables of frames do not fit this network."""
+        self._check_count(frames)
+        dtype = weights_dtype(self)
+        for encoder, table in zip(self.frames, frames, strict=True):
+            if tuple(table.shape[1:]) != encoder.observation_shape:
+                raise ValueError(
+                    f"observations of shape {tuple(table.shape[1:])} do not fit this network: "
+                    f"expected {encoder.observation_shape}"
+                )
+            _check_dtype(table, dtype)
+
+    def _check_count(self, histories: Sequence[Tensor]) -> None:
+        if len(histories) != len(self.frame_encoders):
+            raise ValueError(
+                f"this network reads {len(self.frame_encoders)} histories "
+                f"({', '.join(self.frame_encoders)}), not {len(histories)}"
+            )
 
     @property
     def keeps_frames(self) -> bool:
@@ -324,6 +383,10 @@ def check_history(
             f"[..., {', '.join(map(str, expected))}], which is {num_frames} observations of shape "
             f"{observation_shape}, oldest first (torchrl_tit.History stacks them)"
         )
+    _check_dtype(history, dtype)
+
+
+def _check_dtype(history: Tensor, dtype: torch.dtype) -> None:
     device = history.device.type
     # Some devices, such as "meta", have no autocast.
     autocast = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)

@@ -1,0 +1,439 @@
+"""A backbone in TorchRL's recurrent mode: sequences of steps, with each frame encoded once."""
+
+from __future__ import annotations
+
+import shutil
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+from torch.func import functional_call, stack_module_state
+from torchrl.data import Categorical, LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
+from torchrl.envs import Compose, InitTracker
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives.value import GAE
+
+from tests.modules.frames import CountedFrames
+from tests.networks.test_pairs import NUM_FRAMES, PAIRS, Pair, build, network_of, shape_of
+from tests.numerics import assert_near
+from torchrl_tit import Backbone, EnhancedTIT, settings
+from torchrl_tit.envs import make_env
+from torchrl_tit.modules import make_actor, make_value
+from torchrl_tit.networks import HistoryNetwork, TwoTrunks, build_network
+from torchrl_tit.windows import Padding
+
+pytestmark = pytest.mark.numerics
+
+N, T, ACTIONS = 3, 7, 2
+PADDINGS: list[Padding] = ["same", "constant"]
+# Each history encoder and each frame encoder once; test_pairs.py compiles every pair.
+EACH_ONCE = [p for p in PAIRS if p[0] == ("flat" if p[1].startswith("stacked") else "linear")]
+EACH_ONCE += [p for p in PAIRS if p[1] == "outer" and p[0] != "linear"]
+# Episodes begin within the first two sequences; the third lies inside one.
+IS_INIT = torch.zeros(N, T, 1, dtype=torch.bool)
+IS_INIT[0, 0] = IS_INIT[0, 2] = IS_INIT[0, 3] = IS_INIT[1, 4] = True
+
+
+def sequences(
+    shape: tuple[int, ...], num_frames: int, padding: Padding, dtype: torch.dtype = torch.float64
+) -> TensorDict:
+    """What an environment with `History` writes: N sequences of T steps, [N, T]."""
+    generator = torch.Generator().manual_seed(2)
+    before = torch.randn(N, num_frames - 1, *shape, generator=generator, dtype=torch.float64)
+    observations = torch.randn(N, T, *shape, generator=generator, dtype=torch.float64)
+    histories, window = [], torch.cat([before, before[:, :1]], 1)  # the newest is pushed out
+    for t in range(T):
+        newest = observations[:, t : t + 1]
+        window = torch.cat([before if t == 0 else window[:, 1:], newest], 1)
+        padded = newest if padding == "same" else torch.zeros_like(newest)
+        first = torch.cat([padded.expand(-1, num_frames - 1, *shape), newest], 1)
+        window = torch.where(IS_INIT[:, t].view(N, 1, *[1] * len(shape)), first, window)
+        histories.append(window)
+    entries = {"history": torch.stack(histories, 1), "observation": observations}
+    return TensorDict({k: x.to(dtype) for k, x in entries.items()} | {"is_init": IS_INIT}, [N, T])
+
+
+def context_of(network: HistoryNetwork) -> dict[str, Tensor]:
+    """What the history encoder reads beside the tokens, [N, T, K, ...]."""
+    generator = torch.Generator().manual_seed(3)
+    shape = (N, T, network.num_frames)
+    entries = {
+        "action": torch.randn(*shape, ACTIONS, generator=generator, dtype=torch.float64),
+        "return_to_go": torch.randn(*shape, 1, generator=generator, dtype=torch.float64),
+        "timestep": torch.arange(network.num_frames).expand(shape),
+        "mask": torch.ones(shape, dtype=torch.bool),
+    }
+    return {name: entries[name] for name in network.history_encoder.context}
+
+
+def backbone_of(network: torch.nn.Module, **options: Any) -> Backbone:
+    context = network.history_encoder.context if isinstance(network, HistoryNetwork) else ()
+    return Backbone(network, in_keys=["history", *context], **options)
+
+
+def spoil(td: TensorDictBase, *, keep_starts: bool) -> TensorDictBase:
+    """Overwrites the histories that must not be read."""
+    td = td.clone()
+    kept = IS_INIT.squeeze(-1).clone() if keep_starts else torch.zeros(N, T, dtype=torch.bool)
+    kept[:, 0] = True
+    td["history"][~kept] = torch.nan
+    return td
+
+
+def read(backbone: Backbone, td: TensorDictBase, key: str = "features") -> Tensor:
+    with set_recurrent_mode(True):
+        return backbone(td)[key]
+
+
+def gradients(features: Tensor, network: torch.nn.Module) -> list[Tensor]:
+    probe = torch.linspace(-1, 1, features.numel(), dtype=features.dtype).view_as(features)
+    weights = [w for name, w in network.named_parameters() if "mask_token" not in name]
+    return list(torch.autograd.grad((features * probe).sum(), weights))
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("pair", PAIRS, ids="+".join)
+def test_every_pair_equals_single_steps(pair: Pair, padding: Padding) -> None:
+    network = network_of(pair)
+    td = sequences(shape_of(pair), NUM_FRAMES, padding)
+    td.update(context_of(network))
+    expected = backbone_of(network)(td.clone())["features"]
+    expected_gradients = gradients(expected, network)
+    for options, given in [
+        ({}, spoil(td, keep_starts=True)),
+        ({"padding": padding}, spoil(td, keep_starts=False)),
+    ]:
+        features = read(backbone_of(network, **options), given)
+        torch.testing.assert_close(features, expected, rtol=0, atol=1e-9)
+        for actual, other in zip(gradients(features, network), expected_gradients, strict=True):
+            torch.testing.assert_close(
+                actual, other, rtol=0, atol=1e-9 * (1 + other.abs().max().item())
+            )
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+@pytest.mark.parametrize("pair", [("inner", "paired-outer"), ("linear", "outer")], ids="+".join)
+def test_float32(pair: Pair, padding: Padding) -> None:
+    network = build(pair)
+    td = sequences(shape_of(pair), NUM_FRAMES, padding, torch.float32)
+    expected = backbone_of(network)(td.clone())["features"]
+    features = read(backbone_of(network, padding=padding), td)
+    torch.testing.assert_close(features, expected, rtol=0, atol=1e-5)
+    pairs = zip(gradients(features, network), gradients(expected, network), strict=True)
+    for actual, other in pairs:
+        torch.testing.assert_close(actual, other, rtol=0, atol=1e-3 * other.abs().max().item())
+
+
+@pytest.mark.parametrize("padding", [None, *PADDINGS])
+def test_without_histories_the_valid_steps_are_those_of_single_steps(
+    padding: Padding | None,
+) -> None:
+    network = build(("inner", "paired-outer")).double()
+    td = sequences((6,), NUM_FRAMES, padding or "same")
+    expected = Backbone(network)(td.clone())["features"]
+    out = TensorDict(dict(td.exclude("history").items()), [N, T])
+    features = read(Backbone(network, padding=padding), out)
+    valid = out["features_valid"]
+    assert valid.shape == (N, T, 1)
+    assert valid.dtype == torch.bool
+    # K - 1 = 2 steps of the sequences that begin inside an episode.
+    assert (~valid).squeeze(-1).nonzero().tolist() == [[1, 0], [1, 1], [2, 0], [2, 1]]
+    mask = valid.squeeze(-1)
+    assert_near(features[mask], expected[mask])
+    assert (features - expected)[~mask].abs().amax(-1).min() > 1e-3
+
+
+def test_each_frame_is_encoded_once() -> None:
+    network = EnhancedTIT((4,), num_frames=16)
+    counted = CountedFrames(network)
+    td = TensorDict(
+        {
+            "history": torch.randn(2, 1, 16, 4).expand(2, 32, 16, 4),
+            "observation": torch.randn(2, 32, 4),
+            "is_init": torch.rand(2, 32, 1) < 0.2,
+        },
+        [2, 32],
+    )
+    read(Backbone(network, padding="same"), td.clone())
+    assert counted.take() == 2 * (32 + 15)
+    read(Backbone(network, padding="constant"), td.clone())
+    assert counted.take() == 2 * (32 + 15) + 1  # zeros once
+    read(Backbone(network), td.exclude("history"))
+    assert counted.take() == 2 * 32
+
+
+def test_dropout_is_drawn_once_a_frame() -> None:
+    frame = settings.Inner(patch_size=3, ffn_dropout=0.5, attention_dropout=0.5)
+    network = HistoryNetwork(
+        frame, settings.Outer(), observation_shape=(6,), num_frames=NUM_FRAMES
+    ).double()
+    network.history_encoder.eval()
+    td = sequences((6,), NUM_FRAMES, "same")[2:]
+    torch.manual_seed(0)
+    features = read(Backbone(network, padding="same"), td.clone())
+    frames = torch.cat([td["history"][0, 0], td["observation"][0, 1:]])
+    torch.manual_seed(0)
+    tokens = network.frames[0](frames).unfold(0, NUM_FRAMES, 1).movedim(-1, 1)
+    assert_near(features[0], network.encode_history(tokens))
+    assert not torch.equal(read(Backbone(network, padding="same"), td.clone()), features)
+
+
+@pytest.mark.parametrize("pair", EACH_ONCE, ids="+".join)
+def test_compiles_without_a_graph_break(pair: Pair) -> None:
+    torch.compiler.reset()
+    network = network_of(pair)
+    backbone = backbone_of(network, padding="same")
+    td = sequences(shape_of(pair), NUM_FRAMES, "same").update(context_of(network))
+
+    def features(td: TensorDictBase) -> Tensor:
+        return read(backbone, td.copy())
+
+    compiled = torch.compile(features, backend="aot_eager", fullgraph=True)
+    with torch.no_grad():
+        assert_near(compiled(td), features(td))
+    torch.compiler.reset()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("c++") is None, reason="there is no C++ compiler")
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_inductor_has_the_same_gradients(padding: Padding) -> None:
+    torch.compiler.reset()
+    network = build(("inner", "paired-outer")).double()
+    backbone = Backbone(network, padding=padding)
+    td = sequences((6,), NUM_FRAMES, padding)
+
+    def features(td: TensorDictBase) -> Tensor:
+        return read(backbone, td.copy())
+
+    expected = features(td)
+    actual = torch.compile(features, fullgraph=True)(td)
+    assert_near(actual, expected)
+    assert_near(gradients(actual, network), gradients(expected, network))
+    torch.compiler.reset()
+
+
+@pytest.mark.parametrize("pair", PAIRS, ids="+".join)
+def test_vmap_over_weights_and_over_sequences(pair: Pair) -> None:
+    networks = [build(pair, seed).double() for seed in range(2)]
+    td = sequences(shape_of(pair), NUM_FRAMES, "same").update(context_of(networks[0]))
+    backbones = [backbone_of(network, padding="same") for network in networks]
+    weights, buffers = stack_module_state([b.module for b in backbones])
+
+    def features(weights: Any, buffers: Any, td: TensorDictBase) -> Tensor:
+        prefixed = {f"module.{name}": x for name, x in {**weights, **buffers}.items()}
+        return functional_call(backbones[0], prefixed, (td.copy(),))["features"]
+
+    with set_recurrent_mode(True), torch.no_grad():
+        stacked = torch.vmap(features, (0, 0, None))(weights, buffers, td)
+        alone = [backbone(td.copy())["features"] for backbone in backbones]
+        assert_near(list(stacked), alone)
+        mapped = torch.vmap(
+            partial(features, *({k: v[0] for k, v in x.items()} for x in (weights, buffers)))
+        )(td)
+        assert_near(mapped, alone[0])
+
+
+def test_bfloat16_autocast() -> None:
+    network = build(("inner", "paired-outer"))
+    td = sequences((6,), NUM_FRAMES, "same", torch.float32)
+    expected = Backbone(network, autocast=torch.bfloat16)(td.clone())["features"]
+    features = read(Backbone(network, padding="same", autocast=torch.bfloat16), td.clone())
+    assert features.dtype == torch.float32
+    torch.testing.assert_close(features, expected, rtol=0, atol=2e-2)
+    exact = Backbone(network)(td)["features"]
+    assert not torch.equal(features, exact)
+    assert (features - exact).abs().mean() < 2e-2
+
+
+def rollout_of(num_frames: int, padding: Padding) -> TensorDictBase:
+    env = make_env("CartPole-v1", 3, num_frames=num_frames, padding=padding, seed=0)
+    torch.manual_seed(0)
+    rollout = env.append_transform(InitTracker()).rollout(60, break_when_any_done=False)
+    return rollout.apply(lambda x: x.double() if x.is_floating_point() else x)
+
+
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_flat_batches_of_a_slice_sampler(padding: Padding) -> None:
+    rollout = rollout_of(4, padding)
+    network = EnhancedTIT((4,), 4).double()
+
+    def draw(**options: Any) -> tuple[TensorDictBase, Tensor]:
+        sampler = SliceSampler(slice_len=8, end_key=("next", "done"), **options)
+        storage = LazyTensorStorage(180, ndim=2)
+        buffer = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=400)
+        buffer.extend(rollout)
+        torch.manual_seed(0)
+        flat = buffer.sample()
+        assert flat.shape == (400,)
+        return flat, Backbone(network)(flat.select("history"))["features"]
+
+    flat, expected = draw()  # the sampler sets is_init at the beginning of each slice
+    assert_near(read(Backbone(network), flat), expected)
+    # Without histories, is_init must tell episodes from slices.
+    flat, expected = draw(init_key=None)
+    assert 0 < flat["is_init"].sum() < 25
+    flat = flat.exclude("history")
+    features, valid = read(Backbone(network, padding=padding), flat), flat["features_valid"]
+    starts = flat["is_init"].sum()
+    assert (~valid).sum() == 3 * (50 - starts)
+    assert_near(features[valid.squeeze(-1)], expected[valid.squeeze(-1)])
+
+
+def test_gae_reads_whole_rollouts() -> None:
+    rollout = rollout_of(4, "same")
+    network = EnhancedTIT((4,), 4).double()
+    critic = make_value(network.features_dim).double()
+
+    def advantages(backbone: Backbone) -> Tensor:
+        value = TensorDictSequential(backbone, critic)
+        gae = GAE(gamma=0.9, lmbda=0.9, value_network=value, deactivate_vmap=True)
+        with set_recurrent_mode(True):
+            return gae(rollout.clone())["advantage"]
+
+    expected = advantages(Backbone(network))  # selects histories alone, so reads single steps
+    counted = CountedFrames(network)
+    actual = advantages(Backbone(network, observation_keys="observation"))
+    assert_near(actual, expected)
+    assert counted.take() < 2 * 3 * 60 * 4
+
+
+@pytest.mark.parametrize("padding", [None, "same"])
+def test_two_trunks_and_two_observations(padding: Padding | None) -> None:
+    shapes = {"pixels": (8, 8), "state": (3,)}
+    frame = {"pixels": settings.Inner(patch_size=4), "state": settings.Linear(embed_dim=32)}
+    torch.manual_seed(0)
+    trunks = [
+        HistoryNetwork(frame, settings.Outer(), observation_shape=shapes, num_frames=4).double()
+        for _ in range(2)
+    ]
+    pixels, state = sequences((8, 8), 4, "same"), sequences((3,), 4, "same")
+    td = TensorDict(
+        {
+            "seen": {"history": pixels["history"], "observation": pixels["observation"]},
+            "state_history": state["history"],
+            "state_observation": state["observation"],
+            "is_init": IS_INIT,
+        },
+        [N, T],
+    )
+    keys: dict[str, Any] = {
+        "in_keys": [("seen", "history"), "state_history"],
+        "out_keys": ["policy", "value"],
+    }
+    expected = Backbone(TwoTrunks(*trunks), **keys)(td.clone())
+    with set_recurrent_mode(True):
+        out = Backbone(TwoTrunks(*trunks), **keys, padding=padding)(td.clone())
+    assert_near([out["policy"], out["value"]], [expected["policy"], expected["value"]])
+
+
+def test_every_frame_and_leading_dimensions() -> None:
+    pair = ("linear", "decision-transformer")
+    network = network_of(pair)
+    td = sequences((6,), NUM_FRAMES, "same").update(context_of(network))
+    expected = backbone_of(network, every_frame=True)(td.clone())["features"]
+    assert expected.shape == (N, T, NUM_FRAMES, 4)
+    assert_near(read(backbone_of(network, every_frame=True, padding="same"), td.clone()), expected)
+    deep = td.unsqueeze(0).unsqueeze(2).expand(2, N, 1, T)
+    features = read(backbone_of(network, padding="same"), deep.clone())
+    assert features.shape == (2, N, 1, T, 4)
+    assert_near(features[1, :, 0], expected[:, :, -1])
+
+
+def test_other_modules_read_the_windows() -> None:
+    td = sequences((2,), 3, "constant")
+    module = torch.nn.Flatten(-2)
+    features = read(Backbone(module, padding="constant"), spoil(td, keep_starts=False))
+    assert torch.equal(features, td["history"].flatten(-2))
+
+
+def test_single_steps_stay_what_they_were() -> None:
+    network = EnhancedTIT((4,), 3)
+    histories = torch.randn(5, 3, 4)
+    with set_recurrent_mode(True):  # as within TorchRL's losses
+        features = Backbone(network)(TensorDict({"history": histories}, [5]))["features"]
+    assert torch.equal(features, network(histories))
+
+
+def test_declared_keys() -> None:
+    network = EnhancedTIT((4,), 3)
+    assert Backbone(network).in_keys == ["history"]
+    for options in ({"padding": "same"}, {"observation_keys": ["observation"]}):
+        assert Backbone(network, **options).in_keys == ["history", "observation", "is_init"]
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (
+            lambda td: td.exclude("observation"),
+            KeyError,
+            "have no 'observation' here, only history",
+        ),
+        (lambda td: td.exclude("is_init", "history"), KeyError, "no 'is_init'.*add .*InitTracker"),
+        (lambda td: td[0, 0], ValueError, "this tensordict has none: read a single step within"),
+        (
+            lambda td: td.set("observation", torch.zeros(N, T, 5, dtype=torch.float64)),
+            ValueError,
+            r"observations of shape \(5,\) do not fit this network: expected \(4,\)",
+        ),
+        (
+            lambda td: td.set("history", td["history"][:, :, :2]),
+            ValueError,
+            "which is 3 observations of shape",
+        ),
+        (
+            lambda td: td.set("observation", td["observation"].int()),
+            TypeError,
+            "int32 does not fit this network",
+        ),
+    ],
+)
+def test_wrong_sequences_say_what_to_do(change: Any, error: type[Exception], message: str) -> None:
+    backbone = Backbone(EnhancedTIT((4,), 3).double())
+    with pytest.raises(error, match=message) as raised:
+        read(backbone, change(sequences((4,), 3, "same")))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("padding", [None, "same"])
+def test_shuffled_steps_are_refused(padding: Padding | None) -> None:
+    steps = rollout_of(4, "same").reshape(-1)
+    backbone = Backbone(EnhancedTIT((4,), 4).double(), padding=padding)
+    torch.manual_seed(0)
+    shuffled = steps[torch.randperm(len(steps))]
+    expected = backbone(shuffled.clone())["features"]
+    with pytest.raises(ValueError, match="leave is_init out of shuffled steps") as raised:
+        read(backbone, shuffled.clone())
+    assert "\n" not in str(raised.value)
+    assert_near(read(backbone, shuffled.exclude("is_init")), expected)
+    if padding is None:  # the rows of a rollout one after another, of which only some are done
+        assert_near(read(backbone, steps.clone()), backbone(steps)["features"])
+
+
+def test_wrong_settings_say_what_to_do() -> None:
+    network = EnhancedTIT((4,), 3)
+    with pytest.raises(ValueError, match="padding must be one of 'same', 'constant' or None"):
+        Backbone(network, padding="zeros")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"observation_keys is \['a', 'b'\]: name one for each"):
+        Backbone(network, observation_keys=["a", "b"])
+
+
+def test_a_tit_backbone_drops_into_a_script_with_an_lstm() -> None:
+    for name in ("lstm", "enhanced-tit"):
+        num_frames = 1 if name == "lstm" else 4
+        backbone = Backbone(build_network(settings.NETWORKS[name](num_frames), (4,)))
+        actor = make_actor(backbone.features_dim, Categorical(2))
+        policy = TensorDictSequential(backbone, actor)
+        env = make_env("CartPole-v1", 2, num_frames=num_frames)
+        env = env.append_transform(Compose(InitTracker()))
+        env = env.append_transform(backbone.make_transforms()) if backbone.is_recurrent else env
+        with torch.no_grad():
+            rollout = env.rollout(32, policy, break_when_any_done=False)
+        with set_recurrent_mode(True):
+            again = policy(rollout.exclude("logits", "features"))
+        assert_near(again["logits"], rollout["logits"])

@@ -1,0 +1,160 @@
+"""Reads sequences of consecutive steps from tensordicts, in TorchRL's recurrent mode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import get_args
+
+import torch
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from torch import Tensor
+from torchrl.modules import recurrent_mode
+
+from torchrl_tit.modules.frame_tables import (
+    FrameTable,
+    find_starts,
+    table_of_first,
+    table_of_stored,
+    table_without_histories,
+)
+from torchrl_tit.networks import HistoryNetwork
+from torchrl_tit.windows import Padding
+
+
+@dataclass(frozen=True)
+class SequenceKeys:
+    """Where a backbone finds what it reads of sequences.
+
+    Raises:
+        ValueError: if there is not one observation for each history, or the padding is unknown.
+    """
+
+    histories: list[NestedKey]
+    """Keys of the histories."""
+    observations: list[NestedKey]
+    """Keys of the observations, one for each history."""
+    context: list[NestedKey]
+    """Keys of the history encoder's further inputs."""
+    padding: Padding | None
+    """What precedes an episode; None if the stored histories tell."""
+
+    def __post_init__(self) -> None:
+        if len(self.observations) != len(self.histories):
+            raise ValueError(
+                f"there are histories under {self.histories}, but observation_keys is "
+                f"{self.observations}: name one for each"
+            )
+        if self.padding not in (None, *get_args(Padding)):
+            known = ", ".join(map(repr, get_args(Padding)))
+            raise ValueError(f"padding must be one of {known} or None, not {self.padding!r}")
+
+    def in_sequence(self, tensordict: TensorDictBase) -> bool:
+        """Whether the last batch dimension of a tensordict is time."""
+        if not recurrent_mode():
+            return False
+        entries = tensordict.keys(True)
+        return "is_init" in entries or self.histories[0] not in entries
+
+    def lay_out(
+        self, tensordict: TensorDictBase, trunks: Sequence[HistoryNetwork]
+    ) -> tuple[FrameTable, list[Tensor]]:
+        """Lays the frames of sequences [*B, T] out in a table.
+
+        Args:
+            tensordict: the sequences.
+            trunks: the networks that read them; empty if these are other modules.
+
+        Returns:
+            The table, with windows [N, T, K], and the further inputs, [N, T, K, *entry] each.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if there is no time dimension, an entry does not fit a network, or the next
+                observation of a step is not that of the step after it.
+        """
+        self._check(tensordict, trunks)
+        time = tensordict.ndim - 1
+        count, steps = math.prod(tensordict.batch_size[:-1]), tensordict.batch_size[-1]
+
+        def flat(entry: Tensor) -> Tensor:
+            return entry.reshape(count, steps, *entry.shape[time + 1 :])
+
+        def flags(entry: Tensor) -> Tensor:
+            return entry.reshape(count, steps, -1).any(-1)
+
+        observations = [flat(tensordict.get(key)) for key in self.observations]
+        context = [flat(tensordict.get(key)) for key in self.context]
+        is_init = flags(tensordict.get("is_init"))
+        ends = [tensordict.get(key, None) for key in ("done", ("next", "done"))]
+        starts = find_starts(is_init, [flags(end) for end in ends if end is not None])
+        following = [tensordict.get(unravel_key(("next", key)), None) for key in self.observations]
+        for now, after in zip(observations, following, strict=True):
+            if after is not None:
+                _check_consecutive(now, flat(after), starts)
+        stored = [tensordict.get(key, None) for key in self.histories]
+        histories = [history for history in stored if history is not None]
+        if histories and self.padding is not None:
+            first = [x.select(time, 0).reshape(count, *x.shape[time + 1 :]) for x in histories]
+            return table_of_first(first, observations, is_init, self.padding), context
+        if histories:
+            return table_of_stored([flat(x) for x in histories], observations, starts), context
+        padding, num_frames = self.padding or "same", trunks[0].num_frames
+        table = table_without_histories(observations, is_init, starts, num_frames, padding)
+        return table, context
+
+    def _check(self, tensordict: TensorDictBase, trunks: Sequence[HistoryNetwork]) -> None:
+        entries = tensordict.keys(True)
+        named = ", ".join(sorted(map(str, entries)))
+        for key in (*self.observations, *self.context, "is_init"):
+            if key not in entries:
+                hint = "name the keys of the observations in observation_keys"
+                if key == "is_init":
+                    hint = "add TorchRL's InitTracker to the environment"
+                raise KeyError(
+                    f"in recurrent mode a backbone reads sequences, which have no {key!r} here, "
+                    f"only {named}: {hint}"
+                )
+        present = [key for key in self.histories if key in entries]
+        if len(present) < len(self.histories) and (present or not trunks):
+            raise KeyError(f"of the histories {self.histories}, some are missing: found {named}")
+        if not tensordict.ndim:
+            raise ValueError(
+                "in recurrent mode the last batch dimension is time, but this tensordict has none: "
+                "read a single step within set_recurrent_mode(False)"
+            )
+        for trunk in trunks:
+            observations = (tensordict.get(key) for key in self.observations)
+            trunk.check_frames(*(x.flatten(0, tensordict.ndim - 1) for x in observations))
+            if present:
+                trunk.check(*(tensordict.get(key) for key in present))
+
+
+def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -> None:
+    """Raises ValueError if steps [N, T] do not follow one another, as shuffled ones do not."""
+    if torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None:
+        return
+    now, after = observation[:, 1:], following[:, :-1]
+    differs = ((now != after) & (after == after)).flatten(2).any(-1)  # NaN differs from itself
+    if (differs & ~starts[:, 1:]).any():
+        raise ValueError(
+            "in recurrent mode the last batch dimension is time, but the next observation of a "
+            "step is not the observation of the step after it: leave is_init out of shuffled steps "
+            "(or read them within set_recurrent_mode(False)), and set it where a sequence begins"
+        )
+
+
+def default_observation_keys(histories: Sequence[NestedKey]) -> list[NestedKey]:
+    """Names the observations of histories: their keys, with "history" replaced by "observation".
+
+    Example:
+        >>> default_observation_keys(["history", ("agents", "history")])
+        ['observation', ('agents', 'observation')]
+    """
+    return [
+        key.replace("history", "observation")
+        if isinstance(key, str)
+        else (*key[:-1], key[-1].replace("history", "observation"))
+        for key in histories
+    ]
