@@ -19,6 +19,8 @@ def make_critic(
     action_dim: int,
     hidden: Sequence[int],
     network: Network | None = None,
+    *,
+    slices: bool = False,
 ) -> TensorDictModuleBase:
     """Builds Q(s, a): an MLP on the newest observation or a backbone's features, and the action.
 
@@ -27,6 +29,8 @@ def make_critic(
         action_dim: number A of entries of an action.
         hidden: widths of the MLP's hidden layers.
         network: settings of the backbone; if None, the MLP reads the newest observation.
+        slices: whether the backbone is to read slices of consecutive steps [..., T], if it is
+            within TorchRL's recurrent mode; it then reads "observation" and "is_init" too.
 
     Returns:
         A module that reads "observation" [..., *obs], or "history" [..., K, *obs], and "action"
@@ -40,7 +44,9 @@ def make_critic(
     if network is not None:
         key = "critic_features"
         backbone = Backbone(
-            build_network(network, observation_shape, trunks="shared"), out_keys=[key]
+            build_network(network, observation_shape, trunks="shared"),
+            out_keys=[key],
+            observation_keys=["observation"] if slices else None,
         )
         modules, size = [backbone], backbone.features_dim
     elif len(observation_shape) != 1:

@@ -56,7 +56,13 @@ class CQLAlgorithm(QAlgorithm[CQL]):
         self._policy = ProbabilisticTensorDictSequential(backbone, *head).to(self.device)
         network = recipe.backbone if recipe.critic == "backbone" else None
         critics = [
-            make_critic(self.observation_shape, spec.shape[0], recipe.critic_hidden, network)
+            make_critic(
+                self.observation_shape,
+                spec.shape[0],
+                recipe.critic_hidden,
+                network,
+                slices=recipe.slice_length > 1,
+            )
             for _ in range(2)
         ]
         self.loss: ContinuousCQLLoss = ContinuousCQLLoss(
@@ -107,7 +113,9 @@ class CQLAlgorithm(QAlgorithm[CQL]):
         }
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
-        """Steps temperature, critics, actor and targets, in this order, on transitions [B].
+        """Steps temperature, critics, actor and targets, in this order.
+
+        A batch is transitions [B], or slices [N, T].
 
         The actor runs once for all of them; the actor's loss sees critics and temperature after
         their steps, as in d3rlpy.

@@ -74,7 +74,8 @@ class QAlgorithm(DatasetAlgorithm[RecipeT]):
     def make_backbone(self) -> Backbone:
         """Builds the policy's backbone."""
         return Backbone(
-            build_network(self.recipe.backbone, self.observation_shape, trunks="shared")
+            build_network(self.recipe.backbone, self.observation_shape, trunks="shared"),
+            observation_keys=["observation"] if self.recipe.slice_length > 1 else None,
         )
 
     def make_buffer(self) -> ReplayBuffer:
@@ -94,12 +95,17 @@ class QAlgorithm(DatasetAlgorithm[RecipeT]):
             time_limits=recipe.time_limits,
             terminal_observations=recipe.terminal_observations,
             unfinished=recipe.unfinished,
+            is_init=recipe.slice_length > 1,
         )
-        return make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed)
+        return make_replay_buffer(
+            storage, recipe.batch_size, seed=recipe.seed, slice_length=recipe.slice_length
+        )
 
     def should_compile(self) -> bool:
         """Whether losses run through ``torch.compile``."""
         setting = self.recipe.compile
+        if self.recipe.slice_length > 1:  # their number of frames varies
+            return False
         pays = setting == "on" or self.device.type in self.compiles_on
         return pays and should_compile(setting, self.recipe.total_updates)
 

@@ -21,6 +21,9 @@ class QRecipe(DatasetRecipe):
     """Gradient steps to train for."""
     batch_size: int = 256
     """Transitions in one gradient step, sampled with replacement."""
+    slice_length: int = 1
+    """Consecutive transitions that are drawn together, so that a backbone encodes their frames
+    once; must divide batch_size. 1 draws transitions one by one."""
     gamma: float = 0.99
     """Discount factor."""
     tau: float = 0.005
@@ -45,13 +48,14 @@ class QRecipe(DatasetRecipe):
     """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
     at the start. "auto" compiles if the run is long enough to be worth it. On a CPU, continuous CQL
     compiles only the policy, because compiling does not speed up the critics' matrix products.
-    Discrete CQL is compiled only on a GPU."""
+    Discrete CQL is compiled only on a GPU, and slices of several transitions are not."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_at_least(
             self,
             total_updates=1,
+            slice_length=1,
             gamma=0,
             tau=0,
             conservative_weight=0,
@@ -59,6 +63,16 @@ class QRecipe(DatasetRecipe):
             evaluation_interval=1,
         )
         check_at_most(self, gamma=1, tau=1)
+        if self.batch_size % self.slice_length:
+            raise ValueError(
+                f"slice_length {self.slice_length} does not divide batch_size {self.batch_size}: "
+                "change one of them"
+            )
+        if self.compile == "on" and self.slice_length > 1:
+            raise ValueError(
+                f"compile is on, but slices of {self.slice_length} are not compiled, because their "
+                "number of frames varies: set compile to off, or slice_length to 1"
+            )
         if self.backbone.carries_state:
             raise ValueError(
                 f"{self.algorithm} draws single transitions, so its network cannot carry a state: "

@@ -13,19 +13,22 @@ from tensordict.nn import (
     TensorDictModule,
     TensorDictModuleBase,
     TensorDictSequential,
+    set_skip_existing,
 )
 from torch import Tensor, nn
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, LazyTensorStorage, ReplayBuffer
+from torchrl.data import Bounded, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_tit.checkpoint import load_checkpoint, save_checkpoint
+from torchrl_tit.datasets import OnlineHistoryStorage, keep_batch, make_sampler
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.modules import Backbone, while_acting
 from torchrl_tit.networks import build_network
+from torchrl_tit.objectives import encode_pairs
 
 from ..algorithm import Algorithm, Stateful, check_finite
 from ..critics import make_critic
@@ -34,9 +37,9 @@ from ..stateful import CollectorState
 from .settings import SAC
 
 _STORED = [
-    "history",
+    "observation",
     "action",
-    *(("next", name) for name in ("history", "reward", "terminated", "done")),
+    *(("next", name) for name in ("observation", "reward", "terminated", "done")),
 ]
 
 
@@ -73,7 +76,9 @@ class SACAlgorithm(Algorithm[SAC]):
         # Two critics keep their initial weights; TorchRL would copy a single one and initialise the
         # copy anew.
         critics = [
-            make_critic(shape, size, recipe.critic_hidden, network).to(self.device)
+            make_critic(
+                shape, size, recipe.critic_hidden, network, slices=recipe.slice_length > 1
+            ).to(self.device)
             for _ in range(2)
         ]
         self.loss = SACLoss(self._policy, critics, loss_function="l2", target_entropy=-float(size))
@@ -123,11 +128,21 @@ class SACAlgorithm(Algorithm[SAC]):
             auto_register_policy_transforms=False,
         )
         self.collector_state = CollectorState(self.collector, recipe.seed, step)
+        storage = OnlineHistoryStorage(
+            recipe.final_step,
+            recipe.backbone.num_frames,
+            num_envs=recipe.num_envs,
+            padding=recipe.padding,
+            is_init=recipe.slice_length > 1,
+            device=self.device,
+        )
         self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(recipe.final_step, device=self.device),
+            storage=storage,
+            sampler=make_sampler(recipe.slice_length),
+            collate_fn=keep_batch,
             batch_size=recipe.batch_size,
         )
-        self.buffer_state = ReplayBufferState(self.buffer, folder / "replay")
+        self.buffer_state = StorageState(storage, folder / "replay")
 
     def state(self) -> Mapping[str, Stateful]:
         """Optimizer, collector and environment, and the replay buffer."""
@@ -152,7 +167,7 @@ class SACAlgorithm(Algorithm[SAC]):
     def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
         """Stores a batch, then takes gradient steps on samples of all stored transitions."""
         recipe = self.recipe
-        self.buffer.extend(batch.select(*_STORED).reshape(-1))
+        self.buffer.extend(batch.select(*_STORED).transpose(0, 1).reshape(-1))
         self.collector_state.step = step + batch.numel()
         values = torch.full((len(self.columns),), torch.nan)
         if self.collector_state.step > recipe.random_steps:
@@ -174,10 +189,14 @@ class SACAlgorithm(Algorithm[SAC]):
         self.collector.shutdown()
 
     def _step(self, batch: TensorDictBase) -> Tensor:
-        """Takes a gradient step on transitions [B]; returns its terms, float [terms]."""
-        for group in (batch, batch["next"]):
-            group["observation"] = group["history"][:, -1]  # the newest, which MLP critics read
-        terms = self.loss(batch)
+        """Takes a gradient step on transitions [B] or slices [N, T]; returns its terms."""
+        actor = self.loss.actor_network
+        with self.loss.actor_network_params.to_module(actor, preserve_module_state=False):
+            pairs = encode_pairs(actor, batch)
+        for group, features in zip((batch, batch["next"]), pairs, strict=True):
+            group.update(features)
+        with set_skip_existing(True):  # of the actor's backbone
+            terms = self.loss(batch)
         self.optimizer.zero_grad()
         (terms["loss_actor"] + terms["loss_qvalue"] + terms["loss_alpha"]).backward()
         self.optimizer.step()
@@ -201,33 +220,37 @@ def _make_actor(backbone: Backbone, action_spec: Bounded) -> ProbabilisticActor:
     )
 
 
-class ReplayBufferState:
-    """The state of a replay buffer that never overwrites, as parts on the disk.
+class StorageState:
+    """The state of a storage that only grows, as parts on the disk.
 
-    Each checkpoint writes the transitions that were added since the one before, and lists all parts
-    that belong to it. A checkpoint that held all transitions itself would grow with the run.
+    Each checkpoint writes what was added since the one before, each frame once, and lists all parts
+    that belong to it. A checkpoint that held all steps itself would grow with the run.
 
     Args:
-        buffer: the replay buffer, with room for all transitions of the run.
-        folder: folder of the parts, each numbered by the total number of transitions at its end.
+        storage: the storage.
+        folder: folder of the parts, each numbered by the total number of steps at its end.
     """
 
-    def __init__(self, buffer: ReplayBuffer, folder: Path) -> None:
-        self.buffer = buffer
+    def __init__(self, storage: OnlineHistoryStorage, folder: Path) -> None:
+        self.storage = storage
         self.folder = folder
         self._parts: list[int] = []
+        self._episode_ends = 0  # of all parts
 
     def state_dict(self) -> dict[str, Any]:
-        """Writes the new transitions, and returns the numbers of all parts."""
-        before, count = max(self._parts, default=0), len(self.buffer)
+        """Writes the new steps, and returns the numbers of all parts."""
+        before, count = max(self._parts, default=0), len(self.storage)
         if count > before:
-            save_checkpoint(self.folder, count, self.buffer[before:count], keep=count)
+            part = self.storage.part(before, self._episode_ends)
+            save_checkpoint(self.folder, count, part, keep=count)
             self._parts.append(count)
+            self._episode_ends = self.storage.num_episode_ends
         return {"parts": list(self._parts)}
 
     def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
         """Reads a checkpoint's parts. Other parts belong to lost work and will be replaced."""
         self._parts = list(state_dict["parts"])
         for number in self._parts:
-            _, transitions = load_checkpoint(self.folder, number)
-            self.buffer.extend(transitions)
+            _, part = load_checkpoint(self.folder, number)
+            self.storage.add_part(part)
+        self._episode_ends = self.storage.num_episode_ends

@@ -32,6 +32,9 @@ class SAC(Recipe, algorithm="sac", builds=f"{__package__}.algorithm:SACAlgorithm
     """Gradient steps for each environment step."""
     batch_size: int = 256
     """Transitions in one gradient step, sampled with replacement from all seen so far."""
+    slice_length: int = 1
+    """Consecutive steps that are drawn together, so that a backbone encodes their frames once; must
+    divide batch_size. 1 draws transitions one by one."""
     learning_rate: float = 3e-4
     """Learning rate of Adam for actor, critics and temperature."""
     gamma: float = 0.99
@@ -56,6 +59,7 @@ class SAC(Recipe, algorithm="sac", builds=f"{__package__}.algorithm:SACAlgorithm
             steps_per_batch=1,
             updates_per_step=0,
             batch_size=1,
+            slice_length=1,
             learning_rate=0,
             gamma=0,
             tau=0,
@@ -70,6 +74,16 @@ class SAC(Recipe, algorithm="sac", builds=f"{__package__}.algorithm:SACAlgorithm
             raise ValueError(
                 f"steps_per_batch {self.steps_per_batch} must be a multiple of num_envs "
                 f"{self.num_envs}"
+            )
+        if self.batch_size % self.slice_length:
+            raise ValueError(
+                f"slice_length {self.slice_length} does not divide batch_size {self.batch_size}: "
+                "change one of them"
+            )
+        if self.slice_length * self.num_envs > self.random_steps:
+            raise ValueError(
+                f"slice_length {self.slice_length} is longer than the {self.random_steps} "
+                f"random_steps of {self.num_envs} environments: change one of them"
             )
         if not self.critic_hidden or min(self.critic_hidden) < 1:
             raise ValueError(

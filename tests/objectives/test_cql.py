@@ -249,21 +249,15 @@ def test_forward_computes_the_same_terms_and_does_not_change_the_batch(monkeypat
     assert set(terms.keys()) == set(loss.out_keys)
 
 
-class Counting(EnhancedTIT):
-    calls: list[int]
-
-    def forward(self, *inputs):
-        self.calls.append(inputs[0].shape[0])
-        return super().forward(*inputs)
-
-
 def test_backbones_run_once_a_state_and_all_of_it_trains():
     """The actor at s and at s'; the critics at s, at s', and at s with the actor's action."""
-    calls: dict[str, list[int]] = {"actor": [], "critic": []}
+    calls: dict[str, list[int]] = {"actor": [], "critic": []}  # number of frames in each
 
     def backbone(name, key):
-        network = Counting((OBSERVATION,), 2, embed_dim=16, ffn_dropout_inner=0.1)
-        network.calls = calls[name]
+        network = EnhancedTIT((OBSERVATION,), 2, embed_dim=16, ffn_dropout_inner=0.1)
+        network.frames[0].register_forward_pre_hook(
+            lambda _, frames: calls[name].append(frames[0].numel() // OBSERVATION)
+        )
         return Backbone(network, out_keys=[key]), network.features_dim
 
     first, size = backbone("actor", "features")
@@ -282,16 +276,18 @@ def test_backbones_run_once_a_state_and_all_of_it_trains():
     batch = make_batch().apply(lambda x: x.float() if x.is_floating_point() else x)
     for part in (batch, batch["next"]):
         part["history"] = torch.randn(BATCH, 2, OBSERVATION)
+    batch["next", "history"][:, 0] = batch["history"][:, 1]
     for names in calls.values():
         names.clear()
     terms = loss(batch)
-    assert calls == {"actor": [BATCH] * 2, "critic": [BATCH] * 6}
+    # Of s', the actor encodes the newest frame only.
+    assert calls == {"actor": [2 * BATCH, BATCH], "critic": [2 * BATCH] * 6}
     sum(terms[name] for name in ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha")).backward()
     for params in (loss.actor_network_params, loss.qvalue_network_params):
         assert all(w.grad is not None for w in params.values(True, True) if w.requires_grad)
     calls["critic"].clear()
     loss.critic_gradients(batch, loss.sample_policy(batch), chunk_size=2)
-    chunks, target = [1, 1, 2, 2, 2, 2], [BATCH, BATCH]
+    chunks, target = [2, 2, 4, 4, 4, 4], [2 * BATCH, 2 * BATCH]
     assert sorted(calls["critic"]) == chunks + target
     updater = SoftUpdate(loss, tau=0.5)
     before = loss.target_qvalue_network_params.clone()

@@ -1,5 +1,6 @@
 """Data sets for offline RL: from D4RL, Minari, HDF5 files and arrays to TorchRL replay buffers."""
 
+from torchrl_tit.datasets.consecutive import ConsecutiveSampler
 from torchrl_tit.datasets.d4rl import download_d4rl
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
@@ -7,7 +8,8 @@ from torchrl_tit.datasets.hdf5 import read_hdf5, write_hdf5
 from torchrl_tit.datasets.histories import HistoryStorage
 from torchrl_tit.datasets.minari import read_minari
 from torchrl_tit.datasets.minari_writer import write_minari
-from torchrl_tit.datasets.replay_buffer import make_replay_buffer
+from torchrl_tit.datasets.online import OnlineHistoryStorage
+from torchrl_tit.datasets.replay_buffer import keep_batch, make_replay_buffer, make_sampler
 from torchrl_tit.datasets.scores import (
     REFERENCE_RETURNS,
     has_reference,
@@ -24,10 +26,12 @@ from torchrl_tit.datasets.transitions import episodes_from_arrays
 
 __all__ = [
     "REFERENCE_RETURNS",
+    "ConsecutiveSampler",
     "DatasetError",
     "EpisodeStorage",
     "Episodes",
     "HistoryStorage",
+    "OnlineHistoryStorage",
     "SequenceStorage",
     "TaskSpaces",
     "TransitionParts",
@@ -35,8 +39,10 @@ __all__ = [
     "episodes_from_arrays",
     "has_reference",
     "join_episodes",
+    "keep_batch",
     "load_episodes",
     "make_replay_buffer",
+    "make_sampler",
     "normalized_score",
     "normalized_spread",
     "read_hdf5",

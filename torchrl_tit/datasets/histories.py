@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.storage import EpisodeStorage
-from torchrl_tit.transforms.history import Padding
+from torchrl_tit.windows import Padding, find_windows
 
 TimeLimits = Literal["keep", "drop"]
 TerminalObservations = Literal["keep", "zero"]
@@ -36,6 +36,9 @@ class HistoryStorage(EpisodeStorage):
             as d3rlpy 1 does. They are always zeros if unknown.
         unfinished: ``"drop"`` leaves out an episode that is neither terminated nor truncated
             because the data end there. If it is kept, no flag marks its end.
+        is_init: Whether items have "is_init" and ("next", "is_init") [1], True at the first step of
+            an episode: for slices of consecutive items, of which a
+            :class:`~torchrl_tit.modules.Backbone` then encodes each frame once.
 
     Raises:
         TypeError: If ``num_frames`` is not an integer.
@@ -63,12 +66,9 @@ class HistoryStorage(EpisodeStorage):
         time_limits: TimeLimits = "keep",
         terminal_observations: TerminalObservations = "keep",
         unfinished: Unfinished = "drop",
+        is_init: bool = False,
     ) -> None:
-        if isinstance(num_frames, bool) or not isinstance(num_frames, int):
-            raise TypeError(f"num_frames must be an integer, but is {num_frames!r}.")
-        if num_frames < 1:
-            raise ValueError(f"num_frames must be at least 1, but is {num_frames}.")
-        _check_choice("padding", padding, get_args(Padding))
+        check_windows(num_frames, padding)
         _check_choice("time_limits", time_limits, get_args(TimeLimits))
         zero_or_keep = get_args(TerminalObservations)
         _check_choice("terminal_observations", terminal_observations, zero_or_keep)
@@ -81,49 +81,88 @@ class HistoryStorage(EpisodeStorage):
             counts = counts * episodes.finished
         super().__init__(episodes, counts)
         self._num_frames = num_frames
-        self._constant = padding == "constant" and num_frames > 1
+        # Of one frame nothing is ever missing.
+        self._padding: Padding = padding if num_frames > 1 else "same"
         self._zero_terminals = terminal_observations == "zero"
-        # One window contains both histories: K steps up to this one, and the next one.
-        self._steps = torch.arange(1 - num_frames, 2, device=self.device)
+        self._is_init = is_init
 
     def _cut(self, row: Tensor, episode: Tensor) -> TensorDict:
-        terminated, truncated = self._take("terminated", row), self._take("truncated", row)
-        rows = row.unsqueeze(-1) + self._steps  # [..., K + 1]
-        first = self._first_rows[episode].unsqueeze(-1)
-        window = self._take("observation", rows.maximum(first))  # [..., K + 1, *obs]
-        time, ndim = row.ndim, window.ndim - rows.ndim
-        if self._constant:
-            window.masked_fill_(_expand(rows < first, ndim), 0)
+        first = self._first_rows[episode]
+        windows = find_windows(row, first, self._num_frames, self._padding)
+        following = self._take("observation", row + 1)
         action = self._take("action", row)
         if not action.is_floating_point():
             action = action.long()  # losses use it as an index
+        terminated, truncated = self._take("terminated", row), self._take("truncated", row)
         if self._zero_terminals:
-            window.select(time, -1).masked_fill_(_expand(terminated, ndim - 1), 0)
-        return TensorDict(
-            {
-                "observation": window.select(time, self._num_frames - 1),
-                # A copy, so that writing into one history does not change the other.
-                "history": window.narrow(time, 0, self._num_frames).clone(),
-                "action": action,
-                "next": TensorDict(
-                    {
-                        "observation": window.select(time, self._num_frames),
-                        "history": window.narrow(time, 1, self._num_frames).clone(),
-                        "reward": self._take("reward", row),
-                        "terminated": terminated,
-                        "truncated": truncated,
-                        "done": terminated | truncated,
-                    },
-                    row.shape,
-                ),
-            },
-            row.shape,
-        )
+            mask = terminated.view(*row.shape, *[1] * (following.ndim - row.ndim))
+            following.masked_fill_(mask, 0)
+        outcome = {
+            "reward": self._take("reward", row),
+            "terminated": terminated,
+            "truncated": truncated,
+            "done": terminated | truncated,
+        }
+        history = windows.gather(self._fields["observation"])
+        item = make_item(history, following, action, outcome, row.ndim)
+        return mark_starts(item, row == first) if self._is_init else item
 
 
-def _expand(mask: Tensor, ndim: int) -> Tensor:
-    """Appends ``ndim`` dimensions to a mask; [...] -> [..., 1, 1]."""
-    return mask.view(*mask.shape, *[1] * ndim)
+def make_item(
+    history: Tensor, following: Tensor, action: Tensor, outcome: dict[str, Tensor], ndim: int
+) -> TensorDict:
+    """Makes items of transitions, no entry of which is a view of another.
+
+    Args:
+        history: [..., K, *obs].
+        following: The next observation, [..., *obs].
+        action: [..., *action].
+        outcome: Reward and flags, [..., 1] each.
+        ndim: Number of the dimensions before these.
+    """
+    shape = history.shape[:ndim]
+    moved = torch.cat(
+        [history.narrow(ndim, 1, history.shape[ndim] - 1), following.unsqueeze(ndim)], ndim
+    )
+    return TensorDict(
+        {
+            "observation": history.select(ndim, -1).clone(),
+            "history": history,
+            "action": action,
+            "next": TensorDict({"observation": following, "history": moved, **outcome}, shape),
+        },
+        shape,
+    )
+
+
+def mark_starts(item: TensorDict, starts: Tensor) -> TensorDict:
+    """Adds "is_init" to items, and to the next steps, whose histories are no continuation either.
+
+    Args:
+        item: items [...].
+        starts: where an episode begins, bool [...].
+    """
+    for group in (item, item["next"]):
+        group["is_init"] = starts.unsqueeze(-1)
+    return item
+
+
+def check_windows(num_frames: int, padding: str) -> None:
+    """Checks the settings of windows.
+
+    Args:
+        num_frames: Number of frames of a window.
+        padding: What takes the place of missing ones.
+
+    Raises:
+        TypeError: If the number is not an integer.
+        ValueError: If it is less than 1, or the padding is unknown.
+    """
+    if isinstance(num_frames, bool) or not isinstance(num_frames, int):
+        raise TypeError(f"num_frames must be an integer, but is {num_frames!r}.")
+    if num_frames < 1:
+        raise ValueError(f"num_frames must be at least 1, but is {num_frames}.")
+    _check_choice("padding", padding, get_args(Padding))
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

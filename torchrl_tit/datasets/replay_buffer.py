@@ -9,11 +9,17 @@ from tensordict import TensorDict
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
+from torchrl_tit.datasets.consecutive import ConsecutiveSampler
 from torchrl_tit.datasets.storage import EpisodeStorage
 
 
 def make_replay_buffer(
-    storage: EpisodeStorage, batch_size: int, *, seed: int = 0, **settings: Any
+    storage: EpisodeStorage,
+    batch_size: int,
+    *,
+    seed: int = 0,
+    slice_length: int = 1,
+    **settings: Any,
 ) -> ReplayBuffer:
     """Makes a replay buffer that draws items uniformly, with replacement.
 
@@ -26,6 +32,8 @@ def make_replay_buffer(
             (:class:`~torchrl_tit.datasets.SequenceStorage`).
         batch_size: Items in a batch.
         seed: Seed of the generator.
+        slice_length: If it is more than 1, a batch is [batch_size / slice_length, slice_length]:
+            slices of consecutive items (see :class:`~torchrl_tit.datasets.ConsecutiveSampler`).
         **settings: Passed to `torchrl.data.ReplayBuffer`: ``transform``, ``prefetch``, another
             ``sampler``.
 
@@ -33,7 +41,7 @@ def make_replay_buffer(
         The buffer; ``buffer.sample()`` gives a tensordict [batch_size].
 
     Raises:
-        ValueError: If ``batch_size`` is less than 1.
+        ValueError: If ``batch_size`` or ``slice_length`` is less than 1.
 
     Example:
         >>> import numpy as np
@@ -49,12 +57,26 @@ def make_replay_buffer(
     return ReplayBuffer(
         storage=storage,
         writer=ImmutableDatasetWriter(),
-        collate_fn=_identity,
+        collate_fn=keep_batch,
         batch_size=batch_size,
         generator=torch.Generator(storage.device).manual_seed(seed),
-        **{"sampler": RandomSampler(), **settings},
+        **{"sampler": make_sampler(slice_length), **settings},
     )
 
 
-def _identity(batch: TensorDict) -> TensorDict:
+def make_sampler(slice_length: int) -> RandomSampler:
+    """Makes a sampler of single items, or of slices if ``slice_length`` is not 1.
+
+    Args:
+        slice_length: Number of items of a slice.
+    """
+    return RandomSampler() if slice_length == 1 else ConsecutiveSampler(slice_length)
+
+
+def keep_batch(batch: TensorDict) -> TensorDict:
+    """Returns what a storage has gathered: the ``collate_fn`` of its buffer.
+
+    Args:
+        batch: The items.
+    """
     return batch

@@ -19,6 +19,7 @@ class EpisodeStorage(Storage):
     """A read-only storage with one item for each step of episodes.
 
     Any TorchRL sampler can draw the indices; uniform sampling of indices is uniform over steps.
+    Consecutive indices are consecutive steps, the last of an episode followed by the next episode.
 
     Args:
         episodes: The data, on the device where items are gathered.
@@ -54,7 +55,7 @@ class EpisodeStorage(Storage):
         Raises:
             IndexError: If there is no such item (on a CPU; elsewhere that is not checked).
         """
-        index = self._as_tensor(index)
+        index = as_indices(index, len(self), self.device)
         episode = torch.searchsorted(self._ends, index, right=True)
         return self._cut(index + self._shifts[episode], episode)
 
@@ -63,20 +64,8 @@ class EpisodeStorage(Storage):
         """Gathers the items of these rows and episodes, int64 [...] each."""
 
     def _take(self, name: str, rows: Tensor) -> Tensor:
-        """Rows of a field; index_select is several times as fast as indexing."""
-        field = self._fields[name]
-        return field.index_select(0, rows.flatten()).view(*rows.shape, *field.shape[1:])
-
-    def _as_tensor(self, index: Any) -> Tensor:
-        if isinstance(index, slice):
-            return torch.arange(*index.indices(len(self)), device=self.device)
-        index = torch.as_tensor(index, device=self.device)
-        if index.device.type != "cpu":  # reading the values would synchronize
-            return torch.where(index < 0, index + len(self), index)
-        low, high = (int(index.min()), int(index.max())) if index.numel() else (0, 0)
-        if low < -len(self) or high >= len(self):
-            raise IndexError(f"There are {len(self)} items, and none at {low} or {high}.")
-        return torch.where(index < 0, index + len(self), index) if low < 0 else index
+        """Rows of a field."""
+        return take(self._fields[name], rows)
 
     def __len__(self) -> int:
         return self.max_size
@@ -106,3 +95,44 @@ class EpisodeStorage(Storage):
                 f"The state was saved with {state_dict['num_items']} items, but there are "
                 f"{len(self)}; load the same data with the same settings."
             )
+
+
+def as_indices(index: Any, count: int, device: torch.device) -> Tensor:
+    """Converts the index of items to int64 indices from 0 on.
+
+    Args:
+        index: an integer, slice, sequence or tensor; negative ones count from the end.
+        count: number of items.
+        device: where they are.
+
+    Raises:
+        IndexError: If there is no such item (on a CPU; elsewhere that is not checked).
+
+    Example:
+        >>> as_indices([0, -1], 5, torch.device("cpu"))
+        tensor([0, 4])
+    """
+    if isinstance(index, slice):
+        return torch.arange(*index.indices(count), device=device)
+    index = torch.as_tensor(index, device=device)
+    if index.device.type != "cpu":  # reading the values would synchronize
+        return torch.where(index < 0, index + count, index)
+    if not index.numel():
+        return index
+    low, high = map(int, index.aminmax())
+    if low < -count or high >= count:
+        raise IndexError(f"There are {count} items, and none at {low} or {high}.")
+    return torch.where(index < 0, index + count, index) if low < 0 else index
+
+
+def take(table: Tensor, rows: Tensor) -> Tensor:
+    """Gathers rows; ``index_select`` is several times as fast as indexing.
+
+    Args:
+        table: [R, *entry].
+        rows: int64 [...].
+
+    Returns:
+        [..., *entry].
+    """
+    return table.index_select(0, rows.flatten()).view((*rows.shape, *table.shape[1:]))

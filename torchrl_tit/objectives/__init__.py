@@ -5,6 +5,7 @@ from torchrl_tit.objectives.cql import ContinuousCQLLoss
 from torchrl_tit.objectives.cql_terms import PolicySamples
 from torchrl_tit.objectives.decision_transformer import MaskedDTLoss
 from torchrl_tit.objectives.discrete_cql import DelayedDiscreteCQLLoss
+from torchrl_tit.objectives.pairs import encode_pairs
 
 __all__ = [
     "ContinuousCQLLoss",
@@ -12,4 +13,5 @@ __all__ = [
     "MaskedDTLoss",
     "PolicySamples",
     "contrastive_prediction_loss",
+    "encode_pairs",
 ]

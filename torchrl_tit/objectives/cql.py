@@ -10,11 +10,13 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Bounded
+from torchrl.modules import set_recurrent_mode
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import CQLLoss, distance_loss
 
 from torchrl_tit.modules.many_actions import ManyActions
 from torchrl_tit.objectives.cql_terms import CriticBatch, PolicySamples
+from torchrl_tit.objectives.pairs import encode_pairs, get_dist
 
 OverCritics = Literal["mean", "sum"]
 
@@ -39,6 +41,11 @@ class ContinuousCQLLoss(CQLLoss):
     requires that critics read the same entries as the actor, and runs the actor on m copies of each
     state. Here the actor runs once a state, its distribution is sampled m times, and the modules of
     a critic that do not read the action run once a state.
+
+    A batch is single transitions [B], or slices [N, T] of consecutive ones with "is_init", as
+    :class:`~torchrl_tit.datasets.HistoryStorage` makes them: the loss is the same mean over
+    transitions, and backbones encode each frame of a slice once. The actor encodes the frames that
+    s and s' share once in any case, see :func:`~torchrl_tit.objectives.encode_pairs`.
 
     The terms are meant to be optimized one after the other, in this order, on the samples of one
     pass: :meth:`alpha_loss`, :meth:`critic_losses`, :meth:`actor_loss`. Each then sees the weights
@@ -133,7 +140,7 @@ class ContinuousCQLLoss(CQLLoss):
         self.register_buffer("_high", action_spec.space.high.clone())
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes all terms of a batch [B], which is not changed.
+        """Computes all terms of a batch [*B], which is not changed.
 
         Returns:
             "loss_actor", "loss_qvalue", "loss_cql" (weighted), "loss_alpha", "alpha" (the
@@ -155,20 +162,26 @@ class ContinuousCQLLoss(CQLLoss):
     def sample_policy(self, tensordict: TensorDictBase) -> PolicySamples:
         """Runs the actor once at s and once at s', and samples what the terms need.
 
+        Frames that s and s' share are encoded once (:func:`~torchrl_tit.objectives.encode_pairs`).
+
         Args:
-            tensordict: a batch [B].
+            tensordict: a batch [*B].
         """
         network = self.actor_network
-        with self.actor_network_params.to_module(network, preserve_module_state=False):
-            dist = network.get_dist(tensordict.select(*network.in_keys))
+        with (
+            self.actor_network_params.to_module(network, preserve_module_state=False),
+            set_recurrent_mode(True),
+        ):
+            here, there = encode_pairs(network, tensordict)
+            dist = get_dist(network, here)
             with torch.no_grad():
-                next_dist = network.get_dist(tensordict["next"].select(*network.in_keys))
+                next_dist = get_dist(network, there)
         action, log_prob = rsample_and_log_prob(dist)
         with torch.no_grad():
             shape = torch.Size([self.num_random])
             drawn = [rsample_and_log_prob(d, shape) for d in (dist, next_dist)]
-            actions = torch.cat([a for a, _ in drawn]).movedim(0, -2)  # [B, 2m, A]
-            log_probs = torch.cat([p for _, p in drawn]).movedim(0, -1)  # [B, 2m]
+            actions = torch.cat([a for a, _ in drawn]).movedim(0, -2)  # [*B, 2m, A]
+            log_probs = torch.cat([p for _, p in drawn]).movedim(0, -1)  # [*B, 2m]
             next_action = next_dist.deterministic_sample
         return PolicySamples(action, log_prob, actions, log_probs, next_action)
 
@@ -183,12 +196,13 @@ class ContinuousCQLLoss(CQLLoss):
         """The critics' squared error and weighted conservative term, float [] each.
 
         Args:
-            tensordict: a batch [B].
+            tensordict: a batch [*B].
             samples: from :meth:`sample_policy`; sampled here if not given.
         """
         batch = self._critic_batch(tensordict, samples or self.sample_policy(tensordict))
-        values = self._values(batch.inputs, self.qvalue_network_params)
-        return self._losses(values, batch, len(batch.target))
+        with set_recurrent_mode(True):
+            values = self._values(batch.inputs, self.qvalue_network_params)
+        return self._losses(values, batch, batch.target.numel())
 
     def critic_gradients(
         self, tensordict: TensorDictBase, samples: PolicySamples, chunk_size: int
@@ -200,9 +214,10 @@ class ContinuousCQLLoss(CQLLoss):
         activations of the forward pass still in the cache.
 
         Args:
-            tensordict: a batch [B].
+            tensordict: a batch [*B].
             samples: of :meth:`sample_policy`.
-            chunk_size: states at a time, each with its 3m + 1 actions.
+            chunk_size: states at a time, each with its 3m + 1 actions; whole slices of them if the
+                batch is [N, T].
 
         Returns:
             The values of :meth:`critic_losses`, detached.
@@ -210,11 +225,14 @@ class ContinuousCQLLoss(CQLLoss):
         batch = self._critic_batch(tensordict, samples)
         losses = []
         for critic in self._critics():
-            with critic.to_module(self.qvalue_network, preserve_module_state=False):
+            with (
+                critic.to_module(self.qvalue_network, preserve_module_state=False),
+                set_recurrent_mode(True),
+            ):
                 for chunk in batch.split(chunk_size):
                     outputs = self.qvalue_network(chunk.inputs.copy())
                     values = outputs.get(self.tensor_keys.state_action_value).squeeze(-1)
-                    loss_qvalue, loss_cql = self._losses(values, chunk, len(batch.target))
+                    loss_qvalue, loss_cql = self._losses(values, chunk, batch.target.numel())
                     (loss_qvalue + loss_cql).backward()
                     losses.append(torch.stack([loss_qvalue, loss_cql]).detach())
         loss_qvalue, loss_cql = torch.stack(losses).sum(dim=0).unbind()
@@ -238,37 +256,37 @@ class ContinuousCQLLoss(CQLLoss):
         """The actor's loss, float []; the critics get no gradient.
 
         Args:
-            tensordict: a batch [B].
+            tensordict: a batch [*B].
             samples: from :meth:`sample_policy`; sampled here if not given.
         """
         samples = samples or self.sample_policy(tensordict)
-        inputs = self._inputs(tensordict, samples.action.unsqueeze(1))
-        values = self._values(inputs, self.qvalue_network_params.detach())  # [critics, B, 1]
-        value = values.squeeze(-1).amin(0)  # [B]
+        inputs = self._inputs(tensordict, samples.action.unsqueeze(-2))
+        values = self._values(inputs, self.qvalue_network_params.detach())  # [critics, *B, 1]
+        value = values.squeeze(-1).amin(0)  # [*B]
         alpha = self.log_alpha.detach().exp()
         return (alpha * samples.log_prob - value).mean(), {}
 
     def _critic_batch(self, tensordict: TensorDictBase, samples: PolicySamples) -> CriticBatch:
         """Adds uniform samples to those of the policy, and computes the target."""
         action = tensordict.get(self.tensor_keys.action)
-        num_states, size = action.shape
+        *states, size = action.shape
         width = self._high - self._low
         uniform = self._low + width * torch.rand(
-            num_states, self.num_random, size, dtype=action.dtype, device=action.device
+            *states, self.num_random, size, dtype=action.dtype, device=action.device
         )
-        log_uniform = -width.log().sum().expand(num_states, self.num_random)
-        actions = torch.cat([uniform, samples.actions, action.unsqueeze(1)], dim=1)
+        log_uniform = -width.log().sum().expand(*states, self.num_random)
+        actions = torch.cat([uniform, samples.actions, action.unsqueeze(-2)], dim=-2)
         return CriticBatch(
             inputs=self._inputs(tensordict, actions),
-            log_density=torch.cat([log_uniform, samples.log_probs], dim=1),
+            log_density=torch.cat([log_uniform, samples.log_probs], dim=-1),
             target=self._target(tensordict, samples.next_action),
         )
 
     def _target(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
-        """Target of the critics, without gradient; float [B]."""
-        with torch.no_grad():
-            inputs = self._inputs(tensordict["next"], next_action.unsqueeze(1))
-            values = self._values(inputs, self.target_qvalue_network_params)  # [critics, B, 1]
+        """Target of the critics, without gradient; float [*B]."""
+        with torch.no_grad(), set_recurrent_mode(True):
+            inputs = self._inputs(tensordict["next"], next_action.unsqueeze(-2))
+            values = self._values(inputs, self.target_qvalue_network_params)  # [critics, *B, 1]
             outcome = tensordict["next"].select(
                 self.tensor_keys.reward, self.tensor_keys.terminated, self.tensor_keys.done
             )
@@ -277,24 +295,24 @@ class ContinuousCQLLoss(CQLLoss):
             return self.value_estimator.value_estimate(batch).squeeze(-1)
 
     def _inputs(self, tensordict: TensorDictBase, actions: Tensor) -> TensorDictBase:
-        """The critics' inputs: each state, with m actions, [B, m, A]."""
+        """The critics' inputs: each state, with m actions, [*B, m, A]."""
         keys = [key for key in self.qvalue_network.in_keys if key != self.tensor_keys.action]
-        return tensordict.select(*keys).set(self.tensor_keys.action, actions)
+        return tensordict.select(*keys, strict=False).set(self.tensor_keys.action, actions)
 
     def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """Values of m actions in each state by all critics; [critics, B, m]."""
+        """Values of m actions in each state by all critics; [critics, *B, m]."""
         outputs = self._vmap_qvalue_networkN0(inputs, params)
         return outputs.get(self.tensor_keys.state_action_value).squeeze(-1)
 
     def _losses(self, values: Tensor, batch: CriticBatch, num_states: int) -> tuple[Tensor, Tensor]:
-        """The two losses over b of the B states of a batch, for one critic or all of them.
+        """The two losses over some states of a batch, for one critic or all of them.
 
         Args:
-            values: of the actions, float [b, 3m + 1] or [critics, b, 3m + 1].
-            batch: the b states.
-            num_states: B.
+            values: of the actions, float [*b, 3m + 1] or [critics, *b, 3m + 1].
+            batch: these states, [*b].
+            num_states: number of states of the whole batch.
         """
-        value = values[..., -1]  # of the action taken; [b] or [critics, b]
+        value = values[..., -1]  # of the action taken; [*b] or [critics, *b]
         errors = distance_loss(value, batch.target.expand_as(value), self.loss_function)
         soft_maximum = torch.logsumexp(values[..., :-1] - batch.log_density, dim=-1)
         gap = (soft_maximum - value).sum() / num_states

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -12,34 +13,35 @@ from torch import Tensor
 class PolicySamples(NamedTuple):
     """What all terms of the loss share: one pass of the actor over a batch, at s and at s'.
 
-    B states, m samples of each distribution, A entries of an action.
+    States [*B], m samples of each distribution, A entries of an action.
     """
 
     action: Tensor
-    """Sampled at s, differentiable; float [B, A]."""
+    """Sampled at s, differentiable; float [*B, A]."""
     log_prob: Tensor
-    """Its log density, differentiable; float [B]."""
+    """Its log density, differentiable; float [*B]."""
     actions: Tensor
-    """m samples at s, then m at s', detached; float [B, 2m, A]."""
+    """m samples at s, then m at s', detached; float [*B, 2m, A]."""
     log_probs: Tensor
-    """Their log densities; float [B, 2m]."""
+    """Their log densities; float [*B, 2m]."""
     next_action: Tensor
-    """The deterministic action at s' (the squashed mean), detached; float [B, A]."""
+    """The deterministic action at s' (the squashed mean), detached; float [*B, A]."""
 
 
 @dataclass(frozen=True)
 class CriticBatch:
-    """What the critics evaluate: in each of B states 3m sampled actions, and the action taken."""
+    """What the critics evaluate: in states [*B] 3m sampled actions each, and the action taken."""
 
     inputs: TensorDictBase
-    """What the critics read; the actions are float [B, 3m + 1, A], the action taken last."""
+    """What the critics read; the actions are float [*B, 3m + 1, A], the action taken last."""
     log_density: Tensor
-    """Log densities of the sampled actions; float [B, 3m]."""
+    """Log densities of the sampled actions; float [*B, 3m]."""
     target: Tensor
-    """Target of the value of the action taken; float [B]."""
+    """Target of the value of the action taken; float [*B]."""
 
     def split(self, size: int) -> list[CriticBatch]:
-        """Splits the batch into chunks of ``size`` states."""
+        """Splits the batch into chunks of ``size`` states, or fewer: whole slices, at least one."""
+        size = max(1, size // math.prod(self.target.shape[1:]))
         fields = (self.inputs, self.log_density, self.target)
         chunks = zip(*(field.split(size) for field in fields), strict=True)
         return [CriticBatch(*chunk) for chunk in chunks]

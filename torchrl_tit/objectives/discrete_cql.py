@@ -23,6 +23,10 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
     estimator as ``params``, which the estimator ignores, so its target is computed with Q. In
     addition to what `DiscreteCQLLoss` writes into the batch, this loss writes the value at s'.
 
+    A batch is single transitions [B], or slices [N, T] of consecutive ones with "is_init", of which
+    a backbone encodes each frame once. In single ones s and s' share no work: they are evaluated
+    with different weights.
+
     Args:
         value_network: writes "action_value", float [..., n], and "chosen_action_value", float
             [..., 1].
@@ -61,8 +65,8 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         self.value_estimator.value_network = None  # which would use the trained weights
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """The squared error of a batch [B], float [], and mean values to log."""
-        next_state = tensordict["next"].select(*self.value_network.in_keys)
+        """The squared error of a batch [*B], float [], and mean values to log."""
+        next_state = tensordict["next"].select(*self.value_network.in_keys, strict=False)
         params = self._cached_detached_target_value_params
         with (
             torch.no_grad(),

@@ -58,8 +58,10 @@ def assert_trains(recipe, folder, terms):
         {"backbone": tit(4)},
         {"backbone": tit(4), "critic": "backbone", "over_critics": "sum"},
         {"backbone": lstm(4, embed_dim=8, hidden_dim=8), "critic": "backbone"},
+        {"backbone": tit(4), "critic": "backbone", "slice_length": 4},
+        {"backbone": mlp(4, hidden_dim=16), "slice_length": 4},
     ],
-    ids=["mlp", "tit", "tit-4", "backbone", "lstm-4"],
+    ids=["mlp", "tit", "tit-4", "backbone", "lstm-4", "slices", "mlp-slices"],
 )
 def test_continuous_actions(tmp_path, settings):
     recipe = make_cql(tmp_path, **settings)
@@ -79,9 +81,9 @@ def test_continuous_actions(tmp_path, settings):
     assert not torch.equal(online, target)
 
 
-@pytest.mark.parametrize("num_frames", [1, 3])
-def test_discrete_actions(tmp_path, num_frames):
-    recipe = make_discrete_cql(tmp_path, backbone=tit(num_frames))
+@pytest.mark.parametrize(("num_frames", "slice_length"), [(1, 1), (3, 1), (3, 4)])
+def test_discrete_actions(tmp_path, num_frames, slice_length):
+    recipe = make_discrete_cql(tmp_path, backbone=tit(num_frames), slice_length=slice_length)
     _, weights = assert_trains(recipe, tmp_path, DISCRETE_TERMS)
     online, target = (
         next(w for n, w in weights.items() if n.startswith(f"{name}_params"))

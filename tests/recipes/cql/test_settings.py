@@ -215,6 +215,9 @@ def test_files_that_do_not_mark_time_limits(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"slice_length": 0}, "slice_length must be at least 1, not 0"),
+        ({"slice_length": 2, "compile": "on"}, "compile is on, but slices of 2 are not compiled"),
+        ({"slice_length": 3}, "slice_length 3 does not divide batch_size 8: change one of them"),
         ({"padding": "zeros"}, r"field 'padding' is 'zeros', not one of \('same', 'constant'\)"),
         ({"gaps": "keep"}, r"field 'gaps' is 'keep', not one of \('error', 'cut'\)"),
         ({"time_limits": "cut"}, r"field 'time_limits' is 'cut'"),

@@ -215,20 +215,27 @@ def test_the_order_is_temperature_critic_actor_target(step, order):
     assert same or difference(ours, after) > 1e-6
 
 
+TIT = enhanced_tit(4, embed_dim=8, features_dim=8, share_blocks=True)
+
+
 @pytest.mark.parametrize(
-    ("backbone", "critic"),
+    ("backbone", "critic", "slice_length"),
     [
-        (mlp(hidden_dim=12, num_layers=1, activation="relu"), "mlp"),
-        (enhanced_tit(4, embed_dim=8, features_dim=8, share_blocks=True), "backbone"),
+        (mlp(hidden_dim=12, num_layers=1, activation="relu"), "mlp", 1),
+        (TIT, "backbone", 1),
+        (TIT, "backbone", 4),
     ],
-    ids=["mlp", "backbone"],
+    ids=["mlp", "backbone", "slices"],
 )
-def test_a_whole_batch_through_vmap_is_the_same_as_chunks(tmp_path, backbone: Network, critic: str):
+def test_a_whole_batch_through_vmap_is_the_same_as_chunks(
+    tmp_path, backbone: Network, critic: str, slice_length: int
+):
     """A GPU runs both critics on all states at once, a CPU one after the other on some states."""
     recipe = make_cql(
         tmp_path,
         backbone=backbone,
         critic=critic,
+        slice_length=slice_length,
         action_samples=SAMPLES,
         over_critics="sum",
         tau=TAU,

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import MLP, TanhNormal
 
@@ -18,8 +18,10 @@ from recipes.registry import RECIPES
 from recipes.run import Run
 from recipes.runner import evaluate, train
 from recipes.sac import SAC
+from recipes.sac import algorithm as sac
 from recipes.sac.algorithm import SACAlgorithm
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
+from torchrl_tit.modules import Backbone
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
 SMALL = SAC(
@@ -39,6 +41,8 @@ SMALL = SAC(
 TIT = enhanced_tit(
     num_frames=2, patch_size=1, embed_dim=8, num_blocks=1, features_dim=8, ffn_dropout_inner=0.1
 )
+
+NO_DROPOUT = enhanced_tit(num_frames=4, embed_dim=8, num_blocks=2, features_dim=8)
 
 
 class Batches(Callback):
@@ -117,11 +121,12 @@ def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
         train(SMALL, run, [Batches(last=30)])
         algorithm = make(SMALL)
         algorithm.prepare(0, run.folder)
-        for number in (45, 60):  # of a process that was killed before its checkpoint
-            wrong = TensorDict({"history": torch.full((number, 1, 3), torch.nan)}, [number])
-            algorithm.buffer_state.buffer.empty()
-            algorithm.buffer.extend(wrong)
+        for number in (15, 45):  # of a process that was killed before its checkpoint
+            steps = {"action": torch.zeros(number, 1), **observed(number, torch.nan)}
+            steps["next"] = {**observed(number, torch.nan), **outcome(number)}
+            algorithm.buffer.extend(TensorDict(steps, [number]))
             algorithm.buffer_state.state_dict()
+        assert checkpoint_steps(run.folder / "replay") == [15, 30, 60]
         algorithm.close()
         train(SMALL, run)
         assert trained(run.folder)[1]["buffer"] == {"parts": [30, 60]}
@@ -131,6 +136,7 @@ def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
         algorithm.close()
     stored = algorithm.buffer[:]
     assert len(stored) == 60
+    assert stored["observation"].isfinite().all()
     # The transitions of one environment, in order.
     going_on = ~stored["next", "done"][:-1, 0]
     histories, following = stored["history"][1:], stored["next", "history"][:-1]
@@ -154,24 +160,103 @@ def test_random_steps_are_uniform_and_learn_nothing(tmp_path: Path) -> None:
     assert read_metrics(run.folder / "metrics.csv")[-1]["alpha"] < 1
 
 
+def observed(size: int, value: float) -> dict[str, Any]:
+    """Observations of Pendulum's shape."""
+    return {"observation": torch.full((size, 3), value)}
+
+
+def outcome(size: int) -> dict[str, Any]:
+    """Rewards, and flags that are all False."""
+    flag = torch.zeros(size, 1, dtype=torch.bool)
+    reward = torch.randn(size, 1, dtype=torch.float64)
+    return {"reward": reward, "terminated": flag, "done": flag.clone()}
+
+
 def double(recipe: SAC, folder: Path) -> tuple[SACAlgorithm, TensorDict]:
     """An algorithm in float64, ready for gradient steps, and transitions of Pendulum's shapes."""
+    torch.manual_seed(0)
     algorithm = make(recipe)
     algorithm.prepare(0, folder)
     algorithm.loss.double()
     frames, size = recipe.backbone.num_frames, 16
-    histories = torch.randn(2, size, frames, 3, dtype=torch.float64)
-    flag = torch.zeros(size, 1, dtype=torch.bool)
-    outcome = {
-        "history": histories[1],
-        "reward": torch.randn(size, 1, dtype=torch.float64),
-        "terminated": flag,
-        "done": flag.clone(),
-    }
-    actions = torch.rand(size, 1, dtype=torch.float64)
-    return algorithm, TensorDict(
-        {"history": histories[0], "action": actions, "next": outcome}, [size]
+    seen = torch.randn(size, frames + 1, 3, dtype=torch.float64)
+    here, there = (
+        {"history": history, "observation": history[:, -1]}
+        for history in (seen[:, :-1], seen[:, 1:])
     )
+    actions = torch.rand(size, 1, dtype=torch.float64)
+    batch = {**here, "action": actions, "next": {**there, **outcome(size)}}
+    return algorithm, TensorDict(batch, [size])
+
+
+def step_of(algorithm: SACAlgorithm, batch: TensorDictBase) -> list[Tensor]:
+    """The terms and the gradients of a gradient step."""
+    torch.manual_seed(1)
+    terms = algorithm._step(batch.copy())
+    return [terms, *(w.grad for w in algorithm.loss.parameters() if w.grad is not None)]
+
+
+@pytest.mark.parametrize("critic", ["mlp", "backbone"])
+def test_frames_are_shared_without_changing_the_gradient(
+    critic: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Against passes of their own for s and s'."""
+    frames: list[int] = []
+    results = []
+    for shared in (False, True):
+        algorithm, batch = double(replace(SMALL, backbone=NO_DROPOUT, critic=critic), tmp_path)
+        module = next(m for m in algorithm.policy.modules() if isinstance(m, Backbone))
+        module.module.frames[0].register_forward_pre_hook(
+            lambda _, inputs: frames.append(inputs[0].numel() // 3)
+        )
+        with monkeypatch.context() as patch:
+            if not shared:
+                patch.setattr(sac, "encode_pairs", lambda _, td: (td.empty(), td.empty()))
+            results.append(step_of(algorithm, batch))
+        algorithm.close()
+    torch.testing.assert_close(results[1], results[0], rtol=1e-9, atol=1e-9)
+    assert sorted(frames) == [16, 64, 64, 64]  # without sharing, and s and the rest of s'
+
+
+@pytest.mark.parametrize("critic", ["mlp", "backbone"])
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_slices_have_the_gradient_of_their_transitions(
+    critic: Any, num_envs: int, tmp_path: Path
+) -> None:
+    results = []
+    for length in (1, 4):
+        recipe = replace(
+            SMALL,
+            backbone=NO_DROPOUT,
+            critic=critic,
+            num_envs=num_envs,
+            slice_length=length,
+            total_steps=80,
+        )
+        algorithm, _ = double(recipe, tmp_path)
+        generator = torch.Generator().manual_seed(2)
+        seen = torch.randn(41 * num_envs, 3, generator=generator)
+        done = torch.arange(40 * num_envs).unsqueeze(1) // num_envs % 7 == 5
+        action = torch.rand(40 * num_envs, 1, generator=generator)
+        after = {"observation": seen[num_envs:], **outcome(40 * num_envs), "done": done}
+        after["reward"] = torch.randn(40 * num_envs, 1, generator=generator)
+        steps = {"observation": seen[:-num_envs], "action": action, "next": after}
+        algorithm.buffer.extend(TensorDict(steps, [40 * num_envs]))
+        first = torch.tensor([[2], [9], [17], [20]])
+        index = first + torch.arange(4) * num_envs
+        batch = algorithm.buffer.storage[index if length > 1 else index.flatten()]
+        assert length == 1 or batch["is_init"][:, 1:].any()
+        batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
+        results.append(step_of(algorithm, batch))
+        algorithm.close()
+    torch.testing.assert_close(results[1], results[0], rtol=1e-9, atol=1e-9)
+
+
+def test_a_run_that_draws_slices(tmp_path: Path) -> None:
+    recipe = replace(SMALL, backbone=TIT, critic="backbone", slice_length=4, num_envs=2)
+    with Run.create(tmp_path / "run", recipe) as run:
+        train(recipe, run)
+    assert trained(run.folder)[0] == 60
 
 
 def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
@@ -180,7 +265,7 @@ def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
     batch["next", "terminated"][:] = True
     batch["next", "done"][:] = True
     critics = algorithm.loss.qvalue_network_params["module", "0", "module"]
-    x = torch.cat([batch["history"][:, -1], batch["action"]], -1)
+    x = torch.cat([batch["observation"], batch["action"]], -1)
     expected = torch.zeros((), dtype=torch.float64)
     for critic in critics.unbind(0):
         hidden = x
@@ -256,6 +341,9 @@ def test_evaluation_plays_the_most_likely_actions(tmp_path: Path) -> None:
     ("fields", "message"),
     [
         ({"random_steps": 25}, "random_steps 25 must be a multiple of steps_per_batch 10"),
+        ({"slice_length": 3}, "slice_length 3 does not divide batch_size 8"),
+        ({"slice_length": 0}, "slice_length must be at least 1"),
+        ({"slice_length": 8, "random_steps": 10, "num_envs": 2}, "slice_length 8 is longer than"),
         ({"num_envs": 3}, "steps_per_batch 10 must be a multiple of num_envs 3"),
         ({"gamma": 1.5}, "gamma must be at most 1"),
         ({"tau": -1.0}, "tau must be at least 0"),

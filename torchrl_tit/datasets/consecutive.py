@@ -1,0 +1,69 @@
+"""A sampler of slices of consecutive steps."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchrl.data import RandomSampler, Storage
+
+
+class ConsecutiveSampler(RandomSampler):
+    """Draws slices of consecutive steps, each of which may contain ends of episodes.
+
+    Slices begin at any step, uniformly and with replacement, so every transition is equally likely
+    to be drawn, ends of episodes included, except the first and last ``slice_length - 1`` steps of
+    all. (TorchRL's `SliceSampler` keeps slices within episodes, which then draws an episode's first
+    and last steps less often, and it reads the whole storage to find them.)
+
+    Args:
+        slice_length: Number of steps of a slice, at least 1.
+
+    Raises:
+        ValueError: If it is less than 1, or, when sampling, does not divide the batch size, or
+            there are fewer steps.
+
+    Example:
+        >>> from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays
+        >>> states, ends = torch.arange(8.0).view(8, 1), torch.arange(8) % 4 == 3
+        >>> storage = HistoryStorage(
+        ...     episodes_from_arrays(states, states, states, ends), num_frames=3, is_init=True
+        ... )
+        >>> index, _ = ConsecutiveSampler(4).sample(storage, 12)
+        >>> index.shape, storage[index]["history"].shape
+        (torch.Size([3, 4]), torch.Size([3, 4, 3, 1]))
+    """
+
+    def __init__(self, slice_length: int) -> None:
+        super().__init__()
+        if slice_length < 1:
+            raise ValueError(f"slice_length must be at least 1, but is {slice_length}.")
+        self.slice_length = slice_length
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
+        """Draws indices, int64 [batch_size / slice_length, slice_length].
+
+        Args:
+            storage: Items whose index grows by ``storage.stride`` (1 if it has none) from one step
+                to the next.
+            batch_size: Number of steps in all.
+        """
+        if batch_size % self.slice_length:
+            raise ValueError(
+                f"A batch of {batch_size} steps cannot be divided into slices of "
+                f"{self.slice_length}; choose a slice_length that divides it."
+            )
+        stride = getattr(storage, "stride", 1)
+        span = (self.slice_length - 1) * stride
+        if len(storage) <= span:
+            raise ValueError(
+                f"There are {len(storage) // stride} consecutive steps, which is less than a slice "
+                f"of {self.slice_length}; choose a shorter slice_length."
+            )
+        device = getattr(storage, "device", None)
+        first = torch.randint(
+            len(storage) - span,
+            (batch_size // self.slice_length, 1),
+            generator=storage._rng,
+            device=device,
+        )
+        return first + torch.arange(0, span + 1, stride, device=device), {}
