@@ -21,6 +21,12 @@ T = TypeVar("T")
 STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
 """How torch.compile is called: which kernels run must not depend on the sizes seen before, or a
 resumed run would differ in the last bit."""
+ONLY_TENSORS: dict[str, Any] = {
+    **STATIC_SHAPES,
+    "options": {"guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe},
+}
+"""The same for functions where only tensors change between calls. Checking everything else that was
+compiled in would take as long as several small layers, at every call."""
 
 # About a minute of compiling is earned back by gradient steps that each save a few milliseconds.
 _PAYS_FROM = 10_000
@@ -56,10 +62,10 @@ def compile_and_time(function: Callable[P, T], name: str) -> Callable[P, T]:
     """Compiles a function, and prints how long its first call took, which does the compiling.
 
     Args:
-        function: what to compile.
+        function: what to compile; between its calls, only tensors change (no mode, no setting).
         name: what it is, for the message.
     """
-    fast = torch.compile(function, **STATIC_SHAPES)
+    fast = torch.compile(function, **ONLY_TENSORS)
     first = True
 
     @wraps(function)

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.collectors import BaseCollector, Collector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.collectors import BaseCollector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
@@ -23,7 +23,7 @@ from torchrl.objectives.value import GAE
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.layers import init_orthogonal_
-from torchrl_tit.modules import Backbone, acting, make_actor, make_value, while_acting
+from torchrl_tit.modules import Backbone, make_actor, make_value
 from torchrl_tit.networks import build_network, masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 
@@ -31,6 +31,8 @@ from ..algorithm import Algorithm, Stateful, check_finite, torch_device
 from ..compilation import STATIC_SHAPES, autocast_type, compile_and_time, should_compile
 from ..outcomes import Outcome
 from ..stateful import CollectorState
+from .flat_parameters import FlatParameters
+from .rollout import FrameCollector, Rollout
 from .settings import PPO
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
@@ -50,7 +52,8 @@ class Agent(nn.Module):
         shape = env.observation_spec["observation"].shape[env.batch_dims :]
         separate = recipe.backbone.trunks == "separate"
         keys = ["policy_features", "value_features"] if separate else ["features"]
-        self.backbone = Backbone(build_network(recipe.backbone, shape), out_keys=keys)
+        network = build_network(recipe.backbone, shape)
+        self.backbone = Backbone(network, out_keys=keys, padding=recipe.padding)
         if recipe.initialization == "orthogonal":
             init_orthogonal_(self.backbone)
         features_dim = self.backbone.features_dim
@@ -58,9 +61,15 @@ class Agent(nn.Module):
         self.critic = make_value(features_dim, in_key=keys[-1])
 
     def encode(self, samples: TensorDictBase) -> TensorDictBase:
-        """Writes the features of steps [N], or of sequences [N, time] if recurrent."""
-        with set_recurrent_mode(self.backbone.is_recurrent):
+        """Writes the features of single steps [N], or of sequences [N, time]."""
+        with set_recurrent_mode(samples.ndim == 2):
             return self.backbone(samples)
+
+    @property
+    def state_keys(self) -> list[str]:
+        """What the network reads besides observations: its state, if it carries one."""
+        states = self.backbone.state_shapes
+        return [*states, "is_init"] if states else []
 
     @property
     def policy(self) -> TensorDictModuleBase:
@@ -113,9 +122,9 @@ class PPOAlgorithm(Algorithm[PPO]):
             functional=False,
         )
         self.gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
-        self.parameters = list(agent.parameters())
+        self.parameters = FlatParameters(list(agent.parameters())).flat
         self.optimizer = torch.optim.Adam(
-            self.parameters, lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
+            [self.parameters], lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
         )
         # The length of sequences depends on where episodes begin, so those are not compiled.
         compiled = not recipe.is_recurrent and should_compile(recipe.compile, recipe.gradient_steps)
@@ -132,8 +141,10 @@ class PPOAlgorithm(Algorithm[PPO]):
         return {"optimizer": self.optimizer, "collector": self.collector_state}
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Yields collected batches, [envs, time]; tokens are kept only while one is collected."""
-        return while_acting(self.agent.policy, self.collector)
+        """Yields collected batches, [envs, time]."""
+        for batch in self.collector:
+            # Of several synchronous collectors: [collectors, envs, time].
+            yield batch.flatten(0, 1) if batch.ndim == 3 else batch
 
     def size(self, batch: TensorDictBase) -> int:
         """The number of environment steps."""
@@ -154,13 +165,17 @@ class PPOAlgorithm(Algorithm[PPO]):
         reward = batch["next", "reward"]
         reward = reward.sign() if recipe.clip_rewards else reward
         batch["next", "reward"] = reward * recipe.reward_scale
+        rollout = Rollout(batch, recipe.backbone.num_frames, recipe.padding)
         with torch.no_grad():
-            add_advantages(batch, agent, self.gae, recipe.bootstrap_time_limit)
+            add_advantages(batch, rollout, agent, self.gae, recipe.bootstrap_time_limit)
         agent.train()
-        terms = []
-        for minibatch in minibatches(batch, agent, recipe):
-            terms.append(self._step(minibatch))
+        steps = []
+        for minibatch in minibatches(batch, rollout, agent, recipe):
+            steps.append(self._step(minibatch))
         agent.eval()
+        terms = torch.stack(steps)  # [gradient steps, terms]
+        first = terms.isfinite().all(1).int().argmin()  # the first step that is not finite, if any
+        check_finite(self.terms, terms[first])
         # A step that was too long shows in the next forward pass only, not in its own losses.
         self._check_agent(minibatch)
         if recipe.collectors > 1:
@@ -171,7 +186,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         return {
             "learning_rate": learning_rate,
             "feature_spread": features.std(0).mean(),
-            **dict(zip(self.terms, torch.stack(terms).mean(0), strict=True)),
+            **dict(zip(self.terms, terms.mean(0), strict=True)),
         }
 
     def play(self, step: int) -> list[Outcome]:
@@ -199,13 +214,12 @@ class PPOAlgorithm(Algorithm[PPO]):
         except RuntimeError:  # TorchRL draws samples where an entropy is not finite
             self._check_agent(minibatch)
             raise
-        self.optimizer.zero_grad()
+        assert self.parameters.grad is not None
+        self.parameters.grad.zero_()  # those of all layers are views of it
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.recipe.max_grad_norm)
         self.optimizer.step()
-        terms = torch.cat([values, norm.unsqueeze(0)])
-        check_finite(self.terms, terms)
-        return terms
+        return torch.cat([values, norm.unsqueeze(0)])
 
     def _objective(self, minibatch: TensorDict) -> tuple[Tensor, Tensor]:
         """The loss, float [], and its terms, float [terms]."""
@@ -214,7 +228,8 @@ class PPOAlgorithm(Algorithm[PPO]):
         total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
         values = [terms[name].detach() for name in TERMS]
         if self.recipe.contrastive_coeff:
-            contrast = self._contrastive_loss(minibatch["history"])
+            history = minibatch["history"].flatten(0, minibatch.ndim - 1)
+            contrast = self._contrastive_loss(history)
             total = total + self.recipe.contrastive_coeff * contrast
             values.append(contrast.detach())
         return total, torch.stack(values)
@@ -244,30 +259,32 @@ class PPOAlgorithm(Algorithm[PPO]):
             "device": self.device,
             "trust_policy": True,  # ours is on the right device already
             "auto_register_policy_transforms": False,
+            "use_buffers": False,  # they would have the histories, which steps lack
         }
         if recipe.collectors == 1:
             mode = recipe.vectorization_mode
             # Which tokens are reused is decided between two parts that are compiled separately.
             whole = compiled and not self.agent.backbone.keeps_frames
-            return Collector(
-                self.make_env(recipe.num_envs, recipe.seed, vectorization_mode=mode),
+            return FrameCollector(
+                self.make_env(
+                    recipe.num_envs, recipe.seed, vectorization_mode=mode, keep_histories=False
+                ),
                 policy,
                 total_frames=recipe.final_step,
                 compile_policy=STATIC_SHAPES if whole else None,
                 track_traj_ids=False,
+                return_same_td=True,  # without buffers, each batch has its own memory
                 **settings,
             )
         kind = MultiAsyncCollector if recipe.async_collection else MultiSyncCollector
-        together = {} if recipe.async_collection else {"cat_results": 0}
         make_share = partial(_make_share, recipe, self.agent.backbone, step)
-        with acting(policy):  # their copies of the policy stay in acting mode
-            return kind(
-                [partial(make_share, index) for index in range(recipe.collectors)],
-                policy,
-                total_frames=recipe.final_step - step,
-                **together,
-                **settings,
-            )
+        return kind(
+            [partial(make_share, index) for index in range(recipe.collectors)],
+            policy,
+            total_frames=recipe.final_step - step,
+            collector_class=FrameCollector,
+            **settings,
+        )
 
 
 def make_task(recipe: PPO, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
@@ -309,12 +326,13 @@ def _make_share(recipe: PPO, backbone: Backbone, step: int, index: int) -> EnvBa
     torch.manual_seed(seeds.generate_state(1).item())
     # At the start, the environments have the same seeds as in one process.
     seed = recipe.seed + index * share if step == 0 else seeds.generate_state(2)[1].item() >> 1
-    task = make_task(recipe, share, seed, vectorization_mode=recipe.vectorization_mode)
+    mode = recipe.vectorization_mode
+    task = make_task(recipe, share, seed, vectorization_mode=mode, keep_histories=False)
     return _with_state(task, backbone)
 
 
 def add_advantages(
-    batch: TensorDictBase, agent: Agent, gae: GAE, bootstrap_time_limit: bool
+    batch: TensorDictBase, rollout: Rollout, agent: Agent, gae: GAE, bootstrap_time_limit: bool
 ) -> None:
     """Writes ``advantage`` and ``value_target`` = advantage + value into a batch.
 
@@ -323,40 +341,82 @@ def add_advantages(
 
     Args:
         batch: [envs, time], with the values of its states.
+        rollout: its observations.
         agent: the agent whose critic is used.
         gae: TorchRL's estimator, which stops at terminations and continues at time limits.
         bootstrap_time_limit: if off, a time limit counts as a termination.
     """
-    value = batch["state_value"]  # [envs, time, 1]
-    ends = batch["next", "done"].squeeze(-1).clone()
-    ends[:, -1] = True
-    next_value = value.roll(-1, dims=1)
-    last = batch["next"][ends].select(*agent.backbone.in_keys)
-    next_value[ends] = agent.critic(agent.backbone(last))["state_value"]
+    ends = rollout.ends
+    next_value = batch["state_value"].roll(-1, dims=1)  # [envs, time, 1]
+    states = batch["next"][ends].select(*agent.state_keys)
+    next_value[ends] = next_values(rollout, states, agent)
     batch["next", "state_value"] = next_value
     if not bootstrap_time_limit:
         batch["next", "terminated"] = batch["next", "done"]
     gae(batch)
 
 
-def minibatches(batch: TensorDictBase, agent: Agent, recipe: PPO) -> Iterator[TensorDict]:
+def next_values(rollout: Rollout, states: TensorDictBase, agent: Agent) -> Tensor:
+    """Evaluates the true next states where episodes or the batch end.
+
+    Args:
+        rollout: the observations.
+        states: the network's state there, if it carries one, [E].
+        agent: the agent whose critic is used.
+
+    Returns:
+        float [E, 1].
+    """
+    backbone, values, start = agent.backbone, [], 0
+    for frames, windows in rollout.next_windows():
+        samples = states[start : start + len(windows.rows)]
+        start += len(samples)
+        if backbone.is_recurrent:
+            backbone(samples.set("history", windows.gather(frames)))
+        else:
+            features = backbone.encode_windows([frames], windows)
+            samples.update(dict(zip(backbone.features_keys, features, strict=True)))
+        values.append(agent.critic(samples)["state_value"])
+    return torch.cat(values)
+
+
+def minibatches(
+    batch: TensorDictBase, rollout: Rollout, agent: Agent, recipe: PPO
+) -> Iterator[TensorDict]:
     """Yields shuffled minibatches of a batch, ``recipe.epochs`` times over.
 
     Args:
         batch: [envs, time].
+        rollout: its observations.
         agent: the agent, for what its backbone reads.
         recipe: the settings.
 
     Yields:
-        Single steps [N]; for recurrent networks sequences of consecutive steps [N, time], each with
-        the state that the network had at its start.
+        Sequences of consecutive steps [N, time], or single steps [N] if the network reads one frame
+        and carries no state.
     """
-    keys = [*agent.backbone.in_keys, "action", "action_log_prob", "advantage", "value_target"]
-    length = recipe.sequence_length if recipe.is_recurrent else 1
+    keys = [*agent.state_keys, "action", "action_log_prob", "advantage", "value_target"]
     steps = batch.select(*keys).reshape(-1)
-    samples = steps.reshape(-1, length) if recipe.is_recurrent else steps
+    numbers = torch.arange(len(steps), device=steps.device)
+    if not recipe.reads_sequences:
+        steps["history"] = rollout.histories(numbers)
+        for _ in range(recipe.epochs):
+            order = torch.randperm(len(steps), device=steps.device)
+            yield from steps[order].split(recipe.minibatch_size)
+        return
+    length = recipe.steps_per_sequence
+    sequences = numbers.view(-1, length)
     for _ in range(recipe.epochs):
-        for index in torch.randperm(len(samples), device=samples.device).split(
-            recipe.minibatch_size // length
-        ):
-            yield samples[index]
+        order = torch.randperm(len(sequences), device=steps.device)
+        for index in order.split(recipe.minibatch_size // length):
+            chosen = sequences[index]
+            minibatch = steps[chosen]
+            if rollout.num_frames > 1:
+                minibatch["observation"] = rollout.observations(chosen)
+                minibatch["is_init"] = rollout.is_init[chosen].unsqueeze(-1)
+            if rollout.num_frames == 1 or recipe.contrastive_coeff:
+                minibatch["history"] = rollout.histories(chosen)
+            else:  # the other windows of a sequence follow from the first one
+                first = rollout.histories(chosen[:, :1])
+                minibatch["history"] = first.expand(-1, length, *first.shape[2:])
+            yield minibatch

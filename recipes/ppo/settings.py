@@ -13,6 +13,9 @@ from ..recipe import Compile, Padding, Precision, Recipe
 
 VectorizationMode = Literal["sync", "async"]
 
+# Longer sequences are faster, but their steps resemble each other more.
+_LONGEST = 16
+
 
 @dataclass(frozen=True, kw_only=True)
 class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm"):
@@ -35,9 +38,11 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
     """Environment steps collected before each update; must be a multiple of num_envs."""
     minibatch_size: int = 64
     """Steps in one gradient step."""
-    sequence_length: int = 16
-    """Length of the sequences on which recurrent networks train; must divide minibatch_size and an
-    environment's steps in a batch. Other networks train on single steps."""
+    sequence_length: int | None = None
+    """Length of the sequences of consecutive steps of which minibatches consist, for networks that
+    read several frames or carry a state; others train on single steps. In a sequence each frame is
+    encoded once for all steps that read it. Must divide minibatch_size and an environment's steps
+    in a batch; by default the largest divisor of both and of 16."""
     epochs: int = 10
     """Passes over each batch."""
     learning_rate: float = 3e-4
@@ -102,7 +107,7 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
             num_envs=1,
             collectors=1,
             total_steps=1,
-            sequence_length=1,
+            **({} if self.sequence_length is None else {"sequence_length": 1}),
             minibatch_size=2,  # an advantage alone has no standard deviation
             epochs=1,
             learning_rate=0,
@@ -127,14 +132,12 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
                 "contrastive_coeff is the weight of a loss that only coberl has: set it to 0 for "
                 "other history encoders"
             )
-        if self.is_recurrent:
+        if self.reads_sequences and self.sequence_length is not None:
             steps = self.steps_per_batch // self.num_envs
             _check_divides(self, "sequence_length", "minibatch_size", self.minibatch_size)
             _check_divides(self, "sequence_length", "steps_per_batch / num_envs", steps)
-            if self.precision == "bfloat16":
-                raise ValueError(
-                    "precision is bfloat16, but a recurrent network computes in float32"
-                )
+        if self.is_recurrent and self.precision == "bfloat16":
+            raise ValueError("precision is bfloat16, but a recurrent network computes in float32")
         if self.async_collection and self.collectors == 1:
             raise ValueError("async_collection is on, but there is one collector: set collectors")
 
@@ -142,6 +145,19 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
     def is_recurrent(self) -> bool:
         """Whether the network carries a state from step to step."""
         return self.backbone.carries_state
+
+    @property
+    def reads_sequences(self) -> bool:
+        """Whether minibatches consist of sequences, and not of single steps."""
+        return self.is_recurrent or self.backbone.num_frames > 1
+
+    @property
+    def steps_per_sequence(self) -> int:
+        """``sequence_length``, or its default; 1 where it has no meaning."""
+        if not self.reads_sequences:
+            return 1
+        steps = self.steps_per_batch // self.num_envs
+        return self.sequence_length or math.gcd(_LONGEST, self.minibatch_size, steps)
 
     @property
     def final_step(self) -> int:

@@ -310,3 +310,20 @@ def test_on_a_gpu():
         assert step["next", "history"].is_cuda
         assert_close(step.cpu(), expected_step, 0, 1e-6)
         assert_close(root.cpu(), expected_root, 0, 1e-6)
+
+
+@pytest.mark.parametrize("top", [lambda env: env, lambda env: env.append_transform(Third())])
+def test_steps_that_were_taken_can_lack_their_histories(top):
+    """On the short cut and the general way; what comes next has them."""
+    plain, lean = (
+        top(make_env("Pendulum-v1", 3, seed=0, num_frames=3, keep_histories=keep))
+        for keep in (True, False)
+    )
+    for (step, root), (expected_step, expected_root) in zip(
+        play(lean, 210), play(plain, 210), strict=True
+    ):
+        assert_close(step, expected_step.exclude("history", ("next", "history")), 0, 0)
+        assert_close(root, expected_root, 0, 0)
+        assert "history" in root
+    assert lean.rollout(5, break_when_any_done=False).shape == (3, 5)
+    check_env_specs(lean)

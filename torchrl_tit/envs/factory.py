@@ -17,7 +17,8 @@ from torchrl_tit.envs.mujoco_warnings import show_mujoco_warnings_once
 from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.transforms.hide_velocities import HideVelocities
-from torchrl_tit.transforms.history import History, Padding
+from torchrl_tit.transforms.history import History
+from torchrl_tit.windows import Padding
 
 VectorizationMode = Literal["sync", "async"]
 
@@ -29,6 +30,7 @@ def make_env(
     seed: int | None = None,
     num_frames: int = 1,
     padding: Padding = "same",
+    keep_histories: bool = True,
     hide_velocities: bool = False,
     clip_actions: bool = True,
     vectorization_mode: VectorizationMode = "sync",
@@ -63,6 +65,9 @@ def make_env(
         num_frames: K, the number of observations in a history.
         padding: What fills a history before an episode's first step: see
             :class:`~torchrl_tit.transforms.History`.
+        keep_histories: Whether a step still has its histories once it was taken. If not,
+            ``step_and_maybe_reset`` removes them, from "next" too, and a collector stores
+            observations only; the tensordict that the policy acts on has its histories either way.
         hide_velocities: Whether observations and histories lack the velocities: see
             :class:`~torchrl_tit.transforms.HideVelocities`.
         clip_actions: Whether continuous actions are clipped on their way to the task: see
@@ -117,7 +122,9 @@ def make_env(
         RewardSum(),
         History(num_frames, observation_ndim=observation_ndim, padding=padding),
     )
-    return TransformedVectorEnv(env, transform)
+    return TransformedVectorEnv(
+        env, transform, transient_keys=() if keep_histories else ("history",)
+    )
 
 
 def is_atari(name: str) -> bool:

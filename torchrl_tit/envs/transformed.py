@@ -1,7 +1,10 @@
 """TorchRL's TransformedEnv with less overhead in each step."""
 
-from tensordict import TensorDictBase
-from torchrl.envs import Compose, TransformedEnv
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict import NestedKey, TensorDictBase
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
 
@@ -21,6 +24,10 @@ class TransformedVectorEnv(TransformedEnv):
     Args:
         base_env: The environment.
         transform: As in `TransformedEnv`.
+        transient_keys: Entries that only the policy reads, such as histories: a step that was taken
+            lacks them, at its root and under "next". The tensordict to act on next has them, so a
+            collector works as usual and does not store them.
+        **settings: As in `TransformedEnv`.
 
     Example:
         >>> from torchrl.envs import StepCounter
@@ -31,6 +38,18 @@ class TransformedVectorEnv(TransformedEnv):
         torch.Size([8, 2, 1])
     """
 
+    def __init__(
+        self,
+        base_env: EnvBase,
+        transform: Transform | None = None,
+        *,
+        transient_keys: Sequence[NestedKey] = (),
+        **settings: Any,
+    ) -> None:
+        super().__init__(base_env, transform, **settings)
+        self.transient_keys = tuple(transient_keys)
+        """Entries that a step lacks once it was taken."""
+
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:
@@ -40,7 +59,8 @@ class TransformedVectorEnv(TransformedEnv):
             tensordict: Holds the action; [N].
 
         Returns:
-            The tensordict with its "next", and the one to act on next.
+            The tensordict with its "next", both without ``transient_keys``, and the one to act on
+            next.
         """
         transform, keys = self.transform, tensordict.keys()
         if (
@@ -49,10 +69,16 @@ class TransformedVectorEnv(TransformedEnv):
             or tensordict.device != self.base_env.device
             or not _only_writes(transform)
         ):
-            return super().step_and_maybe_reset(tensordict)
-        outcome = transform._step(tensordict, self.base_env._step(tensordict))
-        tensordict.set("next", outcome)
-        return tensordict, self.maybe_reset(self._step_mdp(tensordict))
+            taken, following = super().step_and_maybe_reset(tensordict)
+        else:
+            outcome = transform._step(tensordict, self.base_env._step(tensordict))
+            taken = tensordict.set("next", outcome)
+            following = self.maybe_reset(self._step_mdp(taken))
+        for key in self.transient_keys:
+            for part in (taken, taken.get("next")):
+                if part.get(key, None) is not None:
+                    part.del_(key)
+        return taken, following
 
 
 def _only_writes(transform: Transform) -> bool:

@@ -1,16 +1,18 @@
 """What a PPO run encodes while it acts: the newest frames, and no others."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
 import torch
 
-from recipes.ppo import PPO, algorithm
+from recipes.ppo import PPO
 from recipes.ppo.algorithm import Agent
 from recipes.run import Run
 from recipes.runner import evaluate, train
 from tests.modules.frames import CountedFrames
 from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.modules import acting_collector
 from torchrl_tit.settings.networks import enhanced_tit
 
 RECIPE = PPO(
@@ -45,9 +47,8 @@ def test_collection_and_evaluation_encode_each_frame_once(frames, tmp_path):
     with Run.create(tmp_path / "run", RECIPE) as run:
         train(RECIPE, run)
         # A batch has 64 steps, the 3 older frames of both environments at its start, the 4 of both
-        # next histories at its end, and a minibatch of 32 histories that is checked to be finite.
-        # Before the first one the collector tries the policy on both environments.
-        assert frames[0].take() <= 2 + 2 * (64 + 2 * 3 + 2 * 4 + 32 * 4)
+        # next histories at its end, and two sequences of 16 that are checked to be finite.
+        assert frames[0].take() <= 2 * (64 + 2 * 3 + 2 * 4 + 2 * (16 + 3))
         evaluate(run)
     assert frames[1].take() <= 2 * (200 + 3)  # two episodes
 
@@ -62,6 +63,6 @@ def test_keeping_frames_changes_no_result(tmp_path, monkeypatch):
             return load_checkpoint(run.checkpoints)[1]["networks"]
 
     kept = weights("kept")
-    monkeypatch.setattr(algorithm, "while_acting", lambda policy, collector: collector)
+    monkeypatch.setattr(acting_collector, "acting", lambda policy: nullcontext())
     for name, weight in weights("plain").items():
         torch.testing.assert_close(kept[name], weight, rtol=0, atol=2e-5)

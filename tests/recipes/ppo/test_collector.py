@@ -12,6 +12,7 @@ from torch import multiprocessing
 from recipes.metrics import Metrics
 from recipes.ppo import PPO
 from recipes.ppo.algorithm import PPOAlgorithm
+from recipes.ppo.rollout import Rollout
 from recipes.run import Run
 from recipes.runner import evaluate, train
 from tests.numerics import assert_near
@@ -40,17 +41,22 @@ def test_batches_are_those_of_the_policy(async_collection, tmp_path):
     algorithm.prepare(0, tmp_path)
     agent, collector = algorithm.agent, algorithm.collector
     envs = 2 if async_collection else 4
-    starts = []
-    for count, batch in enumerate(collector, start=1):
+    starts, continued = [], 0
+    for count, batch in enumerate(algorithm.batches(), start=1):
         assert batch.shape == (envs, 64 // envs)
+        features, first = batch["features"], batch["observation"][:, 0].tolist()
+        rollout = Rollout(batch, 2, "same")
+        windows = rollout.histories(torch.arange(64)).view(*batch.shape, 2, 4)
+        continued += int((windows[:, 0, 0] != windows[:, 0, 1]).any(-1).sum())
         with torch.no_grad():
-            features = agent.backbone.module(batch["history"])
+            expected = agent.backbone.module(windows)
         if count == 1 or not async_collection:  # a later one of those can be an update behind
-            assert_near(batch["features"], features)
-        starts += batch["history"][:, 0, -1].tolist()
+            assert_near(features, expected)
+        starts += first
         for parameter in agent.parameters():
             parameter.data.add_(0.01)
         collector.update_policy_weights_()
+    assert continued >= envs  # windows at the start of a batch know the end of the one before
     collector.shutdown()
     assert count * 64 == 192
     first = algorithm.make_env(4, RECIPE.seed).reset()["history"][:, -1].tolist()

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.objectives.value import GAE
 
 from recipes.ppo import PPO
 from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
+from recipes.ppo.rollout import FrameCollector, Rollout
 from recipes.results.film import film
 from recipes.run import Run
 from recipes.runner import evaluate, train
@@ -38,14 +38,16 @@ def batch():
     """A batch of 200 steps of 2 environments, and the agent that took them."""
     torch.manual_seed(0)
     algorithm = PPOAlgorithm(RECIPE)
-    env, agent = algorithm.make_env(2, seed=0), algorithm.agent.eval()
+    agent = algorithm.agent.eval()
+    env = algorithm.make_env(2, seed=0, keep_histories=False)
     torch.nn.init.normal_(agent.critic.module.weight)
-    collector = Collector(
+    collector = FrameCollector(
         env,
         agent.policy,
         frames_per_batch=400,
         total_frames=400,
         auto_register_policy_transforms=False,
+        use_buffers=False,
     )
     with torch.no_grad():
         yield next(iter(collector)), agent
@@ -56,10 +58,13 @@ def test_the_next_values_know_the_state_before_them(batch):
     """At ends of episodes and of the batch too, where the collector computed none."""
     batch, agent = batch
     gae = GAE(gamma=0.99, lmbda=0.95, value_network=None)
-    add_advantages(batch, agent, gae, bootstrap_time_limit=True)
-    following = agent.critic(agent.backbone(batch["next"].select(*agent.backbone.in_keys)))
+    states = batch["next"].select(*agent.state_keys)
+    states["history"] = batch["next", "observation"].unsqueeze(2)
+    following = agent.critic(agent.backbone(states.clone()))
+    rollout = Rollout(batch, 1, "same")
+    add_advantages(batch, rollout, agent, gae, bootstrap_time_limit=True)
     torch.testing.assert_close(batch["next", "state_value"], following["state_value"])
-    forgetful = batch["next"].select(*agent.backbone.in_keys)
+    forgetful = states
     for key in ("recurrent_state_h", "recurrent_state_c"):
         forgetful[key] = torch.zeros_like(forgetful[key])
     forgetful = agent.critic(agent.backbone(forgetful))["state_value"]
@@ -71,7 +76,7 @@ def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
     number = torch.arange(400).view(2, 200, 1)
     batch["advantage"] = batch["value_target"] = number
     recipe = replace(RECIPE, steps_per_batch=400)
-    parts = list(minibatches(batch, agent, recipe))
+    parts = list(minibatches(batch, Rollout(batch, 1, "same"), agent, recipe))
     assert [part.shape for part in parts] == [(4, 8)] * 12 + [(2, 8)] + [(4, 8)] * 12 + [(2, 8)]
     for epoch in (parts[:13], parts[13:]):
         steps = torch.cat([part["advantage"] for part in epoch]).squeeze(-1)  # [sequences, 8]

@@ -13,6 +13,7 @@ from recipes.ppo import PPO, algorithm
 from recipes.ppo.algorithm import Agent
 from recipes.run import Run
 from recipes.runner import train
+from tests.recipes.ppo import by_hand
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit
 
@@ -22,7 +23,7 @@ RECIPE = PPO(
     total_steps=128,
     steps_per_batch=64,
     num_envs=2,
-    minibatch_size=24,  # the last minibatch of an epoch is smaller
+    minibatch_size=24,  # the last minibatch of an epoch is smaller; sequences have 8 steps
     epochs=2,
     # Large steps, so that ratios are clipped, and a small value loss, so that it hides no other.
     learning_rate=1e-2,
@@ -45,9 +46,9 @@ def batches(monkeypatch):
         original_init(agent, *args)
         agents.append(agent)
 
-    def recording(batch, agent, recipe):
+    def recording(*args):
         recorded.append((deepcopy(agents[0]), []))
-        for minibatch in original_minibatches(batch, agent, recipe):
+        for minibatch in original_minibatches(*args):
             recorded[-1][1].append(minibatch.clone())
             yield minibatch
 
@@ -73,7 +74,8 @@ def log_prob_and_entropy(agent, features, action):
 
 
 def loss_by_hand(agent, minibatch, recipe, clip):
-    features = agent.backbone.module(minibatch["history"])
+    features = agent.backbone.module(by_hand.windows_of(minibatch).flatten(0, 1))
+    minibatch = minibatch.flatten(0, 1)
     log_prob, entropy = log_prob_and_entropy(agent, features, minibatch["action"])
     advantage = minibatch["advantage"].squeeze(-1)
     n = len(advantage)
@@ -122,7 +124,7 @@ def test_two_updates_equal_those_by_hand(env, batches, tmp_path):
     with Run.create(tmp_path / "run", recipe) as run:
         train(recipe, run)
     _, state = load_checkpoint(run.checkpoints)
-    sizes = [[len(minibatch) for minibatch in minibatches] for _, minibatches in batches]
+    sizes = [[minibatch.numel() for minibatch in minibatches] for _, minibatches in batches]
     assert sizes == [[24, 24, 16] * 2] * 2
     start = deepcopy(batches[0][0].state_dict())
     expected = updates_by_hand(recipe, batches).state_dict()

@@ -1,0 +1,137 @@
+"""Collected batches that keep each observation once, and the windows of their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchrl_tit.modules import ActingCollector
+from torchrl_tit.windows import Padding, Windows, find_windows
+
+
+class FrameCollector(ActingCollector):
+    """A collector of batches that hold each observation once, for :class:`Rollout`.
+
+    Its environments remove the histories from the steps that were taken
+    (``make_env(..., keep_histories=False)``). The K - 1 frames that precede the batch are in
+    ``before``, cut into as many pieces as there are steps: an entry [envs, time, size] like any
+    other, which passes between processes and is stacked with the others.
+    """
+
+    def rollout(self) -> TensorDictBase:
+        """Collects a batch, [envs, time]."""
+        older = self._carrier["history"][:, :-1].flatten(1)  # [envs, entries]
+        batch = super().rollout()
+        if older.shape[1]:
+            batch["before"] = _in_pieces(older, batch.shape[1])
+        return batch
+
+
+class Rollout:
+    """The frames of a batch, each once, and where the windows of its steps are.
+
+    The frames of an environment are in order of time: the K - 1 that precede the batch, then the
+    observation of each step. Where an episode or the batch ends, the true next observation follows,
+    since it is the observation of no other step. That is at most
+    ``steps x envs + envs x K + episode ends`` frames.
+
+    Args:
+        batch: of a :class:`FrameCollector`, [envs, time]. Its observations are removed.
+        num_frames: number K of frames in a window.
+        padding: what precedes an episode's first observation.
+
+    Example:
+        >>> from torchrl.modules import RandomPolicy
+        >>> from torchrl_tit.envs import make_env
+        >>> env = make_env("CartPole-v1", 2, num_frames=4, keep_histories=False)
+        >>> policy = RandomPolicy(env.action_spec)
+        >>> collector = FrameCollector(
+        ...     env,
+        ...     policy,
+        ...     frames_per_batch=64,
+        ...     total_frames=64,
+        ...     auto_register_policy_transforms=False,
+        ...     use_buffers=False,
+        ... )
+        >>> batch = next(iter(collector))
+        >>> rollout = Rollout(batch, num_frames=4, padding="same")
+        >>> rollout.histories(torch.arange(32)).shape  # of the first environment
+        torch.Size([32, 4, 4])
+        >>> collector.shutdown()
+    """
+
+    def __init__(self, batch: TensorDictBase, num_frames: int, padding: Padding) -> None:
+        self.num_frames = num_frames
+        self.padding = padding
+        done = batch["next", "done"].squeeze(-1)
+        is_init = done.roll(1, dims=1)
+        is_init[:, 0] = False  # whether or not: the window there is known
+        self.is_init = is_init.flatten()
+        """Whether an episode begins, other than at the start of the batch, bool [steps]."""
+        self.ends = done.clone()
+        """Whether the true next observation is none of the batch's, bool [envs, time]."""
+        self.ends[:, -1] = True
+
+        envs, steps = done.shape
+        ends = self.ends.flatten()
+        past = num_frames - 1
+        # The row of a step: the frames that precede the batches of the environments up to its own,
+        # the steps before it, and the true next observations that follow some of these.
+        precede = torch.arange(1, envs + 1, device=done.device).repeat_interleave(steps) * past
+        before = torch.arange(len(ends), device=done.device) + ends.cumsum(0) - ends.long()
+        self.newest = precede + before
+        """Row of each step's observation, int64 [steps]."""
+        newest = self.newest.view(envs, steps)
+        begins = torch.where(is_init, newest, 0)
+        begins[:, 0] = newest[:, 0] - past
+        self.oldest = begins.cummax(1).values.flatten()
+        """The first row that belongs to each step's window, int64 [steps]."""
+
+        observation, following = batch.pop("observation"), batch["next"].pop("observation")
+        count = envs * (past + steps) + int(ends.sum())
+        self.frames = observation.new_empty(count, *observation.shape[2:])
+        """The frames, [R, *observation_shape]."""
+        self.frames[self.newest] = observation.flatten(0, 1)
+        self.frames[self.newest[ends] + 1] = following[self.ends]
+        if past:
+            older = batch.pop("before").flatten(1)
+            shape = (past, *observation.shape[2:])
+            older = older[:, : torch.Size(shape).numel()].unflatten(1, shape)
+            rows = newest[:, :1] - torch.arange(past, 0, -1, device=done.device)
+            self.frames[rows] = older
+
+    def observations(self, steps: Tensor) -> Tensor:
+        """The observations of steps, int64 [...] -> [..., *observation_shape]."""
+        return Windows(self.newest[steps], None).gather(self.frames)
+
+    def histories(self, steps: Tensor) -> Tensor:
+        """The windows of steps, int64 [...] -> [..., K, *observation_shape]."""
+        return self._windows(self.newest[steps], self.oldest[steps]).gather(self.frames)
+
+    def next_windows(self, max_frames: int = 1024) -> Iterator[tuple[Tensor, Windows]]:
+        """Yields the windows of the true next states at ``ends``, in their order.
+
+        Args:
+            max_frames: frames to encode at once, if there are more than a window has.
+
+        Yields:
+            Frames, each once, [R, *observation_shape], and windows on them, [E, K].
+        """
+        ends = self.ends.flatten()
+        newest, oldest = self.newest[ends] + 1, self.oldest[ends]
+        size = max(1, max_frames // self.num_frames)
+        for pair in zip(newest.split(size), oldest.split(size), strict=True):
+            rows, windows = self._windows(*pair).used()
+            yield self.frames.index_select(0, rows), windows
+
+    def _windows(self, newest: Tensor, oldest: Tensor) -> Windows:
+        return find_windows(newest, oldest, self.num_frames, self.padding)
+
+
+def _in_pieces(entries: Tensor, count: int) -> Tensor:
+    """Cuts rows into equal pieces, the last ones filled up; [N, entries] -> [N, count, size]."""
+    return pad(entries, (0, -entries.shape[1] % count)).unflatten(1, (count, -1))

@@ -1,0 +1,315 @@
+"""Batches that keep each frame once: their windows, values, minibatches, size and checkpoints."""
+
+import shutil
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.modules import RandomPolicy
+from torchrl.objectives.value import GAE
+
+from recipes.compilation import STATIC_SHAPES
+from recipes.ppo import PPO
+from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
+from recipes.ppo.rollout import FrameCollector, Rollout
+from recipes.run import Run
+from recipes.runner import train
+from tests.modules.frames import CountedFrames
+from tests.numerics import assert_near
+from tests.recipes.ppo import by_hand
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.envs import make_env
+from torchrl_tit.settings import CoBERL, Inner, Network
+from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp, vanilla_tit
+
+SMALL: dict[str, Any] = {"embed_dim": 8, "features_dim": 8}
+RECIPE = PPO(
+    env="CartPole-v1",
+    backbone=enhanced_tit(4, **SMALL),
+    num_envs=3,
+    total_steps=192,
+    steps_per_batch=96,
+    minibatch_size=32,
+    epochs=1,
+    compile="off",
+)
+NETWORKS = {
+    "tit": enhanced_tit(4, **SMALL),
+    "vanilla": vanilla_tit(4, temporal_position_encoding=True, **SMALL),
+    "separate trunks": mlp(4, hidden_dim=8),
+    "lstm": lstm(hidden_dim=8, **SMALL),
+    "lstm on windows": replace(lstm(hidden_dim=8, **SMALL), num_frames=4),
+    "coberl": Network(
+        frame=Inner(embed_dim=8),
+        history=CoBERL(num_blocks=1, num_heads=2, hidden_dim=8),
+        num_frames=4,
+    ),
+}
+
+
+class Seen:
+    """Remembers the histories that a policy reads, which the batches lack."""
+
+    def __init__(self):
+        self.histories = []
+
+    def __call__(self, history):
+        self.histories.append(history.clone())
+        return history.new_zeros(len(history), 1)
+
+    def take(self):
+        """[envs, time, K, *obs]"""
+        histories, self.histories = torch.stack(self.histories, 1), []
+        return histories
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize(("envs", "frames"), [(1, 1), (3, 2), (2, 4), (2, 40)])
+def test_windows_are_those_that_the_policy_read(envs, frames, padding):
+    """Across resets and batches, of which several fit into a window of 40."""
+    env = make_env(
+        "CartPole-v1", envs, seed=0, num_frames=frames, padding=padding, keep_histories=False
+    )
+    seen = Seen()
+    policy = TensorDictSequential(
+        TensorDictModule(seen, ["history"], ["seen"]), RandomPolicy(env.action_spec)
+    )
+    collector = FrameCollector(
+        env,
+        policy,
+        frames_per_batch=13 * envs,
+        total_frames=78 * envs,
+        auto_register_policy_transforms=False,
+        use_buffers=False,
+    )
+    ended = 0
+    for batch in collector:
+        whole = batch.clone()
+        assert not any("history" in str(key) for key in batch.keys(True))
+        rollout = Rollout(batch, frames, padding)
+        read = seen.take()
+        number = torch.arange(13 * envs).view(envs, 13)
+        assert torch.equal(rollout.histories(number), read)
+        assert torch.equal(rollout.observations(number), whole["observation"])
+        assert torch.equal(read[:, :, -1], whole["observation"])
+        done = whole["next", "done"].squeeze(-1)
+        is_init = rollout.is_init.view(envs, 13)
+        assert torch.equal(is_init[:, 1:], done[:, :-1])
+
+        ends = done.clone()
+        ends[:, -1] = True
+        assert torch.equal(rollout.ends, ends)
+        newest = whole["next", "observation"].unsqueeze(2)
+        expected = torch.cat([read[:, :, 1:], newest], 2)[ends]
+        parts = [w.gather(table) for table, w in rollout.next_windows(max_frames=frames * 3)]
+        assert torch.equal(torch.cat(parts), expected)
+        assert all(len(part) <= 3 for part in parts)
+        assert len(rollout.frames) == envs * (frames - 1 + 13) + ends.sum()
+        assert "observation" not in batch
+        assert "observation" not in batch["next"]
+        ended += int(done.sum())
+    assert ended >= 3
+    collector.shutdown()
+
+
+@pytest.mark.parametrize("frames", [4, 64])
+def test_a_rollout_keeps_each_frame_once(frames):
+    envs, steps, ends = 8, 256, 12
+    image = torch.zeros(1, dtype=torch.uint8)
+    done = torch.zeros(envs, steps, 1, dtype=torch.bool)
+    done.view(-1)[torch.randperm(envs * steps)[:ends]] = True
+    entries = (frames - 1) * 84 * 84
+    batch = TensorDict(
+        {
+            "observation": image.expand(envs, steps, 84, 84),
+            "before": image.expand(envs, steps, -(-entries // steps)),
+            "next": {"observation": image.expand(envs, steps, 84, 84), "done": done},
+        },
+        [envs, steps],
+    )
+    rollout = Rollout(batch, frames, "same")
+    tensors = [value for value in vars(rollout).values() if isinstance(value, torch.Tensor)]
+    kept = sum(tensor.untyped_storage().nbytes() for tensor in tensors)
+    assert kept <= 1.1 * (steps * envs + envs * frames + ends) * 84 * 84
+
+
+@pytest.fixture
+def short_episodes(monkeypatch):
+    """Ends episodes after eleven steps, if they have not ended before."""
+    limited = partial(make_env, max_episode_steps=11)
+    monkeypatch.setattr("recipes.ppo.algorithm.make_env", limited)
+
+
+def collected(recipe, folder):
+    """An algorithm in float64, its second batch, and the rollout of that."""
+    algorithm = PPOAlgorithm(recipe)
+    with torch.no_grad():  # far from where all actions and values are alike
+        for parameter in algorithm.agent.parameters():
+            parameter.add_(0.2 * torch.randn_like(parameter))
+    algorithm.prepare(0, folder)
+    batches = iter(algorithm.batches())
+    with torch.no_grad():
+        next(batches)
+        batch = next(batches)
+    algorithm.close()
+    algorithm.agent.double()
+    algorithm.loss.double()
+    batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
+    outcome = batch["next", "observation"].clone()
+    rollout = Rollout(batch, recipe.backbone.num_frames, recipe.padding)
+    assert rollout.is_init.any()
+    return algorithm, batch, rollout, outcome
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("bootstrap", [True, False])
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("name", ["tit", "separate trunks", "lstm on windows"])
+def test_values_and_advantages_are_those_of_whole_windows(
+    name, padding, bootstrap, short_episodes, tmp_path
+):
+    recipe = replace(RECIPE, backbone=NETWORKS[name], padding=padding)
+    algorithm, batch, rollout, outcome = collected(recipe, tmp_path)
+    agent, gae = algorithm.agent, GAE(gamma=0.875, lmbda=0.75, value_network=None)
+    done = batch["next", "done"]
+    truncated = done & (done.cumsum(1) % 2 == 0)  # every other episode, whatever ended it
+    assert truncated.any()
+    batch["next"].update({"truncated": truncated, "terminated": done & ~truncated})
+    windows = rollout.histories(torch.arange(96)).view(3, 32, 4, 4)
+    following = torch.cat([windows[:, :, 1:], outcome.unsqueeze(2)], 2)
+    with torch.no_grad():
+        states = TensorDict({"history": torch.stack([windows, following])}, [2, 3, 32])
+        value, next_value = agent.critic(agent.backbone(states))["state_value"]
+        batch["state_value"] = value
+        add_advantages(batch, rollout, agent, gae, bootstrap)
+    assert_near(batch["next", "state_value"], next_value)
+
+    stops = done & ~truncated if bootstrap else done
+    reward = batch["next", "reward"]
+    expected = by_hand.advantages(reward, value, next_value, done, stops, 0.875, 0.75)
+    assert_near(batch["advantage"], expected)
+    assert_near(batch["value_target"], expected + value)
+
+
+def features_by_hand(agent, minibatch, padding):
+    """Step by step: of whole windows, or with the state that the network carries."""
+    if not agent.backbone.is_recurrent:
+        windows = by_hand.windows_of(minibatch, padding).flatten(0, 1)
+        return agent.backbone(TensorDict({"history": windows}, [len(windows)]))
+    steps, state = [], minibatch[:, 0].select(*agent.backbone.state_shapes)
+    for time in range(minibatch.shape[1]):
+        step = agent.backbone(state.update(minibatch[:, time].select("history", "is_init")))
+        steps.append(step.select("features"))
+        state = step["next"].copy()
+    return torch.stack(steps, 1).flatten(0, 1)
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("envs", [1, 3])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_loss_and_gradient_are_those_of_whole_windows(
+    name, envs, padding, short_episodes, tmp_path
+):
+    recipe = replace(
+        RECIPE,
+        backbone=NETWORKS[name],
+        num_envs=envs,
+        padding=padding,
+        entropy_coeff=0.1,
+        contrastive_coeff=1.0 if name == "coberl" else 0.0,
+    )
+    algorithm, batch, rollout, _ = collected(recipe, tmp_path)
+    agent, weights = algorithm.agent, list(algorithm.agent.parameters())
+    with torch.no_grad():
+        add_advantages(batch, rollout, agent, algorithm.gae, True)
+        batch["action_log_prob"] += 0.3 * torch.randn_like(batch["action_log_prob"])  # clips some
+    resets = 0
+    for minibatch in minibatches(batch, rollout, agent, recipe):
+        assert minibatch.shape == (2, 16)
+        resets += int(minibatch["is_init"][:, 1:].sum())
+        torch.manual_seed(1)
+        total, terms = algorithm._objective(minibatch.copy())
+        gradients = torch.autograd.grad(total, weights, allow_unused=True)
+
+        steps = minibatch.exclude("history", "observation").flatten(0, 1)
+        steps.update(features_by_hand(agent, minibatch, padding))
+        losses = algorithm.loss(steps)
+        expected = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
+        if recipe.contrastive_coeff:
+            torch.manual_seed(1)
+            windows = by_hand.windows_of(minibatch, padding).flatten(0, 1)
+            expected = expected + algorithm._contrastive_loss(windows)
+        expected_gradients = torch.autograd.grad(expected, weights, allow_unused=True)
+        assert 0 < terms[5] < 1  # of the ratios some are clipped, others are not
+        assert_near(total, expected)
+        for gradient, other in zip(gradients, expected_gradients, strict=True):
+            assert (gradient is None) == (other is None)
+            if gradient is not None:
+                assert_near(gradient, other)
+    assert resets > 2
+
+
+def test_each_frame_of_a_sequence_is_encoded_once(tmp_path):
+    algorithm, batch, rollout, _ = collected(RECIPE, tmp_path)
+    agent = algorithm.agent
+    with torch.no_grad():
+        counted = CountedFrames(agent.backbone.module)
+        add_advantages(batch, rollout, agent, algorithm.gae, True)
+        assert counted.take() <= len(rollout.frames)
+        for minibatch in minibatches(batch, rollout, agent, RECIPE):
+            agent.encode(minibatch)
+            assert counted.take() == 2 * (16 + 3)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("c++"), reason="torch.compile needs a C++ compiler")
+def test_the_objective_compiles_as_one_graph(tmp_path):
+    recipe = replace(RECIPE, backbone=enhanced_tit(4, num_blocks=1, **SMALL), padding="constant")
+    algorithm, batch, rollout, _ = collected(recipe, tmp_path)
+    agent, weights = algorithm.agent, list(algorithm.agent.parameters())
+    with torch.no_grad():
+        add_advantages(batch, rollout, agent, algorithm.gae, True)
+    fast = torch.compile(algorithm._objective, fullgraph=True, **STATIC_SHAPES)
+    for minibatch in minibatches(batch, rollout, agent, recipe):
+        results = []
+        for objective in (algorithm._objective, fast):
+            total, terms = objective(minibatch.copy())
+            results.append([total, terms, *torch.autograd.grad(total, weights)])
+        assert_near(*results)
+
+
+@pytest.mark.parametrize("frames", [4, 24])  # some windows begin two batches ago
+def test_resumed_is_bit_for_bit_the_same(frames, tmp_path):
+    backbone = replace(RECIPE.backbone, num_frames=frames)
+    recipe = replace(RECIPE, backbone=backbone, steps_per_batch=48, checkpoint_interval=48)
+
+    def weights(run):
+        return TensorDict(load_checkpoint(run.checkpoints)[1]["networks"])
+
+    with Run.create(tmp_path / "whole", recipe) as run:
+        train(recipe, run)
+        expected = weights(run)
+    with Run.create(tmp_path / "parts", recipe) as run:
+        for steps in (48, 144, 192):
+            train(replace(recipe, total_steps=steps), run)
+        assert (weights(run) == expected).all()
+
+
+@pytest.mark.parametrize(
+    ("fields", "length"),
+    [
+        ({}, 16),
+        ({"minibatch_size": 24}, 8),
+        ({"steps_per_batch": 81}, 1),
+        ({"sequence_length": 32}, 32),
+        ({"backbone": enhanced_tit(1, **SMALL), "sequence_length": 32}, 1),
+        ({"backbone": lstm(**SMALL), "minibatch_size": 40}, 8),
+    ],
+)
+def test_the_length_of_sequences(fields, length):
+    assert replace(RECIPE, **fields).steps_per_sequence == length
