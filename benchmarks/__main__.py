@@ -12,8 +12,11 @@ from torchrl_tit.files import write_text_atomic
 BENCHMARKS = [
     "acting",
     "training_step",
+    "segments",
     "memory",
     "cql",
+    "cql_images",
+    "rollouts",
     "decision_transformer",
     "history_windows",
     "ppo_cartpole",

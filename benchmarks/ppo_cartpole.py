@@ -1,9 +1,9 @@
 """PPO on CartPole end to end: our recipe against Stable-Baselines3 with the same network.
 
-Both: Enhanced_TIT with K = 1, width 32, 2 blocks, 1 head and 64 features; 8 environments, 2048
-steps a batch, minibatches of 64, 10 epochs, one thread. Speed is environment steps a second over
-whole batches, collection and update together, without the first batch, in which libraries warm up
-and compile.
+Both: Enhanced_TIT with K = 1 or 8, width 32, 2 blocks, 1 head and 64 features; 8 environments, 2048
+steps a batch, minibatches of 64, 10 epochs, one thread. With K = 8, theirs reads stacked frames,
+and ours trains on sequences. Speed is environment steps a second over whole batches, collection and
+update together, without the first batch, in which libraries warm up and compile.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecFrameStack
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.collectors import Collector
@@ -48,7 +49,22 @@ from torchrl_tit.modules import Backbone
 from .report import publish, spread, table
 from .straightforward import StraightforwardTIT
 
-BATCHES, STEPS, ENVS, REPEATS = 5, 2048, 8, 5
+STEPS, ENVS = 2048, 8
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A number of frames, and how long and often it is measured."""
+
+    num_frames: int
+    batches: int
+    repeats: int
+
+
+SETTINGS = [
+    Setting(num_frames=1, batches=5, repeats=5),
+    Setting(num_frames=8, batches=3, repeats=3),
+]
 
 
 @dataclass
@@ -75,14 +91,15 @@ def lap() -> tuple[float, float]:
 
 
 class Extractor(BaseFeaturesExtractor):
-    """The straightforward network for Stable-Baselines3: observations without a time axis."""
+    """The straightforward network for Stable-Baselines3, whose frames are stacked in one array."""
 
-    def __init__(self, space: Any) -> None:
+    def __init__(self, space: Any, num_frames: int) -> None:
         super().__init__(space, 64)
-        self.network = StraightforwardTIT(space.shape)
+        self.num_frames = num_frames
+        self.network = StraightforwardTIT((space.shape[0] // num_frames,))
 
     def forward(self, observation: Tensor) -> Tensor:
-        return self.network(observation.unsqueeze(1))
+        return self.network(observation.unflatten(1, (self.num_frames, -1)))
 
 
 class Batches(BaseCallback):
@@ -106,35 +123,43 @@ class Batches(BaseCallback):
         self.laps.append(lap())
 
 
-def run_sb3(seed: int) -> Outcome:
+def run_sb3(setting: Setting, seed: int) -> Outcome:
     """Trains Stable-Baselines3 with the straightforward network."""
+    env = make_vec_env("CartPole-v1", ENVS, seed=seed)
     agent = PPO(
         "MlpPolicy",
-        make_vec_env("CartPole-v1", ENVS, seed=seed),
+        VecFrameStack(env, setting.num_frames) if setting.num_frames > 1 else env,
         n_steps=STEPS // ENVS,
         batch_size=64,
         n_epochs=10,
         seed=seed,
         device="cpu",
-        policy_kwargs={"features_extractor_class": Extractor, "net_arch": []},
+        policy_kwargs={
+            "features_extractor_class": Extractor,
+            "features_extractor_kwargs": {"num_frames": setting.num_frames},
+            "net_arch": [],
+        },
     )
     batches = Batches()
     start, _ = lap()
-    agent.learn(BATCHES * STEPS, callback=batches)
+    agent.learn(setting.batches * STEPS, callback=batches)
     parameters = sum(parameter.numel() for parameter in agent.policy.parameters())
     first = batches.laps[0][0] - start
     return Outcome(batches.laps, first, statistics.mean(batches.returns), parameters)
 
 
-def run_ours(seed: int, compile: Compile, timers: Timers | None = None) -> Outcome:
+def run_ours(
+    setting: Setting, seed: int, compile: Compile, timers: Timers | None = None
+) -> Outcome:
     """Trains the recipe as the command line does, with checkpoints and metrics."""
     named = get_recipe("ppo/cartpole/enhanced-tit")
     assert isinstance(named, ppo.PPO)
     recipe = replace(
         named,
+        backbone=replace(named.backbone, num_frames=setting.num_frames),
         num_envs=ENVS,
         steps_per_batch=STEPS,
-        total_steps=BATCHES * STEPS,
+        total_steps=setting.batches * STEPS,
         seed=seed,
         compile=compile,
     )
@@ -182,7 +207,7 @@ class Timers:
         return timed
 
 
-def profile(compile: Compile) -> dict[str, float]:
+def profile(setting: Setting, compile: Compile) -> dict[str, float]:
     """Measures the share of each part in our time, without the first batch."""
     timers = Timers()
     prepare = PPOAlgorithm.prepare
@@ -206,7 +231,7 @@ def profile(compile: Compile) -> dict[str, float]:
             function = timers.around(getattr(owner, name), part)
             stack.enter_context(patch.object(owner, name, function))
         stack.enter_context(patch.object(PPOAlgorithm, "prepare", prepare_timed))
-        laps = run_ours(0, compile, timers).laps
+        laps = run_ours(setting, 0, compile, timers).laps
     seconds = dict(timers.seconds)
     acting = seconds.get("collect: backbone", 0)
     encoding = seconds.get("update: backbone", 0)
@@ -250,34 +275,30 @@ def main(out: Path | None) -> None:
 
 def measure(out: Path | None) -> None:
     """Measures, alternating, and reports."""
-    runs: dict[str, list[Outcome]] = defaultdict(list)
-    for repeat in range(REPEATS):
-        runs["sb3"].append(run_sb3(repeat))
-        runs["ours"].append(run_ours(repeat, "off"))
-        runs["compiled"].append(run_ours(repeat, "on"))
-    (parameters,) = {outcome.parameters for outcomes in runs.values() for outcome in outcomes}
-    shares = {"ours": profile("off"), "compiled": profile("on")}
+    sections, numbers = [], {}
+    for setting in SETTINGS:
+        runs = take_turns(setting)
+        sections.append(section(setting, runs))
+        numbers[f"K = {setting.num_frames}"] = {
+            name: {
+                "steps_per_second": [outcome.speed() for outcome in outcomes],
+                "steps_per_second_of_processor_time": [outcome.speed(1) for outcome in outcomes],
+                "training_return": [outcome.training_return for outcome in outcomes],
+                "first_batch_seconds": [outcome.first_batch for outcome in outcomes],
+            }
+            for name, outcomes in runs.items()
+        }
+    shares = {name: profile(SETTINGS[0], mode) for name, mode in MODES.items()}
     markdown = (
         "# PPO on CartPole-v1, end to end\n\n"
-        "Enhanced_TIT (K 1, width 32, 2 blocks, 1 head, features 64; "
-        f"{parameters} parameters with the heads), {ENVS} environments,\n{STEPS} steps a batch, "
-        f"minibatches of 64, 10 epochs, one thread. {REPEATS} rounds of runs, alternating, of "
-        f"{BATCHES}\nbatches each, of which the first is left out. Medians and ranges; ratios are "
-        "taken round by round.\n\n"
-        + table(
-            ["", "steps a second", "ratio", "ratio of processor time", "return after training"],
-            [
-                row("Stable-Baselines3, straightforward network", runs["sb3"], runs["sb3"]),
-                row("this library, compiled", runs["compiled"], runs["sb3"]),
-                row("this library, `--compile off`", runs["ours"], runs["sb3"]),
-            ],
-        )
-        + "\nThe return is that of the episodes that ended in the last batch, after "
-        f"{(BATCHES - 1) * STEPS} steps of\ntraining: both implementations learn alike. "
-        f"Compiling took {runs['compiled'][0].first_batch:.0f} seconds the first time, with "
-        "nothing\ncached on the disk, in the first batch. It is on by default in runs "
-        "of 10,000 gradient\nsteps or more (100k steps have 15,680), where there is a C++ "
-        "compiler.\n\nWhere our time goes (separate runs, with timers):\n\n"
+        f"Enhanced_TIT (width 32, 2 blocks, 1 head, features 64), {ENVS} environments, {STEPS} "
+        "steps a batch,\nminibatches of 64, 10 epochs, one thread. Runs alternate, and the first "
+        "batch of each is left out. Medians\nand ranges; ratios are taken round by round. The "
+        "return is that of the episodes that ended in the last\nbatch.\n\n"
+        + "\n".join(sections)
+        + "\nCompiling is on by default in runs of 10,000 gradient steps or more (100k steps have "
+        "15,680), where there\nis a C++ compiler.\n\nWhere our time goes with K = 1 (separate "
+        "runs, with timers):\n\n"
         + table(
             ["part", "compiled", "`--compile off`"],
             [
@@ -291,18 +312,41 @@ def measure(out: Path | None) -> None:
         )
         + "\nIn compiled runs, the backbone is part of *the rest* and of *heads and loss*.\n"
     )
-    numbers: dict[str, Any] = {
-        name: {
-            "steps_per_second": [outcome.speed() for outcome in outcomes],
-            "steps_per_second_of_processor_time": [outcome.speed(1) for outcome in outcomes],
-            "training_return": [outcome.training_return for outcome in outcomes],
-            "first_batch_seconds": [outcome.first_batch for outcome in outcomes],
-        }
-        for name, outcomes in runs.items()
-    }
     publish("ppo_cartpole", markdown, {**numbers, "shares": shares}, out)
     if out is not None:
         draw(shares, out / "ppo_cartpole.png")
+
+
+MODES: dict[str, Compile] = {"ours": "off", "compiled": "on"}
+
+
+def take_turns(setting: Setting) -> dict[str, list[Outcome]]:
+    """Runs both libraries in turns."""
+    runs: dict[str, list[Outcome]] = defaultdict(list)
+    for repeat in range(setting.repeats):
+        runs["sb3"].append(run_sb3(setting, repeat))
+        for name, mode in MODES.items():
+            runs[name].append(run_ours(setting, repeat, mode))
+    return runs
+
+
+def section(setting: Setting, runs: dict[str, list[Outcome]]) -> str:
+    """Makes the table of a number of frames."""
+    (parameters,) = {outcome.parameters for outcomes in runs.values() for outcome in outcomes}
+    return (
+        f"K = {setting.num_frames}: {parameters} parameters with the heads, {setting.repeats} "
+        f"rounds of {setting.batches} batches; compiling took "
+        f"{runs['compiled'][0].first_batch:.0f} seconds\nthe first time, with nothing cached, in "
+        "the first batch.\n\n"
+        + table(
+            ["", "steps a second", "ratio", "ratio of processor time", "return after training"],
+            [
+                row("Stable-Baselines3, straightforward network", runs["sb3"], runs["sb3"]),
+                row("this library, compiled", runs["compiled"], runs["sb3"]),
+                row("this library, `--compile off`", runs["ours"], runs["sb3"]),
+            ],
+        )
+    )
 
 
 def row(name: str, runs: list[Outcome], peers: list[Outcome]) -> list[str]:

@@ -5,10 +5,12 @@ from itertools import pairwise
 
 import pytest
 import torch
+from torchrl.modules import set_recurrent_mode
 
-from benchmarks import acting, memory, training_step
+from benchmarks import acting, memory, segments, training_step
 from benchmarks.__main__ import BENCHMARKS, gather
 from benchmarks.cases import Case, same_number_of_weights
+from benchmarks.earlier import earlier_tree
 from benchmarks.matrix_peak import count_flops, peak_flops
 from benchmarks.straightforward_ratios import HEADER, cells
 from tests.numerics import assert_near
@@ -60,6 +62,31 @@ def test_training_step(case, bfloat16):
     row = training_step.measure(case, 2, 0.0, compiled=False, bfloat16=bfloat16)
     assert len(row["ours_ratios"]) == 2
     assert len(cells(row, ms_digits=1, ratio_digits=2)) == len(HEADER)
+
+
+def test_segments_hold_the_windows_that_the_peers_read():
+    case = Case("Enhanced", "arrays", 4, 32)
+    steps = segments.make_segments(case, 16)
+    assert steps.shape == (2, 16)
+    frames = torch.cat([steps["history"][:, 0], steps["observation"][:, 1:]], dim=1)
+    windows = frames.unfold(1, 4, 1).movedim(-1, 2).flatten(0, 1)
+    network = case.ours()
+    backbone = Backbone(network, padding="same")
+    with set_recurrent_mode(True):
+        features = backbone(steps)["features"]
+    assert_near(features.flatten(0, 1), network(windows))
+
+
+def test_segments_against_full_windows_of_the_earlier_commit():
+    row = segments.Row(Case("Enhanced", "arrays", 4, 32), length=16, straightforward=True)
+    try:
+        with earlier_tree() as tree:
+            result = segments.measure(row, tree, rounds=2, seconds=0.0)
+    except SystemExit:
+        pytest.skip("this is no full clone")
+    assert set(result["ms"]) == {"segments", "full windows", "straightforward"}
+    assert all(len(times) == 2 for times in result["ms"].values())
+    assert len(segments.cells(result, rate=1e9)) == 10
 
 
 def test_operations_of_matrix_products_are_counted():
