@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from recipes import registry
 from recipes.recipe_json import recipe_from_json
 
 ROOT = Path(__file__).parents[2]
@@ -36,5 +37,6 @@ def test_python_runs(document):
 def test_results_can_be_run_again():
     files = sorted(ROOT.glob("docs/results/**/recipe.json"))
     assert files
+    assert registry.RECIPES  # every algorithm that a file can name is registered
     for file in files:
         recipe_from_json(file.read_bytes(), name(file))
