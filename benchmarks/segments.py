@@ -32,7 +32,7 @@ from .cases import Case
 from .earlier import COMMIT, Worker, earlier_tree
 from .matrix_peak import count_flops, peak_flops
 from .report import publish, spread, table
-from .training_step import make_step
+from .training_step import make_descent, make_step
 
 SAMPLES, ROUNDS, SECONDS = 64, 5, 0.5
 
@@ -82,20 +82,12 @@ def make_update(case: Case, length: int, compiled: bool) -> Callable[[], None]:
     """Returns a function that takes one training step on segments."""
     network, segments = case.ours(), make_segments(case, length)
     backbone = Backbone(network, padding="same")
-    optimizer = torch.optim.Adam(network.parameters(), fused=True)
 
     def loss_of(segments: TensorDictBase) -> Tensor:
         with set_recurrent_mode(True):
             return backbone(segments.copy())["features"].square().mean()
 
-    loss = torch.compile(loss_of, dynamic=False) if compiled else loss_of
-
-    def update() -> None:
-        optimizer.zero_grad()
-        loss(segments).backward()
-        optimizer.step()
-
-    return update
+    return make_descent(network, loss_of, segments, compiled)
 
 
 def milliseconds(update: Callable[[], None], seconds: float) -> float:

@@ -45,17 +45,24 @@ def make_step(
     network: nn.Module, history: Tensor, autocast: torch.dtype | None, compiled: bool
 ) -> Callable[[], None]:
     """Returns a function that takes one training step."""
-    optimizer = torch.optim.Adam(network.parameters(), fused=True)
 
     def loss_of(history: Tensor) -> Tensor:
         with torch.autocast(history.device.type, autocast) if autocast else nullcontext():
             return network(history).float().square().mean()
 
+    return make_descent(network, loss_of, history, compiled)
+
+
+def make_descent(
+    network: nn.Module, loss_of: Callable[[Any], Tensor], inputs: Any, compiled: bool
+) -> Callable[[], None]:
+    """Returns a function that takes one step of Adam down the gradient of a loss on its inputs."""
+    optimizer = torch.optim.Adam(network.parameters(), fused=True)
     loss = torch.compile(loss_of, dynamic=False) if compiled else loss_of
 
     def step() -> None:
         optimizer.zero_grad()
-        loss(history).backward()
+        loss(inputs).backward()
         optimizer.step()
 
     return step
