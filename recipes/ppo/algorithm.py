@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -169,15 +169,16 @@ class PPOAlgorithm(Algorithm[PPO]):
         with torch.no_grad():
             add_advantages(batch, rollout, agent, self.gae, recipe.bootstrap_time_limit)
         agent.train()
-        steps = []
+        steps: list[Tensor] = []
         for minibatch in minibatches(batch, rollout, agent, recipe):
-            steps.append(self._step(minibatch))
+            try:
+                steps.append(self._step(minibatch))
+            except RuntimeError:  # TorchRL draws samples where an entropy is not finite
+                self._check_update(steps, minibatch)
+                raise
         agent.eval()
+        self._check_update(steps, minibatch)
         terms = torch.stack(steps)  # [gradient steps, terms]
-        first = terms.isfinite().all(1).int().argmin()  # the first step that is not finite, if any
-        check_finite(self.terms, terms[first])
-        # A step that was too long shows in the next forward pass only, not in its own losses.
-        self._check_agent(minibatch)
         if recipe.collectors > 1:
             self.collector.update_policy_weights_()
         self.collector_state.step = step + batch.numel()
@@ -209,11 +210,7 @@ class PPOAlgorithm(Algorithm[PPO]):
 
     def _step(self, minibatch: TensorDict) -> Tensor:
         """Takes a gradient step; returns its terms, float [terms]."""
-        try:
-            total, values = self.objective(minibatch)
-        except RuntimeError:  # TorchRL draws samples where an entropy is not finite
-            self._check_agent(minibatch)
-            raise
+        total, values = self.objective(minibatch)
         assert self.parameters.grad is not None
         self.parameters.grad.zero_()  # those of all layers are views of it
         total.backward()
@@ -241,8 +238,13 @@ class PPOAlgorithm(Algorithm[PPO]):
         return contrastive_prediction_loss(*masked_predictions(network, history, mask), mask)
 
     @torch.no_grad()
-    def _check_agent(self, samples: TensorDictBase) -> None:
-        """Checks that weights, and the values they give to samples, are finite."""
+    def _check_update(self, steps: Sequence[Tensor], samples: TensorDictBase) -> None:
+        """Checks the terms of gradient steps, the weights, and the values they give to samples."""
+        if steps:
+            terms = torch.stack(steps)  # [gradient steps, terms]
+            first = terms.isfinite().all(1).int().argmin()  # the first that is not finite, if any
+            check_finite(self.terms, terms[first])
+        # A step that was too long shows in the next forward pass only, not in its own losses.
         value = self.agent.critic(self.agent.encode(samples))["state_value"].mean()
         weights = nn.utils.get_total_norm(self.parameters)
         check_finite(["weights", "value"], torch.stack([weights, value]))
