@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
-from torchrl.collectors import BaseCollector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.layers import init_orthogonal_
 from torchrl_tit.modules import Backbone, make_actor, make_value
 from torchrl_tit.networks import build_network, masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 
-from ..algorithm import Algorithm, Stateful, check_finite, torch_device
+from ..algorithm import Algorithm, Stateful, check_finite
 from ..compilation import STATIC_SHAPES, autocast_type, compile_and_time, should_compile
 from ..outcomes import Outcome
 from ..stateful import CollectorState
+from .collectors import make_collector, make_task, with_state
 from .flat_parameters import FlatParameters
-from .rollout import FrameCollector, Rollout
+from .rollout import Rollout
 from .settings import PPO
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
@@ -105,7 +101,7 @@ class PPOAlgorithm(Algorithm[PPO]):
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories, and with the state of a recurrent network."""
-        return _with_state(make_task(self.recipe, num_envs, seed, **settings), self.agent.backbone)
+        return with_state(make_task(self.recipe, num_envs, seed, **settings), self.agent.backbone)
 
     def prepare(self, step: int, folder: Path) -> None:
         """Builds loss, optimizer and collector."""
@@ -133,7 +129,9 @@ class PPOAlgorithm(Algorithm[PPO]):
             self.objective = compile_and_time(self._objective, "the loss")
         if compiled and agent.backbone.keeps_frames:
             agent.backbone.compile_parts(**STATIC_SHAPES)
-        self.collector = self._make_collector(step, compiled)
+        self.collector = make_collector(
+            recipe, agent.policy, agent.backbone, step, compiled=compiled
+        )
         self.collector_state = CollectorState(self.collector, recipe.seed, step)
 
     def state(self) -> Mapping[str, Stateful]:
@@ -238,7 +236,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         return contrastive_prediction_loss(*masked_predictions(network, history, mask), mask)
 
     @torch.no_grad()
-    def _check_update(self, steps: Sequence[Tensor], samples: TensorDictBase) -> None:
+    def _check_update(self, steps: list[Tensor], samples: TensorDictBase) -> None:
         """Checks the terms of gradient steps, the weights, and the values they give to samples."""
         if steps:
             terms = torch.stack(steps)  # [gradient steps, terms]
@@ -248,89 +246,6 @@ class PPOAlgorithm(Algorithm[PPO]):
         value = self.agent.critic(self.agent.encode(samples))["state_value"].mean()
         weights = nn.utils.get_total_norm(self.parameters)
         check_finite(["weights", "value"], torch.stack([weights, value]))
-
-    def _make_collector(self, step: int, compiled: bool) -> BaseCollector:
-        """Builds the collector of batches [num_envs, time], in this process or in several.
-
-        Several share the environments, each with a copy of the policy. If they are asynchronous, a
-        batch comes from one of them.
-        """
-        recipe, policy = self.recipe, self.agent.policy
-        settings: dict[str, Any] = {
-            "frames_per_batch": recipe.steps_per_batch,
-            "device": self.device,
-            "trust_policy": True,  # ours is on the right device already
-            "auto_register_policy_transforms": False,
-            "use_buffers": False,  # they would have the histories, which steps lack
-        }
-        if recipe.collectors == 1:
-            mode = recipe.vectorization_mode
-            # Which tokens are reused is decided between two parts that are compiled separately.
-            whole = compiled and not self.agent.backbone.keeps_frames
-            return FrameCollector(
-                self.make_env(
-                    recipe.num_envs, recipe.seed, vectorization_mode=mode, keep_histories=False
-                ),
-                policy,
-                total_frames=recipe.final_step,
-                compile_policy=STATIC_SHAPES if whole else None,
-                track_traj_ids=False,
-                return_same_td=True,  # without buffers, each batch has its own memory
-                **settings,
-            )
-        kind = MultiAsyncCollector if recipe.async_collection else MultiSyncCollector
-        make_share = partial(_make_share, recipe, self.agent.backbone, step)
-        return kind(
-            [partial(make_share, index) for index in range(recipe.collectors)],
-            policy,
-            total_frames=recipe.final_step - step,
-            collector_class=FrameCollector,
-            **settings,
-        )
-
-
-def make_task(recipe: PPO, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
-    """Builds a recipe's task, with histories.
-
-    Args:
-        recipe: the settings.
-        num_envs: environments that are stepped side by side.
-        seed: of the first environment.
-        **settings: of the task.
-    """
-    device = torch_device(recipe.device)
-    return make_env(
-        recipe.env,
-        num_envs,
-        seed=seed,
-        num_frames=recipe.backbone.num_frames,
-        padding=recipe.padding,
-        hide_velocities=recipe.hide_velocities,
-        device=None if device.type == "cpu" else device,
-        **settings,
-    )
-
-
-def _with_state(env: EnvBase, backbone: Backbone) -> EnvBase:
-    """Adds transforms that carry the state of a recurrent network from step to step."""
-    return env.append_transform(backbone.make_transforms()) if backbone.is_recurrent else env
-
-
-def _make_share(recipe: PPO, backbone: Backbone, step: int, index: int) -> EnvBase:
-    """Builds the environments of one process; called in that process.
-
-    Random numbers follow from the run's seed and the step at which the process starts.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the training process
-    torch.set_num_threads(recipe.threads)
-    share = recipe.num_envs // recipe.collectors
-    seeds = np.random.SeedSequence([recipe.seed, index, step])
-    torch.manual_seed(seeds.generate_state(1).item())
-    # At the start, the environments have the same seeds as in one process.
-    seed = recipe.seed + index * share if step == 0 else seeds.generate_state(2)[1].item() >> 1
-    mode = recipe.vectorization_mode
-    task = make_task(recipe, share, seed, vectorization_mode=mode, keep_histories=False)
-    return _with_state(task, backbone)
 
 
 def add_advantages(

@@ -16,7 +16,8 @@ from torchrl.objectives.value import GAE
 
 from recipes.compilation import should_compile
 from recipes.ppo import PPO
-from recipes.ppo.algorithm import Agent, PPOAlgorithm, add_advantages, make_task, minibatches
+from recipes.ppo.algorithm import Agent, PPOAlgorithm, add_advantages, minibatches
+from recipes.ppo.collectors import make_task
 from recipes.ppo.rollout import Rollout
 from recipes.registry import get_recipe
 from recipes.run import Run
