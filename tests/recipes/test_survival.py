@@ -1,11 +1,8 @@
 """Runs that are killed, interrupted, damaged or poisoned."""
 
 import json
-import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -22,11 +19,11 @@ from recipes.recipe_json import recipe_to_json
 from recipes.registry import RECIPES
 from recipes.results.plot import plot_run
 from recipes.run import Run
+from tests.recipes.commands import Command
 from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import CheckpointError, latest_step, load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit
 
-ROOT = Path(__file__).parents[2]
 SMALL = PPO(
     name="ppo/cartpole/small",
     env="CartPole-v1",
@@ -43,19 +40,7 @@ SMALL = PPO(
 HOPPER = replace(SMALL, name="ppo/hopper/small", env="Hopper-v5", total_steps=64 * 12)
 
 
-def start(*words: object, **options) -> subprocess.Popen:
-    return subprocess.Popen(
-        [sys.executable, "-m", "recipes", "train", *map(str, words)],
-        cwd=ROOT,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        text=True,
-        **options,
-    )
-
-
-def wait_for_step(process: subprocess.Popen, run: Path, step: int) -> None:
+def wait_for_step(process: Command, run: Path, step: int) -> None:
     """Waits until a run has saved a step, or ended."""
     while process.poll() is None and (latest_step(run / "checkpoints") or 0) < step:
         time.sleep(0.005)
@@ -73,7 +58,7 @@ def test_killed_and_resumed_is_bit_for_bit_the_same(recipe, tmp_path):
     (tmp_path / "recipe.json").write_text(recipe_to_json(recipe))
     killed = tmp_path / "killed"
     generator = random.Random(0)
-    process = start(tmp_path / "recipe.json", "--out", killed)
+    process = Command(["train", tmp_path / "recipe.json", "--out", killed], tmp_path / "errors")
     kills = 0
     while True:
         wait_for_step(process, killed, (latest_step(killed / "checkpoints") or 0) + 2 * 64)
@@ -81,11 +66,10 @@ def test_killed_and_resumed_is_bit_for_bit_the_same(recipe, tmp_path):
         if process.poll() is not None or kills == 2:
             break
         process.send_signal(signal.SIGKILL)
-        process.communicate()
+        process.wait()
         kills += 1
-        process = start("--resume", killed)
-    _, errors = process.communicate(timeout=120)
-    assert process.returncode == 0, errors
+        process = Command(["train", "--resume", killed], tmp_path / "errors")
+    assert process.wait() == 0, process.errors.read_text()
     assert kills >= 2
     step, state = final(killed)
     expected_step, expected = final(tmp_path / "whole")
@@ -105,14 +89,13 @@ def test_ctrl_c_saves_and_resume_goes_on(tmp_path):
         recipe_to_json(replace(SMALL, checkpoint_interval=10**6, total_steps=64 * 400))
     )
     run = tmp_path / "run"
-    process = start(tmp_path / "recipe.json", "--out", run)
+    process = Command(["train", tmp_path / "recipe.json", "--out", run], tmp_path / "errors")
     while len(read_metrics(run / "metrics.csv")) < 2:
         assert process.poll() is None
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert f"train --resume {run}" in errors
+    assert process.wait() == 130
+    assert f"train --resume {run}" in process.errors.read_text()
     step, _ = final(run)
     assert step == read_metrics(run / "metrics.csv")[-1]["step"]
     assert not (run / "evaluation.json").exists()

@@ -1,8 +1,6 @@
 """`data collect` that is killed, resumed, and given more sets to make."""
 
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -22,9 +20,8 @@ from tests.recipes.collect.collected import (
     check_episodes,
     read,
 )
+from tests.recipes.commands import Command
 from torchrl_tit.checkpoint import checkpoint_steps
-
-ROOT = Path(__file__).parents[3]
 
 
 class Kill(BaseException):
@@ -134,22 +131,17 @@ def test_killed_and_resumed(pendulum: Path, pendulum_settings: Collection, tmp_p
     options = f"Pendulum-v1 --agent {pendulum_settings.agent} --out {tmp_path / 'killed'} "
     options += "--transitions 300 --medium-return -2000 --total-steps 400 --num-envs 2 "
     options += "--evaluation-interval 200 --evaluation-episodes 2 --checkpoint-interval 150 "
-    command = [sys.executable, "-m", "recipes", "data", "collect", *options.split()]
+    words = ["data", "collect", *options.split()]
     checkpoints = tmp_path / "killed" / "training" / "checkpoints"
 
-    def start() -> subprocess.Popen:
-        return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-
     for step in (150, 300):
-        process = start()
+        process = Command(words, tmp_path / "errors")
         while process.poll() is None and max(checkpoint_steps(checkpoints), default=0) < step:
             time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
-    process = start()
-    _, errors = process.communicate(timeout=300)
-    assert process.returncode == 0, errors
+        assert process.wait() == -signal.SIGKILL
+    process = Command(words, tmp_path / "errors")
+    assert process.wait(timeout=300) == 0, process.errors.read_text()
     assert_same(tmp_path / "killed", pendulum)
 
 

@@ -1,13 +1,11 @@
 """Sweeps: complete runs stay, killed ones go on, other settings are refused."""
 
-import os
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
 
@@ -18,9 +16,8 @@ from recipes.registry import RECIPES
 from recipes.results.plot import plot_run
 from recipes.run import Run
 from recipes.sweeps import sweep
+from tests.recipes.commands import Command
 from tests.recipes.sweeps.sweep_runs import TINY, begin
-
-ROOT = Path(__file__).parents[3]
 
 
 def test_patterns_and_seeds_make_the_runs(tmp_path):
@@ -151,23 +148,17 @@ def test_unknown_names_are_refused(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_stops_every_worker(tmp_path, number):
-    out = tmp_path / "sweep"
-    job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], out)[0]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "recipes", "sweep", "ppo/cartpole/mlp", "--out", str(out)],
-        cwd=ROOT,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    out, path = tmp_path / "sweep", tmp_path / "recipe.json"
+    path.write_text(recipe_to_json(replace(TINY, total_steps=10**6, checkpoint_interval=10**6)))
+    job = sweep.make_jobs([str(path)], [0], out)[0]
+    process = Command(["sweep", path, "--out", out], tmp_path / "errors")
     metrics = job.folder / "metrics.csv"
     while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
         assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=90)
-    assert process.returncode == 130
-    assert "the same command resumes it" in errors
+    assert process.wait() == 130
+    assert "the same command resumes it" in process.errors.read_text()
     assert list((job.folder / "checkpoints").iterdir())
     with Run.open(job.folder):  # nobody is at work there any more
         pass

@@ -1,10 +1,7 @@
 """Hyperparameter search: spaces as data, pruning, and searches that were killed."""
 
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -20,6 +17,7 @@ from recipes.registry import get_recipe
 from recipes.run import Run
 from recipes.sweeps.search_space import load_space, with_values
 from recipes.sweeps.tune import Search, Settings
+from tests.recipes.commands import Command
 from torchrl_tit.settings.networks import mlp
 
 optuna = pytest.importorskip("optuna")
@@ -57,18 +55,12 @@ def words(files, trials):
 @pytest.mark.slow
 def test_a_search_that_was_killed_goes_on(files, capsys):
     out = files / "out"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "recipes", *words(files, 2)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        start_new_session=True,
-    )
+    process = Command(words(files, 2), files / "errors")
     deadline = time.monotonic() + 120
     while not (out / "trial-0" / "seed-0" / "recipe.json").exists():
         assert time.monotonic() < deadline
         time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGKILL)
+    process.send_signal(signal.SIGKILL)
     process.wait()
     # Its worker has a session of its own, and holds the folder until it is done.
     while not (out / "trial-0" / "seed-0" / "learning_curve.png").exists():

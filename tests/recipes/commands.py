@@ -1,0 +1,57 @@
+"""The command line in a process of its own, without the seconds that importing PyTorch takes.
+
+Each process is forked from one that has imported everything already.
+"""
+
+import multiprocessing
+import os
+import signal
+import sys
+from pathlib import Path
+
+from recipes.cli import main
+
+_CONTEXT = multiprocessing.get_context("forkserver")
+_CONTEXT.set_forkserver_preload(["recipes.cli.main", "recipes.runner", "recipes.ppo.algorithm"])
+
+
+class Command:
+    """A running command.
+
+    Args:
+        words: the command and its arguments.
+        errors: file for what it writes to standard error.
+    """
+
+    def __init__(self, words: list[object], errors: Path) -> None:
+        self.errors = errors
+        # Not a daemon: it may have processes of its own.
+        self._process = _CONTEXT.Process(target=_run, args=([str(word) for word in words], errors))
+        self._process.start()
+
+    def poll(self) -> int | None:
+        """Returns the exit code, negative after a signal; None before the end."""
+        self._process.join(0)
+        return self._process.exitcode
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Sends the process a signal."""
+        assert self._process.pid is not None
+        os.kill(self._process.pid, number)
+
+    def wait(self, timeout: float = 120) -> int:
+        """Waits for the end, returns the exit code and kills a process that takes longer."""
+        self._process.join(timeout)
+        if self._process.exitcode is None:
+            self._process.kill()
+            raise TimeoutError(f"still running after {timeout} s: {self.errors.read_text()}")
+        return self._process.exitcode
+
+
+def _run(words: list[str], errors: Path) -> None:
+    os.setsid()
+    with errors.open("w") as file, open(os.devnull, "w") as null:
+        os.dup2(null.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+    main(words)
