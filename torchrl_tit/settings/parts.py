@@ -6,7 +6,7 @@ import importlib
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
-from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.names import Names
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class Part:
     kind: ClassVar[str]
     name: ClassVar[str]
     builds: ClassVar[str]
-    registered: ClassVar[dict[str, type[Any]]]
+    registered: ClassVar[Names[type[Any]]]
     """All parts of the kind by name."""
 
     def __init_subclass__(
@@ -39,30 +39,29 @@ class Part:
     ) -> None:
         super().__init_subclass__()
         if kind is not None:
-            cls.kind, cls.registered = kind, {}
+            cls.kind, cls.registered = kind, Names(kind)
         if name is not None and builds is not None:
-            other = cls.registered.get(name)
-            if other is not None and (other.__module__, other.__qualname__) != (
-                cls.__module__,
-                cls.__qualname__,
-            ):
-                raise ValueError(
-                    f"two {cls.kind}s are called {name!r}: {other.__module__}.{other.__qualname__} "
-                    f"and {cls.__module__}.{cls.__qualname__}; rename one of them"
-                )
+            cls.registered.add(name, cls, f"{cls.__module__}.{cls.__qualname__}")
             cls.name, cls.builds = name, builds
-            cls.registered[name] = cls
 
     @classmethod
     def get(cls, name: str) -> type[Self]:
-        """Looks up a part of this kind.
+        """Looks up a part of this kind, in installed plugins too.
 
         Raises:
-            ValueError: if no part has that name; the message suggests similar names.
+            ValueError: if no part, or more than one, has that name; the message suggests similar
+                names.
         """
-        if name not in cls.registered:
-            raise ValueError(f"unknown {cls.kind} {name!r}: {nearest(str(name), cls.registered)}")
-        return cls.registered[name]
+        return cls.registered.find(name)
+
+    @classmethod
+    def from_older(cls, fields: dict[str, Any]) -> dict[str, Any]:
+        """Renames fields of JSON that an older version of the part wrote; by default, none.
+
+        Args:
+            fields: the fields by name, which may be changed in place.
+        """
+        return fields
 
     def build(self, *args: Any, **kwargs: Any) -> Any:
         """Imports the implementation and builds it: ``Class(settings, *args, **kwargs)``."""

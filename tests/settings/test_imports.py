@@ -1,0 +1,123 @@
+"""What is imported by its name, and what is not."""
+
+import re
+import subprocess
+import sys
+
+import pytest
+
+from torchrl_tit.settings.imports import (
+    allow,
+    allowed_modules,
+    import_allowed,
+    import_module,
+    import_named,
+    import_options,
+)
+
+
+@pytest.fixture(autouse=True)
+def _modules(own_modules):
+    """Modules that are not loaded."""
+    for name in ("pack_a", "pack_b"):
+        (own_modules / name).mkdir()
+        (own_modules / name / "__init__.py").touch()
+        (own_modules / name / "parts.py").write_text("ANSWER = 42\n")
+    (own_modules / "raises_a.py").write_text("raise RuntimeError('two\\nlines')\n")
+    (own_modules / "raises_b.py").write_text("import no_such_dependency\n")
+    (own_modules / "no_python.py").write_text("x = (\n")
+    (own_modules / "json.py").touch()
+
+
+def test_a_module_is_imported_if_it_or_a_package_around_it_was_allowed():
+    with pytest.raises(ValueError, match=r"add `--import pack_a\.parts`$"):
+        import_named("pack_a.parts:ANSWER")
+    assert "pack_a" not in sys.modules
+    allow("pack_a")
+    assert import_named("pack_a.parts:ANSWER") == 42  # found in the current directory
+    allow("pack_b.parts")
+    with pytest.raises(ValueError, match="add `--import pack_b`"):  # only a part of it
+        import_named("pack_b:parts")
+    assert import_named("pack_b.parts:ANSWER") == 42
+    allow("pack_a")
+    assert allowed_modules() == ["pack_a", "pack_b.parts"]
+    assert import_options() == ["--import", "pack_a", "--import", "pack_b.parts"]
+
+
+def test_a_name_that_only_begins_alike_is_not_allowed():
+    allow("pack")
+    with pytest.raises(ValueError, match="add `--import pack_a`"):
+        import_named("pack_a:parts")
+
+
+def test_loaded_modules_and_trusted_packages_need_no_word():
+    assert import_named("math:pi") == 3.141592653589793
+    assert import_named("torchrl_tit.settings.checks:nearest")("a", ["b"]) == "choose from b"
+
+
+def test_a_file_is_imported_under_its_own_name_with_its_neighbours(own_modules):
+    (own_modules / "pack_a" / "mine.py").write_text("from parts import ANSWER\n")
+    module = import_allowed("pack_a/mine.py")
+    assert (module.__name__, module.ANSWER) == ("mine", 42)
+    assert import_allowed("pack_a/mine.py") is module  # it runs once
+    assert import_named("mine:ANSWER") == 42
+    assert allowed_modules() == ["pack_a/mine.py"]
+    allow("mine")  # as in `--import pack_a/mine.py --wrappers mine:Wrapper`
+    assert allowed_modules() == ["pack_a/mine.py"]
+
+
+def test_processes_that_are_started_later_may_import_the_same():
+    allow("pack_a")
+    program = (
+        "from torchrl_tit.settings.imports import import_named;"
+        "print(import_named('pack_a.parts:ANSWER'))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "42\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("use", "error", "message"),
+    [
+        (lambda: import_named("math"), ValueError, "'math' names nothing .* module:attribute"),
+        (lambda: import_named("math:f()"), ValueError, "names nothing"),
+        (lambda: import_named("math:no"), ImportError, "math has no 'no', which 'math:no' names"),
+        (lambda: allow("a-b"), ValueError, "'a-b' is not the name of a module"),
+        (lambda: allow("a-b.py"), ValueError, "'a-b.py' is not the name of a module"),
+        (lambda: import_allowed("none.py"), ImportError, "^there is no file none.py$"),
+        (
+            lambda: import_allowed("json.py"),
+            ValueError,
+            r"^json.py has the name of another module, json \(.*\): rename it$",
+        ),
+        (
+            lambda: import_allowed("no_python.py"),
+            ImportError,
+            r"no_python.py is not Python: .* \(line 1\)$",
+        ),
+        (
+            lambda: import_allowed("nowhere.x"),
+            ImportError,
+            "^there is no module 'nowhere', looked",
+        ),
+        (
+            lambda: import_allowed("pack_a.x"),
+            ImportError,
+            r"^there is no module 'pack_a\.x', look",
+        ),
+        (
+            lambda: import_allowed("raises_a"),
+            ImportError,
+            re.escape("module 'raises_a' cannot be imported: RuntimeError: two"),
+        ),
+        (
+            lambda: import_module("raises_b"),
+            ImportError,
+            "^module 'raises_b' cannot be imported: ModuleNotFoundError: .*'no_such_dependency'",
+        ),
+    ],
+)
+def test_errors(use, error, message):
+    sys.path.insert(0, "")
+    with pytest.raises(error, match=message):
+        use()

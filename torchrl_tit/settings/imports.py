@@ -1,0 +1,154 @@
+"""What may be imported by its name: modules that the user named, not those that a file names."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+TRUSTED = frozenset(
+    {"ale_py", "gymnasium", "minigrid", "popgym", "recipes", "torchrl", "torchrl_tit"}
+)
+"""Packages whose modules any recipe may name."""
+
+# An environment variable, so that processes that this one starts may import the same.
+_VARIABLE = "TORCHRL_TIT_IMPORTS"
+
+
+def allow(module: str) -> None:
+    """Allows a module and its submodules to be imported by name, because the user typed it.
+
+    The module's folder becomes importable: that of a Python file, and otherwise the current
+    directory, as with ``python -m``.
+
+    Args:
+        module: a module's name, or the path of a Python file (ending in ".py").
+
+    Raises:
+        ValueError: if it is neither.
+    """
+    name = _module_name(module)
+    if not all(part.isidentifier() for part in name.split(".")):
+        raise ValueError(
+            f"{module!r} is not the name of a module: expected a name such as "
+            "my_package.my_module, or the path of a Python file whose name has only letters, "
+            "digits and '_'"
+        )
+    folder = str(Path(module).absolute().parent) if module.endswith(".py") else os.getcwd()
+    if folder not in sys.path and not (folder == os.getcwd() and "" in sys.path):
+        sys.path.insert(0, folder)
+        importlib.invalidate_caches()
+    if name not in map(_module_name, allowed_modules()):
+        os.environ[_VARIABLE] = os.pathsep.join([*allowed_modules(), module])
+
+
+def allowed_modules() -> list[str]:
+    """Returns what the user named, as typed and in that order, for processes that start later."""
+    return list(filter(None, os.environ.get(_VARIABLE, "").split(os.pathsep)))
+
+
+def import_options() -> list[str]:
+    """Returns the same as options of the command line: ``--import MODULE`` for each."""
+    return [word for module in allowed_modules() for word in ("--import", module)]
+
+
+def import_allowed(module: str) -> ModuleType:
+    """Imports a module, or a Python file, that the user named, and allows it.
+
+    Raises:
+        ImportError: if there is no such module, or it raises, with the reason in one line.
+        ValueError: if it is neither the name of a module nor a Python file, or a module of the
+            file's name is loaded already.
+    """
+    allow(module)
+    if not module.endswith(".py"):
+        return import_module(module)
+    if not Path(module).is_file():
+        raise ImportError(f"there is no file {module}")
+    name = _module_name(module)
+    loaded = import_module(name)
+    origin = getattr(loaded, "__file__", None)
+    if origin is None or not os.path.samefile(origin, module):
+        raise ValueError(f"{module} has the name of another module, {name} ({origin}): rename it")
+    return loaded
+
+
+def import_named(target: str) -> Any:
+    """Imports what "module:attribute" names, if the module may be imported.
+
+    It may if the user named it or a package around it (:func:`allow`), if it is loaded already, or
+    if it belongs to a trusted package. Callers check what the object is before they call it.
+
+    Raises:
+        ValueError: if the form is another, or the module may not be imported.
+        ImportError: if there is no such module, it raises, or it lacks the attribute.
+
+    Example:
+        >>> import_named("this:zen")
+        Traceback (most recent call last):
+            ...
+        ValueError: 'this:zen' names a module that ...: to allow it, add `--import this`
+    """
+    module, colon, attribute = target.partition(":")
+    if not (module and colon and attribute.isidentifier()):
+        raise ValueError(f"{target!r} names nothing to import: expected module:attribute")
+    try:
+        return getattr(import_if_allowed(module, target), attribute)
+    except AttributeError as error:
+        raise ImportError(
+            f"module {module} has no {attribute!r}, which {target!r} names"
+        ) from error
+
+
+def import_if_allowed(module: str, target: str) -> ModuleType:
+    """Imports the module of a target, such as Gymnasium's "module:Name-v0": see `import_named`.
+
+    Raises:
+        ValueError: if the module may not be imported.
+        ImportError: if there is no such module, or it raises.
+    """
+    if not _is_allowed(module):
+        raise ValueError(
+            f"{target!r} names a module that runs code of its own when it is imported, and that "
+            f"you did not name yourself: to allow it, add `--import {module}`"
+        )
+    return import_module(module)
+
+
+def import_module(name: str) -> ModuleType:
+    """Imports a module; the caller has made sure that it may be.
+
+    Raises:
+        ImportError: if there is no such module, or it raises, with the reason in one line.
+    """
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # a user's module can raise anything
+        raise ImportError(_reason(name, error)) from error
+
+
+def _reason(name: str, error: Exception) -> str:
+    if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
+        return (
+            f"there is no module {error.name!r}, looked for in the current directory and in the "
+            "installed packages"
+        )
+    if isinstance(error, SyntaxError):
+        return f"{error.filename or name} is not Python: {error.msg} (line {error.lineno})"
+    return f"module {name!r} cannot be imported: {type(error).__name__}: {error}"
+
+
+def _module_name(module: str) -> str:
+    """The name under which a module or a file is imported."""
+    return Path(module).stem if module.endswith(".py") else module
+
+
+def _is_allowed(module: str) -> bool:
+    return (
+        module in sys.modules
+        or module.partition(".")[0] in TRUSTED
+        or any(f"{module}.".startswith(f"{_module_name(name)}.") for name in allowed_modules())
+    )
