@@ -61,7 +61,7 @@ class ReferenceTIT(nn.Module):
         activation_inner: str = "gelu",
         activation_outer: str = "gelu",
         position_encoding: bool = True,
-        temporal_position_encoding: bool = False,
+        temporal_positions: str = "none",
         share_blocks: bool = False,
         features_dim: int = 64,
         activation_head: str = "tanh",
@@ -90,7 +90,7 @@ class ReferenceTIT(nn.Module):
                 self.obs_patch_pos_encoding = nn.Parameter(torch.randn(1, patches + 1, embed_dim))
         else:
             self.embedding = nn.Linear(math.prod(self.shape), embed_dim, bias=False)
-        if temporal_position_encoding and outer:
+        if temporal_positions == "learned" and outer:
             self.step_pos_encoding = nn.Parameter(torch.randn(num_frames, 1, embed_dim))
 
         count = 1 if share_blocks else num_blocks

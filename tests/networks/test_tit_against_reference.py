@@ -55,11 +55,11 @@ CASES: dict[str, tuple[tuple[int, ...], int, dict[str, Any]]] = {
         {"activation_inner": "silu", "activation_outer": "gelu", "activation_head": "relu"},
     ),
     "no positions": ((4,), 2, {"position_encoding": False}),
-    "temporal positions": ((4,), 4, {"temporal_position_encoding": True}),
+    "temporal positions": ((4,), 4, {"temporal_positions": "learned"}),
     "no positions but temporal": (
         (4,),
         2,
-        {"position_encoding": False, "temporal_position_encoding": True},
+        {"position_encoding": False, "temporal_positions": "learned"},
     ),
     "shared blocks": ((4,), 2, {"share_blocks": True, "num_blocks": 3}),
     "one block": ((4,), 2, {"num_blocks": 1}),
@@ -70,7 +70,7 @@ CASES: dict[str, tuple[tuple[int, ...], int, dict[str, Any]]] = {
     "tall image, temporal positions": (
         (12, 4),
         2,
-        {"patch_size": 2, "temporal_position_encoding": True},
+        {"patch_size": 2, "temporal_positions": "learned"},
     ),
 }
 
@@ -79,7 +79,7 @@ PAIRS = [
     for network, kind in NETWORKS.items()
     for case, (_, _, settings) in CASES.items()
     # Temporal positions are for outer blocks.
-    if kind.get("outer", True) or "temporal_position_encoding" not in settings
+    if kind.get("outer", True) or "temporal_positions" not in settings
 ]
 
 

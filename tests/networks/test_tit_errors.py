@@ -66,8 +66,8 @@ def test_wrong_settings(
 def test_nothing_left() -> None:
     with pytest.raises(ValueError, match="inner and outer cannot both be off"):
         EnhancedTIT((4,), 2, inner=False, outer=False)
-    with pytest.raises(ValueError, match="that of the outer blocks: switch it off"):
-        EnhancedTIT((4,), 2, outer=False, temporal_position_encoding=True)
+    with pytest.raises(ValueError, match="those of the outer blocks: set them to none"):
+        EnhancedTIT((4,), 2, outer=False, temporal_positions="learned")
 
 
 @BOTH
@@ -98,8 +98,9 @@ def test_image_of_another_shape(kind: type[Any]) -> None:
 @pytest.mark.parametrize("dtype", [torch.float64, torch.int64, torch.bool, torch.bfloat16])
 def test_history_of_another_dtype(kind: type[Any], dtype: torch.dtype) -> None:
     tit = kind((3,), 2)
+    hint = "give it uint8, or convert" if dtype.is_floating_point else "if it counts categories"
     for call in (tit, tit.attention_maps):
-        with pytest.raises(TypeError, match=rf"{dtype} .* network of torch.float32: give it uint8"):
+        with pytest.raises(TypeError, match=rf"{dtype} .* network of torch.float32: {hint}"):
             call(torch.zeros(5, 2, 3, dtype=dtype))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -13,6 +13,7 @@ from tests.numerics import assert_near
 from torchrl_tit.histories.outer import StackedOuterTransformer
 from torchrl_tit.layers import SelfAttention, TransformerBlock
 from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, VanillaTIT
+from torchrl_tit.settings import TemporalPositions
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -32,17 +33,17 @@ def make(kind: type[Any], **settings: Any) -> HistoryNetwork:
 
 
 @pytest.mark.parametrize("kind", [EnhancedTIT, VanillaTIT])
-@pytest.mark.parametrize("temporal", [False, True])
+@pytest.mark.parametrize("temporal", get_args(TemporalPositions))
 def test_one_outer_block_sees_the_past_as_a_set_unless_steps_have_positions(
-    kind: type[Any], temporal: bool
+    kind: type[Any], temporal: TemporalPositions
 ) -> None:
     # Enhanced_TIT's outer blocks never stand on each other; Vanilla_TIT's do where there are two.
     blocks = 2 if kind is EnhancedTIT else 1
-    network = make(kind, num_blocks=blocks, temporal_position_encoding=temporal)
+    network = make(kind, num_blocks=blocks, temporal_positions=temporal)
     history = torch.randn(6, 4, 3)
     shuffled_past = history[:, [2, 0, 1, 3]]
     difference = (network(history) - network(shuffled_past)).abs().max()
-    if temporal:
+    if temporal != "none":
         assert difference > 1e-2
     else:
         assert difference < 1e-9

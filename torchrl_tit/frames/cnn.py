@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 from torch import Tensor, nn
 
 from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder, check_image_shape
+from torchrl_tit.frames.observation import Kind
 from torchrl_tit.layers.images import as_images, stacked_shape
 from torchrl_tit.layers.torsos import TORSOS
 
@@ -30,6 +32,8 @@ class CNNFrameEncoder(FrameEncoder):
         >>> encoder(torch.zeros(2, 4, 84, 84)).shape
         torch.Size([2, 4, 1, 255])
     """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("image",)
 
     def __init__(
         self,

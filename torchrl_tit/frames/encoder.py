@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 from torch import Tensor, nn
+
+from torchrl_tit.frames.observation import Kind, check_observation_shape
 
 
 class FrameEncoder(nn.Module):
@@ -14,17 +17,35 @@ class FrameEncoder(nn.Module):
     steps, each frame is encoded once, however many histories it is part of.
 
     A subclass is built as ``Encoder(settings, observation_shape)``, calls ``super().__init__`` with
-    the shapes of its input and output, and implements ``forward``.
+    the shapes of its input and output, and implements ``forward``. One that reads categories names
+    them in ``kinds``, and is built as ``Encoder(settings, observation_shape, categories=counts)``
+    for these, with the number of values of each entry.
 
     Args:
-        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
+        observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
         num_tokens: number L of tokens that an observation becomes.
         width: width D of a token.
 
     Raises:
         ValueError: if the observation is neither an array nor an image.
+
+    Example:
+        >>> import torch
+        >>> class Scaled(FrameEncoder):
+        ...     kinds = ("array",)
+        ...
+        ...     def __init__(self, settings, observation_shape):
+        ...         super().__init__(observation_shape, num_tokens=1, width=observation_shape[0])
+        ...         self.scale = nn.Parameter(torch.ones(self.width))
+        ...
+        ...     def forward(self, observation):
+        ...         return (self.scale * observation).unsqueeze(-2)
+        >>> Scaled(None, (4,))(torch.zeros(8, 3, 4)).shape
+        torch.Size([8, 3, 1, 4])
     """
 
+    kinds: ClassVar[tuple[Kind, ...]] = ("array", "image")
+    """Kinds of observations that it reads: of "array", "image" and "categories"."""
     num_tokens: int
     """Number L of tokens of an observation."""
     width: int
@@ -40,7 +61,8 @@ class FrameEncoder(nn.Module):
         """Encodes observations.
 
         Args:
-            observation: [..., *observation_shape], float, or uint8, which is scaled to 0..1.
+            observation: [..., *observation_shape], float, or uint8, which is scaled to 0..1; of
+                categories, integers [..., D] from 0 to the number of values - 1.
 
         Returns:
             float [..., L, D].
@@ -50,20 +72,6 @@ class FrameEncoder(nn.Module):
     def attention_maps(self, observation: Tensor) -> list[Tensor]:
         """Returns the attention weights of each block, float [..., heads, S, S]; default: none."""
         return []
-
-
-def check_observation_shape(shape: Sequence[int]) -> tuple[int, ...]:
-    """Returns the shape of an observation as a tuple.
-
-    Raises:
-        ValueError: if it is neither the shape of an array nor that of an image.
-    """
-    if not isinstance(shape, Sequence) or len(shape) not in (1, 2, 3) or min(shape) < 1:
-        raise ValueError(
-            f"observation_shape {shape!r} is not that of an array (D,) or an image (H, W) or "
-            "(C, H, W)"
-        )
-    return tuple(shape)
 
 
 def check_image_shape(shape: Sequence[int], smallest: int) -> tuple[int, ...]:

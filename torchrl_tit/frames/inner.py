@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from torchrl_tit import settings
-from torchrl_tit.frames.encoder import FrameEncoder, check_observation_shape
+from torchrl_tit.frames.encoder import FrameEncoder
+from torchrl_tit.frames.observation import Kind, check_observation_shape
 from torchrl_tit.layers.block import TransformerBlock
-from torchrl_tit.layers.patches import make_patch_embedding
+from torchrl_tit.layers.patches import find_patch_size, make_patch_embedding
 
 
 class InnerTransformer(FrameEncoder):
@@ -23,8 +25,10 @@ class InnerTransformer(FrameEncoder):
 
     Args:
         settings: patch size, width, blocks and outputs.
-        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
-        num_frames: number of observations that are stacked as channels.
+        observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
+        num_frames: number of observations that are stacked as channels; not of categories.
+        categories: of categories, the number of values of each entry. Each entry has an embedding,
+            and a patch is the sum of those of its entries.
 
     Raises:
         ValueError: if the patch does not fit the observation, or the heads do not divide the width.
@@ -33,7 +37,12 @@ class InnerTransformer(FrameEncoder):
         >>> inner = InnerTransformer(settings.Inner(patch_size=12, num_heads=4), (84, 84))
         >>> inner(torch.zeros(8, 84, 84, dtype=torch.uint8)).shape
         torch.Size([8, 2, 32])
+        >>> inner = InnerTransformer(settings.Inner(), (2,), categories=(4, 3))
+        >>> inner(torch.tensor([[3, 0], [1, 2]])).shape
+        torch.Size([2, 2, 32])
     """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("array", "image", "categories")
 
     def __init__(
         self,
@@ -41,6 +50,7 @@ class InnerTransformer(FrameEncoder):
         observation_shape: Sequence[int],
         *,
         num_frames: int | None = None,
+        categories: Sequence[int] | None = None,
     ) -> None:
         shape = check_observation_shape(observation_shape)
         super().__init__(
@@ -52,7 +62,11 @@ class InnerTransformer(FrameEncoder):
         self.num_blocks = settings.num_blocks
         self.every_block = settings.every_block
         self.patch_embedding = make_patch_embedding(
-            shape, settings.patch_size or shape[-1], settings.embed_dim, num_frames=num_frames or 1
+            shape,
+            find_patch_size(shape, settings.patch_size),
+            settings.embed_dim,
+            num_frames=num_frames or 1,
+            categories=categories,
         )
         self.class_token = nn.Parameter(torch.empty(1, 1, settings.embed_dim))
         self.positions = (
@@ -77,7 +91,8 @@ class InnerTransformer(FrameEncoder):
 
         Args:
             observation: [..., *observation_shape], or [..., num_frames, *observation_shape] where
-                frames are stacked as channels; float, or uint8 which is divided by 255.
+                frames are stacked as channels; float, or uint8 which is divided by 255; integers
+                of categories.
 
         Returns:
             Class tokens, float [..., L, D], or [..., 1, D] of the last block only.

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from torchrl_tit import settings
-from torchrl_tit.frames.encoder import FrameEncoder, check_observation_shape
+from torchrl_tit.frames.encoder import FrameEncoder
+from torchrl_tit.frames.observation import Kind, check_observation_shape
 from torchrl_tit.layers.activations import make_activation
+from torchrl_tit.layers.categories import CategoryIndex
 from torchrl_tit.layers.patches import embed
 
 
 class LinearFrameEncoder(FrameEncoder):
-    """Maps a whole observation to one token with a linear layer.
+    """Maps a whole observation to one token with a linear layer; categories as one-hot vectors.
 
     The observation embedding of the ablation without inner blocks (arXiv 2212.14538, appendix
     "Ablation Study"); with a bias, that of Decision Transformer.
 
     Args:
         settings: width, bias and activation.
-        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
+        observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
+        categories: of categories, the number of values of each entry.
 
     Example:
         >>> import torch
@@ -30,16 +35,33 @@ class LinearFrameEncoder(FrameEncoder):
         torch.Size([8, 4, 1, 32])
     """
 
-    def __init__(self, settings: settings.Linear, observation_shape: Sequence[int]) -> None:
+    kinds: ClassVar[tuple[Kind, ...]] = ("array", "image", "categories")
+
+    def __init__(
+        self,
+        settings: settings.Linear,
+        observation_shape: Sequence[int],
+        *,
+        categories: Sequence[int] | None = None,
+    ) -> None:
         shape = check_observation_shape(observation_shape)
         super().__init__(shape, num_tokens=1, width=settings.embed_dim)
-        self.linear = nn.Linear(math.prod(shape), settings.embed_dim, bias=settings.bias)
+        self.index = None if categories is None else CategoryIndex(categories)
+        entries = math.prod(shape) if categories is None else sum(categories)
+        self.linear = nn.Linear(entries, settings.embed_dim, bias=settings.bias)
+        if categories is not None:  # as many inputs are 1 as there are categories
+            bound = 1 / math.sqrt(len(categories))
+            nn.init.uniform_(self.linear.weight, -bound, bound)
         self.activation: nn.Module = nn.Identity()
         if settings.activation != "none":
             self.activation = make_activation(settings.activation)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """[..., *observation_shape], float or uint8 -> float [..., 1, D]."""
-        x = observation.flatten(-len(self.observation_shape)).unsqueeze(-2)  # [..., 1, entries]
-        token = embed(x, self.linear.weight)
+        """[..., *observation_shape], float, uint8 or categories -> float [..., 1, D]."""
+        if self.index is None:
+            x = observation.flatten(-len(self.observation_shape)).unsqueeze(-2)  # [..., 1, entries]
+            token = embed(x, self.linear.weight)
+        else:  # of one-hot vectors, all other products are zeros
+            weights = F.embedding(self.index(observation), self.linear.weight.t())
+            token = weights.sum(-2, keepdim=True)
         return self.activation(token if self.linear.bias is None else token + self.linear.bias)

@@ -7,6 +7,7 @@ from torchrl_tit.layers.gated_block import GatedTransformerBlock, GRUGate
 from torchrl_tit.layers.gpt2_block import GPT2Block
 from torchrl_tit.layers.initialization import init_normal_, init_orthogonal_
 from torchrl_tit.layers.patches import ArrayPatchEmbedding, ImagePatchEmbedding
+from torchrl_tit.layers.positions import RelativeBias, Rotary
 from torchrl_tit.layers.relative_attention import RelativeSelfAttention
 
 __all__ = [
@@ -16,7 +17,9 @@ __all__ = [
     "GRUGate",
     "GatedTransformerBlock",
     "ImagePatchEmbedding",
+    "RelativeBias",
     "RelativeSelfAttention",
+    "Rotary",
     "SelfAttention",
     "TransformerBlock",
     "init_normal_",

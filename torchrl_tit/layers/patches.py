@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from torchrl_tit.layers.categories import CategoryPatchEmbedding
+
+_MOST_ARRAY_PATCHES = 16
+_IMAGE_PATCHES = 49  # of the paper's Atari games: 84 pixels in patches of 12
+_MOST_IMAGE_PATCHES = 1024
 
 
 class ArrayPatchEmbedding(nn.Module):
@@ -85,8 +92,7 @@ class ImagePatchEmbedding(nn.Module):
                 f"patch_size {patch_size} is larger than the image of {height} x {width} pixels"
             )
         if height % patch_size or width % patch_size:
-            common = math.gcd(height, width)
-            divisors = [p for p in range(1, common + 1) if common % p == 0]
+            divisors = _common_divisors(height, width)
             raise ValueError(
                 f"patch_size {patch_size} does not divide the image of {height} x {width} pixels: "
                 f"choose one of {divisors}, or resize the image"
@@ -124,21 +130,73 @@ def embed(patches: Tensor, weight: Tensor) -> Tensor:
     return F.linear(patches, weight)
 
 
+def find_patch_size(
+    observation_shape: Sequence[int], patch_size: int | Literal["auto"] | None
+) -> int:
+    """Finds the patch size that settings leave open.
+
+    Args:
+        observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
+        patch_size: a number, which is returned; None for the whole observation; or "auto". Of
+            arrays and categories that is 1 for up to 16 entries, else the smallest divisor of the
+            entries that leaves at most 16 patches. Of images it is the side of the square patch
+            that divides them into the number of patches nearest to 49, the paper's for Atari games.
+
+    Raises:
+        ValueError: if no patch divides an image into fewer than 1025.
+
+    Example:
+        >>> [find_patch_size(shape, "auto") for shape in [(4,), (27,), (17,), (3, 84, 84), (7, 7)]]
+        [1, 3, 17, 12, 1]
+    """
+    if patch_size is None:
+        return observation_shape[-1]
+    if patch_size != "auto":
+        return patch_size
+    if len(observation_shape) == 1:
+        (size,) = observation_shape
+        smallest = math.ceil(size / _MOST_ARRAY_PATCHES)
+        return next(p for p in range(smallest, size + 1) if size % p == 0)
+    height, width = observation_shape[-2:]
+    counts = {p: height * width // p**2 for p in _common_divisors(height, width)}
+    best = min(counts, key=lambda p: abs(counts[p] - _IMAGE_PATCHES))
+    if counts[best] > _MOST_IMAGE_PATCHES:
+        raise ValueError(
+            f"patch_size 'auto' finds no patch for images of {height} x {width} pixels, whose "
+            f"sides have the common divisors {list(counts)}: resize them (TorchRL's Resize), or "
+            "take nature-cnn frames"
+        )
+    return best
+
+
+def _common_divisors(height: int, width: int) -> list[int]:
+    common = math.gcd(height, width)
+    return [p for p in range(1, common + 1) if common % p == 0]
+
+
 def make_patch_embedding(
-    observation_shape: Sequence[int], patch_size: int, embed_dim: int, *, num_frames: int = 1
-) -> ArrayPatchEmbedding | ImagePatchEmbedding:
+    observation_shape: Sequence[int],
+    patch_size: int,
+    embed_dim: int,
+    *,
+    num_frames: int = 1,
+    categories: Sequence[int] | None = None,
+) -> ArrayPatchEmbedding | ImagePatchEmbedding | CategoryPatchEmbedding:
     """Builds the patch embedding that fits an observation.
 
     Args:
-        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
+        observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
         patch_size: entries, or pixels along a side, of a patch.
         embed_dim: width of a token.
-        num_frames: observations stacked as channels.
+        num_frames: observations stacked as channels; 1 of categories.
+        categories: of categories, the number of values of each entry.
 
     Example:
         >>> make_patch_embedding((84, 84), patch_size=12, embed_dim=64, num_frames=4).weight.shape
         torch.Size([64, 4, 12, 12])
     """
+    if categories is not None:
+        return CategoryPatchEmbedding(categories, patch_size, embed_dim)
     if len(observation_shape) == 1:
         return ArrayPatchEmbedding(observation_shape[0], patch_size, embed_dim, channels=num_frames)
     channels = num_frames * (observation_shape[0] if len(observation_shape) == 3 else 1)

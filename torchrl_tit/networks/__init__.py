@@ -1,5 +1,6 @@
 """Networks: plain ``nn.Module``s, tensors in, tensors out."""
 
+from torchrl_tit.networks.by_kind import chosen_by_kind, frames_by_kind
 from torchrl_tit.networks.history_network import (
     AttentionMaps,
     HistoryNetwork,
@@ -15,6 +16,7 @@ from torchrl_tit.networks.systems import (
     CoBERL,
     DecisionTransformer,
     EnhancedTIT,
+    GTrXL,
     NatureCNN,
     OFENet,
     ResNet,
@@ -30,6 +32,7 @@ __all__ = [
     "CoBERL",
     "DecisionTransformer",
     "EnhancedTIT",
+    "GTrXL",
     "HistoryNetwork",
     "NatureCNN",
     "OFENet",
@@ -37,5 +40,7 @@ __all__ = [
     "TwoTrunks",
     "VanillaTIT",
     "build_network",
+    "chosen_by_kind",
+    "frames_by_kind",
     "masked_predictions",
 ]

@@ -11,13 +11,14 @@ from torch import Tensor, nn
 from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.flat import Flat
+from torchrl_tit.frames.observation import Observation, Observations, read_observations
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, RecurrentEncoder
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.initialization import init_normal_
+from torchrl_tit.networks.by_kind import frames_by_kind
+from torchrl_tit.networks.frame_encoders import build_frames, module_names
+from torchrl_tit.networks.own_encoders import build_part, check_contract, check_features, is_own
 from torchrl_tit.windows import Windows
-
-ObservationShape = Sequence[int] | Mapping[str, Sequence[int]]
-"""Shape of an observation, or shapes by key if there are several."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,9 @@ class HistoryNetwork(nn.Module):
     Args:
         frame: settings of the frame encoder.
         history: settings of the history encoder.
-        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images.
+        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images; or TorchRL's spec of an
+            observation, which is needed for categories (see
+            :func:`~torchrl_tit.frames.read_observation`); or a mapping from names to these.
         num_frames: number K >= 1 of observations.
         head: settings of the head.
         initialization: "normal" initialises the weights as the authors of TIT do
@@ -79,7 +82,7 @@ class HistoryNetwork(nn.Module):
         frame: settings.FrameSettings | Mapping[str, settings.FrameSettings],
         history: settings.HistorySettings,
         *,
-        observation_shape: ObservationShape,
+        observation_shape: Observations,
         num_frames: int = 1,
         head: settings.Head | None = None,
         initialization: str = "default",
@@ -92,13 +95,20 @@ class HistoryNetwork(nn.Module):
                 f"{num_frames!r}"
             )
         self.num_frames = num_frames
-        self.frame_encoders = nn.ModuleDict(_build_frames(frame, observation_shape))
-        shape = _history_shape(self.frames, num_frames, action_dim)
-        history_encoder = history.build(shape)
-        assert isinstance(history_encoder, HistoryEncoder)
-        self.history_encoder = history_encoder
+        self.observations = read_observations(observation_shape)
+        """What the network reads, by name."""
+        encoders = build_frames(frame, self.observations)
+        self.frame_settings = (
+            dict(frame) if isinstance(frame, Mapping) else dict.fromkeys(encoders, frame)
+        )
+        """The settings of each frame encoder, by the name of its observation."""
+        self.frame_encoders = nn.ModuleDict(
+            dict(zip(module_names(encoders), encoders.values(), strict=True))
+        )
+        shape = _history_shape(encoders, num_frames, action_dim)
+        self.history_encoder = _build_history(history, shape)
         self.head, self.features_dim = _make_head(
-            history_encoder.out_features, head or settings.Head()
+            self.history_encoder.out_features, head or settings.Head()
         )
         if initialization == "normal":
             init_normal_(self)
@@ -108,8 +118,9 @@ class HistoryNetwork(nn.Module):
 
         Args:
             *inputs: a history [..., K, *observation_shape] for each observation, the oldest frame
-                first; uint8 (scaled to 0..1) or the network's own float type (used as is). Then the
-                other inputs of the history encoder (``history_encoder.context``).
+                first; uint8 (scaled to 0..1) or the network's own float type (used as is), and
+                integers of categories. Then the other inputs of the history encoder
+                (``history_encoder.context``).
 
         Returns:
             float [..., F].
@@ -210,7 +221,9 @@ class HistoryNetwork(nn.Module):
         return self.head(outputs), state
 
     def as_floats(self, tokens: Tensor) -> Tensor:
-        """Converts flat uint8 frames to floats, for history encoders that read tokens."""
+        """Converts flat frames to floats: one-hot vectors, and bytes for encoders of tokens."""
+        if tokens.dtype == torch.bool:
+            return tokens.to(weights_dtype(self))
         if tokens.dtype == torch.uint8 and not self.history_encoder.reads_frames:
             return tokens.to(weights_dtype(self)) / 255
         return tokens
@@ -235,30 +248,30 @@ class HistoryNetwork(nn.Module):
         """Raises ValueError or TypeError if histories do not fit this network."""
         self._check_count(histories)
         dtype = weights_dtype(self)
-        for encoder, history in zip(self.frames, histories, strict=True):
-            ndim = len(encoder.observation_shape) + 1
+        for observation, history in zip(self.observations.values(), histories, strict=True):
+            ndim = len(observation.shape) + 1
             num_frames = self.num_frames
             if self.history_encoder.reads_any_length and history.ndim >= ndim:
                 num_frames = history.shape[-ndim]
-            check_history(history, num_frames, encoder.observation_shape, dtype)
+            check_history(history, num_frames, observation, dtype)
 
     def check_frames(self, *frames: Tensor) -> None:
         """Raises ValueError or TypeError if tables of frames do not fit this network."""
         self._check_count(frames)
         dtype = weights_dtype(self)
-        for encoder, table in zip(self.frames, frames, strict=True):
-            if tuple(table.shape[1:]) != encoder.observation_shape:
+        for observation, table in zip(self.observations.values(), frames, strict=True):
+            if tuple(table.shape[1:]) != observation.shape:
                 raise ValueError(
                     f"observations of shape {tuple(table.shape[1:])} do not fit this network: "
-                    f"expected {encoder.observation_shape}"
+                    f"expected {observation.shape}"
                 )
-            _check_dtype(table, dtype)
+            _check_dtype(table, observation, dtype)
 
     def _check_count(self, histories: Sequence[Tensor]) -> None:
         if len(histories) != len(self.frame_encoders):
             raise ValueError(
                 f"this network reads {len(self.frame_encoders)} histories "
-                f"({', '.join(self.frame_encoders)}), not {len(histories)}"
+                f"({', '.join(self.observations)}), not {len(histories)}"
             )
 
     @property
@@ -305,7 +318,7 @@ class TwoTrunks(nn.Module):
 
 def build_network(
     network: settings.Network,
-    observation_shape: ObservationShape,
+    observation: Observations,
     *,
     action_dim: int | None = None,
     trunks: str | None = None,
@@ -314,13 +327,14 @@ def build_network(
 
     Args:
         network: the settings.
-        observation_shape: shape of an observation, or shapes by key if there are several.
+        observation: shape or spec of an observation, or of each by name if there are several.
         action_dim: entries of an action, for history encoders that read actions.
         trunks: "shared" builds one network even if the settings say two: for an actor with separate
             critics, say.
 
     Raises:
-        ValueError: if the two encoders do not fit each other or the observation.
+        ValueError: if the two encoders do not fit each other or the observation (see
+            :func:`~torchrl_tit.networks.by_kind.frames_by_kind`, which chooses the frame encoders).
 
     Example:
         >>> from torchrl_tit.settings import NETWORKS
@@ -328,25 +342,25 @@ def build_network(
         torch.Size([2, 64])
     """
     if (trunks or network.trunks) == "separate":
-        policy, value = (build_trunk(network, observation_shape, action_dim) for _ in range(2))
+        policy, value = (build_trunk(network, observation, action_dim) for _ in range(2))
         return TwoTrunks(policy, value)
-    return build_trunk(network, observation_shape, action_dim)
+    return build_trunk(network, observation, action_dim)
 
 
 def build_trunk(
-    network: settings.Network, observation_shape: ObservationShape, action_dim: int | None = None
+    network: settings.Network, observation: Observations, action_dim: int | None = None
 ) -> HistoryNetwork:
     """Builds a single network, whether or not the settings share it between policy and value.
 
     Args:
         network: the settings.
-        observation_shape: shape of an observation, or shapes by key if there are several.
+        observation: shape or spec of an observation, or of each by name if there are several.
         action_dim: entries of an action, for history encoders that read actions.
     """
     return HistoryNetwork(
-        network.frame,
+        frames_by_kind(network, observation),
         network.history,
-        observation_shape=observation_shape,
+        observation_shape=observation,
         num_frames=network.num_frames,
         head=network.head,
         initialization=network.initialization,
@@ -366,27 +380,34 @@ def weights_dtype(network: nn.Module) -> torch.dtype:
 
 
 def check_history(
-    history: Tensor, num_frames: int, observation_shape: tuple[int, ...], dtype: torch.dtype
+    history: Tensor, num_frames: int, observation: Observation, dtype: torch.dtype
 ) -> None:
     """Raises ValueError or TypeError if a history does not fit a network.
 
     Args:
         history: the input.
         num_frames: number K of observations that it reads.
-        observation_shape: shape of one of them.
+        observation: what one of them is.
         dtype: type of the network's weights.
     """
-    expected = (num_frames, *observation_shape)
+    expected = (num_frames, *observation.shape)
     if tuple(history.shape[-len(expected) :]) != expected:
         raise ValueError(
             f"a history of shape {tuple(history.shape)} does not fit this network: expected "
             f"[..., {', '.join(map(str, expected))}], which is {num_frames} observations of shape "
-            f"{observation_shape}, oldest first (torchrl_tit.History stacks them)"
+            f"{observation.shape}, oldest first (torchrl_tit.History stacks them)"
         )
-    _check_dtype(history, dtype)
+    _check_dtype(history, observation, dtype)
 
 
-def _check_dtype(history: Tensor, dtype: torch.dtype) -> None:
+def _check_dtype(history: Tensor, observation: Observation, dtype: torch.dtype) -> None:
+    if observation.categories is not None:
+        if history.is_floating_point() or history.is_complex():
+            raise TypeError(
+                f"a history of {history.dtype} does not fit {observation}: give it integers that "
+                "count from 0"
+            )
+        return
     device = history.device.type
     # Some devices, such as "meta", have no autocast.
     autocast = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
@@ -395,47 +416,49 @@ def _check_dtype(history: Tensor, dtype: torch.dtype) -> None:
         autocast and history.is_floating_point() and history.dtype != torch.float64
     )
     if not fits and history.dtype != torch.uint8:
+        hint = "give it uint8, or convert it first (TorchRL's DoubleToFloat, say)"
+        if not history.is_floating_point():
+            hint = (
+                "if it counts categories, build the network with their spec (MultiCategorical) "
+                "instead of their shape; else convert it to floats (TorchRL's DTypeCastTransform)"
+            )
         raise TypeError(
-            f"a history of {history.dtype} does not fit this network of {dtype}: give it uint8, or "
-            "convert it first (TorchRL's DoubleToFloat, say)"
+            f"a history of {history.dtype} does not fit this network of {dtype}: {hint}"
         )
-
-
-def _build_frames(
-    frame: settings.FrameSettings | Mapping[str, settings.FrameSettings],
-    observation_shape: ObservationShape,
-) -> dict[str, FrameEncoder]:
-    """Builds the frame encoder of each observation; a single one is called "observation"."""
-    shapes = observation_shape
-    if not isinstance(shapes, Mapping):
-        shapes = {"observation": shapes}
-    frames = frame if isinstance(frame, Mapping) else dict.fromkeys(shapes, frame)
-    if frames.keys() != shapes.keys():
-        raise ValueError(
-            f"there are frame encoders for {', '.join(frames)}, but observations "
-            f"{', '.join(shapes)}: name one for each"
-        )
-    return {key: frames[key].build(shape) for key, shape in shapes.items()}
 
 
 def _history_shape(
-    frames: Sequence[FrameEncoder], num_frames: int, action_dim: int | None
+    encoders: Mapping[str, FrameEncoder], num_frames: int, action_dim: int | None
 ) -> HistoryShape:
     """Returns the input shape of the history encoder; raises if the token widths differ."""
-    widths = {encoder.width for encoder in frames}
+    widths: dict[int, str] = {}
+    for name, encoder in encoders.items():
+        widths.setdefault(encoder.width, name)
     if len(widths) > 1:
+        (width, name), (other_width, other), *_ = widths.items()
         raise ValueError(
-            f"tokens of the widths {sorted(widths)} cannot stand side by side: give all frame "
-            "encoders the same embed_dim (flat frames are as wide as their observation)"
+            f"tokens of the widths {width} ({name}) and {other_width} ({other}) cannot stand side "
+            "by side: give both frame encoders the same embed_dim (flat frames are as wide as "
+            "their observation)"
         )
-    alone = len(frames) == 1 and isinstance(frames[0], Flat)
+    first = next(iter(encoders.values()))
     return HistoryShape(
         num_frames=num_frames,
-        num_tokens=sum(encoder.num_tokens for encoder in frames),
-        width=widths.pop(),
-        frame_shape=frames[0].observation_shape if alone else None,
+        num_tokens=sum(encoder.num_tokens for encoder in encoders.values()),
+        width=first.width,
+        frame_shape=first.frame_shape if len(encoders) == 1 and isinstance(first, Flat) else None,
         action_dim=action_dim,
     )
+
+
+def _build_history(history: settings.HistorySettings, shape: HistoryShape) -> HistoryEncoder:
+    """Builds the history encoder; raises ValueError if it does not keep its contract."""
+    encoder = build_part(history, shape)
+    if is_own(encoder):
+        check_contract(encoder, HistoryEncoder, ("shape", "out_features"), history)
+        check_features(encoder, shape)
+    assert isinstance(encoder, HistoryEncoder)
+    return encoder
 
 
 def _make_head(in_features: int, head: settings.Head) -> tuple[nn.Module, int]:

@@ -9,12 +9,9 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from torchrl_tit import settings
-from torchrl_tit.networks.history_network import (
-    HistoryNetwork,
-    ObservationShape,
-    TwoTrunks,
-    build_trunk,
-)
+from torchrl_tit.frames.observation import Observations
+from torchrl_tit.networks.by_kind import frames_by_kind
+from torchrl_tit.networks.history_network import HistoryNetwork, TwoTrunks, build_trunk
 from torchrl_tit.settings import networks as systems
 
 
@@ -22,7 +19,8 @@ class System(HistoryNetwork):
     """A named network, described by a function of :mod:`torchrl_tit.settings.networks`.
 
     Args:
-        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images, or a mapping of those.
+        observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images, the spec of an
+            observation, or a mapping from names to these.
         num_frames: number K of observations; if not given, the default of the function.
         action_dim: entries of an action, for history encoders that read actions.
         **hyperparameters: further arguments of the function.
@@ -37,7 +35,7 @@ class System(HistoryNetwork):
 
     def __init__(
         self,
-        observation_shape: ObservationShape,
+        observation_shape: Observations,
         num_frames: int | None = None,
         *,
         action_dim: int | None = None,
@@ -47,7 +45,7 @@ class System(HistoryNetwork):
             hyperparameters["num_frames"] = num_frames
         network = self.system(**hyperparameters)
         super().__init__(
-            network.frame,
+            frames_by_kind(network, observation_shape),
             network.history,
             observation_shape=observation_shape,
             num_frames=network.num_frames,
@@ -162,6 +160,19 @@ class CoBERL(System):
     system = staticmethod(systems.coberl)
 
 
+class GTrXL(System):
+    """GTrXL: see :func:`~torchrl_tit.settings.networks.gtrxl`.
+
+    Example:
+        >>> import torch
+        >>> network = GTrXL(observation_shape=(84, 84), num_frames=4)
+        >>> network(torch.zeros(2, 4, 84, 84, dtype=torch.uint8)).shape
+        torch.Size([2, 512])
+    """
+
+    system = staticmethod(systems.gtrxl)
+
+
 class DecisionTransformer(System):
     """Decision Transformer: see :func:`~torchrl_tit.settings.networks.decision_transformer`.
 
@@ -177,7 +188,7 @@ class DecisionTransformer(System):
 
     def __init__(
         self,
-        observation_shape: ObservationShape,
+        observation_shape: Observations,
         action_dim: int,
         num_frames: int | None = None,
         **hyperparameters: Any,
@@ -205,7 +216,7 @@ class TwoTrunkSystem(TwoTrunks):
     system: ClassVar[Callable[..., settings.Network]]
 
     def __init__(
-        self, observation_shape: ObservationShape, num_frames: int = 1, **hyperparameters: Any
+        self, observation_shape: Observations, num_frames: int = 1, **hyperparameters: Any
     ) -> None:
         network = self.system(num_frames, **hyperparameters)
         super().__init__(*(build_trunk(network, observation_shape) for _ in range(2)))

@@ -16,32 +16,40 @@ from torchrl_tit.settings.frames import (
 )
 from torchrl_tit.settings.histories import (
     D2RL,
+    GRU,
     LSTM,
     MLP,
     Catformer,
+    ChainedOuter,
     CoBERL,
     DecisionTransformer,
+    GTrXL,
     HistorySettings,
     OFENet,
     Outer,
     PairedOuter,
     StackedCNN,
     StackedInner,
+    TemporalPositions,
 )
 from torchrl_tit.settings.networks import NETWORKS, Head, Network
 from torchrl_tit.settings.parts import Part, resolve
+from torchrl_tit.settings.per_key import PerKey
 
 __all__ = [
     "D2RL",
+    "GRU",
     "LSTM",
     "MLP",
     "NETWORKS",
     "Activation",
     "Catformer",
+    "ChainedOuter",
     "CoBERL",
     "DecisionTransformer",
     "Flat",
     "FrameSettings",
+    "GTrXL",
     "Head",
     "HistorySettings",
     "Inner",
@@ -52,8 +60,10 @@ __all__ = [
     "Outer",
     "PairedOuter",
     "Part",
+    "PerKey",
     "ResNetFrames",
     "StackedCNN",
     "StackedInner",
+    "TemporalPositions",
     "resolve",
 ]

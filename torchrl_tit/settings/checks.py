@@ -52,6 +52,13 @@ def check_choice(settings: object, field: str, choices: Iterable[object]) -> Non
         )
 
 
+def check_widths(settings: object, field: str) -> None:
+    """Raises ValueError if a field is not the widths of at least one layer."""
+    widths = getattr(settings, field)
+    if not widths or min(widths) < 1:
+        raise ValueError(f"{field} must be at least one width of at least 1, not {widths}")
+
+
 def nearest(name: str, names: Iterable[str]) -> str:
     """Suggests known names for an unknown one, as the end of an error message.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from torchrl_tit.settings.checks import check_at_least, check_probability
+from torchrl_tit.settings.checks import check_at_least, check_choice, check_probability
 from torchrl_tit.settings.parts import Part
 
 Activation = Literal["gelu", "gelu_tanh", "relu", "silu", "tanh"]
@@ -62,9 +62,10 @@ class TransformerSettings:
 class PatchTransformerSettings(TransformerSettings):
     """Settings of a transformer on the patches of observations."""
 
-    patch_size: int | None = 1
+    patch_size: int | Literal["auto"] | None = 1
     """Entries of an array's patch, or pixels along a side of an image's; the whole observation
-    (of an image, which must be square) if not given."""
+    (of an image, which must be square) if not given. "auto" makes at most 16 patches of an array,
+    and about 49 of an image."""
     embed_dim: int = 32
     """Width D of a token."""
     num_blocks: int = 2
@@ -77,7 +78,9 @@ class PatchTransformerSettings(TransformerSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_at_least(self, embed_dim=1, num_blocks=1)
-        if self.patch_size is not None:
+        if isinstance(self.patch_size, str):
+            check_choice(self, "patch_size", ("auto",))
+        elif self.patch_size is not None:
             check_at_least(self, patch_size=1)
 
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 from torchrl_tit.settings.checks import check_at_least, check_choice, check_probability
 from torchrl_tit.settings.frames import Activation, PatchTransformerSettings, TransformerSettings
 from torchrl_tit.settings.parts import Part
+
+TemporalPositions = Literal["none", "learned", "relative", "rotary"]
+"""How attention over K frames tells them apart: not at all, by a learned encoding that is added to
+the tokens, by a learned bias for each distance and head, or by rotated queries and keys."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,18 +29,33 @@ class HistorySettings(Part, kind="history encoder"):
 
 @dataclass(frozen=True, kw_only=True)
 class OuterSettings(TransformerSettings, HistorySettings):
-    """Settings that both outer transformers share."""
+    """Settings that all outer transformers share."""
 
-    temporal_position_encoding: bool = False
-    """Whether the K frames get a learned position encoding (not in the paper)."""
+    temporal_positions: TemporalPositions = "none"
+    """How the K frames are told apart (the paper's are not): by a learned encoding, a learned bias
+    for each distance ("relative"), or rotations (RoPE)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_choice(self, "temporal_positions", get_args(TemporalPositions))
 
     def check_num_frames(self, num_frames: int) -> None:
-        """Raises ValueError if there is a position encoding but only one frame."""
-        if self.temporal_position_encoding and num_frames == 1:
+        """Raises ValueError if there are temporal positions but only one frame."""
+        if self.temporal_positions != "none" and num_frames == 1:
             raise ValueError(
-                "temporal_position_encoding tells frames apart, but num_frames is 1: raise it, or "
-                "switch the encoding off"
+                f"temporal_positions {self.temporal_positions!r} tells frames apart, but "
+                "num_frames is 1: raise it, or set temporal_positions to none"
             )
+
+    @classmethod
+    def from_older(cls, fields: dict[str, Any]) -> dict[str, Any]:
+        """Reads the switch of learned positions, before there were others."""
+        learned = fields.pop("temporal_position_encoding", None)
+        if isinstance(learned, bool):
+            fields["temporal_positions"] = "learned" if learned else "none"
+        elif learned is not None:
+            raise ValueError(f"temporal_position_encoding is true or false, not {learned!r}")
+        return fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,6 +83,15 @@ class PairedOuter(
     builds="torchrl_tit.histories.outer:PairedOuterTransformer",
 ):
     """The outer blocks of Enhanced_TIT: one for each token of a frame, all outputs concatenated."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChainedOuter(
+    OuterSettings,
+    name="chained-outer",
+    builds="torchrl_tit.histories.outer:ChainedOuterTransformer",
+):
+    """The outer blocks of Enhanced_TIT, each also on the one before it, as in PDiT."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +163,13 @@ class Catformer(
     """Width inside attention, as a multiple of the width (2 in its paper's tuning)."""
     ffn_expansion: int = 4
     """Hidden width of an FFN as a multiple of the width."""
+    temporal_positions: TemporalPositions = "learned"
+    """How the K frames are told apart: by a learned encoding, a learned bias for each distance
+    ("relative"), rotations (RoPE), or not at all."""
 
     def __post_init__(self) -> None:
         check_at_least(self, num_blocks=1, num_heads=1, attention_expansion=1, ffn_expansion=1)
+        check_choice(self, "temporal_positions", get_args(TemporalPositions))
 
     def check_num_frames(self, num_frames: int) -> None:
         """Raises ValueError if there is only one frame."""
@@ -145,8 +177,8 @@ class Catformer(
 
 
 @dataclass(frozen=True, kw_only=True)
-class CoBERL(HistorySettings, name="coberl", builds="torchrl_tit.histories.coberl:CoBERL"):
-    """CoBERL: a gated transformer, a gate and an LSTM, with GTrXL's widths (arXiv 1910.06764)."""
+class GatedTransformerSettings(HistorySettings):
+    """Settings of gated transformer blocks, with GTrXL's widths (arXiv 1910.06764)."""
 
     num_blocks: int = 2
     """Number of gated transformer blocks."""
@@ -156,11 +188,9 @@ class CoBERL(HistorySettings, name="coberl", builds="torchrl_tit.histories.cober
     """Hidden width of an FFN as a multiple of the width."""
     gate_bias: float = 0.0
     """Start value of the bias of all gates; 2 starts them near the identity, as its paper does."""
-    hidden_dim: int = 512
-    """Size of the LSTM's state, which is the encoder's output."""
 
     def __post_init__(self) -> None:
-        check_at_least(self, num_blocks=1, num_heads=1, ffn_expansion=1, hidden_dim=1)
+        check_at_least(self, num_blocks=1, num_heads=1, ffn_expansion=1)
 
     def check_num_frames(self, num_frames: int) -> None:
         """Raises ValueError if there is only one frame."""
@@ -168,16 +198,49 @@ class CoBERL(HistorySettings, name="coberl", builds="torchrl_tit.histories.cober
 
 
 @dataclass(frozen=True, kw_only=True)
-class LSTM(HistorySettings, name="lstm", builds="torchrl_tit.histories.recurrent:LSTM"):
-    """An LSTM. It carries its state through the episode if it reads one frame, else starts at 0."""
+class GTrXL(GatedTransformerSettings, name="gtrxl", builds="torchrl_tit.histories.gtrxl:GTrXL"):
+    """GTrXL: a transformer whose residuals are gated. Its paper has 12 blocks."""
+
+    gate_bias: float = 2.0
+    """Start value of the bias of all gates: 2, as in its paper, starts them near the identity."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CoBERL(GatedTransformerSettings, name="coberl", builds="torchrl_tit.histories.coberl:CoBERL"):
+    """CoBERL: a gated transformer, a gate and an LSTM."""
+
+    hidden_dim: int = 512
+    """Size of the LSTM's state, which is the encoder's output."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(self, hidden_dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecurrentSettings(HistorySettings):
+    """Settings of recurrent networks.
+
+    They carry their state through the episode if they read one frame, else it starts at 0.
+    """
 
     is_recurrent = True
 
     hidden_dim: int = 64
-    """Size of the LSTM's state, which is the encoder's output."""
+    """Size of the state, which is the encoder's output."""
 
     def __post_init__(self) -> None:
         check_at_least(self, hidden_dim=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LSTM(RecurrentSettings, name="lstm", builds="torchrl_tit.histories.recurrent:LSTM"):
+    """An LSTM. It carries its state through the episode if it reads one frame, else starts at 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GRU(RecurrentSettings, name="gru", builds="torchrl_tit.histories.recurrent:GRU"):
+    """A GRU. It carries its state through the episode if it reads one frame, else starts at 0."""
 
 
 @dataclass(frozen=True, kw_only=True)

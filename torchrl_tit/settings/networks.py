@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
@@ -17,18 +17,22 @@ from torchrl_tit.settings.frames import (
 )
 from torchrl_tit.settings.histories import (
     D2RL,
+    GRU,
     LSTM,
     MLP,
     Catformer,
     CoBERL,
     DecisionTransformer,
+    GTrXL,
     HistorySettings,
     OFENet,
     Outer,
     PairedOuter,
     StackedCNN,
     StackedInner,
+    TemporalPositions,
 )
+from torchrl_tit.settings.per_key import PerKey
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +56,11 @@ class Network:
     """A frame encoder followed by a history encoder and a head: any pair that makes sense."""
 
     frame: FrameSettings
-    """What turns one observation into tokens."""
+    """What turns one observation into tokens. If a task has several observations, this is for those
+    that it can read and that ``frames`` leaves out; the others get an encoder of the same width by
+    their kind."""
+    frames: Mapping[str, FrameSettings] = field(default_factory=lambda: PerKey({}))
+    """What turns an observation into tokens, by its name, if a task has several."""
     history: HistorySettings
     """What turns the tokens of the last K frames into one vector."""
     head: Head = field(default_factory=Head)
@@ -66,6 +74,7 @@ class Network:
     code, or the default of each layer."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "frames", PerKey(self.frames))
         check_at_least(self, num_frames=1)
         check_choice(self, "trunks", ("shared", "separate"))
         check_choice(self, "initialization", ("normal", "default"))
@@ -80,7 +89,7 @@ class Network:
 def vanilla_tit(
     num_frames: int = 1,
     *,
-    patch_size: int | None = 1,
+    patch_size: int | Literal["auto"] | None = 1,
     embed_dim: int = 32,
     num_blocks: int = 2,
     num_heads_inner: int = 1,
@@ -94,7 +103,7 @@ def vanilla_tit(
     ffn_dropout_inner: float = 0.0,
     ffn_dropout_outer: float = 0.0,
     position_encoding: bool = True,
-    temporal_position_encoding: bool = False,
+    temporal_positions: TemporalPositions = "none",
     share_blocks: bool = False,
     features_dim: int = 64,
     activation_head: Activation = "tanh",
@@ -106,7 +115,8 @@ def vanilla_tit(
     Args:
         num_frames: number K of observations.
         patch_size: entries of an array's patch, or pixels along a side of an image's; the whole
-            observation if None.
+            observation if None; "auto" chooses (see
+            :func:`~torchrl_tit.layers.patches.find_patch_size`).
         embed_dim: width D of a token.
         num_blocks: number L of inner blocks and of outer blocks.
         num_heads_inner: attention heads of an inner block; must divide the width.
@@ -120,7 +130,8 @@ def vanilla_tit(
         ffn_dropout_inner: dropout on the FFN outputs of inner blocks.
         ffn_dropout_outer: dropout on the FFN outputs of outer blocks.
         position_encoding: whether patches and class token get a learned position encoding.
-        temporal_position_encoding: whether the K frames get one (not in the paper).
+        temporal_positions: how the K frames are told apart (in the paper they are not): "learned"
+            encodings, a learned bias for each distance ("relative"), or "rotary".
         share_blocks: whether all inner blocks share weights, and all outer blocks too.
         features_dim: size of the features.
         activation_head: activation of the head.
@@ -146,7 +157,7 @@ def vanilla_tit(
             activation=activation_outer,
             attention_dropout=attention_dropout_outer,
             ffn_dropout=ffn_dropout_outer,
-            temporal_position_encoding=temporal_position_encoding,
+            temporal_positions=temporal_positions,
             share_blocks=share_blocks,
         ),
         head=Head(features_dim=features_dim, activation=activation_head),
@@ -183,9 +194,9 @@ def enhanced_tit(
     """
     if not (inner or outer):
         raise ValueError("inner and outer cannot both be off: nothing would be left")
-    if hyperparameters.get("temporal_position_encoding") and not outer:
+    if hyperparameters.get("temporal_positions", "none") != "none" and not outer:
         raise ValueError(
-            "temporal_position_encoding is that of the outer blocks: switch it off, or outer on"
+            "temporal_positions are those of the outer blocks: set them to none, or outer to True"
         )
     vanilla = vanilla_tit(num_frames, **hyperparameters)
     assert isinstance(vanilla.frame, Inner)
@@ -238,6 +249,29 @@ def catformer(
     return Network(
         frame=ResNetFrames(embed_dim=embed_dim),
         history=Catformer(**hyperparameters),
+        head=Head(features_dim=features_dim, activation="relu"),
+        num_frames=num_frames,
+    )
+
+
+def gtrxl(
+    num_frames: int = 2, *, embed_dim: int = 256, features_dim: int = 512, **hyperparameters: Any
+) -> Network:
+    """GTrXL: a residual network on each frame, then a gated transformer over the frames.
+
+    Parisotto et al., "Stabilizing Transformers for Reinforcement Learning", arXiv 1910.06764. It is
+    no baseline of arXiv 2212.14538; frames and head are those of :func:`catformer`. For arrays,
+    replace the frame encoder, by :class:`Linear` say.
+
+    Args:
+        num_frames: number K of observations.
+        embed_dim: width of a token.
+        features_dim: size of the features.
+        **hyperparameters: fields of :class:`GTrXL`.
+    """
+    return Network(
+        frame=ResNetFrames(embed_dim=embed_dim),
+        history=GTrXL(**hyperparameters),
         head=Head(features_dim=features_dim, activation="relu"),
         num_frames=num_frames,
     )
@@ -325,6 +359,23 @@ def lstm(
     )
 
 
+def gru(
+    num_frames: int = 1, *, embed_dim: int = 64, hidden_dim: int = 64, features_dim: int = 64
+) -> Network:
+    """GRU: as :func:`lstm`, with TorchRL's GRU.
+
+    Args:
+        num_frames: if 1, the state is carried through the episode; if more, it starts at 0.
+        embed_dim: width of the tanh layer.
+        hidden_dim: size of the state.
+        features_dim: size of the features.
+    """
+    return replace(
+        lstm(num_frames, embed_dim=embed_dim, features_dim=features_dim),
+        history=GRU(hidden_dim=hidden_dim),
+    )
+
+
 def decision_transformer(
     num_frames: int = 20, *, embed_dim: int = 128, **hyperparameters: Any
 ) -> Network:
@@ -350,7 +401,7 @@ def dt_tit(
     num_frames: int = 20,
     *,
     embed_dim: int = 128,
-    patch_size: int | None = None,
+    patch_size: int | Literal["auto"] | None = None,
     num_blocks_inner: int = 1,
     num_heads_inner: int = 1,
     ffn_expansion_inner: int = 1,
@@ -395,14 +446,16 @@ NETWORKS: dict[str, Callable[..., Network]] = {
     "resnet": resnet,
     "catformer": catformer,
     "coberl": coberl,
+    "gtrxl": gtrxl,
     "mlp": mlp,
     "ofenet": ofenet,
     "d2rl": d2rl,
     "lstm": lstm,
+    "gru": gru,
     "decision-transformer": decision_transformer,
     "dt-tit": dt_tit,
 }
-"""The systems of the paper, and LSTM, by name: each is a pair of encoders."""
+"""The systems of the paper, GTrXL, LSTM and GRU by name: each is a pair of encoders."""
 
 
 def _separate(num_frames: int, history: HistorySettings) -> Network:

@@ -1,0 +1,46 @@
+"""The patch size "auto": at most 16 patches of an array, about 49 of an image."""
+
+import pytest
+
+from torchrl_tit.frames import Observation
+from torchrl_tit.layers.patches import find_patch_size
+from torchrl_tit.networks.frame_encoders import build_frame
+from torchrl_tit.settings import Inner, StackedInner
+
+
+@pytest.mark.parametrize(
+    ("shape", "patch_size"),
+    [
+        ((1,), 1),
+        ((16,), 1),
+        ((18,), 2),
+        ((27,), 3),
+        ((105,), 7),
+        ((17,), 17),  # nothing divides it
+        ((376,), 47),
+        ((7, 7), 1),
+        ((3, 84, 84), 12),
+        ((3, 56, 56), 8),
+        ((3, 64, 64), 8),
+        ((3, 96, 96), 16),
+        ((3, 64, 48), 8),
+        ((3, 210, 160), 10),
+        ((83, 83), 83),
+    ],
+)
+def test_auto(shape, patch_size):
+    assert find_patch_size(shape, "auto") == patch_size
+    auto = build_frame(Inner(embed_dim=4, patch_size="auto"), Observation(shape))
+    named = build_frame(Inner(embed_dim=4, patch_size=patch_size), Observation(shape))
+    assert str(auto) == str(named)
+
+
+def test_of_images_whose_sides_share_no_divisor():
+    with pytest.raises(ValueError, match=r"97 x 64 .* divisors \[1\]: resize them .* nature-cnn"):
+        find_patch_size((97, 64), "auto")
+
+
+@pytest.mark.parametrize("settings", [Inner, StackedInner])
+def test_another_word(settings):
+    with pytest.raises(ValueError, match="unknown patch_size 'all': choose one of"):
+        settings(patch_size="all")

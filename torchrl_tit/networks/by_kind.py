@@ -1,0 +1,183 @@
+"""Frame encoders for several observations: by name, or chosen by the kind of observation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, replace
+
+import torch
+
+from torchrl_tit import settings
+from torchrl_tit.frames.encoder import FrameEncoder
+from torchrl_tit.frames.observation import Observation, Observations, read_observations
+from torchrl_tit.networks.frame_encoders import build_frame
+from torchrl_tit.networks.own_encoders import BrokenEncoderError
+from torchrl_tit.settings import FrameSettings
+from torchrl_tit.settings.checks import nearest
+
+_WIDTH = 64
+_MOST_PATCHES = 1024
+_CNN_PIXELS = 36
+
+
+def frames_by_kind(
+    network: settings.Network, observation: Observations
+) -> dict[str, FrameSettings]:
+    """Chooses the settings of the frame encoder of each observation.
+
+    ``network.frames`` names those of some observations. A single other observation has
+    ``network.frame``. Of several, each has the first of these that can read it, all of the same
+    width:
+
+    1. ``network.frame``, unless it is flat: flat frames are as wide as their observations, so they
+       cannot stand side by side;
+    2. the same with the patch size "auto";
+    3. of arrays and categories, a linear layer; of images, NatureCNN, or an inner transformer if
+       they have less than 36 pixels a side.
+
+    Args:
+        network: settings of the network.
+        observation: shape or spec of an observation, or of each by name if there are several.
+
+    Raises:
+        ValueError: if ``network.frames`` names an observation that there is not, or nothing can
+            read an observation; the message names it and its kind.
+
+    Example:
+        >>> from torchrl.data import MultiCategorical
+        >>> from torchrl_tit.settings.networks import enhanced_tit, mlp
+        >>> task = {"image": (3, 56, 56), "direction": MultiCategorical([4])}
+        >>> chosen = frames_by_kind(mlp(), task)
+        >>> chosen["image"], chosen["direction"]
+        (NatureCNNFrames(embed_dim=64), Linear(embed_dim=64, bias=True, activation='none'))
+        >>> frames_by_kind(enhanced_tit(patch_size=12), task)["image"].patch_size
+        'auto'
+    """
+    observations = read_observations(observation)
+    for name in network.frames:
+        if name not in observations:
+            raise ValueError(
+                f"frames names the observation {name!r}, which the task does not have: "
+                f"{nearest(name, observations)}"
+            )
+    others = [name for name in observations if name not in network.frames]
+    if len(observations) == 1:
+        return {name: network.frames.get(name, network.frame) for name in observations}
+    _check_history(network, observations)
+    width = _width(network, observations, others)
+    chosen = {
+        name: _first_that_reads(network.frame, width, observations[name], name) for name in others
+    }
+    return {name: network.frames.get(name) or chosen[name] for name in observations}
+
+
+def chosen_by_kind(network: settings.Network, frames: Mapping[str, FrameSettings]) -> str:
+    """Describes the frame encoders that settings do not name, in a few words; "" if there are none.
+
+    Args:
+        network: settings of the network.
+        frames: what :func:`frames_by_kind` returned.
+
+    Example:
+        >>> from torchrl_tit.settings.networks import mlp
+        >>> chosen_by_kind(mlp(), frames_by_kind(mlp(), {"arm": (7,), "ball": (3,)}))
+        'arm: linear (embed_dim 64, bias True); ball: linear (embed_dim 64, bias True)'
+    """
+    return "; ".join(
+        f"{name}: {_describe(frame)}"
+        for name, frame in frames.items()
+        if frame != network.frames.get(name, network.frame)
+    )
+
+
+def _check_history(network: settings.Network, observations: Mapping[str, Observation]) -> None:
+    encoder = settings.resolve(network.history.builds)
+    if getattr(encoder, "reads_frames", False):
+        raise ValueError(
+            f"{network.history.name} stacks the frames of one observation, but the task has "
+            f"several ({', '.join(observations)}): choose one of them (--observation-keys), or "
+            "another history encoder"
+        )
+
+
+def _width(
+    network: settings.Network, observations: Mapping[str, Observation], others: Iterable[str]
+) -> int:
+    """The width of a token, which all frame encoders share."""
+    named = [(network.frames[name], name) for name in network.frames]
+    default = (
+        [] if isinstance(network.frame, settings.Flat) else [(network.frame, n) for n in others]
+    )
+    for frame, name in (*named, *default):
+        encoder = _try(frame, observations[name])
+        if isinstance(encoder, FrameEncoder):
+            return encoder.width
+    return int(getattr(network.frame, "embed_dim", _WIDTH))
+
+
+def _first_that_reads(
+    frame: FrameSettings, width: int, observation: Observation, name: str
+) -> FrameSettings:
+    refusals = []
+    for candidate in _candidates(frame, width, observation):
+        encoder = _try(candidate, observation)
+        if not isinstance(encoder, ValueError):
+            return candidate
+        refusals.append(encoder)
+    raise ValueError(
+        f"no frame encoder here reads {name}, {observation}: name one in frames "
+        f"(--backbone.frames.{name}), or leave it out (--observation-keys): {refusals[-1]}"
+    )
+
+
+def _candidates(
+    frame: FrameSettings, width: int, observation: Observation
+) -> Iterator[FrameSettings]:
+    patch_size = getattr(frame, "patch_size", None)
+    if not isinstance(frame, settings.Flat) and not _too_many_patches(patch_size, observation):
+        yield frame
+    if "patch_size" in {field.name for field in fields(frame)}:
+        yield replace(frame, patch_size="auto")  # type: ignore[call-arg]
+    if observation.kind != "image":
+        yield settings.Linear(embed_dim=width, bias=True)
+        return
+    if min(observation.shape[-2:]) >= _CNN_PIXELS:
+        yield settings.NatureCNNFrames(embed_dim=width)
+    yield settings.Inner(embed_dim=width, patch_size="auto", every_block=False)
+
+
+def _too_many_patches(patch_size: object, observation: Observation) -> bool:
+    """Whether a patch that is meant for other observations splits an image too finely."""
+    if observation.kind != "image" or not isinstance(patch_size, int):
+        return False
+    height, width = observation.shape[-2:]
+    return height * width > _MOST_PATCHES * patch_size**2
+
+
+def _try(frame: FrameSettings, observation: Observation) -> FrameEncoder | ValueError:
+    """Builds an encoder, or returns what it says if it cannot read the observation.
+
+    Raises:
+        BrokenEncoderError: if it is not that, but an encoder that cannot be built.
+    """
+    try:
+        try:
+            with torch.device("meta"):
+                return build_frame(frame, observation)
+        except (NotImplementedError, RuntimeError):  # needs numbers, as one does that loads weights
+            with torch.random.fork_rng(devices=[]):
+                return build_frame(frame, observation)
+    except BrokenEncoderError:
+        raise
+    except ValueError as error:
+        return error
+
+
+def _describe(frame: FrameSettings) -> str:
+    """The name of an encoder, and its settings that are not the default."""
+    differing = [
+        f"{field.name} {getattr(frame, field.name)}"
+        for field in fields(frame)
+        if getattr(frame, field.name) != field.default
+    ]
+    return f"{frame.name} ({', '.join(differing)})" if differing else frame.name
