@@ -1,10 +1,13 @@
-"""What history encoders share: one token of several, frames themselves, an LSTM from zero."""
+"""What history encoders share: one token of several, frames themselves, states."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
+from torchrl.modules import set_recurrent_mode
 
 from tests.networks.reference import randomize
 from torchrl_tit import settings
@@ -13,10 +16,11 @@ from torchrl_tit.settings import HistorySettings
 
 ONE_TOKEN: list[HistorySettings] = [
     settings.Outer(num_heads=2),
-    settings.Outer(num_heads=2, dense=True, temporal_position_encoding=True),
+    settings.Outer(num_heads=2, dense=True, temporal_positions="learned"),
     settings.Catformer(num_heads=2),
     settings.CoBERL(num_heads=2, hidden_dim=5),
     settings.LSTM(hidden_dim=5),
+    settings.GTrXL(num_heads=2),
 ]
 
 
@@ -54,10 +58,18 @@ def test_masked_predictions_of_several_tokens_compare_the_one_made_of_them() -> 
     assert predictions.shape == (4, 3, 8)
 
 
-def test_lstm_reads_several_frames_from_a_state_of_zeros() -> None:
-    encoder = settings.LSTM(hidden_dim=5).build(HistoryShape(num_frames=3, num_tokens=1, width=8))
-    reference = nn.LSTM(8, 5, batch_first=True)
-    reference.load_state_dict(encoder.memory.lstm.state_dict())
+RECURRENT: dict[str, tuple[Any, Any]] = {
+    "lstm": (settings.LSTM(hidden_dim=5), nn.LSTM),
+    "gru": (settings.GRU(hidden_dim=5), nn.GRU),
+}
+
+
+@pytest.mark.parametrize("name", RECURRENT)
+def test_recurrent_encoders_read_several_frames_from_a_state_of_zeros(name: str) -> None:
+    choices, layer = RECURRENT[name]
+    encoder = choices.build(HistoryShape(num_frames=3, num_tokens=1, width=8))
+    reference = layer(8, 5, batch_first=True)
+    reference.load_state_dict(getattr(encoder.memory, name).state_dict())
     tokens = torch.randn(2, 4, 3, 1, 8)
     expected, _ = reference(tokens.reshape(8, 3, 8))
     torch.testing.assert_close(encoder(tokens), expected[:, -1].reshape(2, 4, 5))
@@ -68,6 +80,31 @@ def test_lstm_reads_several_frames_from_a_state_of_zeros() -> None:
             square = parameter.T @ parameter if name.endswith("hh_l0") else None
             if square is not None:
                 torch.testing.assert_close(square, torch.eye(5))
+
+
+@pytest.mark.parametrize("name", RECURRENT)
+def test_recurrent_encoders_read_sequences_from_a_given_state(name: str) -> None:
+    """One frame a step: PyTorch's layer on each episode, which starts at 0 inside the sequence."""
+    choices, layer = RECURRENT[name]
+    encoder = choices.build(HistoryShape(num_frames=1, num_tokens=1, width=8)).double()
+    randomize(encoder)
+    reference = layer(8, 5, batch_first=True).double()
+    reference.load_state_dict(getattr(encoder.memory, name).state_dict())
+    tokens = torch.randn(2, 6, 1, 8, dtype=torch.float64)
+    is_init = torch.zeros(2, 6, 1, dtype=torch.bool)
+    is_init[:, 4] = True
+    state = {
+        key: torch.randn(2, 6, *shape, dtype=torch.float64) * ~is_init.unsqueeze(-1)
+        for key, shape in encoder.state_shapes.items()
+    }
+    with set_recurrent_mode(True):
+        states, after = encoder.step(tokens, state, is_init)
+    assert list(after) == list(state)
+    given = tuple(x[:, 0].transpose(0, 1).contiguous() for x in state.values())
+    first, _ = reference(tokens[:, :4, 0], given if len(given) > 1 else given[0])
+    second, _ = reference(tokens[:, 4:, 0])
+    torch.testing.assert_close(states, torch.cat([first, second], dim=1))
+    torch.testing.assert_close(after["recurrent_state_h"][:, -1, 0], second[:, -1])
 
 
 def test_frames_that_were_encoded_cannot_be_stacked() -> None:

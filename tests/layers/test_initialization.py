@@ -25,7 +25,7 @@ SHAPES = pytest.mark.parametrize(("shape", "patch_size"), [((12,), 1), ((24, 24)
 
 def make(kind: type[Any], shape: tuple[int, ...], patch_size: int) -> nn.Module:
     torch.manual_seed(0)
-    network = kind(shape, 4, patch_size=patch_size, embed_dim=64, temporal_position_encoding=True)
+    network = kind(shape, 4, patch_size=patch_size, embed_dim=64, temporal_positions="learned")
     assert isinstance(network, nn.Module)
     return network
 

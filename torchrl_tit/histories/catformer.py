@@ -18,7 +18,8 @@ class CatformerAttention(nn.Module):
     Args:
         in_dim: width of the concatenation of all earlier layers' outputs.
         width: width D of the output.
-        settings: heads, and the width at which attention works.
+        settings: heads, the width at which attention works, and temporal positions.
+        num_frames: number K of frames.
         project: whether there is a projection; without it ``in_dim`` is the attention's width.
 
     Raises:
@@ -26,14 +27,25 @@ class CatformerAttention(nn.Module):
     """
 
     def __init__(
-        self, in_dim: int, width: int, settings: settings.Catformer, *, project: bool
+        self,
+        in_dim: int,
+        width: int,
+        settings: settings.Catformer,
+        *,
+        num_frames: int,
+        project: bool,
     ) -> None:
         super().__init__()
         attention_dim = settings.attention_expansion * width
         self.projection = nn.Linear(in_dim, attention_dim) if project else nn.Identity()
         self.norm = nn.LayerNorm(attention_dim)
         self.attention = SelfAttention(
-            attention_dim, settings.num_heads, causal=True, out_dim=width
+            attention_dim,
+            settings.num_heads,
+            causal=True,
+            out_dim=width,
+            positions=settings.temporal_positions,
+            num_frames=num_frames,
         )
 
     def forward(self, x: Tensor, read: Read = "all") -> Tensor:
@@ -55,7 +67,7 @@ class Catformer(HistoryEncoder):
     several tokens, a linear layer merges them into one.
 
     Args:
-        settings: blocks, heads and expansions.
+        settings: blocks, heads, expansions and temporal positions.
         shape: what it reads.
 
     Raises:
@@ -72,14 +84,22 @@ class Catformer(HistoryEncoder):
         super().__init__(shape, out_features=shape.width)
         width = shape.width
         self.one_token = OneToken(shape)
-        self.positions = nn.Parameter(torch.empty(1, shape.num_frames, width))
+        self.positions = (
+            nn.Parameter(torch.empty(1, shape.num_frames, width))
+            if settings.temporal_positions == "learned"
+            else None
+        )
         self.attentions = nn.ModuleList()
         self.ffns = nn.ModuleList()
         for index in range(settings.num_blocks):
             # The first layer reads the tokens without a projection, unless attention is wider.
             project = index > 0 or settings.attention_expansion > 1
             earlier = width * max(2 * index, 1)
-            self.attentions.append(CatformerAttention(earlier, width, settings, project=project))
+            self.attentions.append(
+                CatformerAttention(
+                    earlier, width, settings, num_frames=shape.num_frames, project=project
+                )
+            )
             earlier = width * (2 * index + 1)
             self.ffns.append(
                 nn.Sequential(
@@ -92,8 +112,9 @@ class Catformer(HistoryEncoder):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises the temporal positions: normal with a standard deviation of 0.02."""
-        nn.init.normal_(self.positions, std=0.02)
+        """Initialises learned temporal positions: normal with a standard deviation of 0.02."""
+        if self.positions is not None:
+            nn.init.normal_(self.positions, std=0.02)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., D]."""
@@ -124,7 +145,8 @@ class Catformer(HistoryEncoder):
         return maps
 
     def _steps(self, tokens: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-        """[..., K, L, D] -> [N, K, D] with temporal positions, leading shape."""
+        """[..., K, L, D] -> [N, K, D] with learned temporal positions, leading shape."""
         x = self.one_token(tokens)
         leading = tuple(x.shape[:-2])
-        return x.reshape(math.prod(leading), *x.shape[-2:]) + self.positions, leading
+        x = x.reshape(math.prod(leading), *x.shape[-2:])
+        return x if self.positions is None else x + self.positions, leading

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torchrl.modules import LSTM
 
 from torchrl_tit import settings
-from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
-from torchrl_tit.layers.gated_block import GatedTransformerBlock, GRUGate
+from torchrl_tit.histories.encoder import HistoryShape
+from torchrl_tit.histories.gtrxl import GatedTransformerEncoder
+from torchrl_tit.layers.gated_block import GRUGate
 
 
-class CoBERL(HistoryEncoder):
+class CoBERL(GatedTransformerEncoder):
     """Gated transformer over one token a frame, a gate that mixes its input in, an LSTM.
 
     Banino et al., "CoBERL: Contrastive BERT for Reinforcement Learning", arXiv 2107.05431, figure
@@ -37,18 +36,7 @@ class CoBERL(HistoryEncoder):
     """
 
     def __init__(self, settings: settings.CoBERL, shape: HistoryShape) -> None:
-        super().__init__(shape, out_features=settings.hidden_dim)
-        self.one_token = OneToken(shape)
-        self.blocks = nn.ModuleList(
-            GatedTransformerBlock(
-                shape.width,
-                settings.num_heads,
-                shape.num_frames,
-                ffn_expansion=settings.ffn_expansion,
-                gate_bias=settings.gate_bias,
-            )
-            for _ in range(settings.num_blocks)
-        )
+        super().__init__(settings, shape, out_features=settings.hidden_dim)
         self.mask_token = nn.Parameter(torch.empty(shape.width))
         self.gate = GRUGate(shape.width, settings.gate_bias)
         # TorchRL's LSTM, not PyTorch's: it works under vmap and in a compiled graph.
@@ -82,22 +70,6 @@ class CoBERL(HistoryEncoder):
         hidden = torch.where(mask.unsqueeze(-1), self.mask_token.to(encodings.dtype), encodings)
         x, _ = self._steps(hidden)
         return encodings, self._transform(x, causal=False).reshape(encodings.shape)
-
-    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, float [..., heads, K, K]."""
-        x, leading = self._steps(self.one_token(tokens))
-        maps = []
-        for block in self.blocks:
-            assert isinstance(block, GatedTransformerBlock)
-            weights = block.attention_weights(x)
-            maps.append(weights.reshape(*leading, *weights.shape[1:]))
-            x = block(x, causal=True)
-        return maps
-
-    def _steps(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-        """[..., K, D] -> [N, K, D], leading shape."""
-        leading = tuple(x.shape[:-2])
-        return x.reshape(math.prod(leading), *x.shape[-2:]), leading
 
     def _transform(self, x: Tensor, *, causal: bool) -> Tensor:
         """The gated blocks on [N, K, D]."""

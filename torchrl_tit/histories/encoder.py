@@ -20,7 +20,8 @@ class HistoryShape:
     width: int
     """Width D of a token."""
     frame_shape: tuple[int, ...] | None = None
-    """The observation's shape, if a token is the observation itself."""
+    """The observation's shape, if a token is the observation itself; of categories, that of their
+    one-hot vectors."""
     action_dim: int | None = None
     """Entries of a continuous action, or number of discrete ones, if the task is known."""
 

@@ -13,10 +13,12 @@ from torchrl_tit.layers.block import TransformerBlock
 
 
 class OuterTransformer(HistoryEncoder):
-    """The base of both outer transformers: causal blocks over the frames, read at the newest one.
+    """The base of the outer transformers: causal blocks over the frames, read at the newest one.
 
     The paper gives the outer transformer no position encoding: the newest frame then sees the past
-    as a set. Temporal positions are an option that tells the frames apart.
+    as a set. Temporal positions are an option that tells the frames apart. Learned ones are added
+    to the tokens; a bias for each distance, or rotations, act within attention. Distances are those
+    within the window of K frames.
 
     Args:
         settings: heads, FFN, dropout and temporal positions.
@@ -27,7 +29,7 @@ class OuterTransformer(HistoryEncoder):
 
     def __init__(
         self,
-        settings: settings.Outer | settings.PairedOuter,
+        settings: settings.Outer | settings.PairedOuter | settings.ChainedOuter,
         shape: HistoryShape,
         *,
         num_blocks: int,
@@ -37,11 +39,17 @@ class OuterTransformer(HistoryEncoder):
         self.num_blocks = num_blocks
         self.positions = (
             nn.Parameter(torch.empty(shape.num_frames, 1, shape.width))
-            if settings.temporal_position_encoding
+            if settings.temporal_positions == "learned"
             else None
         )
         self.blocks = nn.ModuleList(
-            TransformerBlock.from_settings(settings, shape.width, causal=True)
+            TransformerBlock.from_settings(
+                settings,
+                shape.width,
+                causal=True,
+                positions=settings.temporal_positions,
+                num_frames=shape.num_frames,
+            )
             for _ in range(1 if settings.share_blocks else num_blocks)
         )
         self.reset_parameters()
@@ -100,6 +108,64 @@ class PairedOuterTransformer(OuterTransformer):
         x, leading = self._steps(tokens)
         maps = (self._block(i).attention_weights(x[:, :, i]) for i in range(self.num_blocks))
         return [weights.reshape(*leading, *weights.shape[1:]) for weights in maps]
+
+
+class ChainedOuterTransformer(OuterTransformer):
+    """The outer blocks of Enhanced_TIT, each also on the output of the one before it.
+
+    Outer block l reads, at all K frames, the sum of token l (the output of inner block l) and the
+    output of outer block l - 1. The newest frame's outputs of all blocks are concatenated, as in
+    Enhanced_TIT. So perception and decision take turns, as in the successor of TIT by its authors:
+    Mao et al., "PDiT: Interleaving Perception and Decision-making Transformers for Deep
+    Reinforcement Learning", arXiv 2312.15863.
+
+    Unlike in a network that interleaves both ways, nothing flows from the history back to the
+    frames: inner block l + 1 does not see what outer block l found. The tokens of a frame still
+    depend on that frame alone, so each frame is encoded once.
+
+    All blocks but the last compute all K frames, where those of
+    :class:`PairedOuterTransformer` compute the newest only.
+
+    Args:
+        settings: heads, FFN, dropout and temporal positions.
+        shape: what it reads.
+
+    Example:
+        >>> shape = HistoryShape(num_frames=4, num_tokens=2, width=32)
+        >>> outer = ChainedOuterTransformer(settings.ChainedOuter(num_heads=4), shape)
+        >>> outer(torch.randn(8, 4, 2, 32)).shape
+        torch.Size([8, 64])
+    """
+
+    def __init__(self, settings: settings.ChainedOuter, shape: HistoryShape) -> None:
+        super().__init__(
+            settings,
+            shape,
+            num_blocks=shape.num_tokens,
+            out_features=shape.num_tokens * shape.width,
+        )
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens of K frames, float [..., K, L, D] -> float [..., L * D]."""
+        tokens, leading = self._steps(tokens)
+        x, newest = tokens[:, :, 0], []
+        for index in range(self.num_blocks - 1):
+            x = self._block(index)(x)
+            newest.append(x[:, -1:])
+            x = x + tokens[:, :, index + 1]
+        newest.append(self._block(self.num_blocks - 1)(x, read="last"))
+        return torch.cat(newest, dim=-1).reshape(*leading, self.out_features)
+
+    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each block, L x float [..., heads, K, K]."""
+        tokens, leading = self._steps(tokens)
+        x, maps = torch.zeros_like(tokens[:, :, 0]), []
+        for index in range(self.num_blocks):
+            x = x + tokens[:, :, index]
+            weights = self._block(index).attention_weights(x)
+            maps.append(weights.reshape(*leading, *weights.shape[1:]))
+            x = self._block(index)(x)
+        return maps
 
 
 class StackedOuterTransformer(OuterTransformer):

@@ -1,24 +1,83 @@
-"""TorchRL's LSTM as a history encoder."""
+"""TorchRL's LSTM and GRU as history encoders."""
 
 from __future__ import annotations
+
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.modules import LSTMModule
+from torchrl.modules import GRUModule, LSTMModule
 
 from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryShape, OneToken, RecurrentEncoder
 
-_STATE = ["recurrent_state_h", "recurrent_state_c"]
 
-
-class LSTM(RecurrentEncoder):
-    """An LSTM over frames.
+class _TorchRLEncoder(RecurrentEncoder):
+    """A recurrent module of TorchRL over frames.
 
     With one frame (K = 1) the state is its memory, which :class:`~torchrl_tit.modules.Backbone`
-    carries through an episode with TorchRL's `LSTMModule`. With more, it reads them from a state of
-    zeros.
+    carries through an episode. With more, it reads them from a state of zeros.
+
+    Args:
+        settings: size of the state.
+        shape: what it reads.
+    """
+
+    memory_class: ClassVar[type[Any]]
+    """TorchRL's module, which reads single steps and whole sequences."""
+    layer_name: ClassVar[str]
+    """Where that module has its layers."""
+    state: ClassVar[tuple[str, ...]]
+    """Keys of the state."""
+
+    def __init__(self, settings: settings.LSTM | settings.GRU, shape: HistoryShape) -> None:
+        super().__init__(shape, out_features=settings.hidden_dim)
+        self.one_token = OneToken(shape)
+        self.memory = self.memory_class(
+            shape.width,
+            settings.hidden_dim,
+            in_keys=["token", *self.state],
+            out_keys=["memory", *(("next", key) for key in self.state)],
+            python_based=shape.num_frames > 1,  # PyTorch's own is faster but not traceable
+        )
+        self.state_shapes = {key: torch.Size([1, settings.hidden_dim]) for key in self.state}
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises the layers: orthogonal weights, biases 0."""
+        for name, parameter in self._layers.named_parameters():
+            if name.startswith("weight"):
+                nn.init.orthogonal_(parameter)
+            else:
+                nn.init.zeros_(parameter)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens of K frames, float [..., K, L, D] -> the state after the last, float [..., E]."""
+        x = self.one_token(tokens)  # [..., K, D]
+        states, _ = self._layers(x.reshape(-1, *x.shape[-2:]))  # [N, K, E]
+        return states[:, -1].reshape(*x.shape[:-2], self.out_features)
+
+    def step(
+        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Tokens float [*B, L, D] and the state before -> float [*B, E] and the state after."""
+        entries = {"token": self.one_token(tokens), **state, "is_init": is_init}
+        outcome = self.memory(TensorDict(entries, tokens.shape[:-2]))
+        return outcome["memory"], {key: outcome["next", key] for key in self.state}
+
+    @property
+    def _layers(self) -> nn.Module:
+        layers = getattr(self.memory, self.layer_name)
+        assert isinstance(layers, nn.Module)
+        return layers
+
+
+class LSTM(_TorchRLEncoder):
+    """An LSTM over frames: TorchRL's `LSTMModule`.
+
+    With one frame (K = 1) the state is its memory, which :class:`~torchrl_tit.modules.Backbone`
+    carries through an episode. With more, it reads them from a state of zeros.
 
     Args:
         settings: size of the state.
@@ -30,37 +89,28 @@ class LSTM(RecurrentEncoder):
         torch.Size([8, 64])
     """
 
-    def __init__(self, settings: settings.LSTM, shape: HistoryShape) -> None:
-        super().__init__(shape, out_features=settings.hidden_dim)
-        self.one_token = OneToken(shape)
-        self.memory = LSTMModule(
-            shape.width,
-            settings.hidden_dim,
-            in_keys=["token", *_STATE],
-            out_keys=["memory", *(("next", key) for key in _STATE)],
-            python_based=shape.num_frames > 1,  # PyTorch's own is faster but not traceable
-        )
-        self.state_shapes = {key: torch.Size([1, settings.hidden_dim]) for key in _STATE}
-        self.reset_parameters()
+    memory_class = LSTMModule
+    layer_name = "lstm"
+    state = ("recurrent_state_h", "recurrent_state_c")
 
-    def reset_parameters(self) -> None:
-        """Initialises the LSTM: orthogonal weights, biases 0."""
-        for name, parameter in self.memory.lstm.named_parameters():
-            if name.startswith("weight"):
-                nn.init.orthogonal_(parameter)
-            else:
-                nn.init.zeros_(parameter)
 
-    def forward(self, tokens: Tensor) -> Tensor:
-        """Tokens of K frames, float [..., K, L, D] -> the state after the last, float [..., E]."""
-        x = self.one_token(tokens)  # [..., K, D]
-        states, _ = self.memory.lstm(x.reshape(-1, *x.shape[-2:]))  # [N, K, E]
-        return states[:, -1].reshape(*x.shape[:-2], self.out_features)
+class GRU(_TorchRLEncoder):
+    """A GRU over frames: TorchRL's `GRUModule`.
 
-    def step(
-        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Tokens float [*B, L, D] and the state before -> float [*B, E] and the state after."""
-        entries = {"token": self.one_token(tokens), **state, "is_init": is_init}
-        outcome = self.memory(TensorDict(entries, tokens.shape[:-2]))
-        return outcome["memory"], {key: outcome["next", key] for key in _STATE}
+    Cho et al., "Learning Phrase Representations using RNN Encoder-Decoder for Statistical Machine
+    Translation", arXiv 1406.1078, in PyTorch's variant. Its state is handled as that of
+    :class:`LSTM`; it has three quarters of its weights.
+
+    Args:
+        settings: size of the state.
+        shape: what it reads.
+
+    Example:
+        >>> gru = GRU(settings.GRU(), HistoryShape(num_frames=4, num_tokens=1, width=32))
+        >>> gru(torch.randn(8, 4, 1, 32)).shape
+        torch.Size([8, 64])
+    """
+
+    memory_class = GRUModule
+    layer_name = "gru"
+    state = ("recurrent_state_h",)

@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_tit.layers.dropout import Dropout
+from torchrl_tit.layers.positions import RelativeBias, Rotary
+from torchrl_tit.settings.histories import TemporalPositions
 
 Read = Literal["all", "first", "last"]
 """Positions of a sequence that are read: all, the first (class token), the last (newest step)."""
@@ -34,9 +36,14 @@ class SelfAttention(nn.Module):
         causal: whether a position sees only itself and earlier ones.
         dropout: probability of dropping an attention weight while training.
         out_dim: width of the output; by default that of the input.
+        positions: whether attention sees the distance between positions: "relative" (only of
+            causal attention) or "rotary". "learned" ones were added to the tokens, so here they are
+            as "none".
+        num_frames: number K of positions of the longest sequence, for "relative" and "rotary".
 
     Raises:
-        ValueError: if ``num_heads`` does not divide ``embed_dim``.
+        ValueError: if ``num_heads`` does not divide ``embed_dim``, "rotary" heads have an odd
+            number of entries, or "relative" attention is not causal.
 
     Example:
         >>> attention = SelfAttention(embed_dim=32, num_heads=4, causal=True)
@@ -53,6 +60,8 @@ class SelfAttention(nn.Module):
         causal: bool = False,
         dropout: float = 0.0,
         out_dim: int | None = None,
+        positions: TemporalPositions = "none",
+        num_frames: int = 1,
     ) -> None:
         super().__init__()
         if num_heads < 1 or embed_dim % num_heads:
@@ -60,6 +69,8 @@ class SelfAttention(nn.Module):
                 f"the width {embed_dim} cannot be split over {num_heads} attention heads: "
                 "choose a number of heads that divides embed_dim"
             )
+        if positions == "relative" and not causal:
+            raise ValueError("relative positions are distances to the past: choose causal=True")
         self.num_heads = num_heads
         self.causal = causal
         self.in_proj_weight = nn.Parameter(torch.empty(3 * embed_dim, embed_dim))
@@ -67,6 +78,8 @@ class SelfAttention(nn.Module):
         self.out_proj = nn.Linear(embed_dim, out_dim or embed_dim)
         # A module, not a number: TorchRL's losses look for nn.Dropout to set vmap's randomness.
         self.dropout = Dropout(dropout)
+        self.relative = RelativeBias(num_heads, num_frames) if positions == "relative" else None
+        self.rotary = Rotary(embed_dim // num_heads, num_frames) if positions == "rotary" else None
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
@@ -83,7 +96,8 @@ class SelfAttention(nn.Module):
             x: tokens, float [N, S, D].
             read: which positions to return, by name or as a slice of S.
             mask: bool [..., S, S], to be broadcast to [N, heads, S, S]: True where a position (row)
-                sees another (column). Each must see at least one. Replaces the causal mask, if any.
+                sees another (column). Each must see at least one. Replaces the causal mask, if any;
+                "relative" positions keep it, as they know no future.
 
         Returns:
             float [N, positions read, D].
@@ -93,7 +107,13 @@ class SelfAttention(nn.Module):
         causal = self.causal and mask is None and read != "last"
         if x.shape[1] == 1:
             mixed = self._attend_itself(x)
-        elif isinstance(read, str) and read != "all" and mask is None and not causal:
+        elif (
+            isinstance(read, str)
+            and read != "all"
+            and mask is None
+            and not causal
+            and self.rotary is None  # turns each key by another angle
+        ):
             mixed = self._attend_one(x, positions)
         else:
             mixed = self._attend(x, positions, mask, causal)
@@ -130,7 +150,7 @@ class SelfAttention(nn.Module):
     def weights(self, x: Tensor) -> Tensor:
         """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1."""
         query, key, _ = self._heads(x, READ_SLICES["all"])
-        return self._weights(query, key, self._past(x) if self.causal else None)
+        return self._weights(query, key, self._mask(x, None, self.causal))
 
     def extra_repr(self) -> str:
         """Shows what the parameters' shapes do not."""
@@ -144,12 +164,14 @@ class SelfAttention(nn.Module):
     def _attend(self, x: Tensor, positions: slice, mask: Tensor | None, causal: bool) -> Tensor:
         """The output of attention at these positions, float [N, positions, D]."""
         query, key, value = self._heads(x, positions)  # [N, heads, positions or S, D / heads]
-        fused = causal and positions == READ_SLICES["all"] and not self._drops
-        if causal and not fused:
-            mask = self._past(x)
+        everything = positions == READ_SLICES["all"]
+        fused = causal and everything and self.relative is None and not self._drops
+        if not fused:
+            mask = self._mask(x, mask, causal)
         if mask is not None:
             mask = mask[..., positions, :]
-        if self._drops:
+        # PyTorch's kernel for CPUs has no gradient for what is added to the scores.
+        if self._drops or self.relative is not None:
             mixed = self.dropout(self._weights(query, key, mask)) @ value
         else:
             mixed = F.scaled_dot_product_attention(query, key, value, mask, is_causal=fused)
@@ -185,8 +207,12 @@ class SelfAttention(nn.Module):
         # The heads take the place of the positions: all read the same tokens.
         query = torch.bmm(query, key_weight).transpose(0, 1).unsqueeze(1)  # [N, 1, heads, D]
         tokens = x.unsqueeze(1)
-        mixed = F.scaled_dot_product_attention(query, tokens, tokens, scale=scale).squeeze(1)
-        value = torch.baddbmm(value_bias, mixed.transpose(0, 1), value_weight.mT)
+        if self.relative is None:
+            mixed = F.scaled_dot_product_attention(query, tokens, tokens, scale=scale)
+        else:
+            scores = query @ tokens.mT * scale + self.relative.newest(x.shape[1])
+            mixed = scores.softmax(dim=-1) @ tokens
+        value = torch.baddbmm(value_bias, mixed.squeeze(1).transpose(0, 1), value_weight.mT)
         return value.transpose(0, 1).flatten(1).unsqueeze(1)
 
     @property
@@ -201,11 +227,25 @@ class SelfAttention(nn.Module):
         else:
             query = self._project(x[:, positions], 0, 1)
             key, value = self._project(x, 1, 3).chunk(2, dim=-1)
-        return self._split(query), self._split(key), self._split(value)
+        query, key, value = self._split(query), self._split(key), self._split(value)
+        if self.rotary is None:
+            return query, key, value
+        length = x.shape[1]
+        return self.rotary(query, length, positions), self.rotary(key, length), value
 
     def _split(self, x: Tensor) -> Tensor:
         """[N, S, D] -> [N, heads, S, D / heads]."""
         return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+
+    def _mask(self, x: Tensor, mask: Tensor | None, causal: bool) -> Tensor | None:
+        """What is added to the scores, float [..., S, S], or which of them count, bool [..., S, S].
+
+        None if all scores are taken as they are.
+        """
+        if self.relative is None:
+            return self._past(x) if causal else mask
+        bias = self.relative(x.shape[1])
+        return bias if mask is None else bias.masked_fill(~mask, -math.inf)
 
     def _past(self, x: Tensor) -> Tensor:
         """The causal mask: bool [S, S], lower triangular."""
@@ -214,5 +254,6 @@ class SelfAttention(nn.Module):
     def _weights(self, query: Tensor, key: Tensor, mask: Tensor | None) -> Tensor:
         scores = query @ key.transpose(-2, -1) / math.sqrt(query.shape[-1])
         if mask is not None:
-            scores = scores.masked_fill(~mask, -math.inf)
+            boolean = mask.dtype == torch.bool
+            scores = scores.masked_fill(~mask, -math.inf) if boolean else scores + mask
         return scores.softmax(dim=-1)

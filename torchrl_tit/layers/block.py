@@ -7,6 +7,7 @@ from torch import Tensor, nn
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.attention import READ_SLICES, Read, SelfAttention
 from torchrl_tit.settings.frames import Activation, TransformerSettings
+from torchrl_tit.settings.histories import TemporalPositions
 
 
 class TransformerBlock(nn.Module):
@@ -23,6 +24,8 @@ class TransformerBlock(nn.Module):
         attention_dropout: dropout on the attention weights.
         ffn_dropout: dropout on the output of the FFN.
         causal: whether a position sees only itself and earlier ones.
+        positions: whether attention sees distances: see :class:`SelfAttention`.
+        num_frames: number K of positions of the longest sequence, if it does.
 
     Example:
         >>> import torch
@@ -41,11 +44,18 @@ class TransformerBlock(nn.Module):
         attention_dropout: float = 0.0,
         ffn_dropout: float = 0.0,
         causal: bool = False,
+        positions: TemporalPositions = "none",
+        num_frames: int = 1,
     ) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(embed_dim)
         self.attention = SelfAttention(
-            embed_dim, num_heads, causal=causal, dropout=attention_dropout
+            embed_dim,
+            num_heads,
+            causal=causal,
+            dropout=attention_dropout,
+            positions=positions,
+            num_frames=num_frames,
         )
         self.norm2 = nn.LayerNorm(embed_dim)
         self.ffn = nn.Sequential(
@@ -57,7 +67,13 @@ class TransformerBlock(nn.Module):
 
     @classmethod
     def from_settings(
-        cls, settings: TransformerSettings, embed_dim: int, *, causal: bool = False
+        cls,
+        settings: TransformerSettings,
+        embed_dim: int,
+        *,
+        causal: bool = False,
+        positions: TemporalPositions = "none",
+        num_frames: int = 1,
     ) -> TransformerBlock:
         """Builds a block of an inner or outer transformer.
 
@@ -65,6 +81,8 @@ class TransformerBlock(nn.Module):
             settings: heads, FFN and dropout.
             embed_dim: width D of a token.
             causal: whether a position sees only itself and earlier ones.
+            positions: whether attention sees distances: see :class:`SelfAttention`.
+            num_frames: number K of positions of the longest sequence, if it does.
         """
         return cls(
             embed_dim,
@@ -74,6 +92,8 @@ class TransformerBlock(nn.Module):
             attention_dropout=settings.attention_dropout,
             ffn_dropout=settings.ffn_dropout,
             causal=causal,
+            positions=positions,
+            num_frames=num_frames,
         )
 
     def forward(self, x: Tensor, read: Read = "all") -> Tensor:

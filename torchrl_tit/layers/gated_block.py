@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from torchrl_tit.layers.attention import READ_SLICES, Read
 from torchrl_tit.layers.relative_attention import RelativeSelfAttention
 
 
@@ -86,14 +87,16 @@ class GatedTransformerBlock(nn.Module):
         )
         self.gate2 = GRUGate(embed_dim, gate_bias)
 
-    def forward(self, x: Tensor, *, causal: bool) -> Tensor:
-        """Transforms tokens, float [N, K, D] -> float [N, K, D].
+    def forward(self, x: Tensor, *, causal: bool, read: Read = "all") -> Tensor:
+        """Transforms tokens, float [N, K, D] -> float [N, K or 1, D].
 
         Args:
             x: tokens.
             causal: whether a step sees only itself and earlier ones.
+            read: which steps to compute and return: all, the first or the last.
         """
-        x = self.gate1(x, torch.relu(self.attention(self.norm1(x), causal=causal)))
+        mixed = self.attention(self.norm1(x), causal=causal, read=read)
+        x = self.gate1(x[:, READ_SLICES[read]], torch.relu(mixed))
         return self.gate2(x, torch.relu(self.ffn(self.norm2(x))))
 
     def attention_weights(self, x: Tensor) -> Tensor:

@@ -6,6 +6,10 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchrl_tit.layers.attention import READ_SLICES, Read
+from torchrl_tit.layers.positions import sinusoids
 
 
 class RelativeSelfAttention(nn.Module):
@@ -28,8 +32,9 @@ class RelativeSelfAttention(nn.Module):
 
     Example:
         >>> attention = RelativeSelfAttention(embed_dim=32, num_heads=4, num_frames=5)
-        >>> attention(torch.randn(8, 5, 32), causal=True).shape
-        torch.Size([8, 5, 32])
+        >>> x = torch.randn(8, 5, 32)
+        >>> attention(x, causal=True).shape, attention(x, causal=True, read="last").shape
+        (torch.Size([8, 5, 32]), torch.Size([8, 1, 32]))
     """
 
     distances: Tensor
@@ -62,56 +67,46 @@ class RelativeSelfAttention(nn.Module):
         nn.init.zeros_(self.content_bias)
         nn.init.zeros_(self.distance_bias)
 
-    def forward(self, x: Tensor, *, causal: bool) -> Tensor:
+    def forward(self, x: Tensor, *, causal: bool, read: Read = "all") -> Tensor:
         """Attends over the steps.
 
         Args:
             x: tokens, float [N, K, D].
             causal: whether a step sees only itself and earlier ones.
+            read: which steps to compute and return: all, the first or the last.
 
         Returns:
-            float [N, K, D].
+            float [N, K or 1, D].
         """
-        query, key, value = self._heads(x)
-        mixed = self._weights(query, key, causal) @ value  # [N, heads, K, D / heads]
+        query, key, value = self._heads(x, read)
+        mixed = self._weights(query, key, causal, read) @ value  # [N, heads, steps, D / heads]
         return self.out_proj(mixed.transpose(1, 2).flatten(2))
 
     def weights(self, x: Tensor, *, causal: bool) -> Tensor:
         """Returns the attention weights, float [N, heads, K, K], rows (queries) summing to 1."""
-        query, key, _ = self._heads(x)
-        return self._weights(query, key, causal)
+        query, key, _ = self._heads(x, "all")
+        return self._weights(query, key, causal, "all")
 
-    def _heads(self, x: Tensor) -> tuple[Tensor, ...]:
-        heads = self.query_key_value(x).unflatten(-1, (3, self.num_heads, self.head_dim))
-        return heads.permute(2, 0, 3, 1, 4).unbind(0)  # [N, heads, K, D / heads] each
+    def _heads(self, x: Tensor, read: Read) -> list[Tensor]:
+        """Queries of the steps read, keys and values of all, [N, heads, ..., D / heads] each."""
+        if read == "all":
+            heads = self.query_key_value(x).chunk(3, dim=-1)
+        else:
+            width = x.shape[-1]
+            weight = self.query_key_value.weight
+            query = F.linear(x[:, READ_SLICES[read]], weight[:width])
+            heads = (query, *F.linear(x, weight[width:]).chunk(2, dim=-1))
+        return [y.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for y in heads]
 
-    def _weights(self, query: Tensor, key: Tensor, causal: bool) -> Tensor:
+    def _weights(self, query: Tensor, key: Tensor, causal: bool, read: Read) -> Tensor:
+        rows = READ_SLICES[read]
         distance_key = self.distance_key(self.distances.to(query.dtype))  # [2K - 1, D]
         distance_key = distance_key.unflatten(-1, (self.num_heads, -1)).permute(1, 2, 0)
-        content = (query + self.content_bias) @ key.transpose(-2, -1)  # [N, heads, K, K]
-        distance = (query + self.distance_bias) @ distance_key  # [N, heads, K, 2K - 1]
-        distance = distance.gather(-1, self.index.expand(*content.shape[:-2], -1, -1))
+        content = (query + self.content_bias) @ key.transpose(-2, -1)  # [N, heads, steps, K]
+        distance = (query + self.distance_bias) @ distance_key  # [N, heads, steps, 2K - 1]
+        distance = distance.gather(-1, self.index[rows].expand(*content.shape[:-2], -1, -1))
         scores = (content + distance) / math.sqrt(self.head_dim)
         if causal:
-            future = torch.ones_like(self.index, dtype=torch.bool).triu(1)
+            future = torch.ones_like(self.index, dtype=torch.bool).triu(1)[rows]
             scores = scores.masked_fill(future, -math.inf)
         return scores.softmax(dim=-1)
-
-
-def sinusoids(positions: Tensor, dim: int) -> Tensor:
-    """Encodes positions as sines and cosines of falling frequencies (arXiv 1706.03762).
-
-    Args:
-        positions: [P].
-        dim: number of entries of an encoding.
-
-    Returns:
-        float32 [P, dim].
-
-    Example:
-        >>> sinusoids(torch.arange(2), 4)[0].tolist()
-        [0.0, 0.0, 1.0, 1.0]
-    """
-    frequencies = 10_000 ** (-torch.arange(0, dim, 2) / dim)
-    angles = positions[:, None] * frequencies
-    return torch.cat([angles.sin(), angles.cos()], dim=-1)[:, :dim]

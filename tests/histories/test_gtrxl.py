@@ -1,0 +1,107 @@
+"""GTrXL against the equations of its paper, and gates that start near the identity."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.layers.test_gated_block import written_out
+from tests.networks.reference import randomize
+from tests.numerics import assert_near
+from torchrl_tit import settings
+from torchrl_tit.histories import HistoryShape
+from torchrl_tit.histories.gtrxl import GTrXL
+from torchrl_tit.layers import GatedTransformerBlock, GRUGate, init_normal_, init_orthogonal_
+from torchrl_tit.networks import GTrXL as GTrXLSystem
+
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
+
+WIDTH, FRAMES = 8, 4
+
+
+def make(num_tokens: int = 1, gate_bias: float = 2.0, num_blocks: int = 2) -> GTrXL:
+    choices = settings.GTrXL(num_heads=2, gate_bias=gate_bias, num_blocks=num_blocks)
+    encoder = choices.build(HistoryShape(num_frames=FRAMES, num_tokens=num_tokens, width=WIDTH))
+    assert isinstance(encoder, GTrXL)
+    return encoder
+
+
+def layer_norm(norm: nn.LayerNorm, x: Tensor) -> Tensor:
+    centred = x - x.mean(-1, keepdim=True)
+    return centred / (centred.square().mean(-1, keepdim=True) + norm.eps).sqrt() * norm.weight + (
+        norm.bias
+    )
+
+
+def gated(gate: GRUGate, x: Tensor, y: Tensor) -> Tensor:
+    """Section 3.2, "Gated-Recurrent-Unit-type gating"."""
+    w = dict(gate.named_parameters())
+    r = torch.sigmoid(y @ w["reset_y.weight"].T + x @ w["reset_x.weight"].T)
+    z = torch.sigmoid(y @ w["update_y.weight"].T + x @ w["update_x.weight"].T - w["bias"])
+    h = torch.tanh(y @ w["candidate_y.weight"].T + (r * x) @ w["candidate_x.weight"].T)
+    return (1 - z) * x + z * h
+
+
+def written_out_block(block: GatedTransformerBlock, x: Tensor) -> Tensor:
+    """One history [K, D]: LayerNorm on the branch, attention or FFN, relu, gate."""
+    attended = written_out(block.attention, layer_norm(block.norm1, x), causal=True)
+    x = gated(block.gate1, x, attended.clamp(min=0))
+    first, _, second = block.ffn
+    assert isinstance(first, nn.Linear)
+    assert isinstance(second, nn.Linear)
+    hidden = (layer_norm(block.norm2, x) @ first.weight.T + first.bias).clamp(min=0)
+    return gated(block.gate2, x, (hidden @ second.weight.T + second.bias).clamp(min=0))
+
+
+def test_it_is_the_equations_of_the_paper_with_their_gradients() -> None:
+    encoder = make()
+    randomize(encoder)
+    tokens = torch.randn(2, FRAMES, 1, WIDTH, requires_grad=True)
+    outputs = []
+    for x in tokens[:, :, 0]:
+        for block in encoder.blocks:
+            assert isinstance(block, GatedTransformerBlock)
+            x = written_out_block(block, x)
+        outputs.append(x[-1])
+    expected, actual = torch.stack(outputs), encoder(tokens)
+    assert_near(actual, expected)
+    probe, inputs = torch.randn_like(actual), [tokens, *encoder.parameters()]
+    assert_near(
+        list(torch.autograd.grad((actual * probe).sum(), inputs)),
+        list(torch.autograd.grad((expected * probe).sum(), inputs)),
+    )
+
+
+def test_attention_sees_the_past_and_tells_its_steps_apart() -> None:
+    encoder = make(num_tokens=2, num_blocks=1)
+    randomize(encoder)
+    tokens = torch.randn(3, 2, FRAMES, 2, WIDTH)
+    (weights,) = encoder.attention_maps(tokens)
+    assert weights.shape == (3, 2, 2, FRAMES, FRAMES)
+    assert torch.equal(weights, weights.tril())
+    assert_near(weights.sum(-1), torch.ones(3, 2, 2, FRAMES))
+    assert encoder(tokens).shape == (3, 2, WIDTH)
+    past_swapped = tokens[:, :, [1, 0, 2, 3]]
+    assert (encoder(past_swapped) - encoder(tokens)).abs().amax(-1).min() > 1e-4
+
+
+def test_gates_start_near_the_identity_and_survive_initialisation() -> None:
+    tokens = torch.randn(2, FRAMES, 1, WIDTH)
+    newest = tokens[:, -1, 0]
+    distances = [(make(gate_bias=bias)(tokens) - newest).norm() for bias in (0, 2, 9)]
+    assert distances[0] > 2 * distances[1] > 4 * distances[2]
+    torch.testing.assert_close(make(gate_bias=9)(tokens), newest, rtol=0, atol=0.01)
+    network = GTrXLSystem((20, 20), FRAMES, embed_dim=WIDTH, num_heads=2, features_dim=4)
+    for initialise in (init_orthogonal_, init_normal_):
+        initialise(network)
+        gates = [module for module in network.modules() if isinstance(module, GRUGate)]
+        assert len(gates) == 4  # two a block
+        assert all((gate.bias == 2).all() for gate in gates)
+
+
+def test_wrong_settings_say_what_to_do() -> None:
+    with pytest.raises(ValueError, match="width 8 cannot be split over 3 attention heads"):
+        settings.GTrXL(num_heads=3).build(HistoryShape(num_frames=4, num_tokens=1, width=8))
+    with pytest.raises(ValueError, match="gtrxl is a transformer over time, but num_frames is 1"):
+        GTrXLSystem((20, 20), 1)

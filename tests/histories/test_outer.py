@@ -1,0 +1,108 @@
+"""Chained outer blocks, and temporal positions of every encoder that has the choice."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import pytest
+import torch
+
+from tests.networks.reference import randomize
+from tests.numerics import assert_near
+from torchrl_tit import settings
+from torchrl_tit.histories import HistoryEncoder, HistoryShape
+from torchrl_tit.settings import HistorySettings, TemporalPositions
+
+pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
+
+WIDTH, FRAMES = 8, 4
+
+
+def make(choices: HistorySettings, num_tokens: int = 3) -> Any:
+    encoder = choices.build(HistoryShape(num_frames=FRAMES, num_tokens=num_tokens, width=WIDTH))
+    assert isinstance(encoder, HistoryEncoder)
+    randomize(encoder)
+    return encoder
+
+
+@pytest.mark.parametrize("share", [False, True])
+def test_a_chained_block_reads_its_token_and_the_block_before(share: bool) -> None:
+    chained = make(settings.ChainedOuter(num_heads=2, share_blocks=share))
+    tokens = torch.randn(5, FRAMES, 3, WIDTH)
+    x, outputs, maps = torch.zeros(5, FRAMES, WIDTH), [], []
+    for index in range(3):
+        block = chained.blocks[0 if share else index]
+        maps.append(block.attention_weights(x + tokens[:, :, index]))
+        x = block(x + tokens[:, :, index])
+        outputs.append(x[:, -1])
+    assert_near(chained(tokens), torch.cat(outputs, dim=-1))
+    assert_near(chained.attention_maps(tokens), maps)
+    assert len(chained.blocks) == (1 if share else 3)
+
+
+def test_the_chain_goes_one_way() -> None:
+    """Past tokens of a block reach the newest output of every later block, and of no earlier."""
+    chained = make(settings.ChainedOuter(num_heads=2))
+    paired = make(settings.PairedOuter(num_heads=2))
+    paired.load_state_dict(chained.state_dict())
+    tokens = torch.randn(1, FRAMES, 3, WIDTH, requires_grad=True)
+    for encoder, reached in ((chained, [1, 2]), (paired, [1])):
+        outputs = encoder(tokens).unflatten(-1, (3, WIDTH))
+        for index in range(3):
+            (gradient,) = torch.autograd.grad(
+                (outputs[:, index] * torch.linspace(-1, 1, WIDTH)).sum(), tokens, retain_graph=True
+            )
+            assert bool(gradient[:, 0, 1].any()) == (index in reached)
+    one = torch.randn(2, FRAMES, 1, WIDTH)
+    alone = [make(c, 1) for c in (settings.ChainedOuter(), settings.PairedOuter())]
+    assert_near(*(encoder(one) for encoder in alone))
+
+
+KINDS: dict[str, Any] = {
+    "outer": settings.Outer,
+    "paired-outer": settings.PairedOuter,
+    "chained-outer": settings.ChainedOuter,
+    "catformer": settings.Catformer,
+}
+
+
+@pytest.mark.parametrize("positions", get_args(TemporalPositions))
+@pytest.mark.parametrize("kind", KINDS)
+def test_temporal_positions(kind: str, positions: TemporalPositions) -> None:
+    encoder = make(KINDS[kind](num_heads=2, temporal_positions=positions), num_tokens=1)
+    names = set(encoder.state_dict())
+    assert ("positions" in names) == (positions == "learned")
+    assert any("relative" in name for name in names) == (positions == "relative")
+    tokens = torch.randn(6, FRAMES, 1, WIDTH)
+    for weights in encoder.attention_maps(tokens):
+        assert torch.equal(weights, weights.tril())
+        assert_near(weights.sum(-1), torch.ones_like(weights[..., 0]))
+    # Same frames at every step are told apart by learned positions only.
+    same = tokens[:, :1].expand(-1, FRAMES, -1, -1)
+    (weights, *_) = encoder.attention_maps(same)
+    uniform = torch.ones(FRAMES, FRAMES).tril() / torch.arange(1, FRAMES + 1).unsqueeze(-1)
+    assert torch.allclose(weights, uniform.expand_as(weights)) == (positions == "none")
+    assert encoder(tokens).shape == (6, encoder.out_features)
+
+
+def test_wrong_positions_say_what_to_do() -> None:
+    for kind in KINDS.values():
+        with pytest.raises(ValueError, match="unknown temporal_positions 'rope': choose one of"):
+            kind(temporal_positions="rope")
+    with pytest.raises(ValueError, match="'rotary' tells frames apart, but num_frames is 1"):
+        settings.Network(
+            frame=settings.Linear(), history=settings.ChainedOuter(temporal_positions="rotary")
+        )
+    shape = HistoryShape(num_frames=FRAMES, num_tokens=1, width=6)
+    with pytest.raises(ValueError, match="pairs of entries, but a head has 3"):
+        settings.Outer(num_heads=2, temporal_positions="rotary").build(shape)
+
+
+def test_fields_of_an_older_version_are_read() -> None:
+    for old, new in ((True, "learned"), (False, "none")):
+        fields = {"temporal_position_encoding": old, "num_heads": 2}
+        assert settings.PairedOuter(**settings.PairedOuter.from_older(fields)) == (
+            settings.PairedOuter(num_heads=2, temporal_positions=new)  # type: ignore[arg-type]
+        )
+    with pytest.raises(ValueError, match="temporal_position_encoding is true or false, not 1"):
+        settings.Outer.from_older({"temporal_position_encoding": 1})

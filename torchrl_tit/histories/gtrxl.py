@@ -1,0 +1,104 @@
+"""GTrXL: a transformer over frames whose residuals are gated."""
+
+from __future__ import annotations
+
+import math
+
+from torch import Tensor, nn
+
+from torchrl_tit import settings
+from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
+from torchrl_tit.layers.gated_block import GatedTransformerBlock
+
+
+class GatedTransformerEncoder(HistoryEncoder):
+    """The base of GTrXL and CoBERL: gated blocks with relative positions over one token a frame.
+
+    If frames have several tokens, a linear layer merges them into one.
+
+    Args:
+        settings: blocks, heads and gates.
+        shape: what it reads.
+        out_features: size of the output.
+    """
+
+    def __init__(
+        self,
+        settings: settings.GTrXL | settings.CoBERL,
+        shape: HistoryShape,
+        *,
+        out_features: int,
+    ) -> None:
+        super().__init__(shape, out_features=out_features)
+        self.one_token = OneToken(shape)
+        self.blocks = nn.ModuleList(
+            GatedTransformerBlock(
+                shape.width,
+                settings.num_heads,
+                shape.num_frames,
+                ffn_expansion=settings.ffn_expansion,
+                gate_bias=settings.gate_bias,
+            )
+            for _ in range(settings.num_blocks)
+        )
+
+    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each block, float [..., heads, K, K]."""
+        x, leading = self._steps(self.one_token(tokens))
+        maps = []
+        for block in self.blocks:
+            assert isinstance(block, GatedTransformerBlock)
+            weights = block.attention_weights(x)
+            maps.append(weights.reshape(*leading, *weights.shape[1:]))
+            x = block(x, causal=True)
+        return maps
+
+    def _steps(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
+        """[..., K, D] -> [N, K, D], leading shape."""
+        leading = tuple(x.shape[:-2])
+        return x.reshape(math.prod(leading), *x.shape[-2:]), leading
+
+
+class GTrXL(GatedTransformerEncoder):
+    """GTrXL's blocks over one token a frame, read at the newest frame.
+
+        x = gate(x, relu(attention(LN(x))))    causal, relative positions of Transformer-XL
+        x = gate(x, relu(FFN(LN(x))))          gates as in a GRU; their bias starts at 2
+
+    Parisotto et al., "Stabilizing Transformers for Reinforcement Learning", arXiv 1910.06764,
+    section 3. LayerNorm stands on the branches only and the gates start near the identity, so a new
+    network hands the newest frame through.
+
+    The paper's blocks also attend to a memory: outputs that they had for earlier steps, computed
+    with older weights and never trained through, so that what is seen reaches back further with
+    each block. Here a block sees the K frames of the window and nothing before, computed afresh
+    and trained through. What is read depends on these K frames alone, as for every encoder.
+
+    Only the newest frame of the last block is read, so only this is computed. The weights have
+    PyTorch's default initialisation.
+
+    Args:
+        settings: blocks, heads and gates.
+        shape: what it reads.
+
+    Raises:
+        ValueError: if the heads do not divide the width.
+
+    Example:
+        >>> import torch
+        >>> shape = HistoryShape(num_frames=4, num_tokens=1, width=32)
+        >>> gtrxl = GTrXL(settings.GTrXL(), shape)
+        >>> gtrxl(torch.randn(8, 4, 1, 32)).shape
+        torch.Size([8, 32])
+    """
+
+    def __init__(self, settings: settings.GTrXL, shape: HistoryShape) -> None:
+        super().__init__(settings, shape, out_features=shape.width)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Tokens of K frames, float [..., K, L, D] -> float [..., D]."""
+        x, leading = self._steps(self.one_token(tokens))  # [N, K, D]
+        *earlier, last = self.blocks
+        for block in earlier:
+            x = block(x, causal=True)
+        return last(x, causal=True, read="last").reshape(*leading, self.out_features)
