@@ -153,7 +153,9 @@ def test_mujoco_vector(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("reset_first", [False, True], ids=["new", "used"])
-@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1", "Ant-v5"])
+@pytest.mark.parametrize(
+    "name", ["CartPole-v1", "Pendulum-v1", "Ant-v5", "Blackjack-v1", "FrozenLake-v1", "Taxi-v4"]
+)
 def test_our_own_vector(tmp_path: Path, name: str, reset_first: bool) -> None:
     def make() -> EnvBase:
         env = make_env(name, 3, num_frames=4, padding="constant", max_episode_steps=13)

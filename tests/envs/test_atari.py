@@ -269,7 +269,7 @@ def test_pictures_of_the_games():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match="'ALE/Pog-v5'; did you mean one of 'ALE/Pong-v5'"):
+    with pytest.raises(ValueError, match="'ALE/Pog-v5'; did you mean 'ALE/Pong-v5'"):
         make_env("ALE/Pog-v5")
     with pytest.raises(ValueError, match="Unknown game 'ping'"):
         AtariGames("ping")

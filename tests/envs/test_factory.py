@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchrl_tit.envs import make_env
+from tests.envs.tasks import Robot
+from torchrl_tit.envs import gymnasium_tasks, make_env
+from torchrl_tit.settings.imports import import_allowed
 
 
 @pytest.mark.parametrize(
@@ -67,10 +69,13 @@ def test_a_seeded_reset_is_gymnasiums():
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("CartPole-v7", "'CartPole-v7'; did you mean one of .*'CartPole-v1'"),
-        ("cartpole-v1", "'cartpole-v1'; did you mean one of .*'CartPole-v1'"),
-        ("Hoper-v5", "'Hoper-v5'; did you mean one of 'Hopper-v5'"),
-        ("xyzzy", "'xyzzy'; is its package imported, or is it an Atari game, .* 'ALE/Pong-v5'"),
+        ("CartPole-v7", "'CartPole-v7'; did you mean .*'CartPole-v1'"),
+        ("cartpole-v1", "'cartpole-v1'; did you mean .*'CartPole-v1'"),
+        ("Hoper-v5", "'Hoper-v5'; did you mean 'Hopper-v5'"),
+        (
+            "xyzzy",
+            "'xyzzy'; is it registered by a module of yours, .* Atari game, .* 'ALE/Pong-v5'",
+        ),
     ],
 )
 def test_unknown_names(name, words):
@@ -83,11 +88,59 @@ def test_no_copies():
         make_env("CartPole-v1", 0)
 
 
+@pytest.mark.filterwarnings("ignore:The observation 'speech'")
 def test_processes():
-    env = make_env("Pendulum-v1", 2, seed=0, num_frames=3, vectorization_mode="async")
-    expected = make_env("Pendulum-v1", 2, seed=0, num_frames=3)
-    assert torch.equal(env.reset()["history"], expected.reset()["history"])
+    ours, expected = (
+        make_env(
+            f"{Robot.__module__}:Robot-v0",
+            2,
+            seed=0,
+            num_frames=3,
+            mask_actions=True,
+            wrappers=["gymnasium.wrappers:TimeAwareObservation(flatten=False)"],
+            vectorization_mode=mode,
+        )
+        for mode in ("async", "sync")
+    )
+    root, other = ours.reset(), expected.reset()
+    for _ in range(8):
+        action = ours.action_spec.rand()
+        step, root = ours.step_and_maybe_reset(root.set("action", action))
+        following, other = expected.step_and_maybe_reset(other.set("action", action))
+        assert (step == following).all()
+        assert (root == other).all()
+    ours.close()
+
+
+SIGNPOST = """
+import gymnasium
+from gymnasium.envs.classic_control import CartPoleEnv
+
+gymnasium.register("Signpost-v0", lambda **kwargs: CartPoleEnv(**kwargs))
+"""
+
+
+def test_processes_import_what_registers_the_task(own_modules):
+    (own_modules / "signpost.py").write_text(SIGNPOST)
+    import_allowed("signpost")
+    env = make_env("Signpost-v0", vectorization_mode="async")
+    assert env.rollout(3).shape[-1] > 0
     env.close()
+
+
+def test_processes_that_fail_print_one_line(own_modules, monkeypatch):
+    monkeypatch.setattr(gymnasium_tasks.signal, "signal", lambda *_: None)
+    with pytest.raises(
+        SystemExit, match=r"ValueError: no module .* registers the task 'Signpost-v0'"
+    ):
+        gymnasium_tasks._task("Signpost-v0", (), home=-1, uses_mujoco=False)
+
+    def end(*args, **kwargs):
+        raise ConnectionResetError
+
+    monkeypatch.setattr(gymnasium_tasks, "AsyncVectorEnv", end)
+    with pytest.raises(ValueError, match="'CartPole-v1' cannot be made in processes of its own"):
+        make_env("CartPole-v1", vectorization_mode="async")
 
 
 def test_settings_that_are_wrong_or_of_no_use():

@@ -4,7 +4,6 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import MultiDiscrete
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict, assert_close
 from torchrl.collectors import Collector
@@ -279,14 +278,6 @@ def test_refuses_what_it_cannot_do():
         make_env("CartPole-v1", num_frames=0)
     with pytest.raises(ValueError, match="padding must be one of"):
         make_env("CartPole-v1", padding="zeros")  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="Observations must be a Box, but are Discrete"):
-        vector(lambda: gymnasium.make("FrozenLake-v1"))
-
-    class TwoChoices(ImageTask):
-        action_space = MultiDiscrete([2, 3])  # type: ignore[assignment]
-
-    with pytest.raises(TypeError, match="Actions must be Discrete from 0 or a Box, but are Multi"):
-        vector(TwoChoices)
     env = vector()
     root = env.rand_action(env.reset())
     root.set("_step", torch.tensor([True, False, True]))

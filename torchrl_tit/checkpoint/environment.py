@@ -18,10 +18,11 @@ from torchrl_tit.envs import GymVectorEnv
 def can_save_env(env: EnvBase) -> bool:
     """Return whether an environment can be saved and resumed.
 
-    This requires that every layer is known: Gymnasium's classic control and MuJoCo tasks (v4, v5)
-    with the wrappers that `gymnasium.make` adds and a few more, single or in a `SyncVectorEnv`,
-    inside `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`. Others, such as Atari
-    environments, have to be reset at each checkpoint.
+    This requires that every layer is known: Gymnasium's classic control, toy text and MuJoCo tasks
+    (v4, v5) with the wrappers that `gymnasium.make` adds and a few more, single or in a
+    `SyncVectorEnv`, inside `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`.
+    Others, such as Atari, MiniGrid and all that are TorchRL's own, have to be reset at each
+    checkpoint.
 
     Args:
         env: A TorchRL environment.

@@ -8,6 +8,7 @@ import numpy as np
 
 _WRAPPERS = "gymnasium.wrappers"
 _CLASSIC = "gymnasium.envs.classic_control"
+_TOY = "gymnasium.envs.toy_text"
 _MUJOCO = "gymnasium.envs.mujoco"
 
 _EPISODE_QUEUES = ("time_queue", "return_queue", "length_queue")
@@ -20,6 +21,10 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     f"{_CLASSIC}.continuous_mountain_car.Continuous_MountainCarEnv": ("state",),
     f"{_CLASSIC}.mountain_car.MountainCarEnv": ("state",),
     f"{_CLASSIC}.pendulum.PendulumEnv": ("state", "last_u"),
+    f"{_TOY}.blackjack.BlackjackEnv": ("dealer", "player"),
+    f"{_TOY}.cliffwalking.CliffWalkingEnv": ("s", "lastaction"),
+    f"{_TOY}.frozen_lake.FrozenLakeEnv": ("s", "lastaction"),
+    f"{_TOY}.taxi.TaxiEnv": ("s", "lastaction", "fickle_step", "taxi_orientation"),
     # All state of a MuJoCo environment is in its mjData, see mujoco_state.
     **{
         f"{_MUJOCO}.{module}_{version}.{name}": ()

@@ -1,14 +1,16 @@
-"""Gymnasium tasks and Atari games as TorchRL environments."""
+"""Gymnasium tasks, Atari games and any TorchRL environment, with the same keys and kinds."""
 
 from torchrl_tit.envs.atari import AtariEnv
 from torchrl_tit.envs.atari_games import AtariGames
 from torchrl_tit.envs.factory import (
-    VectorizationMode,
     is_atari,
     make_env,
     make_games,
     time_limit,
 )
+from torchrl_tit.envs.gymnasium_tasks import VectorizationMode
+from torchrl_tit.envs.spaces import ImageLayout, observation_keys, observation_specs
+from torchrl_tit.envs.torchrl_tasks import TorchRLTask
 from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
 
@@ -16,10 +18,14 @@ __all__ = [
     "AtariEnv",
     "AtariGames",
     "GymVectorEnv",
+    "ImageLayout",
+    "TorchRLTask",
     "TransformedVectorEnv",
     "VectorizationMode",
     "is_atari",
     "make_env",
     "make_games",
+    "observation_keys",
+    "observation_specs",
     "time_limit",
 ]

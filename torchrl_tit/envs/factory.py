@@ -1,26 +1,26 @@
-"""Gymnasium tasks and Atari games by name."""
+"""Tasks by name, with histories of their observations."""
 
-import difflib
-import os
-import signal
-from functools import partial
-from typing import Any, Literal, get_args
+from collections.abc import Sequence
+from typing import Any, get_args
 
 import gymnasium
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from torchrl.envs import Compose, RewardSum, TransformedEnv
+from tensordict import NestedKey
+from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
 
 from torchrl_tit.envs.atari import AtariEnv
 from torchrl_tit.envs.atari_games import FRAME_SKIP, MAX_NUM_FRAMES, AtariGames
-from torchrl_tit.envs.mujoco_warnings import show_mujoco_warnings_once
+from torchrl_tit.envs.gymnasium_tasks import VectorizationMode, make_gymnasium_tasks
+from torchrl_tit.envs.names import find_task, task_spec, unknown
+from torchrl_tit.envs.spaces import ImageLayout
+from torchrl_tit.envs.spaces import observation_keys as keys_of
+from torchrl_tit.envs.torchrl_tasks import make_torchrl_tasks
 from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
+from torchrl_tit.envs.wrappers import load_wrappers
 from torchrl_tit.transforms.hide_velocities import HideVelocities
 from torchrl_tit.transforms.history import History
 from torchrl_tit.windows import Padding
-
-VectorizationMode = Literal["sync", "async"]
 
 
 def make_env(
@@ -33,11 +33,17 @@ def make_env(
     keep_histories: bool = True,
     hide_velocities: bool = False,
     clip_actions: bool = True,
+    observation_keys: Sequence[str] = (),
+    image_layout: ImageLayout = "auto",
+    mask_actions: bool = False,
+    wrappers: Sequence[str] = (),
     vectorization_mode: VectorizationMode = "sync",
     device: torch.device | str | None = None,
     **kwargs: Any,
 ) -> TransformedEnv:
-    """Makes copies of a Gymnasium task or an Atari game, with histories of their observations.
+    """Makes copies of a task, with histories of its observations.
+
+    A task is anything that Gymnasium makes, an Atari game, or any TorchRL environment.
 
     The environment itself (``.base_env``) writes observations only. Transforms write the rest:
     :class:`~torchrl_tit.transforms.HideVelocities` if asked for, TorchRL's `RewardSum`, and
@@ -46,10 +52,12 @@ def make_env(
     ======================  ==================  ===================================================
     key                     shape               what it is
     ======================  ==================  ===================================================
-    ``observation``         [N, *obs]           float32, or the task's own integers (images: uint8)
-    ``history``             [N, K, *obs]        the last K observations, the newest last
+    ``observation``         [N, *obs]           or nested, if there are several: their kinds are
+                                                those of :func:`~torchrl_tit.envs.observation_specs`
+    ``history``             [N, K, *obs]        the last K observations, the newest last; likewise
     ``episode_reward``      [N, 1]              float32, the undiscounted return so far
-    ``action``              [N] or [N, A]       int64 for discrete actions, else float32
+    ``action``              [N] or [N, A]       int64, int8 (MultiBinary) or float32 (Box)
+    ``action_mask``         [N, n]              bool, what is allowed, with ``mask_actions``
     ``reward``              [N, 1]              float32
     ``terminated``          [N, 1]              bool, the task ended the episode
     ``truncated``           [N, 1]              bool, the time limit ended the episode
@@ -57,9 +65,13 @@ def make_env(
     ======================  ==================  ===================================================
 
     Args:
-        name: A name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". Names that
-            begin with "ALE/", such as "ALE/Pong-v5", are Atari games with the preprocessing of
-            :class:`~torchrl_tit.envs.AtariGames`; they need ale-py, the extra "atari".
+        name: A name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". In
+            "module:Name-v0", the module registers the name; in "module:Name", it has a class or a
+            function of that name that makes a TorchRL `EnvBase`, of which copies are made: see
+            :class:`~torchrl_tit.envs.torchrl_tasks.TorchRLTask`. A module is imported only if the
+            user named it on the command line, if it is loaded already, or if it is a library's.
+            Names that begin with "ALE/", such as "ALE/Pong-v5", are Atari games with the
+            preprocessing of :class:`~torchrl_tit.envs.AtariGames`.
         num_envs: N, the number of copies; the batch size is [N], for N = 1 too.
         seed: Copy i is seeded with ``seed + i``; without one, each differs from run to run.
         num_frames: K, the number of observations in a history.
@@ -72,22 +84,29 @@ def make_env(
             :class:`~torchrl_tit.transforms.HideVelocities`.
         clip_actions: Whether continuous actions are clipped on their way to the task: see
             :class:`~torchrl_tit.envs.GymVectorEnv`.
+        observation_keys: Names of the observations to keep, of a task with several; all by default.
+            See :class:`~torchrl_tit.envs.GymVectorEnv`.
+        image_layout: Where the task's images have their channels: ``"HWC"``, ``"CHW"``, or
+            ``"auto"``, which finds it out from their shape.
+        mask_actions: Whether to write which actions the task allows.
+        wrappers: Gymnasium wrappers and TorchRL transforms around each copy, the innermost first,
+            as "module:Class" or "module:Class(argument=literal)".
         vectorization_mode: ``"sync"`` steps the copies one after the other in this process,
             ``"async"`` side by side in one process each, with the same results, which pays off for
             slow tasks. Atari games always run side by side, in threads.
         device: Device of the tensors; by default they stay on the CPU and the device is None.
-        **kwargs: Passed to `gymnasium.make`, such as ``max_episode_steps=200``, or to
-            :class:`~torchrl_tit.envs.AtariGames`.
+        **kwargs: Passed to `gymnasium.make`, such as ``max_episode_steps=200``, to what makes the
+            TorchRL environment, or to :class:`~torchrl_tit.envs.AtariGames`.
 
     Returns:
         The environment. Atari games have further keys: see
         :class:`~torchrl_tit.envs.AtariEnv`.
 
     Raises:
-        ValueError: If the name or the mode is unknown, a package that the task needs is missing,
-            ``num_envs``, ``num_frames`` or the padding is invalid, Atari games are to run in
-            processes, or it is not known which observations are velocities.
-        TypeError: If the task's observations or actions are of a kind that is not supported.
+        ValueError: If the name or the mode is unknown, a wrapper or a setting of the task is
+            wrong, a package that the task needs is missing, ``num_envs``, ``num_frames`` or the
+            padding is invalid, observations or actions are of a kind that is not supported, Atari
+            games are to run in processes, or it is not known which observations are velocities.
 
     Example:
         >>> env = make_env("CartPole-v1", num_envs=8, seed=0, num_frames=4)
@@ -96,7 +115,7 @@ def make_env(
         >>> make_env("CartPole-v2")
         Traceback (most recent call last):
         ...
-        ValueError: Unknown task 'CartPole-v2'; did you mean one of 'CartPole-v1', 'CartPole-v0'...
+        ValueError: Unknown task 'CartPole-v2'; did you mean 'CartPole-v1' or 'CartPole-v0'...
     """
     if num_envs < 1:
         raise ValueError(f"num_envs must be at least 1, but is {num_envs}.")
@@ -104,27 +123,70 @@ def make_env(
         raise ValueError(
             f"vectorization_mode must be 'sync' or 'async', but is {vectorization_mode!r}."
         )
-    env: GymVectorEnv
+    wraps, transforms = load_wrappers(wrappers)
+    reading: dict[str, Any] = {
+        "clip_actions": clip_actions,
+        "observation_keys": observation_keys,
+        "image_layout": image_layout,
+        "mask_actions": mask_actions,
+        "device": device,
+    }
+    env: EnvBase
     if is_atari(name):
         if vectorization_mode == "async":
             raise ValueError(
                 f"{name} runs in threads, side by side; leave vectorization_mode at 'sync'."
             )
+        if wraps or observation_keys or mask_actions:
+            raise ValueError(
+                f"{name} has the usual preprocessing and one observation: it takes no "
+                "gymnasium.Wrapper (only TorchRL transforms), observation_keys or mask_actions."
+            )
         env = AtariEnv(make_games(name, num_envs, **kwargs), device=device)
     else:
-        tasks = _tasks(name, num_envs, vectorization_mode, **kwargs)
-        env = GymVectorEnv(tasks, clip_actions=clip_actions, device=device)
+        task = find_task(name)
+        if isinstance(task, str):
+            tasks = make_gymnasium_tasks(task, num_envs, vectorization_mode, wraps, **kwargs)
+            env = GymVectorEnv(tasks, **reading)
+        else:
+            env = make_torchrl_tasks(
+                task,
+                num_envs,
+                name=name,
+                wrappers=wrappers,
+                vectorization_mode=vectorization_mode,
+                task_settings=kwargs,
+                **reading,
+            )
+            transforms = []  # they are inside
     if seed is not None:
         env.set_seed(seed)
-    observation_ndim = env.observation_spec["observation"].ndim - 1
-    transform = Compose(
-        *([HideVelocities(name)] if hide_velocities else []),
-        RewardSum(),
-        History(num_frames, observation_ndim=observation_ndim, padding=padding),
+    env = TransformedVectorEnv(
+        env, Compose(*transforms), transient_keys=() if keep_histories else ("history",)
     )
-    return TransformedVectorEnv(
-        env, transform, transient_keys=() if keep_histories else ("history",)
-    )
+    if hide_velocities:
+        env.append_transform(HideVelocities(name))
+    env.append_transform(RewardSum())
+    for history in _histories(env, num_frames, padding):
+        env.append_transform(history)
+    return env
+
+
+def _histories(env: EnvBase, num_frames: int, padding: Padding) -> list[History]:
+    """The transforms that write histories: one for all observations of the same order."""
+    keys: dict[int, list[NestedKey]] = {}
+    for key in keys_of(env):
+        keys.setdefault(env.observation_spec[key].ndim - env.ndim, []).append(key)
+    return [
+        History(
+            num_frames,
+            in_keys,
+            ["history" if key == "observation" else ("history", key[1]) for key in in_keys],
+            observation_ndim=ndim,
+            padding=padding,
+        )
+        for ndim, in_keys in keys.items()
+    ]
 
 
 def is_atari(name: str) -> bool:
@@ -158,7 +220,8 @@ def time_limit(name: str) -> int | None:
     """
     if is_atari(name):
         return MAX_NUM_FRAMES // FRAME_SKIP
-    return gymnasium.spec(name).max_episode_steps
+    task = find_task(name)
+    return task_spec(task).max_episode_steps if isinstance(task, str) else None
 
 
 def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
@@ -182,37 +245,6 @@ def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
     return AtariGames(_rom(name), num_envs, **kwargs)
 
 
-def _tasks(
-    name: str, num_envs: int, mode: VectorizationMode, **kwargs: Any
-) -> gymnasium.vector.VectorEnv:
-    # "module:name" makes Gymnasium import the module, which registers the name.
-    if name not in gymnasium.registry and ":" not in name:
-        raise _unknown(name)
-    spec = gymnasium.registry.get(name)
-    if spec is not None and str(spec.entry_point).startswith("ale_py"):
-        raise ValueError(
-            f"Task {name!r} is an Atari game without the preprocessing; use a name such as "
-            "'ALE/Pong-v5'."
-        )
-    # GymVectorEnv copies what the vector environment returns, which need not copy it before.
-    make = partial(_task, os.getpid(), name, **kwargs)
-    vectorize = SyncVectorEnv if mode == "sync" else AsyncVectorEnv
-    try:
-        return vectorize([make] * num_envs, copy=False, autoreset_mode=AutoresetMode.DISABLED)
-    except (gymnasium.error.Error, ImportError) as error:  # a package is missing, say
-        raise ValueError(f"Task {name!r} cannot be made: {error}") from error
-
-
-def _task(home: int, name: str, **kwargs: Any) -> gymnasium.Env:
-    """Makes one copy, in the process that steps it; ``home`` is the main process."""
-    if os.getpid() != home:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C
-    if "mujoco" in str(gymnasium.spec(name).entry_point):
-        show_mujoco_warnings_once()
-    # Gymnasium's checker costs time in each step; the tests check the specs instead.
-    return gymnasium.make(name, disable_env_checker=True, **kwargs)
-
-
 def _rom(name: str) -> str:
     """The name of an Atari game's ROM file."""
     try:
@@ -223,18 +255,5 @@ def _rom(name: str) -> str:
         ) from error
     gymnasium.register_envs(ale_py)
     if name not in gymnasium.registry:
-        raise _unknown(name)
+        raise unknown(name)
     return gymnasium.registry[name].kwargs["game"]
-
-
-def _unknown(name: str) -> ValueError:
-    known = {key.lower(): key for key in gymnasium.registry}
-    nearest = [known[key] for key in difflib.get_close_matches(name.lower(), known, n=3)]
-    hint = (
-        f"did you mean one of {', '.join(map(repr, nearest))}"
-        if nearest
-        else "is its package imported, or is it an Atari game, with a name such as 'ALE/Pong-v5'"
-    )
-    return ValueError(
-        f"Unknown task {name!r}; {hint}? `gymnasium.pprint_registry()` lists all names."
-    )

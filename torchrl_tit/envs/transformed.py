@@ -7,6 +7,8 @@ from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 
+from torchrl_tit.envs.action_masks import MASK
+
 
 class TransformedVectorEnv(TransformedEnv):
     """A `TransformedEnv` around :class:`~torchrl_tit.envs.GymVectorEnv` with faster steps.
@@ -79,6 +81,23 @@ class TransformedVectorEnv(TransformedEnv):
                 if part.get(key, None) is not None:
                     part.del_(key)
         return taken, following
+
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Draws an action, one that is allowed if the tensordict has an "action_mask".
+
+        TorchRL's `ActionMask` would do it, but keeps the mask in the spec, which no checkpoint has.
+
+        Args:
+            tensordict: What the environment wrote; [N].
+
+        Returns:
+            The tensordict with the action.
+        """
+        if tensordict is None or tensordict.get(MASK, None) is None:
+            return super().rand_action(tensordict)
+        spec = self.action_spec.clone()
+        spec.update_mask(tensordict[MASK])
+        return tensordict.set(self.action_key, spec.rand())
 
 
 def _only_writes(transform: Transform) -> bool:

@@ -1,16 +1,20 @@
 """A Gymnasium vector environment as a TorchRL environment that adds little time to a step."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete
 from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
+
+from torchrl_tit.envs.action_masks import MASK, ActionMasks
+from torchrl_tit.envs.actions import ActionWriter
+from torchrl_tit.envs.spaces import ImageLayout, ObservationReader
 
 
 class GymVectorEnv(EnvBase):
@@ -24,27 +28,42 @@ class GymVectorEnv(EnvBase):
     ======================  ==================  ===================================================
     key                     shape               what it is
     ======================  ==================  ===================================================
-    ``observation``         [N, *obs]           float32, or the task's own integers (images: uint8)
-    ``action``              [N] or [N, A]       int64 for discrete actions, else float32
+    ``observation``         [N, *obs]           or nested, if there are several: their kinds are
+                                                those of :func:`~torchrl_tit.envs.observation_specs`
+    ``action``              [N] or [N, A]       int64, int8 (MultiBinary) or float32 (Box)
+    ``action_mask``         [N, n]              bool, what is allowed, with ``mask_actions``
     ``reward``              [N, 1]              float32
     ``terminated``          [N, 1]              bool, the task ended the episode
     ``truncated``           [N, 1]              bool, the time limit ended the episode
     ``done``                [N, 1]              bool, either
     ======================  ==================  ===================================================
 
+    Several observations (Dict, Tuple) are nested: ``("observation", NAME)``, where the name of an
+    observation in a nested Dict joins the keys with "/" (and dots in them become "_"), and those
+    of a Tuple are "0", "1", ...
+    Images are written with their channels first. Text and other unsupported kinds beside supported
+    ones are left out with a warning.
+
     Continuous actions are clipped to the task's bounds only on their way to the task: the
     tensordict keeps the sampled action, which its log-probability belongs to.
 
     Args:
-        env: The vector environment, made with ``autoreset_mode=AutoresetMode.DISABLED``, with
-            array or image observations and discrete or continuous actions.
+        env: The vector environment, made with ``autoreset_mode=AutoresetMode.DISABLED``. Its
+            observations can be Box, Discrete, MultiDiscrete and MultiBinary, and Dict and Tuple of
+            these, its actions Box, Discrete, MultiDiscrete and MultiBinary.
         clip_actions: Whether continuous actions are clipped and their spec is unbounded. Otherwise
             they are passed on unchanged, and the spec has the task's bounds.
+        observation_keys: Names of the observations to keep; all by default.
+        image_layout: Where images have their channels: ``"HWC"``, ``"CHW"``, or ``"auto"``, which
+            finds it out from their shape.
+        mask_actions: Whether to write which actions are allowed: an observation "action_mask" of
+            the task (which is no observation then), or what its ``info`` has under that name.
         device: Device of the tensors; by default they stay on the CPU and the device is None.
 
     Raises:
-        TypeError: If the observations or actions are of another kind.
-        ValueError: If the vector environment resets itself.
+        ValueError: If the vector environment resets itself, observations or actions are of another
+            kind, there is no observation of that name, the layout of an image cannot be found out,
+            or the task has no mask of its actions.
 
     Example:
         >>> from gymnasium.vector import SyncVectorEnv
@@ -59,6 +78,9 @@ class GymVectorEnv(EnvBase):
         env: gymnasium.vector.VectorEnv,
         *,
         clip_actions: bool = True,
+        observation_keys: Sequence[str] = (),
+        image_layout: ImageLayout = "auto",
+        mask_actions: bool = False,
         device: torch.device | str | None = None,
     ) -> None:
         if env.metadata.get("autoreset_mode") is not AutoresetMode.DISABLED:
@@ -66,27 +88,30 @@ class GymVectorEnv(EnvBase):
                 "TorchRL resets environments itself; make the vector environment with "
                 f"autoreset_mode=AutoresetMode.DISABLED, not {env.metadata.get('autoreset_mode')}."
             )
-        space = env.single_observation_space
-        if not isinstance(space, Box):
-            raise TypeError(
-                f"Observations must be a Box, but are {space}; use TorchRL's GymWrapper."
-            )
-        super().__init__(device=device, batch_size=torch.Size([env.num_envs]))
-        self._env = env
-        self.is_closed = False
-        self._observation_dtype = np.dtype("f4") if space.dtype.kind == "f" else space.dtype
-        action = env.single_action_space
-        self._bounds = (
-            (action.low, action.high) if isinstance(action, Box) and clip_actions else None
+        read = ObservationReader(
+            env.single_observation_space,
+            keys=observation_keys,
+            image_layout=image_layout,
+            mask_actions=mask_actions,
         )
-
+        write = ActionWriter(env.single_action_space, clip=clip_actions)
         n = env.num_envs
-        example = torch.from_numpy(np.zeros((n, *space.shape), self._observation_dtype))
-        observation = Unbounded(example.shape, dtype=example.dtype, device=self.device)
+        masks = ActionMasks(n, env.single_action_space) if mask_actions else None
+        super().__init__(device=device, batch_size=torch.Size([n]))
+        self._env, self._read, self._write, self._masks = env, read, write, masks
+        self.is_closed = False
+        if masks is not None:
+            self._check_masks()
+
+        entries = {"observation": read.spec.expand(n, *read.spec.shape)}
+        if masks is not None:
+            entries[MASK] = Binary(masks.shape[-1], shape=masks.shape, dtype=torch.bool)
+        observation = Composite(entries, shape=(n,)).clone()
+        action = write.spec.expand(n, *write.spec.shape).clone()
         flag = Categorical(2, shape=(n, 1), dtype=torch.bool, device=self.device)
         flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
-        self.observation_spec = Composite(observation=observation, shape=(n,), device=self.device)
-        self.action_spec = _action_spec(action, n, clip_actions, self.device)
+        self.observation_spec = observation if device is None else observation.to(device)
+        self.action_spec = action if device is None else action.to(device)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32, device=self.device)
         self.done_spec = Composite(flags, shape=(n,), device=self.device)
 
@@ -94,12 +119,10 @@ class GymVectorEnv(EnvBase):
         stepped = tensordict.get("_step", None)
         if stepped is not None and not stepped.all():
             raise NotImplementedError("GymVectorEnv cannot step only some of its environments.")
-        action = tensordict["action"].numpy(force=True)
-        if self._bounds is not None:
-            action = action.clip(*self._bounds)
+        action = self._write(tensordict["action"].numpy(force=True))
         observations, rewards, terminated, truncated, info = self._env.step(action)
         return self._tensordict(
-            observation=self._tensor(np.array(observations, self._observation_dtype)),
+            **self._observed(observations, info),
             reward=self._tensor(rewards.astype(np.float32)).unsqueeze(-1),
             terminated=self._tensor(terminated).unsqueeze(-1),
             truncated=self._tensor(truncated).unsqueeze(-1),
@@ -115,12 +138,37 @@ class GymVectorEnv(EnvBase):
         observations, info = self._env.reset(seed=seed, options=options)
         flag = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return self._tensordict(
-            observation=self._tensor(np.array(observations, self._observation_dtype)),
+            **self._observed(observations, info),
             terminated=flag,
             truncated=flag.clone(),
             done=flag.clone(),
             **self._further(info),
         )
+
+    def _observed(self, observations: Any, info: dict[str, Any]) -> dict[str, Any]:
+        """The observation, or several in a tensordict, and the mask of the actions."""
+        values = self._read(observations)
+        if not isinstance(values, dict):
+            entries = {"observation": self._tensor(values)}
+        else:
+            parts = {name: self._tensor(value) for name, value in values.items()}
+            entries = {"observation": self._tensordict(**parts)}
+        if self._masks is not None:
+            observed = self._read.masks(observations)
+            entries[MASK] = self._tensor(
+                self._masks.from_observations(observed) if observed else self._masks.from_info(info)
+            )
+        return entries
+
+    def _check_masks(self) -> None:
+        """Raises ValueError if the task has no masks of its actions."""
+        observations, info = self._env.reset()
+        if not self._read.masks(observations) and MASK not in info:
+            raise ValueError(
+                f'The task has no mask of its actions, neither an observation "{MASK}" nor one in '
+                "its info: leave out mask_actions."
+            )
+        self._observed(observations, info)
 
     def _further(self, info: dict[str, Any]) -> dict[str, Tensor]:
         """Further entries of a subclass, from the vector environment's info."""
@@ -167,19 +215,3 @@ class GymVectorEnv(EnvBase):
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self._env}, batch_size={list(self.batch_size)})"
-
-
-def _action_spec(
-    space: gymnasium.Space, n: int, clip: bool, device: torch.device | None
-) -> TensorSpec:
-    if isinstance(space, Discrete) and space.start == 0:
-        return Categorical(int(space.n), shape=(n,), dtype=torch.int64, device=device)
-    if isinstance(space, Box):
-        shape = (n, *space.shape)
-        if clip:
-            return Unbounded(shape, dtype=torch.float32, device=device)
-        low, high = (torch.as_tensor(x).expand(shape) for x in (space.low, space.high))
-        return Bounded(low, high, shape, dtype=torch.float32, device=device)
-    raise TypeError(
-        f"Actions must be Discrete from 0 or a Box, but are {space}; use TorchRL's GymWrapper."
-    )

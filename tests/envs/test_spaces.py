@@ -1,0 +1,292 @@
+"""Every space is written in its kind, with the values that the task returned."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiBinary, MultiDiscrete, Sequence, Text
+from gymnasium.spaces import Tuple as TupleSpace
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import FilterObservation
+from torchrl.data import Binary, Categorical, MultiCategorical, Unbounded
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import check_env_specs
+
+from tests.envs.tasks import Echo, Robot
+from tests.transforms.streams import assert_histories
+from torchrl_tit.envs import GymVectorEnv, make_env, observation_keys, observation_specs
+from torchrl_tit.envs.spaces import ObservationReader
+
+ROBOT = "tests.envs.tasks:Robot-v0"
+NAMES = ["arm/gear", "arm/joint_angles", "camera", "contacts", "wheels"]
+
+
+def kinds(env):
+    """Kind, shape and dtype of each observation, or the sizes of categories."""
+    specs = observation_specs(env)
+    several = specs if isinstance(specs, dict) else {"": specs}
+    found: dict[str, Any] = {}
+    for name, spec in several.items():
+        if isinstance(spec, MultiCategorical):
+            assert spec.dtype is torch.int64
+            found[name] = torch.as_tensor(spec.nvec).tolist()
+        else:
+            assert isinstance(spec, Unbounded)
+            found[name] = (tuple(spec.shape), str(spec.dtype).removeprefix("torch."))
+    return found if isinstance(specs, dict) else found[""]
+
+
+def echo(actions=None, observations=None, copies=2, **settings):
+    tasks = [lambda: Echo(actions or Discrete(2), observations)] * copies
+    return GymVectorEnv(SyncVectorEnv(tasks, autoreset_mode=AutoresetMode.DISABLED), **settings)
+
+
+@pytest.mark.filterwarnings("ignore:The observation 'mission'")
+@pytest.mark.parametrize(
+    ("name", "settings", "expected"),
+    [
+        ("FrozenLake-v1", {}, [16]),
+        ("Taxi-v4", {"mask_actions": True}, [500]),
+        ("Blackjack-v1", {}, {"0": [32], "1": [11], "2": [2]}),
+        ("MiniGrid-Empty-5x5-v0", {}, {"direction": [4], "image": ((3, 7, 7), "uint8")}),
+        ("popgym-RepeatPreviousEasy-v0", {}, [4]),
+    ],
+)
+def test_tasks(name, settings, expected):
+    env = make_env(name, 2, seed=0, num_frames=3, **settings)
+    assert kinds(env) == expected
+    check_env_specs(env)
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (Box(-1, 1, ()), ((1,), "float32")),
+        (Box(-1, 1, (2, 3), np.float64), ((2, 3), "float32")),
+        (Box(0, 9, (3,), np.int32), ((3,), "float32")),
+        (
+            Box(0, 1, (3,), np.bool_),  # type: ignore[arg-type]
+            ((3,), "float32"),
+        ),
+        (Box(0, 255, (128,), np.uint8), ((128,), "uint8")),
+        (Box(0, 255, (9, 8, 3), np.uint8), ((3, 9, 8), "uint8")),
+        (Box(0, 255, (2, 9, 8), np.uint8), ((2, 9, 8), "uint8")),
+        (Discrete(5, start=-2), [5]),
+        (MultiDiscrete(np.array([[2, 3], [4, 5]]), start=np.array([[1, 0], [0, 7]])), [2, 3, 4, 5]),
+        (MultiBinary((2, 2)), [2, 2, 2, 2]),
+        (Dict({"only": Discrete(3)}), [3]),
+        (
+            TupleSpace([Discrete(2), Dict({"b": Box(0, 1, (2,)), "a": Discrete(3)})]),
+            {"0": [2], "1/a": [3], "1/b": ((2,), "float32")},
+        ),
+    ],
+)
+def test_kinds_of_observations(space, expected):
+    env = echo(observations=space)
+    assert kinds(env) == expected
+    check_env_specs(env)
+
+
+def test_values_are_those_of_gym_wrapper():
+    # Of TorchRL's wrapper: the same tasks, seeds and actions.
+    with pytest.warns(UserWarning, match="'speech' .* left out"):
+        ours = make_env(ROBOT, 3, seed=5, num_frames=2)
+    read = ["arm", "camera", "contacts", "wheels"]
+    tasks = SyncVectorEnv(
+        [lambda: FilterObservation(Robot(), read)] * 3, autoreset_mode=AutoresetMode.DISABLED
+    )
+    theirs = GymWrapper(tasks, categorical_action_encoding=True)
+    theirs.set_seed(5)
+    root, expected = ours.reset(), theirs.reset()
+    ended = 0
+    for _ in range(25):
+        seen, arm = root["observation"], expected["arm"]
+        assert list(seen.keys()) == NAMES
+        gear = arm["gear"]
+        assert torch.equal(seen["arm/gear"], gear.reshape(3, 1) - 1)
+        assert torch.equal(seen["arm/joint_angles"], arm["joint.angles"])
+        assert torch.equal(seen["camera"], expected["camera"].movedim(-1, -3))
+        assert torch.equal(seen["contacts"], expected["contacts"].long())
+        assert torch.equal(seen["wheels"], expected["wheels"] - torch.tensor([0, -2]))
+        action = ours.rand_action(root)["action"]
+        step, root = ours.step_and_maybe_reset(root)
+        action = action + torch.tensor([0, -1])  # it passes actions on as they are
+        other, expected = theirs.step_and_maybe_reset(expected.set("action", action))
+        assert torch.equal(step["next", "reward"], other["next", "reward"].float())
+        assert torch.equal(step["next", "done"], other["next", "done"])
+        ended += int(step["next", "done"].sum())
+    assert ended > 3
+
+
+@pytest.mark.filterwarnings("ignore:The observation 'speech'")
+@pytest.mark.parametrize("padding", ["same", "constant"])
+def test_histories_of_each_observation(padding):
+    env = make_env(ROBOT, 3, seed=0, num_frames=3, padding=padding)
+    check_env_specs(env)
+    for name in NAMES:
+        assert_histories(env, 3, padding, 12, ("observation", name), ("history", name))
+
+
+@pytest.mark.filterwarnings("ignore:The observation 'speech'")
+def test_histories_leave_steps_that_were_taken():
+    env = make_env(ROBOT, 2, seed=0, num_frames=3, keep_histories=False)
+    root = env.rand_action(env.reset())
+    assert root["history", "camera"].shape == (2, 3, 3, 5, 6)
+    step, root = env.step_and_maybe_reset(root)
+    assert "history" not in step
+    assert "history" not in step["next"]
+    assert set(root["history"].keys()) == set(root["observation"].keys())
+
+
+@pytest.mark.filterwarnings("ignore:The observation 'speech'")
+def test_general_way_of_stepping_writes_the_same():
+    short, general = (make_env(ROBOT, 2, seed=0, num_frames=2) for _ in range(2))
+    general.base_env.set_seed(0)
+    root, other = short.reset(seed=3), general.reset(seed=3)
+    for _ in range(12):
+        action = short.action_spec.rand()
+        step, root = short.step_and_maybe_reset(root.set("action", action))
+        following, other = super(type(general), general).step_and_maybe_reset(
+            other.set("action", action)
+        )
+        assert (step == following).all()
+        assert (root == other).all()
+
+
+@pytest.mark.parametrize(
+    ("actions", "spec", "shape"),
+    [
+        (Discrete(3, start=-1), Categorical, ()),
+        (MultiDiscrete([2, 3], start=[5, -1]), MultiCategorical, (2,)),
+        (MultiDiscrete(np.array([[2], [3]])), MultiCategorical, (2,)),
+        (MultiBinary(3), Binary, (3,)),
+        (MultiBinary((2, 2)), Binary, (4,)),
+        (Box(-1, 1, (2, 3)), Unbounded, (6,)),
+        (Box(-1, 1, ()), Unbounded, (1,)),
+        (Box(0, 5, (2,), np.int32), Unbounded, (2,)),
+    ],
+)
+def test_kinds_of_actions(actions, spec, shape):
+    env = echo(actions)
+    assert isinstance(env.action_spec, spec)
+    assert env.action_spec_unbatched.shape == shape
+    check_env_specs(env)
+    root = env.rand_action(env.reset())
+    total = root["action"].flatten(1).sum(1) if shape else root["action"]
+    if spec is not Unbounded:
+        start = getattr(actions, "start", None)
+        expected = total + (0 if start is None else int(np.sum(start)))
+        assert torch.equal(env.step(root)["next", "reward"].flatten(), expected.float())
+
+
+def test_boxes_of_any_order_are_clipped_and_restored():
+    low = np.array([[-1, -2, -3], [-1, -1, -1]], np.float32)
+    env = echo(Box(low, -low))
+    root = env.reset().set("action", torch.full((2, 6), -2.0))
+    assert env.step(root)["next", "reward"].flatten().tolist() == [-8, -8]
+    bounded = echo(Box(low, -low), clip_actions=False).action_spec_unbatched
+    assert bounded.space.low.tolist() == low.flatten().tolist()
+
+
+def test_masks_in_info():
+    env = make_env("Taxi-v4", 2, seed=0, mask_actions=True)
+    task: Any = gymnasium.make("Taxi-v4").unwrapped
+    root = env.reset()
+    for _ in range(3):
+        for state, mask in zip(root["observation"], root["action_mask"], strict=True):
+            assert mask.tolist() == task.action_mask(state.item()).astype(bool).tolist()
+        _, root = env.step_and_maybe_reset(env.rand_action(root))
+    # What is not reset keeps its mask.
+    before = root["action_mask"].clone()
+    root["_reset"] = torch.tensor([[True], [False]])
+    after = env.base_env.reset(root)
+    assert torch.equal(after["action_mask"][1], before[1])
+    assert (
+        after["action_mask"][0].tolist()
+        == task.action_mask(after["observation"][0].item()).astype(bool).tolist()
+    )
+    env.close()
+
+
+@pytest.mark.filterwarnings("ignore:The observation 'speech'")
+def test_masks_of_several_actions():
+    env = make_env(ROBOT, 2, seed=0, mask_actions=True)
+    rollout = env.rollout(12, break_when_any_done=False)
+    masks = rollout["action_mask"]
+    assert masks.shape == (2, 12, 5)
+    assert masks[..., 0].all()
+    assert not masks[..., 4].any()
+    assert 0 < masks[..., 1].float().mean() < 1
+    first, second = (action.unsqueeze(-1) for action in rollout["action"].unbind(-1))
+    assert masks[..., :2].gather(-1, first).all()  # random actions are allowed ones
+    assert masks[..., 2:].gather(-1, second).all()
+
+
+def test_masks_among_observations():
+    space = Dict({"action_mask": MultiBinary(3), "place": Discrete(4)})
+    env = echo(Discrete(3), space, mask_actions=True)
+    assert kinds(env) == [4]
+    check_env_specs(env)
+    assert env.reset()["action_mask"].shape == (2, 3)
+    parts = TupleSpace([MultiBinary(2), MultiBinary(3)])
+    env = echo(MultiDiscrete([2, 3]), Dict(action_mask=parts, at=Discrete(4)), mask_actions=True)
+    assert env.reset()["action_mask"].shape == (2, 5)
+    # Otherwise it is an observation as any other.
+    assert kinds(echo(Discrete(3), space)) == {"action_mask": [2, 2, 2], "place": [4]}
+
+
+def test_chosen_observations():
+    env = make_env(ROBOT, 2, observation_keys=["camera"])
+    assert kinds(env) == ((3, 5, 6), "uint8")
+    assert observation_keys(env) == ["observation"]
+    assert env.reset()["history"].shape == (2, 1, 3, 5, 6)
+    env = make_env(ROBOT, 1, observation_keys=["wheels", "arm"])
+    assert list(kinds(env)) == ["arm/gear", "arm/joint_angles", "wheels"]
+
+
+def test_layouts():
+    image = Box(0, 255, (3, 8, 3), np.uint8)
+    assert ObservationReader(image, image_layout="HWC").spec.shape == (3, 3, 8)
+    assert ObservationReader(image, image_layout="CHW").spec.shape == (3, 8, 3)
+    pixels = np.arange(5 * 6 * 3).reshape(1, 5, 6, 3).astype(np.uint8)
+    read = ObservationReader(Box(0, 255, (5, 6, 3), np.uint8))(pixels)
+    np.testing.assert_array_equal(read, pixels.transpose(0, 3, 1, 2))
+    assert not np.shares_memory(read, pixels)
+
+
+BIG = Box(0, 255, (9, 8, 7), np.uint8)
+MIXED = Dict({"pose": Box(-1, 1, (2,)), "speech": Text(3)})
+
+
+@pytest.mark.parametrize(
+    ("space", "settings", "kind", "words"),
+    [
+        (BIG, {}, ValueError, r"\[9, 8, 7\].*`--image-layout HWC` or `--image-layout CHW`"),
+        (Box(0, 1, (2, 9, 4)), {}, ValueError, "not clear whether its channels"),
+        (Box(0, 1, (2, 9, 4)), {"image_layout": "WHC"}, ValueError, "'HWC'.* but is 'WHC'"),
+        (Box(0, 1, (2, 3, 4, 5)), {}, ValueError, "at most 3 dimensions.*FlattenObservation"),
+        (Text(5), {}, ValueError, r"not supported: 'observation' \(Text\(.*Supported are Box"),
+        (Sequence(Discrete(2)), {}, ValueError, "not supported: 'observation'.*Sequence"),
+        (Graph(Box(0, 1, (2,)), None), {}, ValueError, "not supported: 'observation'.*Graph"),
+        (Dict({}), {}, ValueError, "none at all"),
+        (MIXED, {"keys": ["speech"]}, ValueError, "not supported: 'speech'"),
+        (MIXED, {"keys": ["pos"]}, ValueError, "no observation 'pos'.* only pose, speech"),
+    ],
+)
+def test_observations_that_cannot_be_read(space, settings, kind, words):
+    with pytest.raises(kind, match=words) as caught:
+        ObservationReader(space, **settings)
+    assert "\n" not in str(caught.value)
+
+
+def test_actions_and_masks_that_are_not_supported():
+    with pytest.raises(ValueError, match=r"Actions of the kind Dict\(.*not supported, only Disc"):
+        echo(Dict({"a": Discrete(2)}))
+    with pytest.raises(ValueError, match=r"no mask of its actions.*leave out mask_actions"):
+        echo(mask_actions=True)
+    with pytest.raises(ValueError, match="Only Discrete and MultiDiscrete actions can be masked"):
+        echo(Box(-1, 1), mask_actions=True)
+    with pytest.raises(ValueError, match='"action_mask" has 4 entries, but there are 3 actions'):
+        echo(Discrete(3), Dict(action_mask=MultiBinary(4), at=Discrete(2)), mask_actions=True)

@@ -1,0 +1,84 @@
+"""Tasks, wrappers and transforms by name."""
+
+import gymnasium
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+from tests.envs.test_spaces import kinds
+from torchrl_tit.envs import make_env, time_limit
+from torchrl_tit.envs.names import find_task
+
+MINIGRID = "MiniGrid-Empty-5x5-v0"
+FLATTEN = "gymnasium.wrappers:FlattenObservation"
+
+
+class OutOfTune(gymnasium.Wrapper):
+    """Fails when it is made."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        raise RuntimeError("no strings")
+
+
+def test_gymnasium_wrappers_in_order():
+    pixels = make_env(
+        MINIGRID,
+        2,
+        seed=0,
+        wrappers=[
+            "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=2)",
+            "minigrid.wrappers:ImgObsWrapper",
+        ],
+    )
+    assert kinds(pixels) == ((3, 14, 14), "uint8")
+    grey = "gymnasium.wrappers:GrayscaleObservation"
+    inner_first = ["minigrid.wrappers:ImgObsWrapper", grey]
+    assert kinds(make_env(MINIGRID, wrappers=inner_first)) == ((7, 7), "uint8")
+    with pytest.raises(ValueError, match="GrayscaleObservation' cannot be made"):
+        make_env(MINIGRID, wrappers=inner_first[::-1])
+
+
+def test_transforms_before_histories():
+    scaled = "torchrl.envs:ObservationNorm(loc=0.0, scale=2.0, in_keys=['observation'])"
+    env, plain = (
+        make_env("CartPole-v1", 2, seed=0, num_frames=2, wrappers=names) for names in ([scaled], [])
+    )
+    check_env_specs(env)
+    assert torch.equal(env.reset(seed=1)["history"], 2 * plain.reset(seed=1)["history"])
+
+
+def test_settings_of_a_task():
+    env = make_env("FrozenLake-v1", map_name="8x8", is_slippery=False)
+    assert kinds(env) == [64]
+
+
+def test_names_in_modules():
+    assert find_task("tests.envs.tasks:Robot-v0") == "tests.envs.tasks:Robot-v0"
+    assert time_limit("tests.envs.tasks:Robot-v0") == 50
+    assert time_limit("tests.envs.tasks:Corridor") is None
+    assert find_task(MINIGRID) in (MINIGRID, f"minigrid:{MINIGRID}")
+
+
+@pytest.mark.parametrize(
+    ("name", "wrappers", "words"),
+    [
+        ("no_such_module:Task-v0", [], "add `--import no_such_module`"),
+        ("tests.envs.tasks:Plain-v0", [], "no 'Plain-v0' after importing tests.envs.tasks"),
+        ("tests.envs.tasks:Robot", [], "is no EnvBase; expected .*gymnasium.register in the mod"),
+        ("MiniGrid-Emty-5x5-v0", [], "Unknown task .* did you mean 'MiniGrid-Empty-5x5-v0'"),
+        ("CartPole-v1", ["gymnasium:Env"], "'gymnasium:Env' is neither a gymnasium.Wrapper nor"),
+        ("CartPole-v1", ["gymnasium.wrappers:Flat"], "gymnasium.wrappers has no 'Flat'"),
+        ("CartPole-v1", ["no_such_module:Wrapper"], "add `--import no_such_module`"),
+        ("CartPole-v1", [f"{__name__}:OutOfTune"], "cannot be made: RuntimeError: no strings"),
+        (
+            "CartPole-v1",
+            ["torchrl.envs:StepCounter", FLATTEN],
+            "FlattenObservation' stands after a TorchRL transform",
+        ),
+        ("ALE/Pong-v5", [FLATTEN], "usual preprocessing"),
+    ],
+)
+def test_one_line_says_what_is_wrong(name, wrappers, words):
+    with pytest.raises(ValueError, match=words) as caught:
+        make_env(name, wrappers=wrappers)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,87 @@
+"""Copies of a Gymnasium task in one vector, in this process or in one process each."""
+
+import os
+import signal
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal
+
+import gymnasium
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+
+from torchrl_tit.envs.mujoco_warnings import show_mujoco_warnings_once
+from torchrl_tit.envs.names import task_spec
+from torchrl_tit.envs.wrappers import Wrap
+from torchrl_tit.settings.plugins import load_plugins
+
+VectorizationMode = Literal["sync", "async"]
+
+
+def make_gymnasium_tasks(
+    name: str, num_envs: int, mode: VectorizationMode, wraps: Sequence[Wrap], **kwargs: Any
+) -> gymnasium.vector.VectorEnv:
+    """Makes a vector of a Gymnasium task, by a name that :func:`find_task` returned.
+
+    Raises:
+        ValueError: if Gymnasium cannot make it, or not in a process of its own.
+    """
+    uses_mujoco = "mujoco" in str(task_spec(name).entry_point)
+    # GymVectorEnv copies what the vector environment returns, which need not copy it before.
+    settings: dict[str, Any] = {"copy": False, "autoreset_mode": AutoresetMode.DISABLED}
+    copies = [partial(_task, name, tuple(wraps), os.getpid(), uses_mujoco, **kwargs)] * num_envs
+    if mode == "sync":
+        return SyncVectorEnv(copies, **settings)
+    try:
+        try:
+            return AsyncVectorEnv(copies, **settings)
+        except ValueError as error:
+            if not isinstance(error.__cause__, gymnasium.error.CustomSpaceError):
+                raise
+            # A task with a kind of space of its own, such as MiniGrid with its text.
+            return AsyncVectorEnv(copies, shared_memory=False, **settings)
+    except (EOFError, ConnectionError) as error:  # a process has ended
+        raise ValueError(
+            f"Task {name!r} cannot be made in processes of its own, which print the reason: "
+            "correct that, or set vectorization_mode to 'sync'"
+        ) from error
+
+
+def _task(
+    name: str, wraps: Sequence[Wrap], home: int, uses_mujoco: bool, **kwargs: Any
+) -> gymnasium.Env:
+    """Makes one copy, in the process that steps it; ``home`` is the main process."""
+    if os.getpid() == home:
+        return _make(name, wraps, uses_mujoco, **kwargs)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process handles Ctrl-C
+    try:
+        if ":" not in name and name not in gymnasium.registry:
+            _register(name)
+        return _make(name, wraps, uses_mujoco, **kwargs)
+    except Exception as error:
+        line = " ".join(str(error).split())
+        raise SystemExit(f"{type(error).__name__}: {line}") from error  # without a traceback
+
+
+def _register(name: str) -> None:
+    """Imports what the user and the plugins named, which the main process had imported."""
+    failures = load_plugins()
+    if name not in gymnasium.registry:
+        reason = (
+            f"no module that this process imports registers the task {name!r}: add "
+            "`--import MODULE`, or name it 'module:Name-v0'"
+        )
+        raise ValueError("; ".join([reason, *failures]))
+
+
+def _make(name: str, wraps: Sequence[Wrap], uses_mujoco: bool, **kwargs: Any) -> gymnasium.Env:
+    if uses_mujoco:
+        show_mujoco_warnings_once()
+    # Gymnasium's checker costs time in each step; the tests check the specs instead.
+    try:
+        env = gymnasium.make(name, disable_env_checker=True, **kwargs)
+    except Exception as error:  # a package is missing, the task has no such setting, ...
+        kind = "" if isinstance(error, gymnasium.error.Error) else f"{type(error).__name__}: "
+        raise ValueError(f"Task {name!r} cannot be made: {kind}{error}") from error
+    for wrap in wraps:
+        env = wrap(env)
+    return env

@@ -1,0 +1,326 @@
+"""Gymnasium's spaces of observations as TorchRL's specs, and their values in these kinds."""
+
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from numpy.typing import NDArray
+from tensordict import NestedKey
+from torchrl.data import (
+    Composite,
+    MultiCategorical,
+    TensorSpec,
+    Unbounded,
+)
+from torchrl.envs import EnvBase
+
+from torchrl_tit.envs.action_masks import MASK
+
+ImageLayout = Literal["auto", "HWC", "CHW"]
+
+_MAX_CHANNELS = 4
+_MAX_ORDER = 3  # of an observation: channels, height, width
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One observation of a task.
+
+    Args:
+        path: Keys and indices that lead to it in what the task returns.
+        spec: One of the kinds that :func:`observation_specs` lists, without batch dimensions.
+        channels_last: Whether the task's images are (height, width, channels).
+        start: What the task's categories are counted from, an integer for each or one for all.
+    """
+
+    path: tuple[str | int, ...]
+    spec: TensorSpec
+    channels_last: bool = False
+    start: Any = 0
+
+    def read(self, values: NDArray) -> NDArray:
+        """Converts the task's values to the spec's shape and dtype.
+
+        Args:
+            values: Observations of N copies, [N, *space]; they are copied.
+
+        Returns:
+            The observations, [N, *spec].
+        """
+        if isinstance(self.spec, MultiCategorical):
+            values = np.asarray(values).reshape(len(values), -1)
+            return np.subtract(values, self.start, dtype=np.int64)
+        if self.channels_last:
+            values = np.moveaxis(values, -1, 1)
+        dtype = np.uint8 if self.spec.dtype is torch.uint8 else np.float32
+        copied = np.array(values, dtype, order="C")
+        return copied if copied.ndim > 1 else copied[:, None]
+
+
+class ObservationReader:
+    """Reads the observations that a vector of Gymnasium tasks returns.
+
+    Args:
+        space: The space of one task's observations.
+        keys: Names of the observations to keep, or of groups of them; all if there are none.
+        image_layout: Order of the dimensions of the task's images: ``"HWC"`` (height, width,
+            channels), ``"CHW"``, or ``"auto"``, which finds out where the channels are.
+        mask_actions: Whether an observation "action_mask" is none, but the mask of the actions.
+
+    Raises:
+        ValueError: If no observation, or one of ``keys``, is of a kind that is supported, a key is
+            unknown, or the layout of an image cannot be found out.
+
+    Example:
+        >>> space = Dict(camera=Box(0, 255, (84, 84, 3), np.uint8), gear=Discrete(5))
+        >>> reader = ObservationReader(space)
+        >>> {name: tuple(leaf.spec.shape) for name, leaf in reader.leaves.items()}
+        {'camera': (3, 84, 84), 'gear': (1,)}
+    """
+
+    def __init__(
+        self,
+        space: Space,
+        *,
+        keys: Sequence[str] = (),
+        image_layout: ImageLayout = "auto",
+        mask_actions: bool = False,
+    ) -> None:
+        check_layout(image_layout)
+        found = dict(_leaf_spaces(space))
+        masks = [name for name in found if mask_actions and _belongs(name, MASK)]
+        self._mask_paths = [found.pop(name)[0] for name in masks]
+        self.leaves = {
+            name: _leaf(name, path, part, image_layout)
+            for name, (path, part) in choose(found, keys, _is_supported).items()
+        }
+        """The observations by their names."""
+        self._only = next(iter(self.leaves.values())) if len(self.leaves) == 1 else None
+
+    @property
+    def spec(self) -> TensorSpec:
+        """The spec of the only observation, or a `Composite` of all."""
+        return group({name: leaf.spec for name, leaf in self.leaves.items()})
+
+    def __call__(self, values: Any) -> NDArray | dict[str, NDArray]:
+        """Reads the observations.
+
+        Args:
+            values: What the vector of N tasks returned.
+
+        Returns:
+            The only observation [N, *obs], or each by its name; none shares memory with ``values``.
+        """
+        if self._only is not None:
+            return self._only.read(_follow(self._only.path, values))
+        return {name: leaf.read(_follow(leaf.path, values)) for name, leaf in self.leaves.items()}
+
+    def masks(self, values: Any) -> list[Any]:
+        """Returns the masks of actions among the observations, [N, ...] each."""
+        return [_follow(path, values) for path in self._mask_paths]
+
+
+def observation_specs(env: EnvBase) -> TensorSpec | dict[str, TensorSpec]:
+    """Returns the specs of an environment's observations, which networks are built from.
+
+    Their kinds are
+
+    ===========  ==================================================================================
+    array        `Unbounded` [D], float32 or uint8
+    image        `Unbounded` [H, W] or [C, H, W], float32 or uint8
+    categories   `MultiCategorical` [A], int64: Discrete (A = 1), MultiDiscrete and MultiBinary
+    ===========  ==================================================================================
+
+    Args:
+        env: An environment of :func:`~torchrl_tit.envs.make_env`, or any whose observations are
+            under "observation".
+
+    Returns:
+        The spec of the only observation; or, if there are several, of each by its name: NAME's
+        keys are ``("observation", NAME)`` and ``("history", NAME)``. All are without batch
+        dimensions.
+
+    Example:
+        >>> from torchrl_tit.envs import make_env
+        >>> observation_specs(make_env("CartPole-v1")).shape
+        torch.Size([4])
+        >>> list(observation_specs(make_env("Blackjack-v1")))
+        ['0', '1', '2']
+    """
+    spec = env.observation_spec_unbatched["observation"]
+    return dict(spec.items()) if isinstance(spec, Composite) else spec
+
+
+def observation_keys(env: EnvBase) -> list[NestedKey]:
+    """Returns the keys of an environment's observations.
+
+    Example:
+        >>> from torchrl_tit.envs import make_env
+        >>> observation_keys(make_env("CartPole-v1"))
+        ['observation']
+        >>> observation_keys(make_env("Blackjack-v1"))
+        [('observation', '0'), ('observation', '1'), ('observation', '2')]
+    """
+    specs = observation_specs(env)
+    if isinstance(specs, Mapping):
+        return [("observation", name) for name in specs]
+    return ["observation"]
+
+
+def group(specs: dict[str, TensorSpec]) -> TensorSpec:
+    """Returns the only spec, or a `Composite` of several."""
+    return next(iter(specs.values())) if len(specs) == 1 else Composite(specs)
+
+
+def categories_spec(sizes: Sequence[int]) -> MultiCategorical:
+    """The spec of categories, each from 0 to its size - 1; int64 [A]."""
+    return MultiCategorical(sizes, dtype=torch.int64)
+
+
+def array_spec(
+    name: str, shape: Sequence[int], dtype: torch.dtype, layout: ImageLayout
+) -> tuple[Unbounded, bool]:
+    """The spec of an array or an image, and whether its channels come last in the task.
+
+    Raises:
+        ValueError: If it has more than three dimensions, or it cannot be found out which dimension
+            of an image is that of its channels.
+    """
+    if len(shape) > _MAX_ORDER:
+        raise ValueError(
+            f"Observation {name!r} has the shape {list(shape)}, but at most {_MAX_ORDER} "
+            "dimensions are supported: flatten it with the wrapper "
+            "gymnasium.wrappers:FlattenObservation, or leave the stacking of frames to the history."
+        )
+    last = len(shape) == _MAX_ORDER and _channels_last(name, shape, layout)
+    if last:
+        shape = (shape[-1], *shape[:-1])
+    dtype = dtype if dtype is torch.uint8 else torch.float32
+    return Unbounded(torch.Size(shape or (1,)), dtype=dtype), last
+
+
+def choose(
+    found: dict[str, tuple[Any, Any]],
+    keys: Sequence[str],
+    supported: Callable[[tuple[Any, Any]], Any],
+) -> dict[str, tuple[Any, Any]]:
+    """Chooses the observations that are read.
+
+    Args:
+        found: What the task has, by name: where it is, and its space or spec.
+        keys: Names, or the beginnings of names in front of "/"; all if there are none.
+        supported: Tells whether a value of ``found`` is of a supported kind.
+
+    Returns:
+        Those chosen, in the task's order. If there are no keys, unsupported ones are left out with
+        a warning.
+
+    Raises:
+        ValueError: If a key is unknown or of an unsupported kind, or nothing is left.
+    """
+    for key in keys:
+        if not any(_belongs(name, key) for name in found):
+            raise ValueError(
+                f"The task has no observation {key!r}, which observation_keys names, only "
+                f"{', '.join(found)}."
+            )
+    chosen = {
+        name: value
+        for name, value in found.items()
+        if not keys or any(_belongs(name, key) for key in keys)
+    }
+    left_out = {name: value for name, value in chosen.items() if not supported(value)}
+    kept = {name: value for name, value in chosen.items() if name not in left_out}
+    described = ", ".join(f"{name!r} ({_describe(value)})" for name, value in left_out.items())
+    if not kept or (keys and left_out):
+        raise ValueError(
+            f"Observations of this kind are not supported: {described or 'none at all'}. Supported "
+            "are Box, Discrete, MultiDiscrete and MultiBinary, and Dict and Tuple of these."
+        )
+    if left_out:
+        warnings.warn(
+            f"The observation {described} is left out, since its kind is not supported; "
+            f"`--observation-keys {' '.join(kept)}` says so without a warning.",
+            stacklevel=2,
+        )
+    return kept
+
+
+def leaf_name(keys: Iterable[str]) -> str:
+    """The name of a nested observation; modules and buffers cannot have dots in theirs."""
+    return "/".join(keys).replace(".", "_")
+
+
+def check_layout(layout: str) -> None:
+    """Raises ValueError if an image layout is unknown."""
+    if layout not in get_args(ImageLayout):
+        known = ", ".join(map(repr, get_args(ImageLayout)))
+        raise ValueError(f"image_layout must be one of {known}, but is {layout!r}.")
+
+
+def _leaf_spaces(
+    space: Space, path: tuple[str | int, ...] = ()
+) -> Iterator[tuple[str, tuple[tuple[str | int, ...], Space]]]:
+    """Yields the name of each leaf of a nested space, with its path and its own space."""
+    if isinstance(space, Dict | Tuple):
+        parts = space.items() if isinstance(space, Dict) else enumerate(space)
+        for key, part in parts:
+            yield from _leaf_spaces(part, (*path, key))
+    else:
+        yield leaf_name(map(str, path)) or "observation", (path, space)
+
+
+def _follow(path: tuple[str | int, ...], values: Any) -> Any:
+    for key in path:
+        values = values[key]
+    return values
+
+
+def _is_supported(found: tuple[Any, Space]) -> bool:
+    space = found[1]
+    if isinstance(space, Box):
+        return space.dtype.kind in "fiub"
+    return isinstance(space, Discrete | MultiDiscrete | MultiBinary)
+
+
+def _leaf(name: str, path: tuple[str | int, ...], space: Space, layout: ImageLayout) -> Leaf:
+    if isinstance(space, Discrete):
+        return Leaf(path, categories_spec([int(space.n)]), start=int(space.start))
+    if isinstance(space, MultiDiscrete):
+        return Leaf(
+            path, categories_spec(space.nvec.flatten().tolist()), start=space.start.flatten()
+        )
+    if isinstance(space, MultiBinary):
+        return Leaf(path, categories_spec([2] * int(np.prod(space.shape))))
+    assert space.shape is not None  # a Box
+    dtype = torch.uint8 if space.dtype == np.uint8 else torch.float32
+    spec, channels_last = array_spec(name, space.shape, dtype, layout)
+    return Leaf(path, spec, channels_last)
+
+
+def _channels_last(name: str, shape: Sequence[int], layout: ImageLayout) -> bool:
+    if layout != "auto":
+        return layout == "HWC"
+    first, last = (0 < side <= _MAX_CHANNELS for side in (shape[0], shape[-1]))
+    if first == last:
+        raise ValueError(
+            f"Observation {name!r} is an image of shape {list(shape)}, and it is not clear whether "
+            "its channels come first or last: say so with `--image-layout HWC` or "
+            "`--image-layout CHW`."
+        )
+    return last
+
+
+def _belongs(name: str, key: str) -> bool:
+    return name == key or name.startswith(f"{key}/")
+
+
+def _describe(value: Any) -> str:
+    kind = value[1]
+    if isinstance(kind, TensorSpec):  # which would fill several lines
+        return f"{type(kind).__name__} {list(kind.shape)}"
+    return str(kind)

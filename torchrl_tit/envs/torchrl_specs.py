@@ -1,0 +1,192 @@
+"""The specs of any TorchRL environment as those of our environments, and its values likewise."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torch.nn.functional import one_hot
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    TensorSpec,
+    Unbounded,
+)
+
+from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.envs.actions import box_action_spec
+from torchrl_tit.envs.spaces import (
+    ImageLayout,
+    array_spec,
+    categories_spec,
+    check_layout,
+    choose,
+    group,
+    leaf_name,
+)
+
+Convert = Callable[[Tensor], Tensor]
+
+# What TorchRL's own transforms add to the observations.
+_BOOKKEEPING = {"episode_reward", "is_init", "step_count", "traj_ids"}
+
+
+class TensorReader:
+    """Reads the observations of a TorchRL environment without batch dimensions.
+
+    Args:
+        specs: The specs of its observations.
+        keys: Names of the observations to keep, or of groups of them; by default all but what
+            TorchRL's transforms count.
+        image_layout: See :class:`~torchrl_tit.envs.spaces.ObservationReader`.
+        mask_actions: Whether an observation "action_mask" is none, but the mask of the actions.
+
+    Raises:
+        ValueError: If no observation, or one of ``keys``, is of a kind that is supported, a key is
+            unknown, there is no mask, or the layout of an image cannot be found out.
+
+    Example:
+        >>> from torchrl.envs import PendulumEnv
+        >>> reader = TensorReader(PendulumEnv().full_observation_spec, keys=["th", "thdot"])
+        >>> reader.spec["th"].shape
+        torch.Size([1])
+    """
+
+    def __init__(
+        self,
+        specs: Composite,
+        *,
+        keys: Sequence[str] = (),
+        image_layout: ImageLayout = "auto",
+        mask_actions: bool = False,
+    ) -> None:
+        check_layout(image_layout)
+        found = {_name(key): (key, specs[key]) for key in specs.keys(True, True)}
+        self.mask_key: NestedKey | None = None
+        """Key of the mask of the actions, if it is read."""
+        if mask_actions:
+            if MASK not in found:
+                raise ValueError(
+                    f'The task has no mask of its actions, an observation "{MASK}": leave out '
+                    "mask_actions."
+                )
+            self.mask_key = found.pop(MASK)[0]
+        if not keys:
+            found = {name: leaf for name, leaf in found.items() if name not in _BOOKKEEPING}
+        chosen = choose(found, keys, lambda leaf: _sizes(leaf[1]) or _is_array(leaf[1]))
+        read = {name: _observation(name, leaf[1], image_layout) for name, leaf in chosen.items()}
+        self.spec = group({name: spec for name, (spec, _) in read.items()})
+        """The spec of the only observation, or a `Composite` of all."""
+        self._leaves = {name: (chosen[name][0], convert) for name, (_, convert) in read.items()}
+
+    def __call__(self, tensordict: TensorDictBase) -> Any:
+        """Reads the only observation, or each by its name."""
+        values = {
+            name: convert(tensordict.get(key)) for name, (key, convert) in self._leaves.items()
+        }
+        return next(iter(values.values())) if len(values) == 1 else values
+
+
+def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
+    """Converts the spec of a TorchRL environment's action.
+
+    Args:
+        found: Its spec, without batch dimensions.
+        clip: Whether continuous actions are clipped to their bounds, and their spec has none.
+
+    Returns:
+        The spec of our action, and the function that converts one to that of the environment.
+
+    Raises:
+        ValueError: If it is of a kind that is not supported.
+
+    Example:
+        >>> spec, convert = action_spec(OneHot(3), clip=True)
+        >>> type(spec).__name__, convert(torch.tensor(2))
+        ('Categorical', tensor([False, False,  True]))
+    """
+    sizes, shape, dtype = _sizes(found), found.shape, found.dtype
+    if isinstance(found, Binary):
+        spec = Binary(shape.numel(), shape=(shape.numel(),), dtype=torch.int8)
+        return spec, lambda action: action.reshape(shape).to(dtype)
+    if sizes and isinstance(found, OneHot | MultiOneHot):
+        spec = Categorical(sizes[0]) if len(sizes) == 1 else categories_spec(sizes)
+
+        def encode(action: Tensor) -> Tensor:
+            parts = zip(action.reshape(-1), sizes, strict=True)
+            return torch.cat([one_hot(part, size) for part, size in parts]).reshape(shape).to(dtype)
+
+        return spec, encode
+    if sizes:
+        spec = Categorical(sizes[0]) if len(sizes) == 1 else categories_spec(sizes)
+        return spec, lambda action: action.reshape(shape).to(dtype)
+    if _is_array(found) and dtype.is_floating_point:
+        bounded = isinstance(found, Bounded)
+        low = found.space.low if bounded else torch.full(shape, -torch.inf)
+        high = found.space.high if bounded else torch.full(shape, torch.inf)
+        spec = box_action_spec(low.reshape(-1).numpy(), high.reshape(-1).numpy(), clip=clip)
+
+        def bring(action: Tensor) -> Tensor:
+            action = action.reshape(shape).to(dtype)
+            return action.clamp(low, high) if clip else action
+
+        return spec, bring
+    raise ValueError(
+        f"Actions of the kind {type(found).__name__} {list(shape)} ({dtype}) are not supported, "
+        "only floats, Categorical, MultiCategorical, OneHot, MultiOneHot and Binary."
+    )
+
+
+def _name(key: NestedKey) -> str:
+    """The name of an observation; a group "observation" around it adds nothing."""
+    parts = [key] if isinstance(key, str) else list(key)
+    return leaf_name(parts[1:] if parts[0] == "observation" and len(parts) > 1 else parts)
+
+
+def _is_array(spec: TensorSpec) -> bool:
+    return isinstance(spec, Unbounded | Bounded) and not spec.dtype.is_complex
+
+
+def _sizes(spec: TensorSpec) -> list[int]:
+    """The number of categories of each entry; empty if there are none, or it is not known."""
+    if isinstance(spec, MultiCategorical | MultiOneHot):
+        sizes = torch.as_tensor(spec.nvec).flatten().tolist()
+        groups = spec.shape.numel() // (sum(sizes) if isinstance(spec, MultiOneHot) else len(sizes))
+        return [int(size) for size in sizes] * groups
+    if isinstance(spec, Binary):
+        return [2] * spec.shape.numel()
+    if isinstance(spec, OneHot):
+        return [int(spec.space.n)] * spec.shape[:-1].numel()
+    if isinstance(spec, Categorical) and spec.space.n > 0:
+        return [int(spec.space.n)] * spec.shape.numel()
+    return []
+
+
+def _observation(name: str, spec: TensorSpec, layout: ImageLayout) -> tuple[TensorSpec, Convert]:
+    sizes = _sizes(spec)
+    if not sizes:
+        ours, channels_last = array_spec(name, spec.shape, spec.dtype, layout)
+
+        def bring(value: Tensor) -> Tensor:
+            value = value.movedim(-1, 0) if channels_last else value
+            return value.to(ours.dtype).reshape(ours.shape)
+
+        return ours, bring
+    ours = categories_spec(sizes)
+    if not isinstance(spec, OneHot | MultiOneHot):
+        return ours, lambda value: value.long().reshape(-1)
+    widths = [spec.shape[-1]]
+    if isinstance(spec, MultiOneHot):
+        widths = torch.as_tensor(spec.nvec).flatten().tolist()
+
+    def decode(value: Tensor) -> Tensor:
+        parts = value.to(torch.uint8).split(widths, -1)
+        return torch.stack([part.argmax(-1) for part in parts], -1).reshape(-1)
+
+    return ours, decode

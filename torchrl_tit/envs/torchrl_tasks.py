@@ -1,0 +1,292 @@
+"""Copies of any TorchRL environment, side by side, with the keys and kinds of our environments."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
+
+from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.envs.torchrl_specs import TensorReader, action_spec
+from torchrl_tit.envs.wrappers import load_wrappers
+
+
+class TorchRLTask(EnvBase):
+    """One TorchRL environment as a task: its observations, its action and the ends of its episodes.
+
+    It has the keys of :class:`~torchrl_tit.envs.GymVectorEnv`. Observations of several keys are
+    nested: ("observation", NAME), where the name of a nested one joins its keys with "/". What the
+    environment itself reads from step to step stays in here.
+
+    Args:
+        env: The environment, without batch dimensions.
+        clip_actions: See :class:`~torchrl_tit.envs.GymVectorEnv`, as the next three.
+        observation_keys: Names of the observations to keep; all by default.
+        image_layout: Where images have their channels.
+        mask_actions: Whether an observation "action_mask" tells which actions are allowed.
+
+    Raises:
+        ValueError: If its observations or actions are of a kind that is not supported, or it has a
+            batch size, several actions, several rewards, or ends of episodes for parts of it. See
+            also :class:`~torchrl_tit.envs.torchrl_specs.TensorReader`.
+
+    Example:
+        >>> from torchrl.envs import PendulumEnv
+        >>> task = TorchRLTask(PendulumEnv(), observation_keys=["th", "thdot"])
+        >>> task.rollout(3)["observation", "th"].shape
+        torch.Size([3, 1])
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        *,
+        clip_actions: bool = True,
+        observation_keys: Sequence[str] = (),
+        image_layout: Literal["auto", "HWC", "CHW"] = "auto",
+        mask_actions: bool = False,
+    ) -> None:
+        _check(env)
+        read = TensorReader(
+            env.full_observation_spec,
+            keys=observation_keys,
+            image_layout=image_layout,
+            mask_actions=mask_actions,
+        )
+        spec, write = action_spec(env.action_spec, clip=clip_actions)
+        super().__init__(device=env.device, batch_size=torch.Size([]))
+        self._env, self._read, self._write = env, read, write
+        self._carried: TensorDictBase | None = None  # what the environment reads in its next step
+        entries = {"observation": read.spec}
+        if read.mask_key is not None:
+            mask = _mask_size(spec)
+            found = env.full_observation_spec[read.mask_key].shape.numel()
+            if found != mask:
+                raise ValueError(f'The task\'s "{MASK}" has {found} entries, not {mask}.')
+            entries[MASK] = Binary(mask, shape=(mask,), dtype=torch.bool)
+        flag = Categorical(2, shape=(1,), dtype=torch.bool)
+        flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
+        place = (lambda x: x) if self.device is None else (lambda x: x.to(self.device))
+        self.observation_spec = place(Composite(entries))
+        self.action_spec = place(spec)
+        self.reward_spec = place(Unbounded((1,), dtype=torch.float32))
+        self.done_spec = place(Composite(flags))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        assert self._carried is not None
+        self._carried.set(self._env.action_key, self._write(tensordict["action"]))
+        stepped = self._env.step(self._carried)
+        outcome = stepped["next"]
+        self._carried = self._env.step_mdp(stepped)
+        reward = outcome.get(self._env.reward_key).to(torch.float32).reshape(1)
+        return self._tensordict(outcome, reward=reward)
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any
+    ) -> TensorDictBase:
+        if seed is not None:
+            self._env.set_seed(seed)
+        self._carried = self._env.reset()
+        return self._tensordict(self._carried)
+
+    def _tensordict(self, outcome: TensorDictBase, **entries: Any) -> TensorDict:
+        entries["observation"] = self._read(outcome)
+        if self._read.mask_key is not None:
+            entries[MASK] = outcome.get(self._read.mask_key).bool().reshape(-1)
+        done = outcome.get("done").reshape(1)
+        truncated = outcome.get("truncated", torch.zeros_like(done)).reshape(1)
+        terminated = outcome.get("terminated", done & ~truncated).reshape(1)
+        entries |= {"done": done, "terminated": terminated, "truncated": truncated}
+        return TensorDict(entries, device=self.device)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._env.set_seed(seed)
+
+    def render(self) -> np.ndarray:
+        """Renders the task by its own ``render``, or else returns its observation "pixels".
+
+        Returns:
+            uint8 [height, width, 3].
+
+        Raises:
+            ValueError: If it has neither.
+        """
+        own = getattr(self._env, "render", None)
+        picture = own() if callable(own) else None
+        if picture is None and self._carried is not None:
+            picture = self._carried.get("pixels", None)
+        if picture is None:
+            raise ValueError('The task has neither a method "render" nor an observation "pixels".')
+        picture = np.asarray(picture)
+        return np.moveaxis(picture, 0, -1) if picture.shape[0] in (1, 3) else picture
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Closes the task."""
+        if not self._env.is_closed:
+            self._env.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+
+class _SeededCopies(BatchedEnvBase):
+    """Copies whose resets take a seed: copy i is seeded with ``seed + i``."""
+
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any
+    ) -> TensorDictBase:
+        if seed is not None:
+            kwargs["list_of_kwargs"] = [{"seed": seed + i} for i in range(self.num_workers)]
+        return super()._reset(tensordict, **kwargs)
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        """Seeds copy i with ``seed + i``."""
+        self.reset(seed=seed)
+        return None if seed is None else seed + self.num_workers
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Closes the copies, if they have been started; closing twice is allowed."""
+        if not self.is_closed:
+            super().close(raise_if_closed=raise_if_closed)
+
+
+class SerialTasks(_SeededCopies, SerialEnv):
+    """Copies of a task that are stepped one after the other."""
+
+    @property
+    def render_fps(self) -> int:
+        """The task's frames per second."""
+        return 30
+
+    def render(self) -> np.ndarray:
+        """Renders the copies; uint8 [N, height, width, 3].
+
+        Raises:
+            ValueError: If they cannot be rendered.
+        """
+        return np.stack([copy.render() for copy in self._envs])
+
+
+class ParallelTasks(_SeededCopies, ParallelEnv):
+    """Copies of a task that are stepped side by side, in one process each."""
+
+
+def make_torchrl_tasks(
+    make: Callable[..., EnvBase],
+    num_envs: int,
+    *,
+    name: str,
+    wrappers: Sequence[str] = (),
+    vectorization_mode: Literal["sync", "async"] = "sync",
+    device: torch.device | str | None = None,
+    task_settings: dict[str, Any],
+    **reading: Any,
+) -> EnvBase:
+    """Makes copies of a TorchRL environment, as an environment of batch size [N].
+
+    Args:
+        make: A class, or a function, that makes an environment without batch dimensions.
+        num_envs: N.
+        name: The task's name, for messages.
+        wrappers: TorchRL transforms around each copy, as
+            :func:`~torchrl_tit.envs.wrappers.load_wrappers` takes them.
+        vectorization_mode: ``"sync"`` steps the copies in this process (`SerialEnv`), ``"async"``
+            in one process each (`ParallelEnv`).
+        device: Device of the tensors.
+        task_settings: Passed to ``make``. If it takes no ``max_episode_steps``, TorchRL's
+            `StepCounter` truncates the episodes.
+        **reading: See :class:`TorchRLTask`.
+
+    Returns:
+        The environment.
+
+    Raises:
+        ValueError: See :class:`TorchRLTask`; or a setting or a wrapper is wrong.
+
+    Example:
+        >>> from torchrl.envs import PendulumEnv
+        >>> env = make_torchrl_tasks(PendulumEnv, 2, name="pendulum", task_settings={})
+        >>> env.rollout(3).batch_size
+        torch.Size([2, 3])
+    """
+    copy = partial(_copy, make, name, tuple(wrappers), task_settings, reading)
+    copy().close()  # so that errors are those of a copy, not of its processes
+    kind = SerialTasks if vectorization_mode == "sync" else ParallelTasks
+    return kind(num_envs, copy, device=device)
+
+
+def _copy(
+    make: Callable[..., EnvBase],
+    name: str,
+    wrappers: tuple[str, ...],
+    settings: dict[str, Any],
+    reading: dict[str, Any],
+) -> EnvBase:
+    """Makes one copy, in the process that steps it."""
+    wraps, transforms = load_wrappers(wrappers)
+    if wraps:
+        raise ValueError(
+            f"Task {name!r} is a TorchRL environment, which takes TorchRL transforms and no "
+            "gymnasium.Wrapper."
+        )
+    parameters = inspect.signature(make).parameters
+    limit = None
+    if "max_episode_steps" not in parameters:
+        limit = settings.get("max_episode_steps")
+        settings = {key: value for key, value in settings.items() if key != "max_episode_steps"}
+    if "render_mode" not in parameters:  # it renders as it does
+        settings = {key: value for key, value in settings.items() if key != "render_mode"}
+    try:
+        env = make(**settings)
+    except Exception as error:  # each checks its settings in its own way
+        raise ValueError(
+            f"Task {name!r} cannot be made: {type(error).__name__}: {error}"
+        ) from error
+    if not isinstance(env, EnvBase):
+        raise ValueError(
+            f"Task {name!r} must make a TorchRL EnvBase, but made a {type(env).__name__}."
+        )
+    if limit is not None:
+        transforms.append(StepCounter(limit))
+    if transforms:
+        env = TransformedEnv(env, Compose(*transforms))
+    try:
+        return TorchRLTask(env, **reading)
+    except ValueError as error:
+        raise ValueError(f"Task {name!r}: {error}") from error
+
+
+def _check(env: EnvBase) -> None:
+    """Raises ValueError if an environment is not one task with one action and one reward."""
+    if env.batch_size:
+        raise ValueError(
+            f"it has the batch size {list(env.batch_size)}; expected an environment without batch "
+            "dimensions, of which copies are made"
+        )
+    actions = list(env.full_action_spec.keys(True, True))
+    if len(actions) != 1:
+        raise ValueError(f"it has the actions {sorted(map(str, actions))}; expected one")
+    rewards = list(env.full_reward_spec.keys(True, True))
+    if len(rewards) != 1 or env.full_reward_spec[rewards[0]].shape.numel() != 1:
+        raise ValueError(
+            "it has several rewards in a step; expected one number, as for a single agent"
+        )
+    ends = [key for key in env.full_done_spec.keys(True, True) if isinstance(key, tuple)]
+    if ends or "done" not in env.full_done_spec:
+        raise ValueError(
+            f"it has the ends of episodes {sorted(map(str, env.full_done_spec.keys(True, True)))}; "
+            'expected "done", and "terminated" and "truncated" if it tells them apart'
+        )
+
+
+def _mask_size(spec: Any) -> int:
+    """The number of entries of a mask of actions."""
+    if type(spec) is Categorical:
+        return int(spec.space.n)
+    if hasattr(spec, "nvec"):
+        return int(torch.as_tensor(spec.nvec).sum())
+    raise ValueError("only discrete actions can be masked; leave out mask_actions")
