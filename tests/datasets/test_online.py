@@ -1,7 +1,9 @@
-"""A storage of collected steps keeps each frame once, and its histories are the environment's."""
+"""A ring of collected steps keeps each frame once, and its histories are the environment's."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,90 +11,129 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
-from torchrl.data import ReplayBuffer
-from torchrl.envs import TransformedEnv
+from torchrl.data import ReplayBuffer, SliceSampler
 
+from recipes.stateful import BufferState
 from tests.datasets.rollouts import Transitions
-from tests.transforms.streams import StreamEnv
+from tests.datasets.several import MOST_FRAMES, newest, play_several
+from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.datasets import (
     ConsecutiveSampler,
     HistoryStorage,
     OnlineHistoryStorage,
     episodes_from_arrays,
-    keep_batch,
 )
-from torchrl_tit.transforms import History
 
-ENVS, STEPS = 3, 60
-
-
-def play(num_frames: int, padding: Any = "same", seed: int = 0) -> TensorDictBase:
-    """Steps [envs, time] of images with histories; most episodes are shorter than four steps."""
-    env = StreamEnv((ENVS,), (6, 5), torch.uint8, seed=seed)
-    history = History(num_frames, observation_ndim=2, padding=padding)
-    return TransformedEnv(env, history).rollout(STEPS, break_when_any_done=False)
+STEPS = 60
+EXTRA = ("episode", "is_init", ("next", "is_init"))
 
 
-def store(storage: OnlineHistoryStorage, steps: TensorDictBase, sizes: list[int]) -> None:
-    """Adds steps [envs, time] in batches of these numbers of steps."""
-    for batch in steps.exclude("history", ("next", "history")).split(sizes, dim=1):
-        storage.set(range(0), batch.transpose(0, 1).reshape(-1))
+def without_histories(steps: TensorDictBase) -> TensorDictBase:
+    return steps.exclude("history", ("next", "history"))
 
 
-def flat(steps: TensorDictBase) -> TensorDictBase:
-    """[envs, time] -> [time * envs], as stored."""
-    return steps.transpose(0, 1).reshape(-1)
+def make(envs: int | None, max_size: int, num_frames: int, **settings: Any) -> ReplayBuffer:
+    ndim = 1 if envs is None else 2
+    storage = OnlineHistoryStorage(max_size, num_frames, ndim=ndim, **settings)
+    return ReplayBuffer(storage=storage, batch_size=16)
+
+
+def batches(steps: TensorDictBase, generator: torch.Generator) -> Iterator[tuple[int, Any]]:
+    """Splits steps [..., T] at random; yields the time after each batch, and the batch."""
+    time, total = 0, steps.shape[-1]
+    while time < total:
+        stop = min(total, time + int(torch.randint(1, 25, (), generator=generator)))
+        yield stop, without_histories(steps[..., time:stop])
+        time = stop
 
 
 def assert_items(items: TensorDictBase, expected: TensorDictBase) -> None:
-    assert set(items.keys()) == {"observation", "history", "action", "next"}
-    assert {"history", "observation", "reward", "done"} <= set(items["next"].keys())
-    for key in items.keys(True, True):
+    assert set(items.exclude(*EXTRA).keys(True, True)) == set(expected.keys(True, True))
+    for key in expected.keys(True, True):
+        assert items[key].dtype == expected[key].dtype
         assert torch.equal(items[key], expected[key]), key
 
 
-@pytest.mark.parametrize("padding", ["same", "constant"])
-@pytest.mark.parametrize("num_frames", [1, 2, 4, 20])
-def test_items_are_those_of_the_environment(num_frames: int, padding: Any) -> None:
-    steps = play(num_frames, padding)
-    storage = OnlineHistoryStorage(500, num_frames, num_envs=ENVS, padding=padding)
-    store(storage, steps, [1, 7, 30, 22])
-    assert len(storage) == ENVS * STEPS
-    assert_items(storage[:], flat(steps))
-    index = torch.tensor([[0, 17, -1], [100, 3, 44]])
-    assert_items(storage[index], flat(steps)[index])
-    assert_items(storage[5], flat(steps)[5])
+@pytest.mark.parametrize("seed", range(12))
+def test_items_are_those_of_the_environment(seed: int, tmp_path: Path) -> None:
+    """Random episodes, batches and sizes, up to a batch that is larger than the ring.
+
+    A ring that is saved in parts and restored at a random moment goes on as the whole one.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def draw(low: int, high: int) -> int:
+        return int(torch.randint(low, high, (), generator=generator))
+
+    envs, num_frames = (None, 1, 3)[seed % 3], draw(1, MOST_FRAMES + 1)
+    padding = ("same", "constant")[seed % 2]
+    max_size = draw(1, 30) * (envs or 1)
+    steps = play_several(envs, STEPS, num_frames, padding)
+    settings = {"padding": padding, "is_init": True}
+    buffer, restored = (make(envs, max_size, num_frames, **settings) for _ in range(2))
+    state = BufferState(buffer, tmp_path)
+    resume_at = draw(0, STEPS)
+    resumed = False
+    for time, batch in batches(steps, generator):
+        index = buffer.extend(batch)
+        assert_items(buffer.storage[:], newest(steps, time, buffer.storage.max_size))
+        stored = index.flatten(0, -2).unique(dim=0) if index.ndim > 1 else index.unique()
+        assert len(buffer) >= len(stored)
+        if resumed:
+            assert torch.equal(restored.extend(batch), index)
+            assert (restored.storage[:] == buffer.storage[:]).all()
+        saved = state.state_dict()
+        if not resumed and time >= resume_at:
+            BufferState(restored, tmp_path).load_state_dict(saved)
+            resumed = True
+            assert (restored.storage[:] == buffer.storage[:]).all()
+    # What belongs to overwritten steps is gone.
+    ended = newest(steps, STEPS, buffer.storage.max_size)["next", "done"].sum()
+    assert ended <= buffer.storage.num_end_frames <= ended + 2 * (envs or 1)
+    again = make(envs, max_size, num_frames, **settings)
+    buffer.dumps(tmp_path / "whole")
+    again.loads(tmp_path / "whole")
+    assert (again.storage[:] == buffer.storage[:]).all()
+    more = without_histories(play_several(envs, 9, num_frames, padding, seed=1))
+    for each in (buffer, again, restored):
+        each.extend(more)
+    assert (again.storage[:] == buffer.storage[:]).all()
+    assert (restored.storage[:] == buffer.storage[:]).all()
+
+
+def test_is_init_and_episode() -> None:
+    steps = play_several(3, STEPS, 4, "same")
+    buffer = make(3, 3 * STEPS, 4, is_init=True)
+    buffer.extend(without_histories(steps))
+    starts = torch.ones(3, STEPS, dtype=torch.bool)
+    starts[:, 1:] = steps["next", "done"][:, :-1, 0]
+    starts[:, STEPS // 3] = True  # reset without a flag
+    items = buffer[:]
+    for group in (items, items["next"]):
+        assert torch.equal(group["is_init"][..., 0], starts)
+    number = torch.arange(3).unsqueeze(1) * STEPS + starts.cumsum(1)
+    _, expected = number.unique(return_inverse=True)
+    _, episode = items["episode"].unique(return_inverse=True)
+    for ours, theirs in ((episode, expected), (expected, episode)):  # one to one
+        pairs = torch.stack([ours, theirs], -1).flatten(0, 1).unique(dim=0)
+        assert len(pairs) == len(ours.unique())
 
 
 def test_each_frame_is_kept_once() -> None:
-    steps = play(8)
-    storage = OnlineHistoryStorage(ENVS * STEPS, 8, num_envs=ENVS)
-    store(storage, steps, [20, 20, 20])
-    ends = int(steps["next", "done"].sum())
-    assert storage.num_episode_ends == ends > 20
-    images = [x for x in tree_leaves(storage.state_dict()) if x.dtype == torch.uint8]
-    assert sum(len(x) for x in images) == ENVS * STEPS + ends + ENVS
+    steps = play_several(3, STEPS, 8, "same")
+    buffer = make(3, 3 * STEPS, 8)
+    for batch in without_histories(steps).split(20, 1):
+        buffer.extend(batch)
+    ends = int(steps["next", "done"].sum()) + int((~steps["next", "done"][:, STEPS // 3 - 1]).sum())
+    assert buffer.storage.num_end_frames == ends > 20
+    leaves = [x for x in tree_leaves(buffer.storage.state_dict()) if isinstance(x, Tensor)]
+    images = [x for x in leaves if x.dtype == torch.uint8]
+    assert sum(len(x) for x in images) == 3 * STEPS + ends + 3
 
 
-def test_an_environment_that_was_reset_in_between_starts_anew() -> None:
-    first, second = play(4, seed=0), play(4, seed=1)
-    first["next", "done"][:, -1] = False  # cut off without a flag
-    first["next", "terminated"][:, -1] = False
-    storage = OnlineHistoryStorage(1000, 4, num_envs=ENVS, is_init=True)
-    store(storage, first, [STEPS])
-    before = storage.num_episode_ends
-    store(storage, second, [30, 30])
-    assert_items(
-        storage[:].exclude("is_init", ("next", "is_init")), flat(torch.cat([first, second], 1))
-    )
-    assert storage.num_episode_ends == before + ENVS + int(second["next", "done"].sum())
-    starts = storage[:]["is_init"].view(-1, ENVS)
-    assert starts[0].all()
-    assert starts[STEPS].all()
-
-
-def test_an_episode_begins_where_is_init_says_so() -> None:
-    frames = torch.zeros(6, 2)  # that look as if they went on, and are not equal to themselves
+def test_one_observation_and_single_steps() -> None:
+    """Frames that are not equal to themselves; steps that are added one by one."""
+    frames = torch.zeros(6, 2)
     frames[:, 1] = torch.nan
     flag = torch.zeros(6, 1, dtype=torch.bool)
     outcome = {"observation": frames, "reward": torch.ones(6, 1), "terminated": flag, "done": flag}
@@ -100,132 +141,152 @@ def test_an_episode_begins_where_is_init_says_so() -> None:
     begins = flag.clone()
     begins[4] = True
     for is_init, starts in ((None, [0]), (begins, [0, 4])):
-        storage = OnlineHistoryStorage(6, 3, is_init=True)
+        buffer = make(None, 6, 3, is_init=True)
         given = steps if is_init is None else steps.copy().set("is_init", is_init)
-        storage.set(range(0), given[:3])
-        storage.set(range(0), given[3:])
-        assert storage[:]["is_init"].flatten().nonzero().flatten().tolist() == starts
-        assert storage.num_episode_ends == len(starts) - 1
+        buffer.extend(given[:3])
+        for step in given[3:]:
+            buffer.add(step)
+        assert buffer[:]["is_init"].flatten().nonzero().flatten().tolist() == starts
+        assert buffer.storage.num_end_frames == len(starts) - 1
+        assert buffer[:]["action"].tolist() == list(range(6))
 
 
 @pytest.mark.parametrize("padding", ["same", "constant"])
 def test_the_next_history_is_always_the_history_moved_by_one(
     rolled: Transitions, padding: Any
 ) -> None:
-    """Also at ends of episodes, and if terminal observations are zeros."""
-    online = OnlineHistoryStorage(500, 4, num_envs=ENVS, padding=padding)
-    store(online, play(4, padding), [60])
+    """Also if terminal observations are zeros."""
     episodes = episodes_from_arrays(**rolled)
-    for storage in (
-        online,
-        HistoryStorage(episodes, 4, padding=padding),
-        HistoryStorage(episodes, 4, padding=padding, terminal_observations="zero"),
-        HistoryStorage(episodes, 4, padding=padding, time_limits="drop"),
-    ):
-        items = storage[:]
+    changes: list[dict[str, Any]] = [
+        {},
+        {"terminal_observations": "zero"},
+        {"time_limits": "drop"},
+    ]
+    for settings in changes:
+        items = HistoryStorage(episodes, 4, padding=padding, **settings)[:]
         assert items["next", "terminated"].any()
         assert torch.equal(items["next", "history"][:, :-1], items["history"][:, 1:])
         assert torch.equal(items["next", "history"][:, -1], items["next", "observation"])
         assert torch.equal(items["history"][:, -1], items["observation"])
 
 
-def test_parts_restore_everything() -> None:
-    """Saved piece by piece, the second piece after a reset that no flag shows."""
-    first, second = play(4, seed=0), play(4, seed=1)
-    first["next", "done"][:, -1] = False
-    whole, restored = (OnlineHistoryStorage(2000, 4, num_envs=ENVS) for _ in range(2))
-    saved = (0, 0)
-    for steps in (first, second, play(4, seed=2)):
-        store(whole, steps, [25, 35])
-        restored.add_part(whole.part(*saved))
-        saved = (len(whole), whole.num_episode_ends)
-        assert (len(restored), restored.num_episode_ends) == saved
-    assert whole.part(*saved) == {}
-    more = play(4, seed=3)
-    for storage in (whole, restored):
-        store(storage, more, [STEPS])
-    assert (restored[:] == whole[:]).all()
-    again = OnlineHistoryStorage(2000, 4, num_envs=ENVS)
-    again.load_state_dict(whole.state_dict())
-    assert (again[:] == whole[:]).all()
+def test_parts_that_no_checkpoint_needs_are_removed(tmp_path: Path) -> None:
+    """Of the last two checkpoints and of one that may not be complete, each can be loaded."""
+    steps = without_histories(play_several(3, STEPS, 4, "same"))
+    buffer = make(3, 3 * 10, 4)
+    state, saved, whole = BufferState(buffer, tmp_path, checkpoints=2), [], []
+    for batch in steps.split(4, 1):
+        buffer.extend(batch)
+        saved.append(state.state_dict())
+        whole.append(buffer.storage[:].clone())
+    # 10 + 3 frames are in the last 4 parts, and the two checkpoints before need 2 more.
+    assert checkpoint_steps(tmp_path) == [12 * n for n in range(10, 16)]
+    assert saved[-1]["parts"] == [12 * n for n in range(12, 16)]
+    for parts, expected in zip(saved[-3:], whole[-3:], strict=True):
+        restored = make(3, 3 * 10, 4)
+        other = BufferState(restored, tmp_path, checkpoints=2)
+        other.load_state_dict(parts)
+        assert (restored.storage[:] == expected).all()
+    assert state.state_dict() == saved[-1]  # nothing new
 
 
-def make_buffer(slice_length: int) -> ReplayBuffer:
-    storage = OnlineHistoryStorage(1000, 4, num_envs=ENVS, is_init=True)
-    sampler = ConsecutiveSampler(slice_length)
-    buffer = ReplayBuffer(
-        storage=storage, sampler=sampler, collate_fn=keep_batch, batch_size=12, generator=None
-    )
-    buffer.extend(flat(play(4)))
-    return buffer
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_on_a_gpu() -> None:
+    steps = play_several(3, STEPS, 4, "same")
+    buffers = [make(3, 60, 4, device=device) for device in ("cuda", "cuda", "cpu")]
+    for batch in without_histories(steps).split(9, 1):
+        for buffer in buffers[::2]:
+            buffer.extend(batch)
+    buffers[1].load_state_dict(buffers[0].state_dict())
+    for buffer in buffers:
+        assert buffer.sample()["history", "pixels"].device.type == buffer.storage.device.type
+        assert_items(buffer.storage[:].cpu(), newest(steps, STEPS, 60))
 
 
-def test_a_buffer_draws_from_it() -> None:
-    storage = OnlineHistoryStorage(1000, 4, num_envs=ENVS)
-    buffer = ReplayBuffer(storage=storage, collate_fn=keep_batch, batch_size=5000)
-    buffer.extend(flat(play(4)[:, :20]))
-    steps = play(4)[:, :20]
-    drawn = buffer.sample()["next", "reward"].mean()
-    assert drawn.item() == pytest.approx(steps["next", "reward"].mean().item(), abs=0.05)
-    restored = OnlineHistoryStorage(1000, 4, num_envs=ENVS)
-    other = ReplayBuffer(storage=restored, collate_fn=keep_batch, batch_size=5000)
+def test_what_was_not_read_yet_is_refused_after_a_write() -> None:
+    buffer = make(None, 10, 2)
+    steps = without_histories(play_several(None, 30, 2, "same"))
+    buffer.extend(steps[:20])
+    items = buffer.storage[:]
+    action = items["action"].clone()
+    buffer.extend(steps[20:])
+    assert torch.equal(items["action"], action)
+    with pytest.raises(RuntimeError, match=r"'reward'. was not gathered yet, .* written to since"):
+        items["next", "reward"].sum()
+
+
+def test_a_reset_that_shows_after_a_part_was_saved() -> None:
+    steps = play_several(3, STEPS, 4, "same")
+    restored = make(3, 3 * STEPS, 4).storage
+    buffer = make(3, 3 * STEPS, 4)
+    before = 0
+    for batch in without_histories(steps).split([STEPS // 3, STEPS - STEPS // 3], 1):
+        buffer.extend(batch)
+        restored.add_part(buffer.storage.part(before))
+        before = buffer.storage.num_written
+    assert_items(restored[:], newest(steps, STEPS, 3 * STEPS))
+
+
+def test_no_slice_leads_from_the_newest_step_to_the_oldest() -> None:
+    """Of an episode that is longer than the ring."""
+    frames, flag = torch.arange(26.0).unsqueeze(1), torch.zeros(25, 1, dtype=torch.bool)
+    outcome = {"observation": frames[1:], "reward": frames[1:], "terminated": flag, "done": flag}
+    steps = {"observation": frames[:-1], "action": torch.arange(25), "next": outcome}
+    buffer = make(None, 10, 3)
+    buffer.extend(TensorDict(steps, [25]))
+    for sampler in (SliceSampler(slice_len=4), ConsecutiveSampler(4)):
+        buffer.set_sampler(sampler)
+        drawn = torch.cat([buffer.sample()["action"].view(4, 4) for _ in range(10)])
+        assert (drawn.diff(dim=1) == 1).all()
+        assert set(drawn.flatten().tolist()) == set(range(15, 25))
+
+
+def test_an_empty_buffer_starts_anew() -> None:
+    buffer = make(3, 30, 4)
+    steps = play_several(3, STEPS, 4, "same")
+    for _ in range(2):
+        buffer.extend(without_histories(steps))
+        assert_items(buffer.storage[:], newest(steps, STEPS, 30))
+        buffer.empty()
+        assert len(buffer) == buffer.storage.num_end_frames == 0
+    other = make(3, 30, 4)
     other.load_state_dict(buffer.state_dict())
-    assert (other[:] == buffer[:]).all()
-    buffer.empty()
-    assert len(buffer) == 0
-
-
-def test_slices_are_consecutive_steps_of_an_environment() -> None:
-    buffer = make_buffer(4)
-    for _ in range(20):
-        batch = buffer.sample()
-        assert batch.batch_size == (3, 4)
-        goes_on = ~batch["is_init"][:, 1:, 0]
-        assert torch.equal(goes_on, ~batch["next", "done"][:, :-1, 0])
-        assert torch.equal(batch["next", "is_init"], batch["is_init"])
-        before, after = batch["next", "history"][:, :-1], batch["history"][:, 1:]
-        assert torch.equal(before[goes_on], after[goes_on])
-
-
-def counts(sampler: ConsecutiveSampler, storage: Any) -> Tensor:
-    index, _ = sampler.sample(storage, 40_000)
-    return index.flatten().bincount(minlength=len(storage))
-
-
-def test_slices_draw_every_transition_equally(rolled: Transitions) -> None:
-    """The ends of episodes too; only the first and last steps of all are drawn less often."""
-    storage = HistoryStorage(episodes_from_arrays(**rolled), 2)
-    drawn = counts(ConsecutiveSampler(4), storage)
-    expected = 40_000 / (len(storage) - 3)
-    assert ((drawn[3:-3] - expected).abs() < 6 * (4 * expected) ** 0.5).all()
-    assert drawn[0] > 0
-    assert drawn[-1] > 0
+    assert len(other) == 0
 
 
 def test_what_is_refused() -> None:
-    storage = OnlineHistoryStorage(30, 2, num_envs=ENVS)
-    steps = flat(play(2))
-    with pytest.raises(ValueError, match="4 steps cannot be those of 3 environments"):
-        storage.set(range(0), steps[:4])
-    storage.set(range(0), steps[:27])
-    with pytest.raises(RuntimeError, match="room for 30 steps, but not for 33"):
-        storage.set(range(0), steps[27:33])
+    steps = without_histories(play_several(3, 12, 2, "same"))
+    buffer = make(3, 31, 2)
+    storage = buffer.storage
+    assert not len(storage)
+    with pytest.raises(IndexError, match="no items yet"):
+        storage[0]
+    with pytest.raises(KeyError, match=r"Steps need .*'next', 'reward'"):
+        buffer.extend(steps.exclude(("next", "reward")))
+    buffer = make(3, 31, 2)
+    buffer.extend(steps[:, :9])
+    storage = buffer.storage
+    assert storage.max_size == 33  # whole steps of all environments
+    assert storage.contains([0, 8, 9, -9, -10]).tolist() == [True, True, False, True, False]
     with pytest.raises(RuntimeError, match="cannot be changed"):
-        storage[0] = steps[0]
-    for wrong in (27, -28):
-        with pytest.raises(IndexError, match="There are 27 items"):
-            storage[wrong]
-    assert storage.contains([0, 26, 27]).tolist() == [True, True, False]
-    for settings, message in (
+        storage[0] = steps[:, 0]
+    with pytest.raises(RuntimeError, match=r"index 9, but is to be written at \[4\]"):
+        storage.set(range(4, 6), steps[:, :2].transpose(0, 1))
+    with pytest.raises(ValueError, match="steps of 2 environments, but 3 were stored"):
+        storage.set(range(9, 10), steps[:2, :1].transpose(0, 1))
+    with pytest.raises(ValueError, match=r"ndim=1 takes steps \[T\], but these are \[3, 12\]"):
+        make(None, 31, 2).extend(steps)
+    other = make(3, 33, 4)
+    with pytest.raises(ValueError, match="num_frames=2, but this storage has num_frames=4"):
+        other.storage.load_state_dict(storage.state_dict())
+    with pytest.raises(ValueError, match="begin at 15, but 27 were written: add all parts"):
+        storage.add_part(storage.part(15))
+    wrong: list[tuple[dict[str, Any], str]] = [
         ({"num_frames": 0}, "num_frames must be at least 1"),
-        ({"num_envs": 0}, "num_envs must be at least 1"),
+        ({"ndim": 3}, "ndim must be 1 .*, but is 3"),
         ({"padding": "zeros"}, "padding must be one of"),
-    ):
+        ({"max_size": 0}, "max_size must be at least 1, but is 0"),
+    ]
+    for settings, message in wrong:
         with pytest.raises(ValueError, match=message):
-            OnlineHistoryStorage(30, **settings)
-    with pytest.raises(ValueError, match="slice_length must be at least 1, but is 0"):
-        ConsecutiveSampler(0)
-    with pytest.raises(ValueError, match="12 steps cannot be divided into slices of 5"):
-        ConsecutiveSampler(5).sample(storage, 12)
-    with pytest.raises(ValueError, match="9 consecutive steps, which is less than a slice of 10"):
-        ConsecutiveSampler(10).sample(storage, 20)
+            OnlineHistoryStorage(**{"max_size": 30, **settings})

@@ -17,6 +17,7 @@ from torchrl_tit.checkpoint.folder import (
     checkpoint_steps,
     latest_step,
     load_checkpoint,
+    remove_checkpoint,
     save_checkpoint,
 )
 from torchrl_tit.checkpoint.rng import global_rng_state, set_global_rng_state
@@ -33,6 +34,7 @@ __all__ = [
     "global_rng_state",
     "latest_step",
     "load_checkpoint",
+    "remove_checkpoint",
     "reset_unsavable_env",
     "save_checkpoint",
     "set_collector_state",

@@ -159,6 +159,26 @@ def latest_step(folder: str | os.PathLike[str]) -> int | None:
     return max(_checkpoints(Path(folder)), default=None)
 
 
+def remove_checkpoint(folder: str | os.PathLike[str], step: int) -> None:
+    """Remove a checkpoint, if it is there.
+
+    Args:
+        folder: Folder of the run's checkpoints.
+        step: The checkpoint's number.
+
+    Example:
+        >>> import tempfile
+        >>> folder = tempfile.mkdtemp()
+        >>> _ = save_checkpoint(folder, 10, {})
+        >>> remove_checkpoint(folder, 10)
+        >>> checkpoint_steps(folder)
+        []
+    """
+    path = _checkpoints(Path(folder)).get(step)
+    if path is not None:
+        _remove(path)
+
+
 def _name(step: int) -> str:
     return f"{step:012d}"
 

@@ -9,7 +9,7 @@ from torchrl_tit.datasets.histories import HistoryStorage
 from torchrl_tit.datasets.minari import read_minari
 from torchrl_tit.datasets.minari_writer import write_minari
 from torchrl_tit.datasets.online import OnlineHistoryStorage
-from torchrl_tit.datasets.replay_buffer import keep_batch, make_replay_buffer, make_sampler
+from torchrl_tit.datasets.replay_buffer import make_replay_buffer, make_sampler
 from torchrl_tit.datasets.scores import (
     REFERENCE_RETURNS,
     has_reference,
@@ -39,7 +39,6 @@ __all__ = [
     "episodes_from_arrays",
     "has_reference",
     "join_episodes",
-    "keep_batch",
     "load_episodes",
     "make_replay_buffer",
     "make_sampler",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 from torchrl.data import RandomSampler, Storage
@@ -39,12 +41,14 @@ class ConsecutiveSampler(RandomSampler):
             raise ValueError(f"slice_length must be at least 1, but is {slice_length}.")
         self.slice_length = slice_length
 
-    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
+    def sample(
+        self, storage: Storage, batch_size: int
+    ) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         """Draws indices, int64 [batch_size / slice_length, slice_length].
 
         Args:
-            storage: Items whose index grows by ``storage.stride`` (1 if it has none) from one step
-                to the next.
+            storage: Items in the order of steps, of one environment or, in two dimensions, of
+                several. From the newest step to the oldest no slice leads.
             batch_size: Number of steps in all.
         """
         if batch_size % self.slice_length:
@@ -52,18 +56,19 @@ class ConsecutiveSampler(RandomSampler):
                 f"A batch of {batch_size} steps cannot be divided into slices of "
                 f"{self.slice_length}; choose a slice_length that divides it."
             )
-        stride = getattr(storage, "stride", 1)
-        span = (self.slice_length - 1) * stride
-        if len(storage) <= span:
+        steps, *envs = storage.shape or (0,)
+        if steps < self.slice_length:
             raise ValueError(
-                f"There are {len(storage) // stride} consecutive steps, which is less than a slice "
-                f"of {self.slice_length}; choose a shorter slice_length."
+                f"There are {steps} consecutive steps, which is less than a slice of "
+                f"{self.slice_length}; choose a shorter slice_length."
             )
-        device = getattr(storage, "device", None)
-        first = torch.randint(
-            len(storage) - span,
-            (batch_size // self.slice_length, 1),
-            generator=storage._rng,
-            device=device,
-        )
-        return first + torch.arange(0, span + 1, stride, device=device), {}
+        device, count = storage.device, batch_size // self.slice_length
+
+        def draw(high: int) -> Tensor:
+            return torch.randint(high, (count, 1), generator=storage._rng, device=device)
+
+        newest = storage._last_cursor_index if storage._is_full else None
+        oldest = 0 if newest is None else newest + 1
+        offsets = torch.arange(oldest, oldest + self.slice_length, device=device)
+        time = (draw(steps - self.slice_length + 1) + offsets) % steps
+        return (time, *(draw(size).expand_as(time) for size in envs)) if envs else time, {}

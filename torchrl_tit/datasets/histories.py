@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Literal, get_args
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes
+from torchrl_tit.datasets.gathering import Entries, take
 from torchrl_tit.datasets.storage import EpisodeStorage
 from torchrl_tit.windows import Padding, find_windows
 
@@ -23,7 +25,8 @@ class HistoryStorage(EpisodeStorage):
     An item has "observation" [*obs], "history" [K, *obs], "action" (int64 if it is discrete), and
     under "next" "observation", "history", "reward" [1], "terminated" [1], "truncated" [1] and
     "done" [1], like the steps of an environment with :class:`~torchrl_tit.transforms.History`. A
-    history never contains observations of another episode.
+    history never contains observations of another episode. "episode", int64, is the number of the
+    item's episode, where TorchRL's `SliceSampler` looks for it.
 
     Args:
         episodes: The data.
@@ -86,65 +89,82 @@ class HistoryStorage(EpisodeStorage):
         self._zero_terminals = terminal_observations == "zero"
         self._is_init = is_init
 
-    def _cut(self, row: Tensor, episode: Tensor) -> TensorDict:
-        first = self._first_rows[episode]
-        windows = find_windows(row, first, self._num_frames, self._padding)
-        following = self._take("observation", row + 1)
-        action = self._take("action", row)
-        if not action.is_floating_point():
-            action = action.long()  # losses use it as an index
-        terminated, truncated = self._take("terminated", row), self._take("truncated", row)
-        if self._zero_terminals:
-            mask = terminated.view(*row.shape, *[1] * (following.ndim - row.ndim))
-            following.masked_fill_(mask, 0)
-        outcome = {
-            "reward": self._take("reward", row),
-            "terminated": terminated,
-            "truncated": truncated,
-            "done": terminated | truncated,
+    def _cut(self, row: Tensor, episode: Tensor) -> Entries:
+        frames, first = self._fields["observation"], self._first_rows[episode]
+        terminated, truncated = (
+            partial(self._take, name, row) for name in ("terminated", "truncated")
+        )
+
+        def following() -> Tensor:
+            values = take(frames, row + 1)
+            if not self._zero_terminals:
+                return values
+            mask = terminated().view(*row.shape, *[1] * (values.ndim - row.ndim))
+            return values.masked_fill_(mask, 0)
+
+        def action() -> Tensor:
+            values = self._take("action", row)
+            return values if values.is_floating_point() else values.long()  # losses use it as index
+
+        def history() -> Tensor:
+            windows = find_windows(row, first, self._num_frames, self._padding)
+            return windows.gather(frames)
+
+        return {
+            **frame_entries((), partial(take, frames, row), history, following, row.ndim),
+            "action": action,
+            ("next", "reward"): partial(self._take, "reward", row),
+            ("next", "terminated"): terminated,
+            ("next", "truncated"): truncated,
+            ("next", "done"): lambda: terminated() | truncated(),
+            **episode_entries(episode, (row == first) if self._is_init else None),
         }
-        history = windows.gather(self._fields["observation"])
-        item = make_item(history, following, action, outcome, row.ndim)
-        return mark_starts(item, row == first) if self._is_init else item
 
 
-def make_item(
-    history: Tensor, following: Tensor, action: Tensor, outcome: dict[str, Tensor], ndim: int
-) -> TensorDict:
-    """Makes items of transitions, no entry of which is a view of another.
+def frame_entries(
+    leaf: tuple[str, ...],
+    newest: Callable[[], Tensor],
+    history: Callable[[], Tensor],
+    following: Callable[[], Tensor],
+    ndim: int,
+) -> Entries:
+    """Says how to make an observation and its histories, none of which is a view of another.
 
     Args:
-        history: [..., K, *obs].
-        following: The next observation, [..., *obs].
-        action: [..., *action].
-        outcome: Reward and flags, [..., 1] each.
+        leaf: What follows "observation" and "history" in the keys: nothing, or the name of one of
+            several observations.
+        newest: Makes the observation, [..., *obs].
+        history: Makes the history, [..., K, *obs].
+        following: Makes the next observation, [..., *obs].
         ndim: Number of the dimensions before these.
     """
-    shape = history.shape[:ndim]
-    moved = torch.cat(
-        [history.narrow(ndim, 1, history.shape[ndim] - 1), following.unsqueeze(ndim)], ndim
-    )
-    return TensorDict(
-        {
-            "observation": history.select(ndim, -1).clone(),
-            "history": history,
-            "action": action,
-            "next": TensorDict({"observation": following, "history": moved, **outcome}, shape),
-        },
-        shape,
-    )
+    history, following = cache(history), cache(following)
+
+    def moved() -> Tensor:
+        kept = history().narrow(ndim, 1, history().shape[ndim] - 1)
+        return torch.cat([kept, following().unsqueeze(ndim)], ndim)
+
+    return {
+        ("observation", *leaf): newest,
+        ("history", *leaf): history,
+        ("next", "observation", *leaf): following,
+        ("next", "history", *leaf): moved,
+    }
 
 
-def mark_starts(item: TensorDict, starts: Tensor) -> TensorDict:
-    """Adds "is_init" to items, and to the next steps, whose histories are no continuation either.
+def episode_entries(episode: Tensor, starts: Tensor | None) -> Entries:
+    """Says how to make what tells the episodes of items apart.
 
     Args:
-        item: items [...].
-        starts: where an episode begins, bool [...].
+        episode: A number for each episode, int64 [...].
+        starts: Where an episode begins, bool [...], for "is_init". The next steps have it too:
+            their histories are no continuation either.
     """
-    for group in (item, item["next"]):
-        group["is_init"] = starts.unsqueeze(-1)
-    return item
+    entries: Entries = {"episode": lambda: episode}
+    if starts is not None:
+        for key in ("is_init", ("next", "is_init")):
+            entries[key] = starts.unsqueeze(-1).clone
+    return entries
 
 
 def check_windows(num_frames: int, padding: str) -> None:

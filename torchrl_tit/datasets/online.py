@@ -2,39 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Storage
 
-from torchrl_tit.datasets.histories import check_windows, make_item, mark_starts
-from torchrl_tit.datasets.storage import as_indices, take
-from torchrl_tit.windows import Padding, find_windows
+from torchrl_tit.datasets.end_frames import EndFrames
+from torchrl_tit.datasets.gathering import Entries, GatheringStorage, take
+from torchrl_tit.datasets.histories import check_windows, episode_entries, frame_entries
+from torchrl_tit.windows import Padding, Windows, find_windows
 
-_OUTCOMES = ("reward", "terminated", "truncated", "done")
+_HERE = ("observation", "action", "action_mask", "is_init")
+_NEXT = ("observation", "reward", "terminated", "truncated", "done", "action_mask")
+_OPTIONAL = ("action_mask", "is_init", "truncated")
 
 
-class OnlineHistoryStorage(Storage):
-    """Collected steps, whose items have histories like those of :class:`HistoryStorage`.
+class OnlineHistoryStorage(GatheringStorage):
+    """The newest collected steps, whose items have histories as those of :class:`HistoryStorage`.
 
-    Each observation is stored once. In addition, there is a frame for each end of an episode (its
-    last observation, which the next step does not have) and one for each environment (its newest
-    next observation). Histories are gathered when items are drawn, and equal those of
-    :class:`~torchrl_tit.transforms.History` in the environment. Actions, rewards and flags are
-    stored as they come.
+    When it is full, each new step takes the place of the oldest one. Each observation is stored
+    once. In addition, there is a frame for each end of an episode (its last observation, which the
+    next step does not have), one for each environment (its newest next observation), and the K - 1
+    frames before the oldest step. So every item can be drawn, and its histories equal those of
+    :class:`~torchrl_tit.transforms.History` in the environment, also where their first steps were
+    overwritten. Actions, masks of actions, rewards and flags are stored as they come.
 
-    Steps are appended, the environments taking turns: a batch [envs, T] of a collector is extended
-    as ``batch.transpose(0, 1).reshape(-1)``. An episode ends where a step is done, where the next
-    one has "is_init", and where its observation is not the next observation of the step before (an
-    environment that was reset in between). Nothing is overwritten.
+    As in TorchRL's storages, a collector's batches [envs, T] need ``ndim=2``. They are extended
+    as they are, and items are numbered by time and environment. An episode ends where a step is
+    done, where the next one has "is_init", and where its observation is not the next observation of
+    the step before (an environment that was reset in between). It begins at the latest with the
+    first step that was ever written.
 
     Args:
-        max_size: Number of steps that there is room for. Memory is taken as it is filled.
+        max_size: Number of steps that there is room for, rounded up to whole steps of all
+            environments. Memory is taken as it is filled.
         num_frames: Number K of observations in a history, at least 1.
-        num_envs: Number of environments, which take turns.
+        ndim: 1 if one environment's steps [T] are stored, 2 for those of several, [envs, T].
         padding: The frames before the first step of an episode: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
         is_init: Whether items have "is_init"; see :class:`HistoryStorage`.
@@ -42,13 +48,13 @@ class OnlineHistoryStorage(Storage):
 
     Raises:
         TypeError: If ``num_frames`` is not an integer.
-        ValueError: If a number is less than 1 or the padding is unknown.
+        ValueError: If a number is less than 1, the padding is unknown, or ``ndim`` is not 1 or 2.
 
     Example:
         >>> from torchrl.data import ReplayBuffer
         >>> from torchrl.envs import GymEnv
         >>> storage = OnlineHistoryStorage(1000, num_frames=8)
-        >>> buffer = ReplayBuffer(storage=storage, collate_fn=lambda batch: batch, batch_size=32)
+        >>> buffer = ReplayBuffer(storage=storage, batch_size=32)
         >>> _ = buffer.extend(GymEnv("CartPole-v1").rollout(100, break_when_any_done=False))
         >>> buffer.sample()["next", "history"].shape
         torch.Size([32, 8, 4])
@@ -59,214 +65,348 @@ class OnlineHistoryStorage(Storage):
         max_size: int,
         num_frames: int = 1,
         *,
-        num_envs: int = 1,
+        ndim: int = 1,
         padding: Padding = "same",
         is_init: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
         check_windows(num_frames, padding)
-        for name, value in (("max_size", max_size), ("num_envs", num_envs)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, but is {value}.")
-        super().__init__(max_size=max_size)
-        self.device = torch.device(device)
-        self.stride = num_envs
-        """From an item to that of the environment's next step."""
+        if max_size < 1:
+            raise ValueError(f"max_size must be at least 1, but is {max_size}.")
+        if ndim not in (1, 2):
+            raise ValueError(f"ndim must be 1 (steps) or 2 (environments, steps), but is {ndim}.")
+        super().__init__(max_size, device=device, ndim=ndim)
+        self.max_size: int
         self._num_frames = num_frames
         self._padding: Padding = padding if num_frames > 1 else "same"
         self._is_init = is_init
-        self._fields: dict[str, Tensor] = {}  # of each step: action and outcome
-        self._frames = torch.empty(0)  # of each step, then the newest of each environment
-        self._starts = torch.empty(0)  # of each step: the step where its episode begins
-        # Of each step: the place of its next observation among the last frames, or -1 if the
-        # environment's next step has it.
-        self._ends = torch.empty(0)
-        self._last_frames = torch.empty(0)  # of episodes, with room for more
-        self._size = self._num_ends = 0
+        self._envs = 1
+        self._count = 0  # steps of each environment so far; a step's time is counted from 0 on
+        # In these tables, the rows of a time are next to each other, one for each environment.
+        self._steps = TensorDict()  # action and outcome, of the newest times
+        self._frames = TensorDict()  # of the same times, K - 1 older ones and the next one
+        self._starts = torch.empty(0)  # of each step: the time at which its episode begins
+        self._ends = torch.empty(0)  # of each step: the number of its end frame, or -1
+        self._end_frames = EndFrames(TensorDict(batch_size=[1]))
 
     @property
-    def num_episode_ends(self) -> int:
+    def num_written(self) -> int:
+        """Number of steps that were written so far, overwritten ones included."""
+        return self._count * self._envs
+
+    @property
+    def reach(self) -> int:
+        """How many of the newest steps items are made of: all stored ones and the frames before."""
+        return self.max_size + (self._num_frames - 1) * self._envs
+
+    @property
+    def num_end_frames(self) -> int:
         """Number of frames that are stored because an episode ended."""
-        return self._num_ends
+        return self._end_frames.stop - self._end_frames.first
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
-        """Appends steps.
+        """Writes steps after the newest ones.
 
         Args:
-            cursor: Not read: steps are appended in the order in which they come.
-            data: Steps [T * num_envs] with "observation", "action", and under "next" "observation",
-                "reward", "terminated" and "done"; other entries are left out.
+            cursor: Where TorchRL's `RoundRobinWriter` puts them, which is in the order in which
+                they come.
+            data: Steps [T], or [T, envs] if the storage has two dimensions, with "observation"
+                (a tensor, or a tensordict of several), "action", and under "next" "observation",
+                "reward", "terminated" and "done"; of the other entries only "truncated" and
+                "action_mask" are stored.
             set_cursor: False if items are to be changed, which is refused.
 
         Raises:
-            RuntimeError: If there is no room left, or items are to be changed.
+            RuntimeError: If items are to be changed, or written out of order.
             ValueError: If the steps are not those of all environments.
         """
         if not set_cursor:
             raise RuntimeError("Stored steps cannot be changed, only added.")
-        data = data.reshape(-1).to(self.device)
-        begin, stop, envs = self._size, self._size + len(data), self.stride
-        if len(data) % envs:
+        index = torch.as_tensor(cursor if not isinstance(cursor, range) else list(cursor)).cpu()
+        data = data.unsqueeze(0) if index.ndim == 0 else data
+        if data.ndim != self.ndim:
+            names = "[T]" if self.ndim == 1 else "[envs, T]"
             raise ValueError(
-                f"{len(data)} steps cannot be those of {envs} environments; extend whole batches, "
-                "as batch.transpose(0, 1).reshape(-1)."
+                f"A storage of ndim={self.ndim} takes steps {names}, but these are "
+                f"{list(data.shape)} as stored; choose the ndim of the collector's batches."
             )
-        if stop > self.max_size:
+        steps = _select(data).to(self.device)
+        steps = steps if self.ndim == 2 else steps.unsqueeze(-1)  # [T, envs]
+        if not self.initialized:
+            self._make_room(steps.select("observation")[0], _fields_of(steps)[0])
+        if steps.shape[1] != self._envs:
+            raise ValueError(
+                f"These are steps of {steps.shape[1]} environments, but {self._envs} were stored."
+            )
+        expected = (self._count + torch.arange(len(steps))) % self._num_times
+        if not torch.equal(index.flatten(), expected):
             raise RuntimeError(
-                f"There is room for {self.max_size} steps, but not for {stop}; raise max_size."
+                f"The next step has the index {int(expected[0])}, but is to be written at "
+                f"{index.flatten()[:1].tolist()}: steps are stored in the order in which they come,"
+                " by a RoundRobinWriter, whose state belongs to that of the storage."
             )
-        if not self._fields:
-            outcome = data["next"].select(*_OUTCOMES, strict=False)
-            fields = {"action": data["action"], **outcome.to_dict()}
-            self._make_room(data["observation"], fields)
-        following, known = data["next", "observation"], min(begin, envs)
-        # Of the newest steps stored so far, and of the new ones.
-        following = torch.cat([self._frames[begin : begin + known], following])
-        done = torch.cat([self._fields["done"][begin - known : begin], data["next", "done"]])
-        goes_on = torch.zeros(len(data), dtype=torch.bool, device=self.device)
-        goes_on[envs - known :] = ~done[:-envs].squeeze(-1) & _equal(
-            following[:-envs], data["observation"][envs - known :]
-        )
-        is_init = data.get("is_init", None)
-        if is_init is not None:
-            goes_on &= ~is_init.squeeze(-1)
-        self._ends[begin:stop] = -1
-        ends = torch.cat([~goes_on[envs - known :], done[-envs:].squeeze(-1)])
-        ends &= self._ends[begin - known : stop] < 0
-        self._add_last_frames(following[ends], begin - known + ends.nonzero().squeeze(-1))
-        rows = torch.arange(begin, stop, device=self.device)
-        starts = torch.where(goes_on, -1, rows)
-        starts[:known] = starts[:known].maximum(self._starts[begin - known : begin])
-        self._starts[begin:stop] = starts.view(-1, envs).cummax(0).values.flatten()
-        self._frames[begin:stop] = data["observation"]
-        self._frames[stop : stop + envs] = following[-envs:]
-        for name, field in self._fields.items():
-            field[begin:stop] = data[name] if name == "action" else data["next", name]
-        self._size = stop
-        self._bump_mutation_revision()
+        for part in steps.split(self._num_times):
+            self._append(part)
+        self._finish()
 
-    def get(self, index: int | slice | Sequence[int] | Tensor) -> TensorDict:
-        """Gathers items, with the shape of the index; see :meth:`HistoryStorage.get`.
+    def _append(self, data: TensorDictBase) -> None:
+        """Writes steps [T, envs], at most as many as there is room for."""
+        begin, count, envs = self._count, len(data), self._envs
+        frames, following = (group.select("observation") for group in (data, data["next"]))
+        done = _flag(data, "done")
+        goes_on = torch.zeros(count, envs, dtype=torch.bool, device=self.device)
+        goes_on[1:] = ~done[:-1] & _equal(following[:-1], frames[1:])
+        last = self._rows(begin - 1, begin)  # the newest steps so far
+        if begin:
+            newest = self._frames[self._frame_rows(begin, begin + 1)]
+            goes_on[0] = ~_flag(self._steps[last], "done") & _equal(newest, frames[0])
+        if (is_init := data.get("is_init", None)) is not None:
+            goes_on &= ~is_init.reshape(count, envs)
+        if begin:  # whether they ended an episode may show only now
+            ended = ~goes_on[0] & (self._ends[last] < 0)
+            self._ends[last[ended]] = self._push(newest[ended])
+        starts = torch.arange(begin, begin + count, device=self.device).unsqueeze(-1)
+        starts = torch.where(goes_on, -1, starts)
+        if begin:
+            starts[0] = starts[0].maximum(self._starts[last])
+        ends = torch.full_like(starts, -1)
+        ended = torch.cat([~goes_on[1:], done[-1:]])
+        rows = self._rows(begin, begin + count)
+        self._end_frames.drop(int((self._ends[rows] >= 0).sum()))  # of the steps in their place
+        ends[ended] = self._push(following[ended])
+        self._starts[rows] = starts.cummax(0).values.flatten()
+        self._ends[rows] = ends.flatten()
+        self._steps[rows] = _fields_of(data).flatten()
+        self._frames[self._frame_rows(begin, begin + count + 1)] = torch.cat(
+            [frames, following[-1:]]
+        ).flatten()
+        self._count += count
 
-        Args:
-            index: Indices of items; negative ones count from the end.
+    def _push(self, frames: TensorDictBase) -> Tensor:
+        return self._end_frames.push(frames).to(self.device)
 
-        Raises:
-            IndexError: If there is no such item (on a CPU; elsewhere that is not checked).
-        """
-        row = as_indices(index, len(self), self.device)
-        if not self._fields:
-            return TensorDict({}, row.shape)
-        start = take(self._starts, row)
-        windows = find_windows(row, start, self._num_frames, self._padding, self.stride)
-        outcome = {name: take(field, row) for name, field in self._fields.items()}
-        action, history = outcome.pop("action"), windows.gather(self._frames)
-        item = make_item(history, self._next_frames(row), action, outcome, row.ndim)
-        return mark_starts(item, row == start) if self._is_init else item
+    def _entries(self, items: Tensor) -> Entries:
+        env = items % self._envs
+        newest = self._count - 1
+        time = newest - (newest - items // self._envs) % self._num_times
+        start = take(self._starts, items)
+        end = cache(partial(take, self._ends, items))
+        first_of_episode = (time == start) if self._is_init else None
+        entries = episode_entries(start * self._envs + env, first_of_episode)
 
-    def __len__(self) -> int:
-        return self._size
+        @cache
+        def windows() -> Windows:
+            found = find_windows(time, start, self._num_frames, self._padding)
+            return Windows(self._row(found.rows, env.unsqueeze(-1)), found.missing)
 
-    def contains(self, item: Any) -> Tensor:
-        """Whether there are items of these indices, bool of their shape."""
-        index = torch.as_tensor(item, device=self.device)
-        return (index < len(self)) & (index >= -len(self))
+        def following(table: Tensor, last: Tensor) -> Tensor:
+            frames = take(table, self._row(time + 1, env))
+            here = (end() < 0).view(*items.shape, *[1] * (frames.ndim - items.ndim))
+            return torch.where(here, frames, take(last, end().clamp(min=0) % len(last)))
+
+        def history(table: Tensor) -> Tensor:
+            return windows().gather(table)
+
+        for key, table in self._frames.items(True, True):
+            _, *leaf = (key,) if isinstance(key, str) else key
+            last = self._end_frames.table[key]
+            entries |= frame_entries(
+                tuple(leaf),
+                partial(_take_later, table, lambda: self._row(time, env)),
+                partial(history, table),
+                partial(following, table, last),
+                items.ndim,
+            )
+        for key, table in self._steps.items(True, True):
+            entries[key] = partial(take, table, items)
+        return entries
+
+    def _row(self, time: Tensor, env: Tensor) -> Tensor:
+        """Rows among the frames of times and environments, int64 [...]."""
+        return time % (self._num_times + self._num_frames) * self._envs + env
+
+    def _rows(self, begin: int, stop: int) -> Tensor:
+        """Rows of the steps of some times, int64 [(stop - begin) * envs]."""
+        return self._of_all_envs(torch.arange(begin, stop) % self._num_times)
+
+    def _frame_rows(self, begin: int, stop: int) -> Tensor:
+        """Rows of the frames of some times."""
+        return self._of_all_envs(torch.arange(begin, stop) % (self._num_times + self._num_frames))
+
+    def _of_all_envs(self, times: Tensor) -> Tensor:
+        rows = times.unsqueeze(-1) * self._envs + torch.arange(self._envs)
+        return rows.flatten().to(self.device)
+
+    @property
+    def _num_times(self) -> int:
+        """Number of steps of each environment that there is room for."""
+        return self.max_size // self._envs
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the steps, each frame once."""
-        return self.part(0, 0)
+        return self.part(0)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Replaces all steps by those of a return value of `state_dict`."""
         self._empty()
         self.add_part(state_dict)
 
-    def part(self, num_steps: int, num_episode_ends: int) -> dict[str, Any]:
-        """Returns what was added since an earlier time, to be saved piece by piece.
+    def part(self, num_written: int) -> dict[str, Any]:
+        """Returns what was written since an earlier time, to be saved piece by piece.
+
+        Pieces of steps among the newest :attr:`reach` ones restore the storage; older ones have no
+        use any more.
 
         Args:
-            num_steps: ``len(storage)`` at that time.
-            num_episode_ends: ``storage.num_episode_ends`` then.
+            num_written: :attr:`num_written` at that time.
         """
-        stop, known = len(self), min(num_steps, self.stride)
-        if stop == num_steps:
+        stop, since = self._count, num_written // self._envs
+        if stop == since:
             return {}
+        begin = max(since, stop - self._num_times)
+        # Frames before the first step are in the piece before, if that is still all there.
+        first_frame = begin if begin == since else max(0, begin - self._num_frames + 1)
+        # Whether the newest steps of that time ended an episode may have shown later.
+        first_end = max(0, begin - 1, stop - self._num_times)
+        ends = self._ends[self._rows(first_end, stop)]
+        first = int(torch.where(ends < 0, self._end_frames.stop, ends).min())
         return {
-            "fields": {name: field[num_steps:stop] for name, field in self._fields.items()},
-            "frames": self._frames[num_steps : stop + self.stride],
-            "starts": self._starts[num_steps:stop],
-            # Whether the newest steps of that time ended an episode may have shown later.
-            "ends": self._ends[num_steps - known : stop],
-            "last_frames": self._last_frames[num_episode_ends : self._num_ends],
+            "begin": begin,
+            "stop": stop,
+            "max_size": self.max_size,
+            "num_frames": self._num_frames,
+            "num_envs": self._envs,
+            "steps": self._steps[self._rows(begin, stop)].to_dict(),
+            "starts": self._starts[self._rows(begin, stop)],
+            "first_frame": first_frame,
+            "frames": self._frames[self._frame_rows(first_frame, stop + 1)].to_dict(),
+            "ends": ends,
+            "first_end_frame": first,
+            "end_frames": self._end_frames.read(first).to_dict(),
         }
 
     def add_part(self, part: dict[str, Any]) -> None:
-        """Adds what :meth:`part` returned when as many steps were stored as now."""
+        """Adds what :meth:`part` returned, after the pieces before it.
+
+        Raises:
+            ValueError: If it was saved by a storage of another size, or a piece before is missing.
+        """
         if not part:
             return
-        part = {name: _to(value, self.device) for name, value in part.items()}
-        begin, known = self._size, min(self._size, self.stride)
-        stop = begin + len(part["starts"])
-        if not self._fields:
-            self._make_room(part["frames"], part["fields"])
-        for name, field in self._fields.items():
-            field[begin:stop] = part["fields"][name]
-        self._frames[begin : stop + self.stride] = part["frames"]
-        self._starts[begin:stop] = part["starts"]
-        rows = torch.arange(0, device=self.device)
-        self._add_last_frames(part["last_frames"], rows)
-        self._ends[begin - known : stop] = part["ends"]
-        self._size = stop
-        self._bump_mutation_revision()
+        begin, stop, envs = (int(part[name]) for name in ("begin", "stop", "num_envs"))
+        frames, steps = _table(part["frames"], self.device), _table(part["steps"], self.device)
+        if not self.initialized:
+            self._make_room(frames[:envs], steps[:envs])
+        self._check_part(part)
+        self._steps[self._rows(begin, stop)] = steps
+        self._starts[self._rows(begin, stop)] = part["starts"].to(self.device)
+        self._frames[self._frame_rows(int(part["first_frame"]), stop + 1)] = frames
+        ends = part["ends"].to(self.device)
+        self._ends[self._rows(stop - len(ends) // envs, stop)] = ends
+        kept, first = self._ends[self._ends >= 0], int(part["first_end_frame"])
+        self._end_frames.first = int(kept.min()) if len(kept) else first
+        self._end_frames.stop = max(self._end_frames.stop, self._end_frames.first)
+        end_frames = _table(part["end_frames"], self.device)
+        self._end_frames.write(end_frames, first + torch.arange(len(end_frames)))
+        self._count = stop
+        self._finish()
+
+    def _check_part(self, part: dict[str, Any]) -> None:
+        mine = {"max_size": self.max_size, "num_frames": self._num_frames, "num_envs": self._envs}
+        for name, value in mine.items():
+            if int(part[name]) != value:
+                raise ValueError(
+                    f"These steps were saved with {name}={int(part[name])}, but this storage has "
+                    f"{name}={value}: load them into one of the same size."
+                )
+        begin, stop = int(part["begin"]), int(part["stop"])
+        if self._count and begin != self._count and stop - begin < self._num_times:
+            raise ValueError(
+                f"These steps begin at {begin * self._envs}, but {self.num_written} were written: "
+                "add all parts, in order."
+            )
 
     def _empty(self) -> None:
-        self._size = self._num_ends = 0
+        self._count = 0
+        self._ends.fill_(-1)
+        self._end_frames.first = self._end_frames.stop = 0
+        self._len = 0
+        self._bump_mutation_revision()
 
-    def _make_room(self, frames: Tensor, fields: dict[str, Tensor]) -> None:
-        """Allocates the memory, which the system provides where it is written."""
-
-        def room(like: Tensor, more: int = 0) -> Tensor:
-            return like.new_empty(self.max_size + more, *like.shape[1:])
-
-        self._frames = room(frames, self.stride)
-        self._last_frames = frames.new_zeros(1, *frames.shape[1:])
-        self._fields = {name: room(field) for name, field in fields.items()}
-        self._starts, self._ends = (
-            torch.empty(self.max_size, dtype=torch.int64, device=self.device) for _ in range(2)
-        )
-
-    def _add_last_frames(self, frames: Tensor, rows: Tensor) -> None:
-        """Adds next observations that no row has.
+    def _make_room(self, frames: TensorDictBase, steps: TensorDictBase) -> None:
+        """Allocates the memory, which the system provides where it is written.
 
         Args:
-            frames: [E, *obs].
-            rows: of the steps that they follow, int64 [E].
+            frames: Those of all environments at one time, [envs].
+            steps: The other entries, [envs].
         """
-        begin, stop = self._num_ends, self._num_ends + len(frames)
-        if stop > len(self._last_frames):
-            more = self._last_frames.new_zeros(2 * stop, *frames.shape[1:])
-            more[:begin] = self._last_frames[:begin]
-            self._last_frames = more
-        self._last_frames[begin:stop] = frames
-        self._ends[rows] = torch.arange(begin, begin + len(rows), device=self.device)
-        self._num_ends = stop
+        self._envs = len(frames)
+        num_times = -(-self.max_size // self._envs)
+        self.max_size = num_times * self._envs
 
-    def _next_frames(self, row: Tensor) -> Tensor:
-        """The next observations of steps, int64 [...] -> [..., *obs]."""
-        end = take(self._ends, row)
-        frames = take(self._frames, row + self.stride)
-        last = take(self._last_frames, end.clamp(min=0))
-        here = (end < 0).view(*row.shape, *[1] * (frames.ndim - row.ndim))
-        return torch.where(here, frames, last)
+        def room(like: TensorDictBase, times: int) -> TensorDict:
+            count = times * self._envs
+            tables = {
+                key: value.new_empty(count, *value.shape[1:])
+                for key, value in like.items(True, True)
+            }
+            return TensorDict(tables, [count], device=self.device)
+
+        self._steps, self._frames = (
+            room(steps, num_times),
+            room(frames, num_times + self._num_frames),
+        )
+        self._end_frames = EndFrames(frames.to(self.device))
+        self._starts, self._ends = (
+            torch.full((self.max_size,), -1, device=self.device) for _ in range(2)
+        )
+        self._total_shape_value = torch.Size([num_times, self._envs][: self.ndim])
+        self.initialized = True
+
+    def _finish(self) -> None:
+        """Tells TorchRL how much there is, and what is the newest."""
+        self._len = min(self._count, self._num_times) * self._envs
+        self._set_last_cursor((self._count - 1) % self._num_times)
+        self._bump_mutation_revision()
 
 
-def _equal(left: Tensor, right: Tensor) -> Tensor:
-    """Whether observations are the same, NaN included; [N, *obs] each -> bool [N]."""
-    same = (left == right) | ((left != left) & (right != right))
-    return same.flatten(1).all(dim=1)
+def _select(steps: TensorDictBase) -> TensorDictBase:
+    """Selects what is stored, and "is_init"."""
+    groups = ((steps, (), _HERE), (steps["next"], ("next",), _NEXT))
+    for group, prefix, names in groups:
+        for name in names:
+            if name not in group.keys() and name not in _OPTIONAL:  # noqa: SIM118 (a tensordict)
+                raise KeyError(
+                    f"Steps need {(*prefix, name)}, but have only {sorted(group.keys())}."
+                )
+    here = steps.select(*_HERE, strict=False)
+    return here.set("next", steps["next"].select(*_NEXT, strict=False))
 
 
-def _to(value: Any, device: torch.device) -> Any:
-    if isinstance(value, Tensor):
-        return value.to(device)
-    return {name: _to(entry, device) for name, entry in value.items()}
+def _fields_of(steps: TensorDictBase) -> TensorDictBase:
+    return steps.exclude("observation", "is_init", ("next", "observation"))
+
+
+def _take_later(table: Tensor, rows: Callable[[], Tensor]) -> Tensor:
+    return take(table, rows())
+
+
+def _flag(steps: TensorDictBase, name: str) -> Tensor:
+    """A flag of the steps, [..., 1] -> bool [...]."""
+    return steps["next", name].reshape(steps.shape)
+
+
+def _equal(left: TensorDictBase, right: TensorDictBase) -> Tensor:
+    """Whether observations [...] are the same, NaN included; bool [...]."""
+    same = torch.ones(left.shape, dtype=torch.bool, device=left.device)
+    for key, ours in left.items(True, True):
+        theirs = right[key]
+        equal = (ours == theirs) | ((ours != ours) & (theirs != theirs))
+        same &= equal.unsqueeze(-1).flatten(left.ndim).all(-1)
+    return same
+
+
+def _table(entries: dict[str, Any], device: torch.device) -> TensorDict:
+    """Makes a tensordict [R] of tensors [R, ...]."""
+    table = TensorDict(entries, device=device)
+    return table.auto_batch_size_(1)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
@@ -57,7 +56,6 @@ def make_replay_buffer(
     return ReplayBuffer(
         storage=storage,
         writer=ImmutableDatasetWriter(),
-        collate_fn=keep_batch,
         batch_size=batch_size,
         generator=torch.Generator(storage.device).manual_seed(seed),
         **{"sampler": make_sampler(slice_length), **settings},
@@ -71,12 +69,3 @@ def make_sampler(slice_length: int) -> RandomSampler:
         slice_length: Number of items of a slice.
     """
     return RandomSampler() if slice_length == 1 else ConsecutiveSampler(slice_length)
-
-
-def keep_batch(batch: TensorDict) -> TensorDict:
-    """Returns what a storage has gathered: the ``collate_fn`` of its buffer.
-
-    Args:
-        batch: The items.
-    """
-    return batch

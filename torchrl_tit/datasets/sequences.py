@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes
+from torchrl_tit.datasets.gathering import Entries
 from torchrl_tit.datasets.storage import EpisodeStorage
 
 
@@ -68,30 +68,35 @@ class SequenceStorage(EpisodeStorage):
         self._action_padding = action_padding
         self._steps = torch.arange(num_frames, device=self.device)
 
-    def _cut(self, row: Tensor, episode: Tensor) -> TensorDict:
+    def _cut(self, row: Tensor, episode: Tensor) -> Entries:
         row, last = row.unsqueeze(-1), self._last_rows[episode].unsqueeze(-1)
         length = (last - row + 1).clamp(max=len(self._steps))  # [..., 1]
         step = self._steps - (len(self._steps) - length)  # [..., K]: below 0 at padding
         mask = step >= 0
         rows = row + step.clamp(min=0)
-        observation = self._take("observation", rows)  # [..., K, *obs]
-        if self._mean is not None and self._std is not None:
-            observation = (observation - self._mean) / self._std
-        action = self._take("action", rows)  # [..., K, *action]
-        if not action.is_floating_point():
-            action = action.long()  # padding is negative
-        return_to_go = self._returns_to_go[rows]
-        timestep = rows - self._first_rows[episode].unsqueeze(-1)
-        return TensorDict(
-            {
-                "observation": _fill(observation, mask, 0),
-                "action": _fill(action, mask, self._action_padding),
-                "return_to_go": _fill(return_to_go, mask, 0).unsqueeze(-1),
-                "timestep": _fill(timestep, mask, 0),
-                "mask": mask,
-            },
-            mask.shape[:-1],
-        )
+
+        def observation() -> Tensor:
+            values = self._take("observation", rows)  # [..., K, *obs]
+            if self._mean is not None and self._std is not None:
+                values = (values - self._mean) / self._std
+            return _fill(values, mask, 0)
+
+        def action() -> Tensor:
+            values = self._take("action", rows)  # [..., K, *action]
+            if not values.is_floating_point():
+                values = values.long()  # padding is negative
+            return _fill(values, mask, self._action_padding)
+
+        def timestep() -> Tensor:
+            return _fill(rows - self._first_rows[episode].unsqueeze(-1), mask, 0)
+
+        return {
+            "observation": observation,
+            "action": action,
+            "return_to_go": lambda: _fill(self._returns_to_go[rows], mask, 0).unsqueeze(-1),
+            "timestep": timestep,
+            "mask": mask.clone,
+        }
 
 
 def _fill(values: Tensor, mask: Tensor, padding: float) -> Tensor:

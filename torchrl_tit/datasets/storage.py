@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 from typing import Any, NoReturn
 
 import torch
-from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import Storage
 
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.gathering import Entries, GatheringStorage, take
 
 
-class EpisodeStorage(Storage):
+class EpisodeStorage(GatheringStorage):
     """A read-only storage with one item for each step of episodes.
 
-    Any TorchRL sampler can draw the indices; uniform sampling of indices is uniform over steps.
+    TorchRL's samplers draw the indices; uniform sampling of indices is uniform over steps.
     Consecutive indices are consecutive steps, the last of an episode followed by the next episode.
 
     Args:
@@ -30,45 +28,32 @@ class EpisodeStorage(Storage):
     """
 
     def __init__(self, episodes: Episodes, counts: Tensor) -> None:
-        super().__init__(max_size=int(counts.sum()))
-        if self.max_size == 0:
+        count = int(counts.sum())
+        if count == 0:
             raise DatasetError(
                 episodes.source,
                 f"nothing can be drawn from its {len(episodes.lengths)} episodes: none is "
                 f"finished, or all their transitions are left out.",
             )
-        self.device = episodes.lengths.device
+        super().__init__(count, device=episodes.lengths.device)
+        self.initialized, self._len = True, count
+        self._total_shape_value = torch.Size([count])
         self._fields = dict(episodes.rows.items())  # [R, ...]
         self._first_rows = episodes.first_rows
         self._ends = counts.cumsum(0)  # [E]: index after the last item of each episode
         self._shifts = episodes.first_rows - (self._ends - counts)  # [E]: row minus index
 
-    def get(self, index: int | slice | Sequence[int] | Tensor) -> TensorDict:
-        """Gathers items.
-
-        Args:
-            index: Indices of items; negative ones count from the end.
-
-        Returns:
-            The items, with the shape of the index.
-
-        Raises:
-            IndexError: If there is no such item (on a CPU; elsewhere that is not checked).
-        """
-        index = as_indices(index, len(self), self.device)
-        episode = torch.searchsorted(self._ends, index, right=True)
-        return self._cut(index + self._shifts[episode], episode)
+    def _entries(self, items: Tensor) -> Entries:
+        episode = torch.searchsorted(self._ends, items.contiguous(), right=True)
+        return self._cut(items + self._shifts[episode], episode)
 
     @abstractmethod
-    def _cut(self, row: Tensor, episode: Tensor) -> TensorDict:
-        """Gathers the items of these rows and episodes, int64 [...] each."""
+    def _cut(self, row: Tensor, episode: Tensor) -> Entries:
+        """Says how to gather the items of these rows and episodes, int64 [...] each."""
 
     def _take(self, name: str, rows: Tensor) -> Tensor:
         """Rows of a field."""
         return take(self._fields[name], rows)
-
-    def __len__(self) -> int:
-        return self.max_size
 
     def set(self, *args: Any, **kwargs: Any) -> NoReturn:
         """Refuses to write."""
@@ -90,49 +75,9 @@ class EpisodeStorage(Storage):
         Raises:
             ValueError: If it was saved with other data.
         """
-        if state_dict["num_items"] != len(self):
+        count = int(state_dict["num_items"])
+        if count != len(self):
             raise ValueError(
-                f"The state was saved with {state_dict['num_items']} items, but there are "
-                f"{len(self)}; load the same data with the same settings."
+                f"The state was saved with {count} items, but there are {len(self)}; load the same "
+                "data with the same settings."
             )
-
-
-def as_indices(index: Any, count: int, device: torch.device) -> Tensor:
-    """Converts the index of items to int64 indices from 0 on.
-
-    Args:
-        index: an integer, slice, sequence or tensor; negative ones count from the end.
-        count: number of items.
-        device: where they are.
-
-    Raises:
-        IndexError: If there is no such item (on a CPU; elsewhere that is not checked).
-
-    Example:
-        >>> as_indices([0, -1], 5, torch.device("cpu"))
-        tensor([0, 4])
-    """
-    if isinstance(index, slice):
-        return torch.arange(*index.indices(count), device=device)
-    index = torch.as_tensor(index, device=device)
-    if index.device.type != "cpu":  # reading the values would synchronize
-        return torch.where(index < 0, index + count, index)
-    if not index.numel():
-        return index
-    low, high = map(int, index.aminmax())
-    if low < -count or high >= count:
-        raise IndexError(f"There are {count} items, and none at {low} or {high}.")
-    return torch.where(index < 0, index + count, index) if low < 0 else index
-
-
-def take(table: Tensor, rows: Tensor) -> Tensor:
-    """Gathers rows; ``index_select`` is several times as fast as indexing.
-
-    Args:
-        table: [R, *entry].
-        rows: int64 [...].
-
-    Returns:
-        [..., *entry].
-    """
-    return table.index_select(0, rows.flatten()).view((*rows.shape, *table.shape[1:]))

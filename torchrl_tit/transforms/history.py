@@ -9,8 +9,9 @@ from tensordict.utils import expand_right
 from torch import Tensor
 from torchrl.data import Composite, SliceSampler, TensorSpec
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import CatFrames, Transform, UnsqueezeTransform
+from torchrl.envs.transforms import CatFrames, Compose, ExcludeTransform, Transform
 
+from torchrl_tit.transforms.stored_histories import find_histories
 from torchrl_tit.windows import Padding
 
 
@@ -27,9 +28,8 @@ class History(CatFrames):
     before it, and its step rolls and copies the whole buffer. This class writes the same in about
     60% of the time for small observations. The buffers are in the environment's ``state_dict``.
 
-    In a replay buffer, `CatFrames`' own methods make histories of stored observations: as a
-    transform of sampled trajectories ``[..., T]``, or with
-    :meth:`make_rb_transform_and_sampler`.
+    As a transform of a replay buffer it makes the histories of sampled slices, see
+    :meth:`unfolding` and :meth:`make_rb_transform_and_sampler`.
 
     Args:
         num_frames: K, the number of observations in a history, at least 1.
@@ -167,33 +167,57 @@ class History(CatFrames):
         return spec.expand(shape).clone()
 
     def unfolding(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Makes the histories of stored steps, as `CatFrames` does.
+        """Makes the histories of stored steps, and of the next steps if these are stored.
+
+        A history begins at the latest where its slice does: at t = 0, at "is_init", after a step
+        that is done, and where an observation is not the next observation of the step before. What
+        came before a slice is not known: padding takes its place.
 
         Args:
-            tensordict: [..., T], the last dimension time, with ``("next", "done")``.
+            tensordict: [..., T], the last dimension (or the one that is named "time") time.
 
         Returns:
             The same tensordict with the histories [..., T, K, *obs].
+
+        Raises:
+            ValueError: If the steps are no slices, or nothing tells where slices begin.
         """
-        self._unsqueeze(self.in_keys, self.out_keys)(tensordict)
-        if self.N > 1:
-            self._frames(self.out_keys).unfolding(tensordict)
+        time = tensordict.ndim - 1
+        named = [axis for axis, name in enumerate(tensordict.names) if name == "time"]
+        if named and named[0] != time:
+            made = self.unfolding(tensordict.transpose(named[0], time))
+            return tensordict.update(made.transpose(named[0], time))
+        windows = find_histories(tensordict, self.in_keys, self.N, self.padding)
+        for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            frames = tensordict.get(in_key).flatten(0, time)
+            history = windows.gather(frames).movedim(time + 1, self.dim)
+            tensordict.set(out_key, history)
+            following = tensordict.get(unravel_key(("next", in_key)), None)
+            if following is not None:
+                kept = history.narrow(self.dim, 1, self.N - 1)
+                moved = torch.cat([kept, following.unsqueeze(self.dim)], self.dim)
+                tensordict.set(unravel_key(("next", out_key)), moved)
         return tensordict
 
     def make_rb_transform_and_sampler(
         self, batch_size: int, **sampler_kwargs: Any
     ) -> tuple[Transform, SliceSampler]:
-        """Builds what a replay buffer needs to store observations once and sample histories.
+        """Builds what a TorchRL storage needs to store observations once and sample histories.
 
-        See `CatFrames.make_rb_transform_and_sampler`: histories, and those under "next", are left
-        out when steps are stored, and made when they are sampled.
+        As `CatFrames.make_rb_transform_and_sampler`: histories, and those under "next", are left
+        out when steps are stored. To sample a step, the K - 1 steps before it are read too. So an
+        episode's first K - 1 steps are never drawn;
+        :class:`~torchrl_tit.datasets.OnlineHistoryStorage` draws every step and reads less.
 
         Args:
-            batch_size: The sampler's batch size.
-            **sampler_kwargs: Passed to `SliceSampler`.
+            batch_size: Not read; it is that of the buffer.
+            **sampler_kwargs: Passed to `SliceSampler`, which finds the episodes.
 
         Returns:
             The transform and the sampler.
+
+        Raises:
+            ValueError: If slices may be shorter than K steps.
 
         Example:
             >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -210,21 +234,28 @@ class History(CatFrames):
             >>> buffer.sample()["next", "history"].shape
             torch.Size([8, 4, 4])
         """
-        transform, sampler = self._frames(self.out_keys).make_rb_transform_and_sampler(
-            batch_size, **sampler_kwargs
+        if not sampler_kwargs.get("strict_length", True):
+            raise ValueError(
+                f"slices of {self.N} steps must be whole, so strict_length=False cannot be: use an "
+                "OnlineHistoryStorage, which pads the histories of an episode's first steps"
+            )
+        sampler = SliceSampler(slice_len=self.N, **sampler_kwargs)
+        sampler._batch_size_multiplier = self.N  # as CatFrames does
+        history = History(
+            self.N,
+            self.in_keys,
+            self.out_keys,
+            observation_ndim=self._observation_ndim,
+            padding=self.padding,
         )
-        both = [[*keys, *(("next", key) for key in keys)] for keys in (self.in_keys, self.out_keys)]
-        transform.insert(0, self._unsqueeze(*both))
+        made = [*self.out_keys, *(unravel_key(("next", key)) for key in self.out_keys)]
+        transform = Compose(
+            lambda steps: steps.reshape(-1, self.N),
+            history,
+            lambda slices: slices[:, -1],
+            ExcludeTransform(*made, inverse=True),
+        )
         return transform, sampler
-
-    def _unsqueeze(
-        self, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
-    ) -> UnsqueezeTransform:
-        return UnsqueezeTransform(self.dim, in_keys=in_keys, out_keys=out_keys)
-
-    def _frames(self, keys: Sequence[NestedKey]) -> CatFrames:
-        """Builds TorchRL's `CatFrames`, for observations that already have the new axis."""
-        return CatFrames(self.N, self.dim, in_keys=keys, padding=self.padding, reset_key="_reset")
 
     def _check_observation(self, key: NestedKey, specs: Composite) -> None:
         if key not in specs.keys(True, True):

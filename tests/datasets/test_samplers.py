@@ -1,0 +1,307 @@
+"""TorchRL's samplers, indices, transforms and prefetching, on storages that gather their items."""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import (
+    LazyTensorStorage,
+    PrioritizedSampler,
+    RandomSampler,
+    ReplayBuffer,
+    SamplerWithoutReplacement,
+    SliceSampler,
+    SliceSamplerWithoutReplacement,
+    TensorDictReplayBuffer,
+)
+from torchrl.envs import RenameTransform
+from torchrl.modules import set_recurrent_mode
+
+from tests.datasets import segment_trees
+from tests.datasets.rollouts import Transitions
+from tests.datasets.several import newest, play_several
+from torchrl_tit import Backbone, EnhancedTIT
+from torchrl_tit.datasets import (
+    ConsecutiveSampler,
+    Episodes,
+    HistoryStorage,
+    OnlineHistoryStorage,
+    SequenceStorage,
+    episodes_from_arrays,
+    gathering,
+)
+from torchrl_tit.windows import Windows
+
+Make = Callable[..., ReplayBuffer]
+
+
+@pytest.fixture(scope="module")
+def episodes(rolled: Transitions) -> Episodes:
+    return episodes_from_arrays(**rolled)
+
+
+def on_data(episodes: Episodes) -> Make:
+    def make(kind: Any = ReplayBuffer, **settings: Any) -> ReplayBuffer:
+        # The last transition of truncated episodes is left out, so nothing marks their ends.
+        storage = HistoryStorage(episodes, 3, is_init=True, time_limits="drop")
+        return kind(storage=storage, batch_size=24, **settings)
+
+    return make
+
+
+def on_ring(envs: int | None) -> Make:
+    def make(kind: Any = ReplayBuffer, **settings: Any) -> ReplayBuffer:
+        storage = OnlineHistoryStorage(
+            40 * (envs or 1), 3, ndim=1 if envs is None else 2, is_init=True
+        )
+        buffer = kind(storage=storage, batch_size=24, **settings)
+        steps = play_several(envs, 60, 3, "same").exclude("history", ("next", "history"))
+        for batch in steps.split(25, -1):
+            buffer.extend(batch)
+        return buffer
+
+    return make
+
+
+@pytest.fixture(params=["data", "one", "many"])
+def make(request: pytest.FixtureRequest, episodes: Episodes) -> Make:
+    return {"data": on_data(episodes), "one": on_ring(None), "many": on_ring(3)}[request.param]
+
+
+SAMPLERS: dict[str, Callable[[], Any]] = {
+    "random": RandomSampler,
+    "without replacement": SamplerWithoutReplacement,
+    "prioritized": lambda: PrioritizedSampler(1000, alpha=0.7, beta=0.5),
+    "consecutive": lambda: ConsecutiveSampler(4),
+    "slices": lambda: SliceSampler(slice_len=2),
+    "cached slices": lambda: SliceSampler(num_slices=12, cache_values=True),
+    "short slices": lambda: SliceSampler(slice_len=4, strict_length=False),
+    "slices without replacement": lambda: SliceSamplerWithoutReplacement(
+        slice_len=2, strict_length=False
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_samplers(make: Make, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    segment_trees.provide(monkeypatch)
+    for kind in (ReplayBuffer, TensorDictReplayBuffer):
+        buffer = make(kind, sampler=SAMPLERS[name](), prefetch=2)
+        seen = []
+        for _ in range(6):
+            batch, info = buffer.sample(return_info=True)
+            index = info["index"]
+            seen.append(torch.stack(index, -1) if isinstance(index, tuple) else index)
+            expected = buffer.storage.get(index)
+            for key in set(expected.keys(True, True)) - set(info):
+                assert torch.equal(batch[key], expected[key]), key
+            if "slices" in name:
+                check_slices(batch, marked=kind is TensorDictReplayBuffer)
+        # Old and new, and of all environments.
+        width = seen[0].shape[-1] if buffer.storage.ndim > 1 else 1
+        drawn = torch.cat([x.reshape(-1, width) for x in seen])
+        assert (drawn.amax(0) >= torch.tensor(buffer.storage.shape) * 3 // 4 - 1).all()
+        if name == "prioritized":
+            every = torch.ones(buffer.storage.shape).nonzero()
+            buffer.update_priority(every.squeeze(-1), torch.full((len(every),), 1e-9))
+            buffer.update_priority(drawn[:1].squeeze(-1), torch.ones(1))
+            buffer._prefetch_queue.clear()
+            index = buffer.sample(24, return_info=True)[1]["index"]
+            index = torch.stack(index, -1) if isinstance(index, tuple) else index.unsqueeze(-1)
+            assert (index == drawn[0]).all(-1).float().mean() > 0.9
+
+
+def check_slices(batch: TensorDictBase, marked: bool) -> None:
+    """Steps follow one another within slices, which never leave an episode."""
+    episode, done = batch["episode"], batch["next", "done"][:, 0]
+    name = "observation" if isinstance(batch["observation"], Tensor) else ("observation", "pixels")
+    following = ("next", *((name,) if isinstance(name, str) else name))
+    same = (batch[name][1:] == batch[following][:-1]).flatten(1).all(1)
+    assert same.any()
+    assert not (same & (episode[1:] != episode[:-1])).any()
+    assert not (same & done[:-1]).any()
+    if marked:
+        assert torch.equal(batch["is_init"][1:, 0], ~same)
+        assert torch.equal(done[:-1], ~same)
+
+
+@pytest.mark.parametrize("strict_length", [True, False])
+def test_a_backbone_reads_flat_batches_of_slices(make: Make, strict_length: bool) -> None:
+    sampler = SliceSampler(slice_len=4, strict_length=strict_length)
+    buffer = make(TensorDictReplayBuffer, sampler=sampler)
+    torch.manual_seed(0)
+    batch = buffer.sample()
+    if not isinstance(batch["history"], Tensor):  # one of several observations
+        for group in (batch, batch["next"]):
+            group.update({key: group[key, "state"].double() for key in ("history", "observation")})
+    batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
+    shape = batch["observation"].shape[1:]
+    network = EnhancedTIT(shape, num_frames=3, embed_dim=8, num_blocks=1, features_dim=4).double()
+    backbone = Backbone(network)
+    for group in (batch, batch["next"]):
+        expected = backbone(group.select("history"))["features"]
+        with set_recurrent_mode(True):
+            features = backbone(group.copy())["features"]
+        torch.testing.assert_close(features, expected)
+
+
+INDICES: list[Any] = [
+    0,
+    -3,
+    np.int64(4),
+    slice(None),
+    slice(3, -2, 2),
+    range(2, 9, 3),
+    [0, 5, -1],
+    [],
+    np.array([1, -2]),
+    torch.tensor(7),
+    torch.tensor([[0, 5], [-1, 2]], dtype=torch.int32),
+    "mask",
+    "numpy mask",
+    "list mask",
+    "full mask",
+    "short mask",
+    "long mask",
+    (slice(None), 1),
+    (torch.tensor([4, 2]), torch.tensor([-1, 0])),
+    (torch.tensor([4, 2]),),
+    (torch.tensor([4, 2]), torch.tensor([3, 0])),
+    10**6,
+    -(10**6),
+    [0, 10**6],
+    torch.tensor([0.0, 1.0]),
+    ...,
+]
+
+
+@pytest.mark.parametrize("index", INDICES, ids=str)
+def test_indices_are_those_of_torchrls_storages(make: Make, index: Any) -> None:
+    """Compared with a TorchRL storage of the same items; what it refuses, we refuse."""
+    storage = make().storage
+    items = storage.get(slice(None))
+    theirs = LazyTensorStorage(items.numel(), ndim=storage.ndim)
+    theirs.set(range(len(items)), items)
+    if isinstance(index, str):
+        mask = torch.arange(len(items)) % 3 == 1
+        index = {
+            "mask": mask,
+            "numpy mask": mask.numpy(),
+            "list mask": mask.tolist(),
+            "full mask": torch.rand(storage.shape) < 0.3,
+            "short mask": mask[:-1],
+            "long mask": torch.cat([mask, mask]),
+        }[index]
+    expected = None
+    with contextlib.suppress(IndexError):
+        expected = theirs.get(index)
+    if expected is None:
+        with pytest.raises(IndexError) as error:
+            storage.get(index)
+        assert "\n" not in str(error.value)
+        return
+    found = storage.get(index)
+    assert found.batch_size == expected.batch_size
+    assert (found == expected).all()
+    assert (storage[index] == expected).all()
+
+
+def test_finding_episodes_gathers_no_histories(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor does what a slice sampler asks about the steps it drew."""
+    buffer = make(sampler=SliceSampler(slice_len=2))
+    buffer.sample()
+    taken: list[int] = []
+    gathered: list[int] = []
+    gather = Windows.gather
+
+    def take(table: Tensor, rows: Tensor) -> Tensor:
+        taken.append(rows.numel() * table[0].numel())
+        return gathering.take(table, rows)
+
+    def counted(windows: Windows, frames: Tensor) -> Tensor:
+        gathered.append(windows.rows.numel())
+        return gather(windows, frames)
+
+    monkeypatch.setattr(Windows, "gather", counted)
+    for module in ("histories", "online", "storage"):
+        monkeypatch.setattr(f"torchrl_tit.datasets.{module}.take", take)
+    buffer.sample()
+    assert set(filter(None, gathered)) == {24 * 3}
+    assert max(taken) <= max(24 * 12, len(buffer))  # episodes of all, frames of 24
+
+
+def test_transforms_and_their_batches(make: Make) -> None:
+    rename = RenameTransform(["history"], ["past"])
+    buffer = make(transform=rename)
+    buffer.append_transform(lambda batch: batch.set("twice", 2 * batch["next", "reward"]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        batch = buffer.sample()
+    assert "history" not in batch.keys()  # noqa: SIM118 (a tensordict)
+    assert torch.equal(batch["twice"], 2 * batch["next", "reward"])
+
+
+def test_sequences_need_no_collate_fn(episodes: Episodes) -> None:
+    batch = ReplayBuffer(storage=SequenceStorage(episodes, 5), batch_size=6).sample()
+    assert batch["observation"].shape == (6, 5, 11)
+
+
+def drawn(sampler: ConsecutiveSampler, storage: Any) -> Tensor:
+    index, _ = sampler.sample(storage, 40_000)
+    flat = index[0] * storage.shape[1] + index[1] if isinstance(index, tuple) else index
+    return flat.flatten().bincount(minlength=len(storage))
+
+
+def test_consecutive_steps_are_drawn_equally(make: Make) -> None:
+    """The ends of episodes too; only the oldest and newest steps are drawn less often."""
+    storage = make().storage
+    counts = drawn(ConsecutiveSampler(4), storage).view(storage.shape)
+    if storage._last_cursor_index is not None:
+        counts = counts.roll(-storage._last_cursor_index - 1, 0)  # the oldest first
+    expected = 40_000 / (len(storage) - 3 * storage.shape[1:].numel())
+    assert ((counts[3:-3] - expected).abs() < 6 * (4 * expected) ** 0.5).all()
+    assert (counts[[0, -1]] > 0).all()
+    assert (counts[[0, -1]] < 0.5 * expected).all()
+
+
+def test_consecutive_steps_are_those_of_an_environment(make: Make) -> None:
+    buffer = make(sampler=ConsecutiveSampler(4))
+    for _ in range(10):
+        batch = buffer.sample()
+        assert batch.batch_size == (6, 4)
+        goes_on = ~batch["is_init"][:, 1:, 0]
+        assert torch.equal(batch["next", "is_init"], batch["is_init"])
+        leaves = batch.select("history", ("next", "history")).flatten_keys()
+        for name, history in batch.select("history").flatten_keys().items():
+            following = leaves[f"next.{name}"]
+            assert torch.equal(following[:, :-1][goes_on], history[:, 1:][goes_on])
+
+
+def test_slices_that_cannot_be_drawn(make: Make) -> None:
+    storage = make().storage
+    with pytest.raises(ValueError, match="slice_length must be at least 1, but is 0"):
+        ConsecutiveSampler(0)
+    with pytest.raises(ValueError, match="12 steps cannot be divided into slices of 5"):
+        ConsecutiveSampler(5).sample(storage, 12)
+    with pytest.raises(ValueError, match="consecutive steps, which is less than a slice of 1000"):
+        ConsecutiveSampler(1000).sample(storage, 2000)
+    with pytest.raises(ValueError, match="There are 0 consecutive steps"):
+        ConsecutiveSampler(2).sample(OnlineHistoryStorage(10, ndim=2), 4)
+
+
+def test_a_mask_of_what_a_ring_holds() -> None:
+    storage = on_ring(3)().storage
+    expected = newest(play_several(3, 60, 3, "same"), 60, 120)
+    mask = expected["next", "done"].squeeze(-1)
+    chosen = storage[mask]
+    assert chosen["next", "done"].all()
+    assert torch.equal(chosen["history", "cell"], expected["history", "cell"][mask])
+    assert isinstance(chosen, TensorDict)
