@@ -14,7 +14,9 @@ IMAGE = (8, 8)
 
 NETWORKS = {
     "enhanced": lambda k: EnhancedTIT((3,), k, **SMALL),
-    "vanilla": lambda k: VanillaTIT((3,), k, temporal_position_encoding=k > 1, **SMALL),
+    "vanilla": lambda k: VanillaTIT(
+        (3,), k, temporal_positions="learned" if k > 1 else "none", **SMALL
+    ),
     "without dense": lambda k: EnhancedTIT((3,), k, dense=False, **SMALL),
     "without inner": lambda k: EnhancedTIT((3,), k, inner=False, **SMALL),
     "images": lambda k: EnhancedTIT(IMAGE, k, patch_size=4, **SMALL),

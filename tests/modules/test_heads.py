@@ -1,15 +1,42 @@
 """Policy and value heads."""
 
+from itertools import product
+
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical, OneHot, Unbounded
+from torch.nn.functional import one_hot
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    Unbounded,
+)
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import ClipPPOLoss
 
 from tests.numerics import assert_near
 from torchrl_tit.modules import make_actor, make_value
 
 pytestmark = pytest.mark.numerics
+
+NVEC = torch.tensor([[2, 3], [1, 4]])
+DISCRETE = {
+    "categorical": (Categorical(3), [3], {}),
+    "categorical-int32": (Categorical(3, dtype=torch.int32), [3], {}),
+    "several-categorical": (Categorical(3, shape=(2,)), [3, 3], {"batch_dims": 0}),
+    "one-hot": (OneHot(3), [3], {}),
+    "multi-categorical": (MultiCategorical([2, 3]), [2, 3], {}),
+    "multi-categorical-matrix": (MultiCategorical(NVEC), [2, 3, 1, 4], {"batch_dims": 0}),
+    "multi-one-hot": (MultiOneHot([2, 3]), [2, 3], {}),
+    "binary": (Binary(3), [2, 2, 2], {}),
+    "binary-bool-matrix": (Binary(shape=(1, 2), dtype=torch.bool), [2, 2], {"batch_dims": 0}),
+}
+MASKABLE = [name for name in DISCRETE if "binary" not in name]
 
 
 def features(n=200):
@@ -24,35 +51,173 @@ def spread(actor):
     return actor
 
 
-@pytest.mark.parametrize("spec", [Categorical(3), OneHot(3)])
-def test_discrete(spec):
-    actor = spread(make_actor(16, spec))
-    with set_exploration_type(ExplorationType.RANDOM):
-        td = actor(features())
-    logits = td["logits"].log_softmax(-1)
-    index = td["action"] if td["action"].ndim == 1 else td["action"].long().argmax(-1)
-    assert_near(td["action_log_prob"], logits.gather(-1, index.unsqueeze(-1)).squeeze(-1))
-    assert len(set(index.tolist())) == 3
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        td = actor(features())
-    action = td["action"] if td["action"].ndim == 1 else td["action"].long().argmax(-1)
-    assert torch.equal(action, td["logits"].argmax(-1))
+def act(actor, td, kind=ExplorationType.RANDOM):
+    with set_exploration_type(kind):
+        return actor(td.clone())
 
 
-@pytest.mark.parametrize("spec", [Bounded(-1, 1, (2,)), Unbounded((2,))])
-def test_continuous(spec):
-    actor = make_actor(16, spec)
-    with set_exploration_type(ExplorationType.RANDOM):
-        td = actor(features())
-    assert torch.equal(td["scale"], torch.ones(200, 2))
+def all_actions(spec, sizes):
+    """Every action of a spec, [actions, *shape], and the options that it consists of."""
+    options = torch.tensor(list(product(*map(range, sizes))))
+    if isinstance(spec, OneHot):
+        parts = [one_hot(x, n) for x, n in zip(options.unbind(-1), sizes, strict=True)]
+        return torch.cat(parts, -1).to(spec.dtype), options
+    return options.reshape(-1, *spec.shape).to(spec.dtype), options
+
+
+def probabilities(actor, td, spec, sizes, options):
+    """Probabilities of all actions by hand, [rows, actions]."""
+    weight, bias = actor.parameters()
+    flat = td["features"] @ weight.T + bias
+    if isinstance(spec, Binary):  # the logit of "on"; that of "off" is 0
+        flat = torch.stack([torch.zeros_like(flat), flat], -1).flatten(-2)
+    if "action_mask" in td:
+        flat = flat.masked_fill(~td["action_mask"], -torch.inf)
+    components = [logits.softmax(-1) for logits in flat.split(sizes, -1)]
+    chosen = [p[:, x] for p, x in zip(components, options.unbind(-1), strict=True)]
+    return torch.stack(chosen).prod(0)
+
+
+def some_mask(rows, sizes):
+    """Random masks [rows, options] that allow an option of each component at least."""
+    mask = torch.rand(rows, sum(sizes)) < 0.5
+    for part in mask.split(sizes, -1):
+        part.scatter_(-1, torch.randint(part.shape[-1], (rows, 1)), True)
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("name", "masked"),
+    [*((name, False) for name in DISCRETE), *((name, True) for name in MASKABLE)],
+)
+def test_discrete_actions_against_enumeration(name, masked):
+    spec, sizes, settings = DISCRETE[name]
+    actor = make_actor(16, spec, mask_key="action_mask" if masked else None, **settings)
+    spread(actor).double()
+    td = features(5).double()
+    if masked:
+        td["action_mask"] = some_mask(5, sizes)
+    actions, options = all_actions(spec, sizes)
+    expected = probabilities(actor, td, spec, sizes, options)
+    assert_near(expected.sum(-1), torch.ones(5, dtype=torch.float64))
+
+    policy = actor.get_dist(td)
+    each = actions.unsqueeze(1).expand(-1, 5, *spec.shape)
+    assert_near(policy.log_prob(each).exp().T, expected)
+    assert_near(policy.entropy(), torch.special.entr(expected).sum(-1))
+
+    # Compiled losses draw samples of samples.
+    assert policy.log_prob(policy.sample((2,))).shape == (2, 5)
+
+    likely = act(actor, td, ExplorationType.DETERMINISTIC)
+    assert torch.equal(likely["action"], actions[expected.argmax(-1)])
+
+    drawn = act(actor, td[:1].expand(20_000))
+    assert drawn["action"].shape == (20_000, *spec.shape)
+    assert drawn["action"].dtype == spec.dtype
+    assert spec.expand(20, *spec.shape).is_in(drawn["action"][:20])
+    same = drawn["action"].reshape(20_000, 1, -1) == actions.reshape(1, len(actions), -1)
+    which = same.all(-1).long().argmax(-1)
+    assert_near(drawn["action_log_prob"], expected[0].log()[which])
+    shares = which.bincount(minlength=len(actions)) / 20_000
+    assert (shares - expected[0]).abs().max() < 0.02
+    assert not shares[expected[0] == 0].any()
+
+
+@pytest.mark.parametrize("name", [name for name in DISCRETE if "binary" in name or "hot" in name])
+def test_the_mode_of_a_tie_is_an_action(name):
+    spec, _, settings = DISCRETE[name]
+    td = TensorDict({"features": torch.zeros(2, 16)}, [2])  # equal logits
+    action = act(make_actor(16, spec, **settings), td, ExplorationType.DETERMINISTIC)["action"]
+    assert spec.expand(2, *spec.shape).is_in(action)
+
+
+@pytest.mark.parametrize("shape", [(), (2,), (2, 3)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_continuous(shape, dtype):
+    spec = Unbounded(shape, dtype=dtype)
+    actor = make_actor(16, spec, batch_dims=0)
+    td = act(actor, features())
+    assert td["action"].shape == (200, *shape)
+    assert td["action"].dtype == dtype
+    assert torch.equal(td["scale"], torch.ones(200, *shape, dtype=dtype))
     assert td["action"].abs().max() > 1.5  # neither squashed nor clipped
-    expected = torch.distributions.Normal(td["loc"], td["scale"]).log_prob(td["action"]).sum(-1)
-    assert_near(td["action_log_prob"], expected)
-    log_scale = [p for p in actor.parameters() if p.shape == (2,) and not p.any()]
+    normal = torch.distributions.Normal(td["loc"], td["scale"])
+    assert_near(td["action_log_prob"], normal.log_prob(td["action"]).reshape(200, -1).sum(-1))
+    assert_near(actor.get_dist(td).entropy(), normal.entropy().reshape(200, -1).sum(-1))
+    log_scale = [p for p in actor.parameters() if not p.any() and p.shape == (spec.shape.numel(),)]
     assert log_scale  # state-independent, learned, at 0
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        td = actor(features())
+    td = act(actor, features(), ExplorationType.DETERMINISTIC)
     assert torch.equal(td["action"], td["loc"])
+
+
+@pytest.mark.parametrize("name", ["categorical", "one-hot", "multi-categorical", "multi-one-hot"])
+def test_a_batched_spec_gives_the_same_head(name):
+    spec, _, _ = DISCRETE[name]
+    td = act(make_actor(16, spec.expand(4, 7, *spec.shape)), features(28).reshape(4, 7))
+    assert td["action"].shape == (4, 7, *spec.shape)
+
+
+@pytest.mark.parametrize("spec", [Bounded(-1, 1, (8, 2)), Unbounded((8, 2)), Binary(shape=(8, 2))])
+def test_a_batched_spec_that_does_not_tell_is_refused(spec):
+    with pytest.raises(ValueError, match=r"shape=\[8, 2\].*: pass env.action_spec_unbatched"):
+        make_actor(16, spec)
+    assert act(make_actor(16, spec, batch_dims=1), features(8))["action"].shape == (8, 2)
+
+
+@pytest.mark.parametrize("name", MASKABLE)
+def test_ppo_loss_with_masks(name):
+    """One log-probability a step; gradients are finite, and 0 for what is never allowed."""
+    spec, sizes, settings = DISCRETE[name]
+    actor = spread(make_actor(16, spec, mask_key="action_mask", **settings))
+    td = features(6)
+    td["action_mask"] = some_mask(6, sizes)
+    forbidden = sizes[0] - 1 if sizes[0] > 1 else None
+    if forbidden is not None:
+        td["action_mask"][:, forbidden] = False
+        td["action_mask"][:, 0] = True
+    td = act(actor, td).detach()
+    td["advantage"], td["value_target"] = torch.randn(6, 1), torch.randn(6, 1)
+    loss = ClipPPOLoss(
+        actor,
+        make_value(16),
+        entropy_coeff=0.1,
+        functional=False,
+        log_explained_variance=False,
+    )
+    with torch.no_grad():
+        for parameter in actor.parameters():
+            parameter.mul_(1.1)
+    terms = loss(td)
+    expected = (td["action_log_prob"] - actor.get_dist(td).log_prob(td["action"])).mean()
+    assert_near(terms["kl_approx"], expected.detach())
+    (terms["loss_objective"] + terms["loss_entropy"]).backward()
+    weight = next(actor.parameters()).grad
+    assert weight.isfinite().all()
+    assert weight.any()
+    if forbidden is not None:
+        assert not weight[forbidden].any()
+
+
+def test_vmap_and_compile():
+    spec, sizes, _ = DISCRETE["multi-one-hot"]
+    actor = make_actor(16, spec, mask_key="action_mask")
+    td = act(actor, features(6).set("action_mask", some_mask(6, sizes)))
+    assert_near(torch.vmap(actor.log_prob)(td), td["action_log_prob"])
+    compiled = torch.compile(actor.log_prob, backend="eager")
+    assert_near(compiled(td), td["action_log_prob"])
+
+
+def test_a_row_without_any_action_is_refused():
+    actor = make_actor(16, MultiCategorical([2, 3]), mask_key=("agent", "mask"))
+    mask = torch.ones(4, 5, dtype=torch.bool)
+    mask[2, 2:] = False
+    with pytest.raises(ValueError, match=r"\('agent', 'mask'\) allows no action at \[2, 1\]"):
+        actor(features(4).set(("agent", "mask"), mask))
+    with pytest.raises(ValueError, match=r"bool mask of the shape \[4, 5\], but is torch.int8"):
+        actor(features(4).set(("agent", "mask"), mask.to(torch.int8)))
+    with pytest.raises(ValueError, match="no action mask for the action space Binary"):
+        make_actor(16, Binary(2), mask_key="action_mask")
 
 
 def test_value_and_keys():
@@ -64,7 +229,15 @@ def test_value_and_keys():
     )
 
 
-@pytest.mark.parametrize("spec", [Unbounded((2, 3)), Unbounded((2,), dtype=torch.int64)])
+@pytest.mark.parametrize(
+    "spec", [Unbounded((2,), dtype=torch.int64), Composite(a=Categorical(2), b=Categorical(2))]
+)
 def test_other_action_spaces_are_refused(spec):
     with pytest.raises(ValueError, match="no policy head"):
         make_actor(16, spec)
+    with pytest.raises(ValueError, match="batch_dims must be at least 0 and at most 1"):
+        make_actor(16, OneHot(3), batch_dims=2)
+    with pytest.raises(ValueError, match=r"shape \[8, 3\] .* raise batch_dims"):
+        make_actor(16, OneHot(3, shape=(8, 3)), batch_dims=0)
+    with pytest.raises(ValueError, match="other numbers of options in each row"):
+        make_actor(16, MultiCategorical(NVEC))

@@ -12,6 +12,7 @@ from torchrl_tit.modules.decision_transformer import (
 from torchrl_tit.modules.frame_cache import FrameCache
 from torchrl_tit.modules.heads import make_actor, make_value
 from torchrl_tit.modules.many_actions import ManyActions
+from torchrl_tit.modules.observation_keys import history_keys
 from torchrl_tit.modules.squashed_actor import make_squashed_actor
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "FrameCache",
     "ManyActions",
     "acting",
+    "history_keys",
     "make_actor",
     "make_dt_actor",
     "make_dt_backbone",

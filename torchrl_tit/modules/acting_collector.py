@@ -32,6 +32,13 @@ class ActingCollector(Collector):
         >>> in_processes = partial(MultiSyncCollector, [env], collector_class=ActingCollector)
     """
 
+    def __bool__(self) -> bool:
+        """True: Ray asks when a method failed, and TorchRL's collectors would raise for a length.
+
+        The error that made it fail would then be lost.
+        """
+        return True
+
     def rollout(self) -> TensorDictBase:
         """Collects a batch."""
         with acting(self.policy):

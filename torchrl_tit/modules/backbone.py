@@ -79,7 +79,8 @@ class Backbone(TensorDictModule):
             module that maps one tensor for each of ``in_keys`` to one for each of ``out_keys``.
         in_keys: keys, nested or not, of the history of each observation (see
             :class:`~torchrl_tit.transforms.History`), in the order of the network, then of the
-            history encoder's further inputs. A single key can be given as a string.
+            history encoder's further inputs. A single key can be given as a string. Of several
+            observations, :func:`~torchrl_tit.modules.history_keys` names them.
         out_keys: keys of the features: one, or one for the policy and one for the value. A single
             key can be given as a string.
         autocast: dtype of matrix products, such as ``torch.bfloat16``; weights and features keep

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any, NamedTuple
+
+import torch
 from tensordict import NestedKey
 from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
-from torch import distributions, nn
-from torchrl.data import Categorical, OneHot, TensorSpec
+from torch import Tensor, distributions, nn
+from torch.nn.functional import pad
+from torchrl.data import Binary, Categorical, OneHot, TensorSpec
 from torchrl.modules import (
     IndependentNormal,
-    OneHotCategorical,
+    MaskedCategorical,
     ProbabilisticActor,
     ValueOperator,
 )
 
 from torchrl_tit.layers import init_orthogonal_
+from torchrl_tit.modules.action_specs import action_shape, describe, numbers_of_options
+from torchrl_tit.modules.distributions import (
+    IndependentBernoulli,
+    IndependentCategorical,
+    IndependentOneHotCategorical,
+)
 
 
 def make_actor(
@@ -22,65 +33,81 @@ def make_actor(
     *,
     in_key: NestedKey = "features",
     action_key: NestedKey = "action",
+    mask_key: NestedKey | None = None,
+    batch_dims: int | None = None,
 ) -> ProbabilisticActor:
     """Builds the policy head for an action space.
 
-    Discrete actions have a categorical distribution. Continuous ones have a diagonal Gaussian whose
-    log standard deviation is a parameter that starts at 0; they are neither squashed nor clipped,
-    so the environment should clip them. The weights start orthogonal with gain 0.01, as in
-    Stable-Baselines3, which trained the paper's agents.
+    ======================  ==================================================  ====================
+    spec                    distribution of an action                           mask
+    ======================  ==================================================  ====================
+    ``Categorical(n)``      categorical                                         [..., n]
+    ``OneHot(n)``           categorical, written as a one-hot vector            [..., n]
+    ``MultiCategorical``    independent categoricals                            [..., sum(nvec)]
+    ``MultiOneHot``         independent categoricals, one-hot vectors joined    [..., sum(nvec)]
+    ``Binary``              independent Bernoullis                              none
+    float, of any order     diagonal Gaussian, whose log standard deviation     none
+                            is a parameter that starts at 0
+    ======================  ==================================================  ====================
+
+    An action has the shape and dtype of the spec, and one log-probability and one entropy: the sums
+    over its components. Gaussian actions are neither squashed nor clipped, so the environment
+    should clip them (as :func:`~torchrl_tit.envs.make_env` does). The weights start orthogonal with
+    gain 0.01, as in Stable-Baselines3, which trained the paper's agents.
 
     Args:
         features_dim: size of the features.
-        action_spec: spec of one action without batch dimensions: ``Categorical``, ``OneHot`` or a
-            one-dimensional float spec.
+        action_spec: spec of the action, such as ``env.action_spec_unbatched``.
         in_key: key of the features [..., F].
-        action_key: key of the action: int64 [...], bool [..., n], or float [..., n].
+        action_key: key of the action.
+        mask_key: key of the action mask, bool, True where an action is allowed; the components of
+            an action one after the other. Others have probability 0. None allows all.
+        batch_dims: number of batch dimensions of ``action_spec``, whose others are those of an
+            action. By default, those before the last dimension of ``OneHot``, ``MultiOneHot`` and
+            ``MultiCategorical`` specs, all of a ``Categorical`` spec, none of others.
 
     Returns:
         A :class:`~torchrl.modules.ProbabilisticActor` that writes the action and its
         log-probability [...] and follows TorchRL's exploration type: random, or the most likely
-        action under ``ExplorationType.DETERMINISTIC``.
+        action under ``ExplorationType.DETERMINISTIC``. With a mask, it raises ValueError where
+        no action is allowed.
 
     Raises:
-        ValueError: for any other action space.
+        ValueError: for any other action space; if it is not clear which dimensions are batch; or
+            if actions that have no mask are to be masked.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> actor = make_actor(64, Categorical(2))
         >>> td = actor(TensorDict({"features": torch.randn(5, 64)}, [5]))
         >>> td["action"].shape, td["action_log_prob"].shape
         (torch.Size([5]), torch.Size([5]))
+        >>> from torchrl.data import MultiCategorical
+        >>> actor = make_actor(64, MultiCategorical([2, 3]), mask_key="action_mask")
+        >>> td["action_mask"] = torch.tensor([True, False, True, False, True]).expand(5, 5)
+        >>> actor(td)["action"][:, 0]
+        tensor([0, 0, 0, 0, 0])
     """
-    network: nn.Module
-    distribution: type[distributions.Distribution]
-    if isinstance(action_spec, Categorical | OneHot):
-        network = nn.Linear(features_dim, action_spec.space.n)
-        parameters = ["logits"]
-        categorical = isinstance(action_spec, Categorical)
-        distribution = distributions.Categorical if categorical else OneHotCategorical
-    elif action_spec.dtype.is_floating_point and action_spec.ndim == 1:
-        size = action_spec.shape[0]
-        network = nn.Sequential(
-            nn.Linear(features_dim, size), AddStateIndependentNormalScale(size, scale_lb=0.0)
-        )
-        parameters = ["loc", "scale"]
-        distribution = IndependentNormal
-    else:
+    shape = action_shape(action_spec, batch_dims)
+    if isinstance(action_spec, Categorical | OneHot) and not isinstance(action_spec, Binary):
+        parts = _choices(features_dim, action_spec, shape, mask_key)
+    elif mask_key is not None:
         raise ValueError(
-            f"no policy head for the action space {action_spec}: expected a Categorical or OneHot "
-            "spec, or a float spec of one dimension, without batch dimensions"
+            f"no action mask for the action space {describe(action_spec)}, only for Categorical, "
+            "OneHot, MultiCategorical and MultiOneHot: leave out mask_key"
         )
-    init_orthogonal_(network, gain=0.01)
-    # Validating logits and samples takes a third of the head's time at each step.
-    checks = {} if distribution is OneHotCategorical else {"validate_args": False}
+    elif isinstance(action_spec, Binary):
+        parts = _switches(features_dim, action_spec, shape)
+    else:
+        parts = _gaussian(features_dim, action_spec, shape)
+    init_orthogonal_(parts.network, gain=0.01)
+    in_keys = [in_key] if mask_key is None else [in_key, mask_key]
     return ProbabilisticActor(
-        TensorDictModule(network, in_keys=[in_key], out_keys=parameters),
-        in_keys=parameters,
+        TensorDictModule(parts.network, in_keys=in_keys, out_keys=list(parts.parameters.values())),
+        in_keys=parts.parameters,
         out_keys=[action_key],
-        distribution_class=distribution,
-        distribution_kwargs=checks,
+        distribution_class=parts.distribution,
+        distribution_kwargs=parts.settings,
         return_log_prob=True,
         log_prob_key="action_log_prob",
     )
@@ -105,3 +132,129 @@ def make_value(features_dim: int, *, in_key: NestedKey = "features") -> ValueOpe
     layer = nn.Linear(features_dim, 1)
     init_orthogonal_(layer, gain=1.0)
     return ValueOperator(layer, in_keys=[in_key])
+
+
+class _Parts(NamedTuple):
+    """What an actor consists of."""
+
+    network: nn.Module
+    parameters: dict[str, str]
+    """Keys of what the network writes, by the distribution's name for it."""
+    distribution: type[distributions.Distribution]
+    settings: dict[str, Any]
+
+
+def _choices(
+    features_dim: int, spec: Categorical | OneHot, shape: torch.Size, mask_key: NestedKey | None
+) -> _Parts:
+    """Parts for actions of which each component is one of several options."""
+    distribution: type[distributions.Distribution]
+    settings: dict[str, Any]
+    sizes = numbers_of_options(spec, shape)
+    parameters = {"logits": "logits"}
+    if mask_key is not None:
+        parameters["mask"] = "allowed"
+    if isinstance(spec, OneHot):
+        distribution, shape = IndependentOneHotCategorical, torch.Size([len(sizes)])
+        settings = {"sizes": sizes, "dtype": spec.dtype}
+    elif shape or spec.dtype != torch.int64:
+        distribution = IndependentCategorical
+        settings = {"event_dim": len(shape), "dtype": spec.dtype}
+    elif mask_key is not None:
+        # Its cross-entropy takes no samples of samples, which compiled losses draw.
+        distribution, settings = MaskedCategorical, {"use_cross_entropy": False}
+    else:
+        # Validating logits and samples takes a third of the head's time at each step.
+        distribution, settings = distributions.Categorical, {"validate_args": False}
+        return _Parts(nn.Linear(features_dim, sizes[0]), parameters, distribution, settings)
+    network = _ChoicesHead(features_dim, sizes, shape, mask_key)
+    return _Parts(network, parameters, distribution, settings)
+
+
+def _switches(features_dim: int, spec: Binary, shape: torch.Size) -> _Parts:
+    """Parts for actions of which each component is on or off."""
+    layer = nn.Linear(features_dim, math.prod(shape))
+    network = layer if len(shape) == 1 else nn.Sequential(layer, _Fit(shape))
+    settings = {"event_dim": len(shape), "dtype": spec.dtype}
+    return _Parts(network, {"logits": "logits"}, IndependentBernoulli, settings)
+
+
+def _gaussian(features_dim: int, spec: TensorSpec, shape: torch.Size) -> _Parts:
+    """Parts for continuous actions."""
+    size = math.prod(shape)
+    network = nn.Sequential(
+        nn.Linear(features_dim, size), AddStateIndependentNormalScale(size, scale_lb=0.0)
+    )
+    if len(shape) != 1 or spec.dtype != torch.float32:
+        network.append(_Fit(shape, spec.dtype))
+    settings = {"event_dim": len(shape), "validate_args": False}
+    return _Parts(network, {"loc": "loc", "scale": "scale"}, IndependentNormal, settings)
+
+
+class _Fit(nn.Module):
+    """Gives tensors [..., entries] the shape and the dtype of an action."""
+
+    def __init__(self, shape: torch.Size, dtype: torch.dtype | None = None) -> None:
+        super().__init__()
+        self.shape = shape
+        self.dtype = dtype
+
+    def forward(self, tensors: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
+        """[..., entries] -> [..., *shape], of one tensor or of each."""
+        if isinstance(tensors, Tensor):
+            dtype = tensors.dtype if self.dtype is None else self.dtype
+            return tensors.reshape((*tensors.shape[:-1], *self.shape)).to(dtype)
+        return tuple(self(tensor) for tensor in tensors)
+
+
+class _ChoicesHead(nn.Module):
+    """Logits of choices, and which options are allowed.
+
+    Args:
+        features_dim: size of the features.
+        sizes: number of options of each component.
+        shape: the components' shape.
+        mask_key: key of the action mask, for messages; None if there is none.
+    """
+
+    def __init__(
+        self, features_dim: int, sizes: list[int], shape: torch.Size, mask_key: NestedKey | None
+    ) -> None:
+        super().__init__()
+        self.linear = nn.Linear(features_dim, sum(sizes))
+        self.mask_key = mask_key
+        # Which logit belongs to each option of each component; the one behind the last to none.
+        columns = torch.full((len(sizes), max(sizes)), sum(sizes))
+        for row, numbers in zip(columns, torch.arange(sum(sizes)).split(sizes), strict=True):
+            row[: len(numbers)] = numbers
+        self.columns: Tensor
+        self.register_buffer("columns", columns.view(*shape, -1), persistent=False)
+
+    def forward(
+        self, features: Tensor, mask: Tensor | None = None
+    ) -> Tensor | tuple[Tensor, Tensor]:
+        """Features [..., F] and mask [..., sum(sizes)] -> both [..., *shape, options]."""
+        flat = self.linear(features)
+        logits = pad(flat, (0, 1), value=-math.inf)[..., self.columns]
+        if mask is None:
+            return logits
+        if mask.shape != flat.shape or mask.dtype != torch.bool:
+            raise ValueError(
+                f"{self.mask_key!r} must be a bool mask of the shape {list(flat.shape)}, but is "
+                f"{mask.dtype} of the shape {list(mask.shape)}"
+            )
+        allowed = pad(mask, (0, 1), value=False)[..., self.columns]
+        self._check_allowed(allowed)
+        return logits, allowed
+
+    def _check_allowed(self, allowed: Tensor) -> None:
+        transformed = torch._C._functorch.peek_interpreter_stack() is not None
+        if torch.compiler.is_compiling() or transformed:
+            return  # neither can depend on values
+        possible = allowed.any(-1)
+        if not possible.all():
+            where = (~possible).nonzero()[0].tolist()
+            raise ValueError(
+                f"{self.mask_key!r} allows no action at {where}: every step (and every component "
+                "of an action) needs at least one True"
+            )

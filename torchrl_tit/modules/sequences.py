@@ -149,12 +149,14 @@ def default_observation_keys(histories: Sequence[NestedKey]) -> list[NestedKey]:
     """Names the observations of histories: their keys, with "history" replaced by "observation".
 
     Example:
-        >>> default_observation_keys(["history", ("agents", "history")])
-        ['observation', ('agents', 'observation')]
+        >>> default_observation_keys(["history", ("history", "image"), ("agents", "history")])
+        ['observation', ('observation', 'image'), ('agents', 'observation')]
     """
     return [
         key.replace("history", "observation")
         if isinstance(key, str)
+        else ("observation", *key[1:])
+        if key[0] == "history"  # of several observations
         else (*key[:-1], key[-1].replace("history", "observation"))
         for key in histories
     ]

@@ -8,6 +8,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_tit.layers.gaussian_head import ClampedGaussianHead
+from torchrl_tit.modules.action_specs import describe
 
 
 def make_squashed_actor(
@@ -44,8 +45,8 @@ def make_squashed_actor(
     """
     if not isinstance(action_spec, Bounded) or action_spec.ndim != 1:
         raise ValueError(
-            f"no squashed policy for the action space {action_spec}: expected a Bounded spec of "
-            "one dimension, without batch dimensions"
+            f"no squashed policy for the action space {describe(action_spec)}: expected a Bounded "
+            "spec of one dimension, such as env.action_spec_unbatched"
         )
     head = ClampedGaussianHead(features_dim, action_spec.shape[0])
     return ProbabilisticActor(

@@ -1,0 +1,104 @@
+"""What specs tell about an action: its shape, and the options of its components."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torchrl.data import (
+    Binary,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    TensorSpec,
+)
+
+
+def action_shape(spec: TensorSpec, batch_dims: int | None) -> torch.Size:
+    """Finds the shape of one action.
+
+    Args:
+        spec: the action's spec.
+        batch_dims: number of its batch dimensions; None if the kind of the spec is to tell.
+
+    Raises:
+        ValueError: if it is of a kind without a policy head, or does not tell.
+
+    Example:
+        >>> action_shape(OneHot(3, shape=(8, 3)), None)
+        torch.Size([3])
+    """
+    supported = isinstance(spec, Categorical | OneHot) or (
+        not isinstance(spec, Composite) and spec.dtype.is_floating_point
+    )
+    if not supported:
+        raise ValueError(
+            f"no policy head for the action space {describe(spec)}: expected a Categorical, "
+            "OneHot, MultiCategorical, MultiOneHot, Binary or float spec"
+        )
+    if batch_dims is None:
+        if isinstance(spec, Binary) or not isinstance(spec, Categorical | OneHot):
+            if spec.ndim > 1:
+                raise ValueError(
+                    f"it is not clear how many dimensions of the action space {describe(spec)} are "
+                    "batch: pass env.action_spec_unbatched, with batch_dims=0 if an action has "
+                    "more than one dimension"
+                )
+            batch_dims = 0
+        else:
+            own = isinstance(spec, MultiCategorical | OneHot)
+            batch_dims = spec.ndim - own
+    if not 0 <= batch_dims <= spec.ndim:
+        raise ValueError(
+            f"batch_dims must be at least 0 and at most {spec.ndim}, the dimensions of the action "
+            f"space {describe(spec)}, but is {batch_dims}"
+        )
+    return spec.shape[batch_dims:]
+
+
+def numbers_of_options(spec: Categorical | OneHot, shape: torch.Size) -> list[int]:
+    """Finds the number of options of each component of an action.
+
+    Args:
+        spec: the action's spec.
+        shape: the shape of one action.
+
+    Raises:
+        ValueError: if it is not the same for all actions of a batched spec, or the action consists
+            of several rows of one-hot vectors.
+
+    Example:
+        >>> numbers_of_options(MultiCategorical([2, 3]), torch.Size([2]))
+        [2, 3]
+    """
+    if isinstance(spec, MultiCategorical):
+        numbers = spec.nvec.reshape(-1, *shape)
+        if (numbers != numbers[0]).any():
+            raise ValueError(
+                f"the action space {describe(spec)} has other numbers of options in each row: pass "
+                "env.action_spec_unbatched, with batch_dims=0 if an action has several dimensions"
+            )
+        return numbers[0].flatten().tolist()
+    if isinstance(spec, OneHot) and len(shape) != 1:
+        raise ValueError(
+            f"an action of the shape {list(shape)} in the action space {describe(spec)} is not "
+            "supported: one-hot vectors have one dimension, so raise batch_dims"
+        )
+    if isinstance(spec, MultiOneHot):
+        return list(spec.nvec)
+    return [spec.space.n] * (1 if isinstance(spec, OneHot) else math.prod(shape))
+
+
+def describe(spec: TensorSpec) -> str:
+    """Describes a spec in one line.
+
+    Example:
+        >>> describe(Binary(3))
+        'Binary(shape=[3], dtype=int8)'
+    """
+    if isinstance(spec, Composite):
+        return f"Composite({', '.join(map(str, spec.keys()))})"
+    dtype = str(spec.dtype).removeprefix("torch.")
+    return f"{type(spec).__name__}(shape={list(spec.shape)}, dtype={dtype})"
