@@ -93,7 +93,7 @@ def gradients(loss: Tensor, params: Any) -> list[Tensor]:
 NETWORKS = {
     "enhanced": enhanced_tit(FRAMES, **SMALL),
     "vanilla": vanilla_tit(FRAMES, **SMALL),
-    "positions": enhanced_tit(FRAMES, temporal_position_encoding=True, **SMALL),
+    "positions": enhanced_tit(FRAMES, temporal_positions="learned", **SMALL),
     "lstm": lstm(FRAMES, embed_dim=8, hidden_dim=8, features_dim=8),
 }
 

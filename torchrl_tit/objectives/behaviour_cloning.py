@@ -1,0 +1,42 @@
+"""Behaviour cloning with any distribution of actions."""
+
+from __future__ import annotations
+
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from torchrl.objectives import BCLoss
+
+
+class LikelihoodBCLoss(BCLoss):
+    """Replaces TorchRL's `BCLoss`, which fails for policies of discrete actions.
+
+    The negative log-likelihood of the actions, a mean over the batch::
+
+        loss_bc  -log pi(a | s)
+
+    `BCLoss` of TorchRL 0.14.1 passes the action that a policy has drawn to a cross-entropy if
+    actions are integers, where the logits belong, and runs a stochastic policy twice if they are
+    not. This loss asks the policy for its distribution, in one pass.
+
+    Args:
+        actor_network: a policy with ``get_dist``, such as a `ProbabilisticActor`.
+        **settings: ``reduction``.
+
+    Example:
+        >>> import torch
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_tit.modules import make_actor
+        >>> loss = LikelihoodBCLoss(make_actor(8, Categorical(3)))
+        >>> batch = {"features": torch.randn(16, 8), "action": torch.randint(3, (16,))}
+        >>> loss(TensorDict(batch, [16]))["loss_bc"].shape
+        torch.Size([])
+    """
+
+    target_actor_network_params: TensorDictParams
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Computes the loss of a batch [*B], which is left unchanged."""
+        action = tensordict.get(self.tensor_keys.action)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            dist = self.actor_network.get_dist(tensordict.copy())
+        loss = self._reduce_loss(-dist.log_prob(action), tensordict=tensordict)
+        return TensorDict({"loss_bc": loss})
