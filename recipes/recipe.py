@@ -10,12 +10,15 @@ from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_
 import msgspec
 import tyro
 
-from torchrl_tit.settings import Network, Part
-from torchrl_tit.settings.checks import check_at_least, check_at_most, nearest
+from torchrl_tit.settings import Network, Part, PerKey
+from torchrl_tit.settings.checks import check_at_least, check_at_most
+from torchrl_tit.settings.literals import parse_assignments, parse_call
+from torchrl_tit.settings.names import Names
 
 Compile = Literal["auto", "on", "off"]
 Precision = Literal["auto", "float32", "bfloat16"]
 Padding = Literal["same", "constant"]
+ImageLayout = Literal["auto", "HWC", "CHW"]
 
 # NumPy takes 32 bits, and environments are seeded with this seed and those that follow.
 _MAX_SEED = 2**31
@@ -32,7 +35,7 @@ class Recipe:
 
     algorithm: ClassVar[str]
     builds: ClassVar[str]
-    registered: ClassVar[dict[str, type[Recipe]]] = {}
+    registered: ClassVar[Names[type[Recipe]]] = Names("algorithm")
     """Recipes by the name of their algorithm."""
     offline: ClassVar[bool] = False
     """Whether it trains offline: steps are gradient steps, and returns are from evaluations."""
@@ -44,7 +47,17 @@ class Recipe:
     backbone: Network
     """The network: its frame encoder, its history encoder, and the number of frames it reads."""
     env: str
-    """Name of a Gymnasium environment: the task."""
+    """Name of a Gymnasium environment: the task. Also module:Name, for a name that the module
+    registers, or for a TorchRL environment in it."""
+    env_settings: tuple[str, ...] = ()
+    """Settings of the task, such as is_slippery=False map_name=8x8."""
+    wrappers: tuple[str, ...] = ()
+    """Gymnasium wrappers and TorchRL transforms around the task, the innermost first, such as
+    "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)"."""
+    observation_keys: tuple[str, ...] = ()
+    """Which observations are read, if the task has several; all by default."""
+    image_layout: ImageLayout = "auto"
+    """Order of an image's dimensions, where it cannot be told from their sizes."""
     seed: int = 0
     """Seed of the networks, the environments and the order of minibatches."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
@@ -63,8 +76,8 @@ class Recipe:
     def __init_subclass__(cls, *, algorithm: str | None = None, builds: str | None = None) -> None:
         super().__init_subclass__()
         if algorithm is not None and builds is not None:  # skips base classes of several algorithms
+            Recipe.registered.add(algorithm, cls, f"{cls.__module__}.{cls.__qualname__}")
             cls.algorithm, cls.builds = algorithm, builds
-            Recipe.registered[algorithm] = cls
 
     def __post_init__(self) -> None:
         if not isinstance(self.backbone, Network):
@@ -88,10 +101,18 @@ class Recipe:
             evaluation_seed=0,
         )
         check_at_most(self, seed=_MAX_SEED, evaluation_seed=_MAX_SEED)
+        parse_assignments(self.env_settings)
+        for wrapper in self.wrappers:
+            parse_call(wrapper)
         if self.name and not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", self.name):
             raise ValueError(
                 f"name must be words joined by '/', such as ppo/cartpole/mine, not {self.name!r}"
             )
+
+    @property
+    def task_settings(self) -> dict[str, Any]:
+        """The values of :attr:`env_settings` by name."""
+        return parse_assignments(self.env_settings)
 
     @property
     def final_step(self) -> int:
@@ -116,7 +137,7 @@ def check_types(settings: object, prefix: str = "") -> None:
         >>> check_types(Inner(patch_size=2.5))
         Traceback (most recent call last):
             ...
-        ValueError: field 'patch_size' is 2.5: Expected `int | null`, got `float`
+        ValueError: field 'patch_size' is 2.5: Expected `int | str | null`, got `float`
     """
     for name, kind in field_types(type(settings)).items():
         value = getattr(settings, name)
@@ -127,6 +148,9 @@ def check_types(settings: object, prefix: str = "") -> None:
                     f"{type(value).__name__}"
                 )
             check_types(value, f"{prefix}{name}.")
+        elif isinstance(value, PerKey):  # has checked what it holds
+            for key, part in value.items():
+                check_types(part, f"{prefix}{name}.{key}.")
         else:
             checked(prefix + name, value, kind)
 
@@ -154,12 +178,9 @@ def checked(name: str, value: object, kind: Any) -> Any:
 
 
 def get_recipe_class(algorithm: str) -> type[Recipe]:
-    """Looks up the recipes of an algorithm.
+    """Looks up the recipes of an algorithm, in installed plugins too.
 
     Raises:
-        ValueError: if there is no such algorithm.
+        ValueError: if there is no such algorithm, or more than one.
     """
-    if algorithm not in Recipe.registered:
-        names = nearest(str(algorithm), Recipe.registered)
-        raise ValueError(f"unknown algorithm {algorithm!r}: {names}")
-    return Recipe.registered[algorithm]
+    return Recipe.registered.find(algorithm)

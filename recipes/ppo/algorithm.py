@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -16,17 +16,21 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
+from torchrl_tit.envs import observation_specs
+from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.layers import init_orthogonal_
-from torchrl_tit.modules import Backbone, make_actor, make_value
+from torchrl_tit.modules import Backbone, history_keys, make_actor, make_value
 from torchrl_tit.networks import build_network, masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 
 from ..algorithm import Algorithm, Stateful, check_finite
 from ..compilation import STATIC_SHAPES, autocast_type, compile_and_time, should_compile
 from ..outcomes import Outcome
+from ..ray_collector import check_cluster
 from ..stateful import CollectorState
-from .collectors import make_collector, make_task, with_state
+from ..task import make_task
+from .collectors import make_collector, with_state
 from .flat_parameters import FlatParameters
 from .rollout import Rollout
 from .settings import PPO
@@ -45,15 +49,27 @@ class Agent(nn.Module):
 
     def __init__(self, recipe: PPO, env: EnvBase) -> None:
         super().__init__()
-        shape = env.observation_spec["observation"].shape[env.batch_dims :]
+        self.recipe = recipe
+        observation = observation_specs(env)
         separate = recipe.backbone.trunks == "separate"
         keys = ["policy_features", "value_features"] if separate else ["features"]
-        network = build_network(recipe.backbone, shape)
-        self.backbone = Backbone(network, out_keys=keys, padding=recipe.padding)
+        self.backbone = Backbone(
+            build_network(recipe.backbone, observation),
+            in_keys=history_keys(observation),
+            out_keys=keys,
+            padding=recipe.padding,
+        )
         if recipe.initialization == "orthogonal":
             init_orthogonal_(self.backbone)
         features_dim = self.backbone.features_dim
-        self.actor = make_actor(features_dim, env.action_spec_unbatched, in_key=keys[0])
+        self.mask_key = MASK if recipe.mask_actions else None
+        self.actor = make_actor(
+            features_dim,
+            env.action_spec_unbatched,
+            in_key=keys[0],
+            mask_key=self.mask_key,
+            batch_dims=0,
+        )
         self.critic = make_value(features_dim, in_key=keys[-1])
 
     def encode(self, samples: TensorDictBase) -> TensorDictBase:
@@ -61,11 +77,24 @@ class Agent(nn.Module):
         with set_recurrent_mode(samples.ndim == 2):
             return self.backbone(samples)
 
+    def rollout(self, batch: TensorDictBase) -> Rollout:
+        """Lays the frames of a collected batch out for windows; see :class:`Rollout`."""
+        backbone, network = self.backbone, self.recipe.backbone
+        keys = backbone.sequence_keys.observations
+        return Rollout(batch, network.num_frames, self.recipe.padding, keys)
+
     @property
     def state_keys(self) -> list[str]:
         """What the network reads besides observations: its state, if it carries one."""
         states = self.backbone.state_shapes
         return [*states, "is_init"] if states else []
+
+    @property
+    def step_keys(self) -> list[str]:
+        """What a step is trained on besides its observation."""
+        masks = [] if self.mask_key is None else [self.mask_key]
+        results = ["action", "action_log_prob", "advantage", "value_target"]
+        return [*self.state_keys, *masks, *results]
 
     @property
     def policy(self) -> TensorDictModuleBase:
@@ -163,7 +192,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         reward = batch["next", "reward"]
         reward = reward.sign() if recipe.clip_rewards else reward
         batch["next", "reward"] = reward * recipe.reward_scale
-        rollout = Rollout(batch, recipe.backbone.num_frames, recipe.padding)
+        rollout = agent.rollout(batch)
         with torch.no_grad():
             add_advantages(batch, rollout, agent, self.gae, recipe.bootstrap_time_limit)
         agent.train()
@@ -177,7 +206,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         agent.eval()
         self._check_update(steps, minibatch)
         terms = torch.stack(steps)  # [gradient steps, terms]
-        if recipe.collectors > 1:
+        if recipe.collectors > 1 or recipe.ray is not None:
             self.collector.update_policy_weights_()
         self.collector_state.step = step + batch.numel()
         # If this goes to 0, the features are the same in all states, and so is the policy.
@@ -198,6 +227,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         """Lets the policy act once in the task."""
         recipe = self.recipe
         should_compile(recipe.compile, recipe.gradient_steps)
+        check_cluster(recipe.ray, recipe.collectors, recipe.threads)
         env = self.make_env(1, recipe.seed, vectorization_mode=recipe.vectorization_mode)
         with closing(env), torch.no_grad():
             self.policy(env.reset())
@@ -223,17 +253,19 @@ class PPOAlgorithm(Algorithm[PPO]):
         total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
         values = [terms[name].detach() for name in TERMS]
         if self.recipe.contrastive_coeff:
-            history = minibatch["history"].flatten(0, minibatch.ndim - 1)
-            contrast = self._contrastive_loss(history)
+            contrast = self._contrastive_loss(minibatch.flatten(0, minibatch.ndim - 1))
             total = total + self.recipe.contrastive_coeff * contrast
             values.append(contrast.detach())
         return total, torch.stack(values)
 
-    def _contrastive_loss(self, history: Tensor) -> Tensor:
+    def _contrastive_loss(self, steps: TensorDict) -> Tensor:
         """CoBERL's contrastive loss, in a pass of its own: its transformer looks both ways."""
-        mask = torch.rand(history.shape[:2], device=history.device) < self.recipe.masked_fraction
-        network = self.agent.backbone.module
-        return contrastive_prediction_loss(*masked_predictions(network, history, mask), mask)
+        backbone = self.agent.backbone
+        histories = [steps[key] for key in backbone.history_keys]
+        draws = torch.rand(histories[0].shape[:2], device=histories[0].device)
+        mask = draws < self.recipe.masked_fraction
+        predictions = masked_predictions(backbone.module, histories, mask)
+        return contrastive_prediction_loss(*predictions, mask)
 
     @torch.no_grad()
     def _check_update(self, steps: list[Tensor], samples: TensorDictBase) -> None:
@@ -289,9 +321,10 @@ def next_values(rollout: Rollout, states: TensorDictBase, agent: Agent) -> Tenso
         samples = states[start : start + len(windows.rows)]
         start += len(samples)
         if backbone.is_recurrent:
-            backbone(samples.set("history", windows.gather(frames)))
+            histories = [windows.gather(table) for table in frames]
+            backbone(_set_all(samples, backbone.history_keys, histories))
         else:
-            features = backbone.encode_windows([frames], windows)
+            features = backbone.encode_windows(frames, windows)
             samples.update(dict(zip(backbone.features_keys, features, strict=True)))
         values.append(agent.critic(samples)["state_value"])
     return torch.cat(values)
@@ -312,11 +345,11 @@ def minibatches(
         Sequences of consecutive steps [N, time], or single steps [N] if the network reads one frame
         and carries no state.
     """
-    keys = [*agent.state_keys, "action", "action_log_prob", "advantage", "value_target"]
-    steps = batch.select(*keys).reshape(-1)
+    steps = batch.select(*agent.step_keys).reshape(-1)
+    history_keys = agent.backbone.history_keys
     numbers = torch.arange(len(steps), device=steps.device)
     if not recipe.reads_sequences:
-        steps["history"] = rollout.histories(numbers)
+        _set_all(steps, history_keys, rollout.histories(numbers))
         for _ in range(recipe.epochs):
             order = torch.randperm(len(steps), device=steps.device)
             yield from steps[order].split(recipe.minibatch_size)
@@ -329,11 +362,21 @@ def minibatches(
             chosen = sequences[index]
             minibatch = steps[chosen]
             if rollout.num_frames > 1:
-                minibatch["observation"] = rollout.observations(chosen)
+                observation_keys = agent.backbone.sequence_keys.observations
+                _set_all(minibatch, observation_keys, rollout.observations(chosen))
                 minibatch["is_init"] = rollout.is_init[chosen].unsqueeze(-1)
             if rollout.num_frames == 1 or recipe.contrastive_coeff:
-                minibatch["history"] = rollout.histories(chosen)
+                histories = rollout.histories(chosen)
             else:  # the other windows of a sequence follow from the first one
                 first = rollout.histories(chosen[:, :1])
-                minibatch["history"] = first.expand(-1, length, *first.shape[2:])
-            yield minibatch
+                histories = [x.expand(-1, length, *x.shape[2:]) for x in first]
+            yield _set_all(minibatch, history_keys, histories)
+
+
+def _set_all(
+    samples: TensorDictBase, keys: Sequence[NestedKey], tensors: Sequence[Tensor]
+) -> TensorDictBase:
+    """Sets several entries, and returns the samples."""
+    for key, tensor in zip(keys, tensors, strict=True):
+        samples.set(key, tensor)
+    return samples

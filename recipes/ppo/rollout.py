@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -18,16 +18,24 @@ class FrameCollector(ActingCollector):
 
     Its environments remove the histories from the steps that were taken
     (``make_env(..., keep_histories=False)``). The K - 1 frames that precede the batch are in
-    ``before``, cut into as many pieces as there are steps: an entry [envs, time, size] like any
-    other, which passes between processes and is stacked with the others.
+    ``before``, or in ``("before", NAME)`` for each of several observations, cut into as many pieces
+    as there are steps: an entry [envs, time, size] like any other, which passes between processes
+    and is stacked with the others.
     """
 
     def rollout(self) -> TensorDictBase:
         """Collects a batch, [envs, time]."""
-        older = self._carrier["history"][:, :-1].flatten(1)  # [envs, entries]
+        history = self._carrier["history"]
+        histories: dict[NestedKey, Tensor] = (
+            {"before": history}
+            if isinstance(history, Tensor)
+            else {("before", name): leaf for name, leaf in history.items()}
+        )
+        older = {key: leaf[:, :-1].flatten(1) for key, leaf in histories.items()}  # [envs, entries]
         batch = super().rollout()
-        if older.shape[1]:
-            batch["before"] = _in_pieces(older, batch.shape[1])
+        for key, entries in older.items():
+            if entries.shape[1]:
+                batch[key] = _in_pieces(entries, batch.shape[1])
         return batch
 
 
@@ -37,12 +45,14 @@ class Rollout:
     The frames of an environment are in order of time: the K - 1 that precede the batch, then the
     observation of each step. Where an episode or the batch ends, the true next observation follows,
     since it is the observation of no other step. That is at most
-    ``steps x envs + envs x K + episode ends`` frames.
+    ``steps x envs + envs x K + episode ends`` frames. A frame consists of one tensor for each of
+    the observations, whose windows are the same.
 
     Args:
         batch: of a :class:`FrameCollector`, [envs, time]. Its observations are removed.
         num_frames: number K of frames in a window.
         padding: what precedes an episode's first observation.
+        keys: keys of the observations: "observation", or ``("observation", NAME)`` of each.
 
     Example:
         >>> from torchrl.modules import RandomPolicy
@@ -59,12 +69,19 @@ class Rollout:
         ... )
         >>> batch = next(iter(collector))
         >>> rollout = Rollout(batch, num_frames=4, padding="same")
-        >>> rollout.histories(torch.arange(32)).shape  # of the first environment
+        >>> [history] = rollout.histories(torch.arange(32))  # of the first environment
+        >>> history.shape
         torch.Size([32, 4, 4])
         >>> collector.shutdown()
     """
 
-    def __init__(self, batch: TensorDictBase, num_frames: int, padding: Padding) -> None:
+    def __init__(
+        self,
+        batch: TensorDictBase,
+        num_frames: int,
+        padding: Padding,
+        keys: Sequence[NestedKey] = ("observation",),
+    ) -> None:
         self.num_frames = num_frames
         self.padding = padding
         done = batch["next", "done"].squeeze(-1)
@@ -91,42 +108,51 @@ class Rollout:
         self.oldest = begins.cummax(1).values.flatten()
         """The first row that belongs to each step's window, int64 [steps]."""
 
-        observation, following = batch.pop("observation"), batch["next"].pop("observation")
         count = envs * (past + steps) + int(ends.sum())
-        self.frames = observation.new_empty(count, *observation.shape[2:])
-        """The frames, [R, *observation_shape]."""
-        self.frames[self.newest] = observation.flatten(0, 1)
-        self.frames[self.newest[ends] + 1] = following[self.ends]
-        if past:
-            older = batch.pop("before").flatten(1)
-            shape = (past, *observation.shape[2:])
-            older = older[:, : torch.Size(shape).numel()].unflatten(1, shape)
-            rows = newest[:, :1] - torch.arange(past, 0, -1, device=done.device)
-            self.frames[rows] = older
+        earlier = newest[:, :1] - torch.arange(past, 0, -1, device=done.device)
+        self.frames: list[Tensor] = []
+        """The frames, [R, *observation_shape] of each observation."""
+        for key in keys:
+            observation, following = batch.get(key), batch["next"].get(key)
+            frames = observation.new_empty(count, *observation.shape[2:])
+            frames[self.newest] = observation.flatten(0, 1)
+            frames[self.newest[ends] + 1] = following[self.ends]
+            if past:
+                older = batch.get(("before", *key[1:]) if isinstance(key, tuple) else "before")
+                shape = (past, *observation.shape[2:])
+                older = older.flatten(1)[:, : torch.Size(shape).numel()]
+                frames[earlier] = older.unflatten(1, shape)
+            self.frames.append(frames)
+        batch.pop("before", None)
+        for part in (batch, batch["next"]):
+            part.del_("observation")
 
-    def observations(self, steps: Tensor) -> Tensor:
-        """The observations of steps, int64 [...] -> [..., *observation_shape]."""
-        return Windows(self.newest[steps], None).gather(self.frames)
+    def observations(self, steps: Tensor) -> list[Tensor]:
+        """The observations of steps, int64 [...] -> [..., *observation_shape] of each."""
+        rows = Windows(self.newest[steps], None)
+        return [rows.gather(frames) for frames in self.frames]
 
-    def histories(self, steps: Tensor) -> Tensor:
-        """The windows of steps, int64 [...] -> [..., K, *observation_shape]."""
-        return self._windows(self.newest[steps], self.oldest[steps]).gather(self.frames)
+    def histories(self, steps: Tensor) -> list[Tensor]:
+        """The windows of steps, int64 [...] -> [..., K, *observation_shape] of each observation."""
+        windows = self._windows(self.newest[steps], self.oldest[steps])
+        return [windows.gather(frames) for frames in self.frames]
 
-    def next_windows(self, max_frames: int = 1024) -> Iterator[tuple[Tensor, Windows]]:
+    def next_windows(self, max_frames: int = 1024) -> Iterator[tuple[list[Tensor], Windows]]:
         """Yields the windows of the true next states at ``ends``, in their order.
 
         Args:
             max_frames: frames to encode at once, if there are more than a window has.
 
         Yields:
-            Frames, each once, [R, *observation_shape], and windows on them, [E, K].
+            Frames, each once, [R, *observation_shape] of each observation, and windows on them,
+            [E, K].
         """
         ends = self.ends.flatten()
         newest, oldest = self.newest[ends] + 1, self.oldest[ends]
         size = max(1, max_frames // self.num_frames)
         for pair in zip(newest.split(size), oldest.split(size), strict=True):
             rows, windows = self._windows(*pair).used()
-            yield self.frames.index_select(0, rows), windows
+            yield [frames.index_select(0, rows) for frames in self.frames], windows
 
     def _windows(self, newest: Tensor, oldest: Tensor) -> Windows:
         return find_windows(newest, oldest, self.num_frames, self.padding)

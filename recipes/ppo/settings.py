@@ -9,6 +9,7 @@ from typing import Literal
 from torchrl_tit.settings import CoBERL
 from torchrl_tit.settings.checks import check_at_least, check_at_most, check_positive
 
+from ..ray_cluster import check_address
 from ..recipe import Compile, Padding, Precision, Recipe
 
 VectorizationMode = Literal["sync", "async"]
@@ -28,6 +29,8 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
     """What fills a history before the first observation: that observation, or zeros."""
     hide_velocities: bool = False
     """Whether observations lack the velocities, so that one observation is not enough."""
+    mask_actions: bool = False
+    """Whether the policy chooses only actions that the task allows, by its action_mask."""
     num_envs: int = 1
     """Number of environments; they share the steps of a batch."""
     vectorization_mode: VectorizationMode = "sync"
@@ -87,8 +90,11 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
     """Environment steps between checkpoints."""
     collectors: int = 1
     """Number of processes that collect, each with its share of the environments; 1 collects in the
-    training process. Several are for slow environments. A run with several can be resumed, but then
-    draws other random numbers than an uninterrupted run."""
+    training process, if ray is not set. Several are for slow environments. A run with several can
+    be resumed, but then draws other random numbers than an uninterrupted run."""
+    ray: str | None = None
+    """Address of a Ray cluster whose machines the collectors run on: auto, or HOST:PORT. See
+    docs/recipes.md."""
     async_collection: bool = False
     """Whether several collectors continue to collect during updates. A batch then comes from one of
     them, and its policy is up to one update old."""
@@ -140,6 +146,12 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
             raise ValueError("precision is bfloat16, but a recurrent network computes in float32")
         if self.async_collection and self.collectors == 1:
             raise ValueError("async_collection is on, but there is one collector: set collectors")
+        check_address(self)
+        if self.async_collection and self.ray is not None:
+            raise ValueError(
+                "async_collection is on, but collectors on Ray wait for the weights of each "
+                "update: switch it off"
+            )
 
     @property
     def is_recurrent(self) -> bool:

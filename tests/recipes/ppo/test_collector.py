@@ -12,10 +12,10 @@ from torch import multiprocessing
 from recipes.metrics import Metrics
 from recipes.ppo import PPO
 from recipes.ppo.algorithm import PPOAlgorithm
-from recipes.ppo.rollout import Rollout
 from recipes.run import Run
 from recipes.runner import evaluate, train
 from tests.numerics import assert_near
+from tests.recipes.ppo import tasks
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.settings.networks import enhanced_tit
 
@@ -35,8 +35,11 @@ RECIPE = PPO(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("async_collection", [False, True])
-def test_batches_are_those_of_the_policy(async_collection, tmp_path):
-    recipe = replace(RECIPE, async_collection=async_collection, reward_scale=1.0)
+def test_batches_are_those_of_the_policy(async_collection, tmp_path, monkeypatch):
+    """Of a task with several observations."""
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", tasks.__name__)  # in the processes, too
+    wrappers = (f"{tasks.__name__}:Split",)
+    recipe = replace(RECIPE, async_collection=async_collection, reward_scale=1.0, wrappers=wrappers)
     algorithm = PPOAlgorithm(recipe)
     algorithm.prepare(0, tmp_path)
     agent, collector = algorithm.agent, algorithm.collector
@@ -44,12 +47,13 @@ def test_batches_are_those_of_the_policy(async_collection, tmp_path):
     starts, continued = [], 0
     for count, batch in enumerate(algorithm.batches(), start=1):
         assert batch.shape == (envs, 64 // envs)
-        features, first = batch["features"], batch["observation"][:, 0].tolist()
-        rollout = Rollout(batch, 2, "same")
-        windows = rollout.histories(torch.arange(64)).view(*batch.shape, 2, 4)
-        continued += int((windows[:, 0, 0] != windows[:, 0, 1]).any(-1).sum())
+        features, first = batch["features"], batch["observation", "pole"][:, 0].tolist()
+        histories = agent.rollout(batch).histories(torch.arange(64))
+        windows = [history.view(*batch.shape, 2, 2) for history in histories]
+        poles = windows[1][:, 0]
+        continued += int((poles[:, 0] != poles[:, 1]).any(-1).sum())
         with torch.no_grad():
-            expected = agent.backbone.module(windows)
+            expected = agent.backbone.module(*windows)
         if count == 1 or not async_collection:  # a later one of those can be an update behind
             assert_near(features, expected)
         starts += first
@@ -59,7 +63,7 @@ def test_batches_are_those_of_the_policy(async_collection, tmp_path):
     assert continued >= envs  # windows at the start of a batch know the end of the one before
     collector.shutdown()
     assert count * 64 == 192
-    first = algorithm.make_env(4, RECIPE.seed).reset()["history"][:, -1].tolist()
+    first = algorithm.make_env(4, RECIPE.seed).reset()["history", "pole"][:, -1].tolist()
     assert all(start in first for start in starts[:envs])  # each environment has its own seed
     assert len(set(map(tuple, starts[:envs]))) == envs
 

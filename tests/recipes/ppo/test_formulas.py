@@ -17,11 +17,11 @@ from torchrl.objectives.value import GAE
 from recipes.compilation import should_compile
 from recipes.ppo import PPO
 from recipes.ppo.algorithm import Agent, PPOAlgorithm, add_advantages, minibatches
-from recipes.ppo.collectors import make_task
 from recipes.ppo.rollout import Rollout
 from recipes.registry import get_recipe
 from recipes.run import Run
 from recipes.runner import train
+from recipes.task import make_task
 from tests.numerics import assert_near
 from tests.recipes.ppo import by_hand
 

@@ -58,7 +58,7 @@ def test_settings_of_tit(task, network):
         "patch_size": 1, "embed_dim": width, "num_blocks": 2, "num_heads_outer": outer,
         "num_heads_inner": inner, "ffn_expansion_outer": 4, "ffn_expansion_inner": 4,
         "activation_outer": "gelu", "activation_inner": "gelu", "position_encoding": True,
-        "temporal_position_encoding": False, "share_blocks": False, "features_dim": features,
+        "temporal_positions": "none", "share_blocks": False, "features_dim": features,
         "activation_head": "tanh", "attention_dropout_inner": 0.0, "attention_dropout_outer": 0.0,
         "ffn_dropout_inner": 0.0, "ffn_dropout_outer": 0.0,
     }  # fmt: skip

@@ -24,9 +24,8 @@ def test_recipes_can_be_built_and_hide_the_velocities(name):
     network = name.rpartition("/")[2]
     assert recipe.backbone.num_frames == (8 if "8" in network else 1)
     backbone = recipe.backbone
-    assert getattr(backbone.history, "temporal_position_encoding", False) == (
-        "positions" in network or "tuned" in network
-    )
+    positions = "learned" if "positions" in network or "tuned" in network else "none"
+    assert getattr(backbone.history, "temporal_positions", "none") == positions
     assert isinstance(backbone.history, StackedInner) == ("wo-outer" in network)
     entries = {"CartPole-v1": 2, "Acrobot-v1": 4, "Hopper-v5": 5}[recipe.env]
     if "tuned" in network:

@@ -2,13 +2,13 @@
 
 import shutil
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch.utils._pytree import tree_leaves
 from torchrl.modules import RandomPolicy
 from torchrl.objectives.value import GAE
 
@@ -37,9 +37,10 @@ RECIPE = PPO(
     epochs=1,
     compile="off",
 )
+SHORT_EPISODES = replace(RECIPE, env_settings=("max_episode_steps=11",))
 NETWORKS = {
     "tit": enhanced_tit(4, **SMALL),
-    "vanilla": vanilla_tit(4, temporal_position_encoding=True, **SMALL),
+    "vanilla": vanilla_tit(4, temporal_positions="learned", **SMALL),
     "separate trunks": mlp(4, hidden_dim=8),
     "lstm": lstm(hidden_dim=8, **SMALL),
     "lstm on windows": replace(lstm(hidden_dim=8, **SMALL), num_frames=4),
@@ -93,8 +94,8 @@ def test_windows_are_those_that_the_policy_read(envs, frames, padding):
         rollout = Rollout(batch, frames, padding)
         read = seen.take()
         number = torch.arange(13 * envs).view(envs, 13)
-        assert torch.equal(rollout.histories(number), read)
-        assert torch.equal(rollout.observations(number), whole["observation"])
+        assert torch.equal(rollout.histories(number)[0], read)
+        assert torch.equal(rollout.observations(number)[0], whole["observation"])
         assert torch.equal(read[:, :, -1], whole["observation"])
         done = whole["next", "done"].squeeze(-1)
         is_init = rollout.is_init.view(envs, 13)
@@ -105,10 +106,10 @@ def test_windows_are_those_that_the_policy_read(envs, frames, padding):
         assert torch.equal(rollout.ends, ends)
         newest = whole["next", "observation"].unsqueeze(2)
         expected = torch.cat([read[:, :, 1:], newest], 2)[ends]
-        parts = [w.gather(table) for table, w in rollout.next_windows(max_frames=frames * 3)]
+        parts = [w.gather(table) for [table], w in rollout.next_windows(max_frames=frames * 3)]
         assert torch.equal(torch.cat(parts), expected)
         assert all(len(part) <= 3 for part in parts)
-        assert len(rollout.frames) == envs * (frames - 1 + 13) + ends.sum()
+        assert len(rollout.frames[0]) == envs * (frames - 1 + 13) + ends.sum()
         assert "observation" not in batch
         assert "observation" not in batch["next"]
         ended += int(done.sum())
@@ -132,16 +133,9 @@ def test_a_rollout_keeps_each_frame_once(frames):
         [envs, steps],
     )
     rollout = Rollout(batch, frames, "same")
-    tensors = [value for value in vars(rollout).values() if isinstance(value, torch.Tensor)]
+    tensors = [value for value in tree_leaves(vars(rollout)) if isinstance(value, torch.Tensor)]
     kept = sum(tensor.untyped_storage().nbytes() for tensor in tensors)
     assert kept <= 1.1 * (steps * envs + envs * frames + ends) * 84 * 84
-
-
-@pytest.fixture
-def short_episodes(monkeypatch):
-    """Ends episodes after eleven steps, if they have not ended before."""
-    limited = partial(make_env, max_episode_steps=11)
-    monkeypatch.setattr("recipes.ppo.algorithm.make_env", limited)
 
 
 def collected(recipe, folder):
@@ -160,7 +154,7 @@ def collected(recipe, folder):
     algorithm.loss.double()
     batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
     outcome = batch["next", "observation"].clone()
-    rollout = Rollout(batch, recipe.backbone.num_frames, recipe.padding)
+    rollout = algorithm.agent.rollout(batch)
     assert rollout.is_init.any()
     return algorithm, batch, rollout, outcome
 
@@ -169,17 +163,15 @@ def collected(recipe, folder):
 @pytest.mark.parametrize("bootstrap", [True, False])
 @pytest.mark.parametrize("padding", ["same", "constant"])
 @pytest.mark.parametrize("name", ["tit", "separate trunks", "lstm on windows"])
-def test_values_and_advantages_are_those_of_whole_windows(
-    name, padding, bootstrap, short_episodes, tmp_path
-):
-    recipe = replace(RECIPE, backbone=NETWORKS[name], padding=padding)
+def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstrap, tmp_path):
+    recipe = replace(SHORT_EPISODES, backbone=NETWORKS[name], padding=padding)
     algorithm, batch, rollout, outcome = collected(recipe, tmp_path)
     agent, gae = algorithm.agent, GAE(gamma=0.875, lmbda=0.75, value_network=None)
     done = batch["next", "done"]
     truncated = done & (done.cumsum(1) % 2 == 0)  # every other episode, whatever ended it
     assert truncated.any()
     batch["next"].update({"truncated": truncated, "terminated": done & ~truncated})
-    windows = rollout.histories(torch.arange(96)).view(3, 32, 4, 4)
+    windows = rollout.histories(torch.arange(96))[0].view(3, 32, 4, 4)
     following = torch.cat([windows[:, :, 1:], outcome.unsqueeze(2)], 2)
     with torch.no_grad():
         states = TensorDict({"history": torch.stack([windows, following])}, [2, 3, 32])
@@ -212,11 +204,9 @@ def features_by_hand(agent, minibatch, padding):
 @pytest.mark.parametrize("padding", ["same", "constant"])
 @pytest.mark.parametrize("envs", [1, 3])
 @pytest.mark.parametrize("name", NETWORKS)
-def test_loss_and_gradient_are_those_of_whole_windows(
-    name, envs, padding, short_episodes, tmp_path
-):
+def test_loss_and_gradient_are_those_of_whole_windows(name, envs, padding, tmp_path):
     recipe = replace(
-        RECIPE,
+        SHORT_EPISODES,
         backbone=NETWORKS[name],
         num_envs=envs,
         padding=padding,
@@ -243,6 +233,7 @@ def test_loss_and_gradient_are_those_of_whole_windows(
         if recipe.contrastive_coeff:
             torch.manual_seed(1)
             windows = by_hand.windows_of(minibatch, padding).flatten(0, 1)
+            windows = TensorDict({"history": windows}, [len(windows)])
             expected = expected + algorithm._contrastive_loss(windows)
         expected_gradients = torch.autograd.grad(expected, weights, allow_unused=True)
         assert 0 < terms[5] < 1  # of the ratios some are clipped, others are not
@@ -260,7 +251,7 @@ def test_each_frame_of_a_sequence_is_encoded_once(tmp_path):
     with torch.no_grad():
         counted = CountedFrames(agent.backbone.module)
         add_advantages(batch, rollout, agent, algorithm.gae, True)
-        assert counted.take() <= len(rollout.frames)
+        assert counted.take() <= len(rollout.frames[0])
         for minibatch in minibatches(batch, rollout, agent, RECIPE):
             agent.encode(minibatch)
             assert counted.take() == 2 * (16 + 3)

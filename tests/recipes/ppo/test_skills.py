@@ -141,4 +141,4 @@ def test_a_network_that_does_not_fit_is_refused_before_anything_runs(
 
 def test_settings_that_make_no_network_are_refused():
     with pytest.raises(ValueError, match="num_frames"):
-        enhanced_tit(1, temporal_position_encoding=True)
+        enhanced_tit(1, temporal_positions="learned")

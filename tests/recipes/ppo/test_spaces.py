@@ -1,0 +1,154 @@
+"""PPO on observations and actions of all kinds, with masks."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from recipes.ppo import PPO
+from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
+from recipes.run import Run
+from recipes.runner import train
+from tests.numerics import assert_near
+from tests.recipes.ppo import tasks
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.settings import Flat
+from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
+
+SMALL: dict[str, Any] = {"embed_dim": 8, "features_dim": 8}
+TIT = enhanced_tit(3, patch_size="auto", num_blocks=1, **SMALL)
+RECIPE = PPO(
+    env="CartPole-v1",
+    backbone=TIT,
+    num_envs=2,
+    total_steps=64,
+    steps_per_batch=32,
+    minibatch_size=16,
+    epochs=1,
+    evaluation_episodes=2,
+    compile="off",
+)
+SPLIT = "tests.recipes.ppo.tasks:Split"
+TASKS: dict[str, dict[str, Any]] = {
+    **{name: {"env": f"{name}Actions-v0"} for name in tasks.ACTIONS},
+    "masked Discrete": {"env": "DiscreteActions-v0", "mask_actions": True},
+    "masked MultiDiscrete": {"env": "MultiDiscreteActions-v0", "mask_actions": True},
+    "one frame": {"env": "MultiDiscreteActions-v0", "backbone": replace(TIT, num_frames=1)},
+    "lstm": {"env": "MultiBinaryActions-v0", "backbone": lstm(hidden_dim=8, **SMALL)},
+    "Split": {"wrappers": (SPLIT,), "padding": "constant"},
+}
+
+
+def trained(recipe, folder):
+    """The networks after training, and the rows of metrics without their times."""
+    with Run.create(folder, recipe) as run:
+        train(recipe, run)
+        rows = [line.split(",") for line in (run.folder / "metrics.csv").read_text().splitlines()]
+        weights = TensorDict(load_checkpoint(run.checkpoints)[1]["networks"])
+    return weights, [[row[0], *row[2:]] for row in rows]
+
+
+@pytest.mark.numerics
+@pytest.mark.parametrize("name", TASKS)
+def test_training_sees_what_the_policy_saw(name, tmp_path):
+    """Values and log-probabilities of minibatches are those that were collected.
+
+    So histories of several observations, states, masks and actions are those that the policy read
+    and wrote. Only allowed actions were taken, and a full run, which evaluates, has finite metrics.
+    """
+    recipe = replace(RECIPE, **TASKS[name])
+    algorithm = PPOAlgorithm(recipe)
+    agent = algorithm.agent
+    with torch.no_grad():  # far from where all actions and values are alike
+        for parameter in agent.parameters():
+            parameter.add_(0.2 * torch.randn_like(parameter))
+    algorithm.prepare(0, tmp_path)
+    with torch.no_grad():
+        batches = iter(algorithm.batches())
+        next(batches)
+        batch = next(batches)
+        algorithm.close()
+        assert not any("history" in str(key) for key in batch.keys(True))
+        assert batch["action_log_prob"].isfinite().all()
+        rollout = agent.rollout(batch)
+        assert rollout.is_init.any()
+        assert "observation" not in batch
+        add_advantages(batch, rollout, agent, algorithm.gae, True)
+        spread = batch["state_value"].std()
+        for minibatch in minibatches(batch, rollout, agent, recipe):
+            agent.encode(minibatch)
+            value = agent.critic(minibatch)["state_value"]
+            assert_near(value, minibatch["value_target"] - minibatch["advantage"])
+            assert_near(agent.actor.log_prob(minibatch), minibatch["action_log_prob"])
+            if recipe.mask_actions:
+                sizes = [3, 2, 4] if "Multi" in name else [3]
+                masks = minibatch["action_mask"].split(sizes, -1)
+                choices = minibatch["action"].reshape(*minibatch.shape, -1).unbind(-1)
+                for mask, choice in zip(masks, choices, strict=True):
+                    assert mask.gather(-1, choice.unsqueeze(-1)).all()
+                    assert not mask.all()
+        assert spread > 1e-3
+
+    with Run.create(tmp_path / "run", recipe) as run:
+        train(recipe, run)
+        assert "nan" not in (run.folder / "metrics.csv").read_text()
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_an_observation_in_parts_trains_as_a_whole(frames, tmp_path):
+    """Flat frames of the parts, side by side, are that of the whole: so are all later weights."""
+    network = mlp(frames, hidden_dim=8)
+    whole = replace(RECIPE, backbone=network)
+    parts = replace(
+        whole,
+        backbone=replace(network, frames={"cart": Flat(), "pole": Flat()}),
+        wrappers=(SPLIT,),
+    )
+    weights, rows = trained(whole, tmp_path / "whole")
+    other, other_rows = trained(parts, tmp_path / "parts")
+    assert (weights == other).all()
+    assert rows == other_rows
+
+
+@pytest.mark.parametrize("name", ["masked MultiDiscrete", "lstm"])
+def test_resumed_is_bit_for_bit_the_same(name, tmp_path):
+    recipe = replace(RECIPE, **TASKS[name], checkpoint_interval=32)
+    expected, _ = trained(recipe, tmp_path / "whole")
+    with Run.create(tmp_path / "parts", recipe) as run:
+        for steps in (32, 64):
+            train(replace(recipe, total_steps=steps), run)
+        weights = TensorDict(load_checkpoint(run.checkpoints)[1]["networks"])
+    assert (weights == expected).all()
+
+
+def test_taxi_never_takes_a_forbidden_action(tmp_path):
+    recipe = replace(RECIPE, env="Taxi-v4", mask_actions=True, steps_per_batch=64, total_steps=128)
+    algorithm = PPOAlgorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    for number, batch in enumerate(algorithm.batches()):
+        mask = batch["action_mask"]
+        assert (~mask).any()
+        assert mask.gather(-1, batch["action"].unsqueeze(-1)).all()
+        entropy = batch["logits"].masked_fill(~mask, -torch.inf).softmax(-1)
+        expected = torch.special.entr(entropy).sum(-1).mean()
+        terms = algorithm.update(batch, 64 * number)
+        assert (
+            abs(float(terms["entropy"]) - expected) < 0.01
+        )  # of the mask's actions, not of all six
+        assert abs(float(terms["kl_approx"])) < 0.01
+    assert number == 1
+    algorithm.close()
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        ("BoxActions-v0", "Only Discrete and MultiDiscrete actions can be masked"),
+        ("CartPole-v1", "no mask of its actions"),
+    ],
+)
+def test_masks_that_there_are_not_are_refused(env, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        PPOAlgorithm(replace(RECIPE, env=env, mask_actions=True))
