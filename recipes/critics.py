@@ -1,63 +1,76 @@
-"""Critics of actor-critic algorithms with replay: Q(s, a) on observations or on a backbone."""
+"""Value networks of actor-critic algorithms: on observations or on a backbone."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.modules import MLP, ValueOperator
 
-from torchrl_tit.modules import Backbone
-from torchrl_tit.networks import build_network
+from torchrl_tit.frames.observation import Observations, read_observations
 from torchrl_tit.settings import Network
+
+from .policies import make_backbone
 
 
 def make_critic(
-    observation_shape: torch.Size,
+    observation: Observations,
     action_dim: int,
     hidden: Sequence[int],
     network: Network | None = None,
     *,
+    values: int = 1,
+    out_key: str = "state_action_value",
     slices: bool = False,
 ) -> TensorDictModuleBase:
-    """Builds Q(s, a): an MLP on the newest observation or a backbone's features, and the action.
+    """Builds an MLP on the newest observation or a backbone's features, and on the action, if any.
 
     Args:
-        observation_shape: shape of an observation.
-        action_dim: number A of entries of an action.
+        observation: spec of the observation, or of each by name.
+        action_dim: number A of entries of an action; 0 if it is not read.
         hidden: widths of the MLP's hidden layers.
         network: settings of the backbone; if None, the MLP reads the newest observation.
+        values: how many values there are, such as one for each of a few discrete actions.
+        out_key: key of the values.
         slices: whether the backbone is to read slices of consecutive steps [..., T], if it is
             within TorchRL's recurrent mode; it then reads "observation" and "is_init" too.
 
     Returns:
-        A module that reads "observation" [..., *obs], or "history" [..., K, *obs], and "action"
-        [..., A], and writes "state_action_value", float [..., 1].
+        A module that reads "observation" [..., D], or "history" [..., K, *obs], and "action"
+        [..., A], and writes ``out_key``, float [..., values].
 
     Raises:
-        ValueError: if there is no backbone to read observations of more than one dimension.
+        ValueError: if there is no backbone to read observations other than one array.
     """
     modules: list[TensorDictModuleBase] = []
-    key, size = "observation", observation_shape.numel()
     if network is not None:
         key = "critic_features"
-        backbone = Backbone(
-            build_network(network, observation_shape, trunks="shared"),
-            out_keys=[key],
-            observation_keys=["observation"] if slices else None,
-        )
+        backbone = make_backbone(network, observation, out_key=key, slices=slices)
         modules, size = [backbone], backbone.features_dim
-    elif len(observation_shape) != 1:
-        raise ValueError(
-            f"an MLP cannot value images {tuple(observation_shape)}: set critic to 'backbone'"
-        )
+    else:
+        key, size = "observation", _array_size(observation)
     mlp = MLP(
         size + action_dim,
-        1,
+        values,
         num_cells=list(hidden),
         activation_class=nn.ReLU,
         activation_kwargs={"inplace": True},
     )
-    return TensorDictSequential(*modules, ValueOperator(mlp, in_keys=[key, "action"]))
+    in_keys = [key, "action"] if action_dim else [key]
+    return TensorDictSequential(*modules, ValueOperator(mlp, in_keys=in_keys, out_keys=[out_key]))
+
+
+def _array_size(observation: Observations) -> int:
+    """The number of entries of the only observation, an array."""
+    read = read_observations(observation)
+    first = next(iter(read.values()))
+    if len(read) > 1:
+        raise ValueError(
+            f"an MLP cannot value several observations ({', '.join(read)}): set critic to "
+            "'backbone'"
+        )
+    if first.kind != "array":
+        kind = "images" if first.kind == "image" else first.kind
+        raise ValueError(f"an MLP cannot value {kind} {first.shape}: set critic to 'backbone'")
+    return first.entries

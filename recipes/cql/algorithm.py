@@ -19,7 +19,9 @@ from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples
 from ..algorithm import Stateful
 from ..compilation import compile_and_time
 from ..critics import make_critic
-from .q_algorithm import QAlgorithm, describe, parameters_of
+from ..policies import describe, is_continuous
+from ..transition_algorithm import descend, parameters_of
+from .q_algorithm import QAlgorithm
 from .settings import CQL
 
 # The activations of critics with three layers of 256 for so many actions, 8 MB, fit into a CPU's
@@ -38,7 +40,6 @@ class CQLAlgorithm(QAlgorithm[CQL]):
             its observations.
     """
 
-    continuous = True
     compiles_on = ("cpu", "cuda")
     # The losses are in the order of the steps: the first that is not finite is the one to blame.
     columns = ("loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy")
@@ -46,7 +47,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
     def __init__(self, recipe: CQL) -> None:
         super().__init__(recipe)
         spec = self.action_spec
-        if not isinstance(spec, Bounded) or spec.ndim != 1:
+        if not (isinstance(spec, Bounded) and is_continuous(spec)):
             raise ValueError(
                 f"cql needs continuous actions within bounds, but those of {recipe.env} are "
                 f"{describe(spec)}: use a discrete-cql recipe if they are discrete"
@@ -57,7 +58,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
         network = recipe.backbone if recipe.critic == "backbone" else None
         critics = [
             make_critic(
-                self.observation_shape,
+                self.observation,
                 spec.shape[0],
                 recipe.critic_hidden,
                 network,
@@ -122,12 +123,12 @@ class CQLAlgorithm(QAlgorithm[CQL]):
         """
         samples = self.sample_policy(batch)
         loss_alpha = self.loss.alpha_loss(samples)
-        _descend(loss_alpha, self.temperature_optimizer)
+        descend(loss_alpha, self.temperature_optimizer)
         self.critic_optimizer.zero_grad()
         loss_qvalue, loss_cql = self._critic_gradients(batch, samples)
         self.critic_optimizer.step()
         loss_actor, _ = self.actor_loss(batch, samples)
-        _descend(loss_actor, self.actor_optimizer)
+        descend(loss_actor, self.actor_optimizer)
         self.target.step()
         alpha, entropy = self.loss.log_alpha.exp(), -samples.log_prob.mean()
         terms = [loss_alpha, loss_qvalue, loss_cql, loss_actor, alpha, entropy]
@@ -142,10 +143,3 @@ class CQLAlgorithm(QAlgorithm[CQL]):
         loss_qvalue, loss_cql = self.critic_losses(batch, samples)
         (loss_qvalue + loss_cql).backward()
         return loss_qvalue, loss_cql
-
-
-def _descend(loss: Tensor, optimizer: torch.optim.Optimizer) -> None:
-    """Takes a step down a loss's gradient."""
-    optimizer.zero_grad()
-    loss.backward()
-    optimizer.step()

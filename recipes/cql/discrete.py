@@ -7,17 +7,16 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
-from torchrl.data import Categorical
-from torchrl.modules import QValueModule
+from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
 from torchrl_tit.objectives import DelayedDiscreteCQLLoss
 
 from ..algorithm import Stateful
 from ..compilation import compile_and_time
-from .q_algorithm import QAlgorithm, describe, parameters_of
+from ..policies import describe, is_discrete, make_value_policy
+from ..transition_algorithm import parameters_of
+from .q_algorithm import QAlgorithm
 from .settings import DiscreteCQL
 
 
@@ -31,23 +30,18 @@ class DiscreteCQLAlgorithm(QAlgorithm[DiscreteCQL]):
         ValueError: if the task's actions are not discrete.
     """
 
-    continuous = False
     compiles_on = ("cuda",)
     columns = ("loss_qvalue", "loss_cql", "value")
 
     def __init__(self, recipe: DiscreteCQL) -> None:
         super().__init__(recipe)
         spec = self.action_spec
-        if not isinstance(spec, Categorical):
+        if not is_discrete(spec):
             raise ValueError(
                 f"discrete-cql needs a few discrete actions, but those of {recipe.env} are "
                 f"{describe(spec)}: use a cql recipe if they are continuous"
             )
-        backbone = self.make_backbone()
-        values = nn.Linear(backbone.features_dim, spec.space.n)
-        head = TensorDictModule(values, ["features"], ["action_value"])
-        policy = TensorDictSequential(backbone, head, QValueModule(spec=spec))
-        self._policy = policy.to(self.device)
+        self._policy = make_value_policy(self.make_backbone(), spec).to(self.device)
         self.loss = DelayedDiscreteCQLLoss(self._policy, action_space="categorical")
         self.loss.make_value_estimator(gamma=recipe.gamma)
 

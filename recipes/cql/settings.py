@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from torchrl_tit.settings.checks import check_at_least, check_at_most, check_positive
+from torchrl_tit.settings.checks import (
+    check_at_least,
+    check_at_most,
+    check_positive,
+    check_widths,
+)
 
-from ..dataset_recipe import DatasetRecipe
-from ..recipe import Compile, Padding
+from ..recipe import Compile
+from ..transition_recipe import TransitionRecipe
 
 
 @dataclass(frozen=True, kw_only=True)
-class QRecipe(DatasetRecipe):
-    """Settings of every recipe that learns Q values from a data set."""
+class QRecipe(TransitionRecipe):
+    """Settings of both recipes of conservative Q-learning."""
 
-    padding: Padding = "same"
-    """What fills a history before the first observation: that observation, or zeros."""
-    total_updates: int = 500_000
-    """Gradient steps to train for."""
-    batch_size: int = 256
-    """Transitions in one gradient step, sampled with replacement."""
-    slice_length: int = 1
-    """Consecutive transitions that are drawn together, so that a backbone encodes their frames
-    once; must divide batch_size. 1 draws transitions one by one."""
     gamma: float = 0.99
     """Discount factor."""
     tau: float = 0.005
@@ -32,18 +28,9 @@ class QRecipe(DatasetRecipe):
     """Weight of the conservative term."""
     adam_eps: float = 1e-8
     """Epsilon of Adam."""
-    time_limits: Literal["keep", "drop"] = "drop"
-    """Whether to keep the last transition of an episode that a time limit truncated. d3rlpy 1.1.1,
-    which the paper used, dropped it."""
     terminal_observations: Literal["keep", "zero"] = "zero"
     """Whether to keep terminal observations, or zero them as d3rlpy 1.1.1 did. No loss reads
     them."""
-    unfinished: Literal["keep", "drop"] = "drop"
-    """Whether to keep the last episode if the data stop before it ends."""
-    evaluation_interval: int = 1000
-    """Gradient steps between evaluations."""
-    evaluation_episodes: int = 10
-    """Number of episodes in an evaluation, played side by side."""
     compile: Compile = "auto"
     """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
     at the start. "auto" compiles if the run is long enough to be worth it. On a CPU, continuous CQL
@@ -52,41 +39,17 @@ class QRecipe(DatasetRecipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(
-            self,
-            total_updates=1,
-            slice_length=1,
-            gamma=0,
-            tau=0,
-            conservative_weight=0,
-            adam_eps=0,
-            evaluation_interval=1,
-        )
+        check_at_least(self, gamma=0, tau=0, conservative_weight=0, adam_eps=0)
         check_at_most(self, gamma=1, tau=1)
-        if self.batch_size % self.slice_length:
-            raise ValueError(
-                f"slice_length {self.slice_length} does not divide batch_size {self.batch_size}: "
-                "change one of them"
-            )
         if self.compile == "on" and self.slice_length > 1:
             raise ValueError(
                 f"compile is on, but slices of {self.slice_length} are not compiled, because their "
                 "number of frames varies: set compile to off, or slice_length to 1"
             )
-        if self.backbone.carries_state:
-            raise ValueError(
-                f"{self.algorithm} draws single transitions, so its network cannot carry a state: "
-                "set backbone.num_frames to 2 or more, or use a ppo recipe"
-            )
 
-    @property
-    def final_step(self) -> int:
-        """Gradient steps of the whole run."""
-        return self.total_updates
-
-    def evaluation_due(self, step: int) -> bool:
-        """Returns whether to evaluate after a number of gradient steps."""
-        return step % self.evaluation_interval == 0 or step == self.total_updates
+    def drawing(self) -> dict[str, Any]:
+        """As :meth:`TransitionRecipe.drawing`."""
+        return {**super().drawing(), "terminal_observations": self.terminal_observations}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,10 +88,7 @@ class CQL(QRecipe, algorithm="cql", builds=f"{__package__}.algorithm:CQLAlgorith
             action_samples=1,
         )
         check_positive(self, "temperature_init")
-        if not self.critic_hidden or min(self.critic_hidden) < 1:
-            raise ValueError(
-                f"critic_hidden must be at least one width of at least 1, not {self.critic_hidden}"
-            )
+        check_widths(self, "critic_hidden")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import Bounded, Categorical
+from torchrl.data import Bounded, Categorical, MultiCategorical, TensorSpec
 from torchrl.envs import Compose, EnvBase, ObservationNorm, TargetReturn
 
 from torchrl_tit.datasets import Episodes, SequenceStorage, load_episodes
-from torchrl_tit.envs import make_env, time_limit
+from torchrl_tit.envs import observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.modules import DTHead, make_dt_actor
 from torchrl_tit.networks import HistoryNetwork, build_network
@@ -22,6 +22,7 @@ from torchrl_tit.transforms import SequenceHistory
 
 from ..dataset_algorithm import DatasetAlgorithm
 from ..outcomes import Outcome
+from ..task import make_task, task_limit
 from .settings import SequenceRecipe
 
 RecipeT = TypeVar("RecipeT", bound=SequenceRecipe)
@@ -64,9 +65,9 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
-        task = make_env(recipe.env, clip_actions=False)
-        spec = task.observation_spec["observation"]
-        shape = spec.shape[1:]
+        task = make_task(recipe, num_frames=1, clip_actions=False)
+        spec = _check_observation(recipe, observation_specs(task))
+        shape = spec.shape
         self.normalizes = spec.dtype.is_floating_point
         """Whether observations are normalised; uint8 images, which networks divide by 255, are
         not."""
@@ -106,16 +107,9 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             **settings: further settings of the task.
         """
         recipe, agent = self.recipe, self.agent
-        if time_limit(recipe.env) is None:
+        if task_limit(recipe) is None:
             settings = {"max_episode_steps": recipe.history.max_ep_len, **settings}
-        env = make_env(
-            recipe.env,
-            num_envs,
-            seed=seed,
-            clip_actions=False,
-            device=None if self.device.type == "cpu" else self.device,
-            **settings,
-        )
+        env = make_task(recipe, num_envs, seed, num_frames=1, clip_actions=False, **settings)
         if target_return is None:
             target_return = recipe.target_returns[0]
         key = "observation"
@@ -226,6 +220,25 @@ def warn_of_targets(target_returns: Sequence[float], episodes: Episodes) -> None
         )
 
 
+def _check_observation(
+    recipe: SequenceRecipe, spec: TensorSpec | dict[str, TensorSpec]
+) -> TensorSpec:
+    """Returns the spec of a task's observation.
+
+    Raises:
+        ValueError: if there are several, or it has categories.
+    """
+    several = isinstance(spec, dict)
+    if several or isinstance(spec, MultiCategorical):
+        found = f"several observations ({', '.join(spec)})" if several else "categories"
+        raise ValueError(
+            f"{recipe.env} has {found}, but a Decision Transformer reads one array or image: "
+            "choose one with observation_keys, or flatten them with the wrapper "
+            "gymnasium.wrappers:FlattenObservation"
+        )
+    return spec
+
+
 def _check_task(recipe: SequenceRecipe, action_spec: Any) -> int:
     """Returns the entries of a continuous action, or the number of discrete ones.
 
@@ -233,13 +246,18 @@ def _check_task(recipe: SequenceRecipe, action_spec: Any) -> int:
         ValueError: if the network cannot act in the task.
     """
     env, settings = recipe.env, recipe.history
-    limit = time_limit(env)
+    limit = task_limit(recipe)
     if settings.timestep_embedding and limit is not None and limit > settings.max_ep_len:
         raise ValueError(
             f"episodes of {env} have up to {limit} steps, but max_ep_len is "
             f"{settings.max_ep_len}: raise backbone.history.max_ep_len to {limit} or more"
         )
-    discrete = isinstance(action_spec, Categorical)
+    discrete = type(action_spec) is Categorical
+    if not (discrete or isinstance(action_spec, Bounded)):
+        raise ValueError(
+            f"{env} has {type(action_spec).__name__} actions, but a Decision Transformer takes "
+            "one choice (Discrete) or a vector (Box): use a ppo recipe"
+        )
     if discrete != (recipe.action_space == "discrete"):
         kind = "discrete" if discrete else "continuous"
         raise ValueError(

@@ -29,7 +29,7 @@ def _networks(task: str) -> dict[str, Network]:
     visible, tuned = _VISIBLE[task], TUNED_TIT[task]
     patch_size = min(tuned.patch_size or visible, visible)
     tit: dict[str, Any] = {"patch_size": patch_size, "activation_head": tuned.activation_head}
-    positions = {**tit, "temporal_position_encoding": True}
+    positions = {**tit, "temporal_positions": "learned"}
     return {
         "mlp": mlp(),
         "mlp-stack-8": mlp(8),

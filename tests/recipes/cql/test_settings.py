@@ -75,7 +75,7 @@ def test_named_recipes_have_the_papers_settings(data):
     assert (inner.num_heads, inner.ffn_expansion) == (1, 1)
     assert (inner.attention_dropout, inner.ffn_dropout) == (0, 0)
     assert (inner.activation, outer.activation) == ("gelu", "gelu")
-    assert (inner.position_encoding, outer.temporal_position_encoding) == (False, False)
+    assert (inner.position_encoding, outer.temporal_positions) == (False, "none")
     assert inner.every_block
     assert head.norm
     assert (tit.backbone.initialization, tit.backbone.trunks) == ("normal", "shared")
@@ -125,7 +125,7 @@ def refused(recipe):
             "cql needs continuous actions within bounds, but those of CartPole-v1 are discrete",
         ),
         ({"env": "ALE/Pong-v5"}, "those of ALE/Pong-v5 are discrete"),
-        ({"env": "Hoper-v5"}, "did you mean one of 'Hopper-v5'"),
+        ({"env": "Hoper-v5"}, "did you mean 'Hopper-v5'"),
         ({"env": "Walker2d-v5"}, "[11], but in Walker2d-v5 it is [17]"),
         ({"dataset": "hopper"}, "'hopper' is not a data set: give an HDF5 file"),
         ({"dataset": "./no.hdf5"}, "no.hdf5"),
@@ -161,8 +161,8 @@ def test_a_network_that_carries_a_state(tmp_path, make):
 def test_a_transformer_over_time_needs_several_frames():
     with pytest.raises(ValueError, match="num_frames is 1: set it to 2 or more"):
         catformer(1)
-    with pytest.raises(ValueError, match="temporal_position_encoding tells frames apart"):
-        tit(temporal_position_encoding=True)
+    with pytest.raises(ValueError, match="temporal_positions 'learned' tells frames apart"):
+        tit(temporal_positions="learned")
 
 
 def test_data_of_another_task(tmp_path):

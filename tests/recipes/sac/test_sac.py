@@ -124,17 +124,18 @@ def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
         for number in (15, 45):  # of a process that was killed before its checkpoint
             steps = {"action": torch.zeros(number, 1), **observed(number, torch.nan)}
             steps["next"] = {**observed(number, torch.nan), **outcome(number)}
-            algorithm.buffer.extend(TensorDict(steps, [number]))
+            algorithm.buffer.extend(TensorDict(steps, [number]).unsqueeze(0))
             algorithm.buffer_state.state_dict()
         assert checkpoint_steps(run.folder / "replay") == [15, 30, 60]
         algorithm.close()
         train(SMALL, run)
-        assert trained(run.folder)[1]["buffer"] == {"parts": [30, 60]}
+        state = trained(run.folder)[1]["buffer"]
+        assert state["parts"] == [30, 60]
         algorithm = make(SMALL)
         algorithm.prepare(60, run.folder)
-        algorithm.buffer_state.load_state_dict({"parts": [30, 60]})
+        algorithm.buffer_state.load_state_dict(state)
         algorithm.close()
-    stored = algorithm.buffer[:]
+    stored = algorithm.buffer[:][0]
     assert len(stored) == 60
     assert stored["observation"].isfinite().all()
     # The transitions of one environment, in order.
@@ -192,7 +193,7 @@ def double(recipe: SAC, folder: Path) -> tuple[SACAlgorithm, TensorDict]:
 def step_of(algorithm: SACAlgorithm, batch: TensorDictBase) -> list[Tensor]:
     """The terms and the gradients of a gradient step."""
     torch.manual_seed(1)
-    terms = algorithm._step(batch.copy())
+    terms = algorithm._step(batch.copy(), 0)
     return [terms, *(w.grad for w in algorithm.loss.parameters() if w.grad is not None)]
 
 
@@ -241,10 +242,12 @@ def test_slices_have_the_gradient_of_their_transitions(
         after = {"observation": seen[num_envs:], **outcome(40 * num_envs), "done": done}
         after["reward"] = torch.randn(40 * num_envs, 1, generator=generator)
         steps = {"observation": seen[:-num_envs], "action": action, "next": after}
-        algorithm.buffer.extend(TensorDict(steps, [40 * num_envs]))
+        steps = TensorDict(steps, [40 * num_envs]).unflatten(0, (40, num_envs))
+        algorithm.buffer.extend(steps.transpose(0, 1))
         first = torch.tensor([[2], [9], [17], [20]])
         index = first + torch.arange(4) * num_envs
-        batch = algorithm.buffer.storage[index if length > 1 else index.flatten()]
+        index = index if length > 1 else index.flatten()
+        batch = algorithm.buffer.storage.get((index // num_envs, index % num_envs))
         assert length == 1 or batch["is_init"][:, 1:].any()
         batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
         results.append(step_of(algorithm, batch))
@@ -274,7 +277,7 @@ def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
             hidden = hidden.relu()
         q = nn.functional.linear(hidden, critic["4", "weight"], critic["4", "bias"])
         expected += (q - batch["next", "reward"]).square().mean()
-    terms = dict(zip(algorithm.columns, algorithm._step(batch), strict=True))
+    terms = dict(zip(algorithm.columns, algorithm._step(batch, 0), strict=True))
     algorithm.close()
     torch.testing.assert_close(terms["loss_qvalue"], expected.detach())
     assert terms["alpha"] == 1
@@ -284,7 +287,7 @@ def test_a_gradient_step_moves_weights_and_targets(tmp_path: Path) -> None:
     recipe = replace(SMALL, learning_rate=1e-3, tau=0.1, gamma=0.5)
     algorithm, batch = double(recipe, tmp_path)
     before = {name: value.clone() for name, value in algorithm.loss.state_dict().items()}
-    algorithm._step(batch)
+    algorithm._step(batch, 0)
     algorithm.close()
     after = algorithm.loss.state_dict()
     for name, value in after.items():

@@ -1,0 +1,35 @@
+"""Settings of implicit Q-learning; the algorithm is in algorithm.py."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torchrl_tit.settings.checks import check_at_least, check_positive, check_probability
+
+from ..transition_recipe import ActorCriticRecipe
+
+
+@dataclass(frozen=True, kw_only=True)
+class IQL(ActorCriticRecipe, algorithm="iql", builds=f"{__package__}.algorithm:IQLAlgorithm"):
+    """Implicit Q-learning (arXiv 2110.06169), with continuous or with discrete actions.
+
+    The defaults are those of the paper for MuJoCo.
+    """
+
+    learning_rate: float = 3e-4
+    """Learning rate of Adam for all networks."""
+    decay_learning_rate: bool = True
+    """Whether the actor's learning rate falls to 0 along a cosine."""
+    expectile: float = 0.7
+    """Expectile of Q(s, a) over the data's actions that V(s) estimates; 0.5 is the mean."""
+    temperature: float = 3.0
+    """Inverse temperature of the weights exp(temperature * advantage) of the actor's loss."""
+    normalize_rewards: bool = False
+    """Whether rewards are divided by the range of the episodes' returns and multiplied by 1000, as
+    in the paper for MuJoCo."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_at_least(self, learning_rate=0, temperature=0)
+        check_positive(self, "expectile")
+        check_probability(self, "expectile")

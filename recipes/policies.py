@@ -1,0 +1,128 @@
+"""Backbones of actors and critics, and policies besides those of torchrl_tit.modules."""
+
+from __future__ import annotations
+
+import math
+
+from tensordict.nn import (
+    AddStateIndependentNormalScale,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictSequential,
+)
+from torch import nn
+from torchrl.data import Bounded, Categorical, TensorSpec
+from torchrl.modules import IndependentNormal, ProbabilisticActor, QValueModule, TanhModule
+
+from torchrl_tit.frames.observation import Observations
+from torchrl_tit.modules import Backbone, history_keys, make_actor
+from torchrl_tit.modules.sequences import default_observation_keys
+from torchrl_tit.networks import build_network
+from torchrl_tit.settings import Network
+
+_MIN_LOG_STD = -5.0
+
+
+def make_backbone(
+    network: Network, observation: Observations, *, out_key: str = "features", slices: bool = False
+) -> Backbone:
+    """Builds the backbone of an actor or of a critic.
+
+    Args:
+        network: its settings.
+        observation: spec of the observation, or of each by name.
+        out_key: key of the features.
+        slices: whether it is to read slices of consecutive steps [..., T], if it is within
+            TorchRL's recurrent mode; it then reads the observations and "is_init" too.
+    """
+    histories = history_keys(observation)
+    return Backbone(
+        build_network(network, observation, trunks="shared"),
+        in_keys=histories,
+        out_keys=[out_key],
+        observation_keys=default_observation_keys(histories) if slices else None,
+    )
+
+
+def make_cloning_policy(
+    backbone: Backbone, action_spec: TensorSpec
+) -> ProbabilisticTensorDictSequential:
+    """Builds a policy that gives every action in a data set a finite likelihood.
+
+    Actions within bounds have a Gaussian whose mean a tanh keeps within them, and whose standard
+    deviation does not depend on the state (Kostrikov et al., arXiv 2110.06169, and its authors'
+    code). A squashed Gaussian would have an infinite density at the bounds, where data have many
+    actions. Other actions have the head of :func:`~torchrl_tit.modules.make_actor`.
+
+    Args:
+        backbone: the backbone.
+        action_spec: spec of an action, without batch dimensions.
+
+    Raises:
+        ValueError: if there is no head for the actions.
+    """
+    if not (isinstance(action_spec, Bounded) and is_continuous(action_spec)):
+        return ProbabilisticTensorDictSequential(
+            backbone, *make_actor(backbone.features_dim, action_spec)
+        )
+    mean = _bounded(backbone, action_spec, "loc")
+    scale = AddStateIndependentNormalScale(action_spec.shape[0], scale_lb=math.exp(_MIN_LOG_STD))
+    return ProbabilisticActor(
+        TensorDictSequential(*mean, TensorDictModule(scale, ["loc"], ["loc", "scale"])),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        distribution_kwargs={"validate_args": False},
+    )
+
+
+def make_deterministic_policy(backbone: Backbone, action_spec: Bounded) -> TensorDictSequential:
+    """Builds a policy whose action is linear in the features, kept within its bounds by a tanh.
+
+    Args:
+        backbone: the backbone.
+        action_spec: bounds of an action, without batch dimensions.
+    """
+    return TensorDictSequential(*_bounded(backbone, action_spec, "action"))
+
+
+def make_value_policy(
+    backbone: Backbone, action_spec: Categorical, *, mask_key: str | None = None
+) -> TensorDictSequential:
+    """Builds a policy that takes the action of the highest value, with a linear layer of values.
+
+    Args:
+        backbone: the backbone.
+        action_spec: spec of an action, without batch dimensions.
+        mask_key: key of the actions that are allowed, if it reads them.
+    """
+    values = nn.Linear(backbone.features_dim, action_spec.space.n)
+    head = TensorDictModule(values, ["features"], ["action_value"])
+    choice = QValueModule(spec=action_spec, action_mask_key=mask_key)
+    return TensorDictSequential(backbone, head, choice)
+
+
+def is_continuous(spec: TensorSpec) -> bool:
+    """Whether actions are arrays of floats."""
+    return spec.dtype.is_floating_point and spec.ndim == 1
+
+
+def is_discrete(spec: TensorSpec) -> bool:
+    """Whether an action is one of a few; TorchRL's specs of several are subclasses of that spec."""
+    return type(spec) is Categorical and spec.ndim == 0
+
+
+def describe(spec: TensorSpec) -> str:
+    """Describes actions, for messages."""
+    kind = "continuous" if spec.dtype.is_floating_point else "discrete"
+    return f"{kind} ({type(spec).__name__}, shape {list(spec.shape)})"
+
+
+def _bounded(backbone: Backbone, action_spec: Bounded, key: str) -> list[nn.Module]:
+    """A backbone, a linear layer, and a tanh that is scaled to the bounds."""
+    linear = nn.Linear(backbone.features_dim, action_spec.shape[0])
+    space = action_spec.space
+    return [
+        backbone,
+        TensorDictModule(linear, ["features"], [key]),
+        TanhModule(in_keys=[key], low=space.low, high=space.high),
+    ]

@@ -1,0 +1,50 @@
+"""Behaviour cloning, IQL and TD3+BC on D4RL's sets of version 2, as in the papers of the latter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from torchrl_tit.settings import Network
+from torchrl_tit.settings.networks import enhanced_tit, mlp, vanilla_tit
+
+from ..bc import BC
+from ..iql import IQL
+from ..td3bc import TD3BC
+from ..transition_recipe import TransitionRecipe
+
+# D4RL's data are of the tasks' v3; v4 is nearer to that than v5.
+_TASKS = {"halfcheetah": "HalfCheetah-v4", "hopper": "Hopper-v4", "walker2d": "Walker2d-v4"}
+_KINDS = ("medium", "medium-replay", "medium-expert")
+# The MLP of the papers of IQL and TD3+BC. For TIT the whole observation is one patch, as in the
+# paper's CQL; the sizes are those of its CQL on hopper-medium and walker2d-medium.
+_TIT: dict[str, Any] = {
+    "patch_size": None,
+    "num_blocks": 1,
+    "num_heads_outer": 2,
+    "ffn_expansion_inner": 1,
+    "ffn_expansion_outer": 1,
+    "position_encoding": False,
+    "features_dim": 512,
+    "activation_head": "relu",
+}
+_NETWORKS: dict[str, Network] = {
+    "mlp": mlp(hidden_dim=256, activation="relu"),
+    "enhanced-tit": enhanced_tit(**_TIT),
+    "vanilla-tit": vanilla_tit(**_TIT),
+}
+
+
+def _named() -> Iterator[TransitionRecipe]:
+    for task, env in _TASKS.items():
+        for data in (f"{task}-{kind}-v2" for kind in _KINDS):
+            for network, backbone in _NETWORKS.items():
+                fields: dict[str, Any] = {"dataset": data, "env": env, "backbone": backbone}
+                name = f"{data}/{network}"
+                yield BC(name=f"bc/{name}", **fields)
+                yield IQL(name=f"iql/{name}", normalize_rewards=True, **fields)
+                yield TD3BC(name=f"td3bc/{name}", **fields)
+
+
+OFFLINE_RECIPES: dict[str, TransitionRecipe] = {recipe.name: recipe for recipe in _named()}
+"""``bc/DATASET/NETWORK``, ``iql/DATASET/NETWORK`` and ``td3bc/DATASET/NETWORK``."""

@@ -1,0 +1,288 @@
+"""DQN: its gradient steps, its exploration, what it reads, and runs that are resumed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, MultiDiscrete
+from tensordict import TensorDict, TensorDictBase
+
+from recipes.algorithm import make_algorithm
+from recipes.callback import Callback
+from recipes.dqn import DQN
+from recipes.dqn.algorithm import DQNAlgorithm
+from recipes.metrics import read_metrics
+from recipes.registry import RECIPES, get_recipe
+from recipes.run import Run
+from recipes.runner import train
+from tests.recipes.cql.cql_runs import tit
+from tests.recipes.states import assert_same
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.settings.networks import lstm, mlp
+
+SEVERAL = "SeveralActions-v0"
+
+
+class SeveralActions(gymnasium.Env):
+    """Two actions at each step; nothing is ever done."""
+
+    observation_space = Box(-1, 1, (4,), np.float32)
+    action_space = MultiDiscrete([2, 3])
+
+
+SMALL = DQN(
+    name="dqn/cartpole/small",
+    env="CartPole-v1",
+    backbone=mlp(hidden_dim=8, activation="relu"),
+    batch_size=8,
+    random_steps=20,
+    steps_per_batch=10,
+    total_steps=60,
+    updates_per_step=0.5,
+    target_interval=3,
+    log_interval=10,
+    checkpoint_interval=30,
+    evaluation_episodes=1,
+)
+
+
+class Batches(Callback):
+    """Keeps the collected batches, and may end the training at a step."""
+
+    def __init__(self, last: int | None = None) -> None:
+        self.last = last
+        self.batches: list[TensorDictBase] = []
+
+    def collected(self, step: int, batch: Any) -> None:
+        self.batches.append(batch.clone())
+
+    def updated(self, step: int, policy: Any) -> bool:
+        return step == self.last
+
+
+def make(recipe: DQN) -> DQNAlgorithm:
+    algorithm = make_algorithm(recipe)
+    assert isinstance(algorithm, DQNAlgorithm)
+    return algorithm
+
+
+def double(recipe: DQN, folder: Path) -> tuple[DQNAlgorithm, TensorDict]:
+    """An algorithm in float64, whose target network says the opposite, and transitions."""
+    torch.manual_seed(0)
+    algorithm = make(recipe)
+    algorithm.prepare(0, folder)
+    algorithm.close()
+    algorithm.loss.double()
+    with torch.no_grad():
+        for name, weight in algorithm.loss.state_dict().items():
+            if name.startswith("target_value_network_params.module.1."):  # the values' layer
+                weight.neg_()
+    size, frames = 16, recipe.backbone.num_frames
+    seen = torch.randn(size, frames + 1, 4, dtype=torch.float64)
+    terminated = (torch.arange(size) % 4 == 0).unsqueeze(-1)
+    here, there = (
+        {"history": history, "observation": history[:, -1]}
+        for history in (seen[:, :-1], seen[:, 1:])
+    )
+    reward = torch.randn(size, 1, dtype=torch.float64)
+    after = {**there, "reward": reward, "terminated": terminated, "done": terminated}
+    batch = {**here, "action": torch.randint(2, (size,)), "next": after}
+    return algorithm, TensorDict(batch, [size])
+
+
+def values(algorithm: DQNAlgorithm, states: TensorDictBase, params: str) -> torch.Tensor:
+    """The values of all actions with the weights of a network, [B, actions]."""
+    with getattr(algorithm.loss, params).data.to_module(algorithm.policy):
+        return algorithm.policy(states.select("history"))["action_value"].detach()
+
+
+@pytest.mark.parametrize("doubled", [True, False])
+def test_the_target_of_a_gradient_step(doubled: bool, tmp_path: Path) -> None:
+    algorithm, batch = double(replace(SMALL, double=doubled, gamma=0.9), tmp_path)
+    trained, target = "value_network_params", "target_value_network_params"
+    q = values(algorithm, batch, trained).gather(1, batch["action"].unsqueeze(1))
+    following = values(algorithm, batch["next"], target)
+    best = values(algorithm, batch["next"], trained if doubled else target).argmax(1, keepdim=True)
+    other = values(algorithm, batch["next"], target if doubled else trained).argmax(1, keepdim=True)
+    assert (best != other).all()
+    alive = 1 - batch["next", "terminated"].double()
+    expected = (q - batch["next", "reward"] - 0.9 * alive * following.gather(1, best)).square()
+    loss, epsilon = algorithm._step(batch, 0)
+    torch.testing.assert_close(loss, expected.mean())
+    assert epsilon == 1
+
+
+def test_target_updates_and_learning(tmp_path: Path) -> None:
+    recipe = replace(SMALL, learning_rate=0.05, target_interval=30)
+    algorithm, batch = double(recipe, tmp_path)
+    before = {n: w.clone() for n, w in algorithm.loss.state_dict().items()}
+    losses = [algorithm._step(batch.clone(), number)[0] for number in range(29)]
+    state = algorithm.loss.state_dict()
+    targets = [n for n in state if n.startswith("target_")]
+    assert all(torch.equal(state[n], before[n]) for n in targets)
+    assert losses[-1] < 0.7 * losses[0]
+    algorithm._step(batch, 29)
+    state = algorithm.loss.state_dict()
+    assert all(torch.equal(state[n], state[n.removeprefix("target_")]) for n in targets)
+
+
+def test_slices_have_the_loss_of_their_transitions(tmp_path: Path) -> None:
+    network = tit(3, attention_dropout_outer=0.0, ffn_dropout_inner=0.0)
+    losses = []
+    for length in (1, 4):
+        recipe = replace(SMALL, backbone=network, num_envs=2, slice_length=length)
+        algorithm, _ = double(recipe, tmp_path)
+        generator = torch.Generator().manual_seed(2)
+        seen = torch.randn(2, 21, 4, generator=generator)
+        done = (torch.arange(20) % 7 == 5).expand(2, 20).unsqueeze(-1)
+        after = {"observation": seen[:, 1:], "reward": torch.ones(2, 20, 1), "terminated": done}
+        action = torch.randint(2, (2, 20), generator=generator)
+        steps = {"observation": seen[:, :-1], "action": action, "next": {**after, "done": done}}
+        algorithm.buffer.extend(TensorDict(steps, [2, 20]))
+        time = torch.tensor([[3], [10]]) + torch.arange(4)
+        env = torch.tensor([[0], [1]]).expand(2, 4)
+        index = (time, env) if length > 1 else (time.flatten(), env.flatten())
+        batch = algorithm.buffer.storage.get(index)
+        assert length == 1 or batch["is_init"][:, 1:].any()
+        batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
+        losses.append(algorithm._step(batch, 0)[0])
+    torch.testing.assert_close(losses[1], losses[0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"backbone": tit(2), "buffer_size": 30},  # which is overwritten
+        {"backbone": mlp(2, hidden_dim=8), "slice_length": 2, "num_envs": 2},
+    ],
+    ids=["tit", "slices"],
+)
+def test_resumed_is_bit_for_bit_the_same(changes: dict[str, Any], tmp_path: Path) -> None:
+    recipe = replace(SMALL, **changes)
+    with Run.create(tmp_path / "whole", recipe) as run:
+        train(recipe, run)
+    with Run.create(tmp_path / "stopped", recipe) as run:
+        train(recipe, run, [Batches(last=40)])
+        torch.manual_seed(123)  # the resuming process may be in any state
+        train(recipe, run)
+    (step, state), (expected_step, expected) = (
+        load_checkpoint(tmp_path / name / "checkpoints") for name in ("stopped", "whole")
+    )
+    assert step == expected_step == 60
+    for name in ("networks", "optimizer", "exploration", "record", "rng"):
+        assert_same(state[name], expected[name])
+    rows, expected_rows = (
+        [{n: str(v) for n, v in row.items() if n != "time"} for row in read_metrics(path)]
+        for path in (tmp_path / name / "metrics.csv" for name in ("stopped", "whole"))
+    )
+    assert rows == expected_rows
+
+
+def test_exploration(tmp_path: Path) -> None:
+    """Random actions first, then less and less, and none in evaluations."""
+    recipe = replace(SMALL, exploration_fraction=0.5, final_epsilon=0.1, random_steps=30)
+    with Run.create(tmp_path / "run", recipe) as run:
+        batches = Batches()
+        train(recipe, run, [batches])
+    actions = torch.cat([batch["action"].flatten() for batch in batches.batches[:3]])
+    assert 0.2 < actions.double().mean() < 0.8
+    rows = read_metrics(run.folder / "metrics.csv")
+    epsilons = [row["epsilon"] for row in rows]
+    assert epsilons[:3] == pytest.approx([float("nan")] * 3, nan_ok=True)
+    assert epsilons[3:] == pytest.approx([1.0, 0.7, 0.4], abs=1e-5)
+    algorithm = make(recipe)
+    assert algorithm.play(60)[0].returns == algorithm.play(60)[0].returns
+
+
+def test_forbidden_actions_are_neither_taken_nor_valued(tmp_path: Path) -> None:
+    recipe = replace(SMALL, env="Taxi-v4", mask_actions=True, num_envs=2, total_steps=40)
+    with Run.create(tmp_path / "run", recipe) as run:
+        batches = Batches()
+        train(recipe, run, [batches])
+    masks, actions = (
+        torch.cat([batch[name].flatten(0, 1) for batch in batches.batches])
+        for name in ("action_mask", "action")
+    )
+    assert masks.gather(1, actions.unsqueeze(1)).all()
+    assert not masks.all()
+    algorithm = make(replace(recipe, gamma=1.0))
+    algorithm.prepare(0, tmp_path / "other")
+    algorithm.close()
+    algorithm.buffer.extend(algorithm.stored(batches.batches[0]))
+    batch = algorithm.buffer.sample()
+    # A target of the best allowed action, which is not always the best of all.
+    following = values_of_taxi(algorithm, batch["next"])
+    allowed = following.masked_fill(~batch["next", "action_mask"], -torch.inf)
+    assert (allowed.argmax(1) != following.argmax(1)).any()
+    q = values_of_taxi(algorithm, batch).gather(1, batch["action"].unsqueeze(1)).squeeze(1)
+    target = batch["next", "reward"].squeeze(1) + allowed.max(1).values
+    loss, _ = algorithm._step(batch, 0)
+    torch.testing.assert_close(loss, (q - target).square().mean())
+
+
+def values_of_taxi(algorithm: DQNAlgorithm, states: TensorDictBase) -> torch.Tensor:
+    """The values of all actions, masked or not."""
+    everything = states.select("history", "observation").set(
+        "action_mask", torch.ones_like(states["action_mask"])
+    )
+    return algorithm.policy(everything)["action_value"].detach()
+
+
+def test_several_observations(tmp_path: Path) -> None:
+    recipe = replace(SMALL, env="Blackjack-v1", backbone=tit(2), total_steps=40)
+    with Run.create(tmp_path / "run", recipe) as run:
+        train(recipe, run)
+    assert read_metrics(run.folder / "metrics.csv")[-1]["loss"] > 0
+
+
+def test_clipped_rewards(tmp_path: Path) -> None:
+    algorithm = make(replace(SMALL, clip_rewards=True))
+    reward = torch.tensor([[[-3.0], [0.0], [0.2]]])
+    batch = TensorDict({"next": {"reward": reward, "observation": torch.zeros(1, 3, 4)}}, [1, 3])
+    assert algorithm.stored(batch)["next", "reward"].flatten().tolist() == [-1, 0, 1]
+    assert batch["next", "reward"] is reward  # what callbacks see
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"env": "Pendulum-v1"}, "dqn needs a few discrete actions, but those of Pendulum-v1 are"),
+        (
+            {"env": SEVERAL},
+            r"dqn needs a few discrete .* \(MultiCategorical, shape \[2\]\): use a ppo",
+        ),
+        ({"backbone": lstm()}, "dqn draws single transitions, so its network cannot carry a state"),
+        ({"final_epsilon": 1.5}, "final_epsilon must be at most 1"),
+        ({"exploration_fraction": -0.1}, "exploration_fraction must be at least 0"),
+        ({"target_interval": 0}, "target_interval must be at least 1, not 0"),
+        ({"tau": 2.0}, "tau must be at most 1"),
+        ({"buffer_size": 5}, "buffer_size 5 has no room for a batch of 10 steps"),
+        ({"random_steps": 25}, "random_steps 25 must be a multiple of steps_per_batch 10"),
+        ({"loss_function": "l1"}, r"field 'loss_function' is 'l1', not one of \('l2', 'smooth_l1'"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
+    if changes.get("env") == SEVERAL and SEVERAL not in gymnasium.registry:
+        gymnasium.register(SEVERAL, entry_point=lambda **_: SeveralActions())
+    with pytest.raises(ValueError, match=message):
+        make(replace(SMALL, **changes))
+
+
+def test_named_recipes() -> None:
+    names = {f"dqn/{t}/{n}" for t, n in (("cartpole", "mlp"), ("pong", "nature-cnn"))}
+    names |= {"dqn/cartpole/enhanced-tit", "dqn/pong/enhanced-tit"}
+    assert {name for name in RECIPES if name.startswith("dqn/")} == names
+    pong = get_recipe("dqn/pong/enhanced-tit")
+    assert isinstance(pong, DQN)
+    # CleanRL's dqn_atari.py; its target network is copied every 1000 steps.
+    assert (pong.batch_size, pong.learning_rate, pong.gamma) == (32, 1e-4, 0.99)
+    assert (pong.buffer_size, pong.random_steps) == (1_000_000, 80_000)
+    assert pong.target_interval / pong.updates_per_step == 1000
+    assert (pong.final_epsilon, pong.exploration_fraction, pong.double) == (0.01, 0.1, True)
+    assert (pong.clip_rewards, pong.backbone.num_frames) == (True, 4)

@@ -1,0 +1,169 @@
+"""Runs of behaviour cloning, IQL and TD3+BC: training, resuming, evaluation, what they read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import step_mdp
+
+from recipes.metrics import read_metrics
+from recipes.registry import RECIPES, get_recipe
+from recipes.runner import evaluate, load_trained
+from tests.datasets.rollouts import roll, write
+from tests.recipes.cql.cql_runs import tit
+from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train
+from tests.recipes.offline.offline_runs import BC, IQL, TD3BC, double, make, make_algorithm
+from torchrl_tit.settings.networks import lstm
+
+COLUMNS = {
+    BC: ["loss_bc"],
+    IQL: ["loss_value", "loss_qvalue", "loss_actor", "nll"],
+    TD3BC: ["loss_qvalue", "loss_actor", "loss_bc"],
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        (BC, {"backbone": tit(4), "env": "CartPole-v1"}),
+        (IQL, {"backbone": tit(2), "critic": "backbone", "total_updates": 9}),
+        (IQL, {"backbone": tit(), "env": "CartPole-v1", "normalize_rewards": True}),
+        (TD3BC, {"backbone": tit(2), "critic": "backbone", "total_updates": 9}),
+    ],
+    ids=["bc", "iql", "discrete-iql", "td3bc"],
+)
+def test_trains_and_resumes_bit_for_bit(tmp_path, kind, settings):
+    recipe = make(kind, tmp_path, **settings)
+    make_algorithm(recipe).check()
+    assert_resumes_bit_for_bit(recipe, tmp_path)
+    rows = read_metrics(tmp_path / "whole" / "metrics.csv")
+    assert list(rows[0]) == ["step", "time", "return_mean", *COLUMNS[kind]]
+    assert all(np.isfinite(row[name]) for row in rows for name in COLUMNS[kind])
+    assert np.isfinite(rows[-1]["return_mean"])
+
+
+@pytest.mark.parametrize("kind", [BC, IQL, TD3BC])
+def test_learns(tmp_path, kind):
+    """How unlikely, or far, the data's actions are for the policy, after some updates."""
+    rate = "actor_learning_rate" if kind is TD3BC else "learning_rate"
+    algorithm = make_algorithm(make(kind, tmp_path, batch_size=64, **{rate: 0.02}))
+    algorithm.prepare(0, tmp_path)
+    batch = algorithm.buffer.sample()
+    batch["action"] = 0.8 * batch["observation"][:, :3].tanh()
+    seen = [algorithm.update(batch.clone(), 0)[COLUMNS[kind][-1]] for _ in range(40)]
+    assert seen[-1] < 0.7 * seen[0] if kind is TD3BC else seen[-1] < seen[0] - 1
+
+
+def test_normalized_observations(tmp_path):
+    recipe = make(TD3BC, tmp_path, backbone=tit(3), padding="constant")
+    assert recipe.normalize_observations
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    mean, std = algorithm.statistics.mean, algorithm.statistics.std
+    rows = algorithm.load_data()
+    torch.testing.assert_close((mean, std), rows.observation_statistics())
+    raw = make_algorithm(replace(recipe, normalize_observations=False))
+    raw.prepare(0, tmp_path)
+    ours, theirs = algorithm.buffer.sample(), raw.buffer.sample()
+    pairs = [(ours, theirs), (ours["next"], theirs["next"])]
+    # In the task, as in the data.
+    actions = torch.zeros(2, 3)
+    steps = []
+    for one in (algorithm, raw):
+        env = one.make_env(2, seed=0)
+        first = env.reset()
+        second = step_mdp(env.step(first.clone().set("action", actions)))
+        steps.append((first, second))
+        env.close()
+    for normalized, plain in [*pairs, *zip(*steps, strict=True)]:
+        for key in ("observation", "history"):
+            torch.testing.assert_close(normalized[key], (plain[key] - mean) / std)
+    # They belong to the networks, so that a trained agent sees what it was trained on.
+    state = algorithm.networks().state_dict()
+    torch.testing.assert_close(state["statistics.mean"], mean)
+
+
+def test_a_trained_agent_keeps_its_statistics(tmp_path):
+    run = train(make(TD3BC, tmp_path, total_updates=2), tmp_path / "run")
+    algorithm: Any = load_trained(run)[1]
+    assert algorithm.statistics.std.ne(1).any()
+    (outcome,) = algorithm.play(2)
+    assert outcome.returns == evaluate(run)["returns"]
+
+
+@pytest.mark.parametrize("kind", [BC, IQL, TD3BC])
+def test_slices_have_the_loss_of_their_transitions(tmp_path, kind):
+    settings = {} if kind is BC else {"critic": "backbone"}
+    network = tit(3, attention_dropout_outer=0.0, ffn_dropout_inner=0.0)
+    terms = []
+    for length in (1, 4):
+        recipe = make(kind, tmp_path, backbone=network, slice_length=length, **settings)
+        algorithm, _ = double(recipe, tmp_path)
+        index = torch.tensor([[3], [20]]) + torch.arange(4)  # with an end of an episode
+        batch = algorithm.buffer.storage[index if length > 1 else index.flatten()]
+        if recipe.normalize_observations:
+            batch = algorithm.buffer._transform(batch)
+        batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
+        noise = torch.linspace(-0.1, 0.1, 24, dtype=torch.float64)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(torch, "randn_like", lambda x: noise.view(x.shape))  # noqa: B023
+            terms.append(algorithm.update(batch, 0))
+    torch.testing.assert_close(terms[1], terms[0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (TD3BC, {"env": "CartPole-v1"}, "td3bc needs continuous actions .* CartPole-v1 are discre"),
+        (BC, {"env": "Walker2d-v5"}, r"\[11\], but in Walker2d-v5 it is \[17\]"),
+        (IQL, {"env": "Blackjack-v1"}, "data sets hold one observation, but .* has several"),
+        (BC, {"env": "FrozenLake-v1", "normalize_observations": True}, "int64, not floats: swit"),
+        (BC, {"backbone": lstm()}, "bc draws single transitions, so its network cannot carry"),
+        (IQL, {"expectile": 1.0}, r"expectile is a probability in \[0, 1\), not 1.0"),
+        (IQL, {"temperature": -1.0}, "temperature must be at least 0"),
+        (IQL, {"critic_hidden": ()}, "critic_hidden must be at least one width"),
+        (TD3BC, {"policy_delay": 0}, "policy_delay must be at least 1, not 0"),
+        (TD3BC, {"alpha": -1.0}, "alpha must be at least 0"),
+        (BC, {"learning_rate": -1.0}, "learning_rate must be at least 0"),
+        (BC, {"slice_length": 3}, "slice_length 3 does not divide batch_size 8"),
+    ],
+)
+def test_what_does_not_fit_is_refused(tmp_path, kind, settings, message):
+    with pytest.raises(ValueError, match=message):
+        make_algorithm(make(kind, tmp_path, **settings)).check()
+
+
+def test_rewards_that_cannot_be_scaled(tmp_path):
+    rolled = roll()
+    rolled["rewards"][:] = 0
+    data = str(write(tmp_path / "same.hdf5", rolled))
+    recipe = make(IQL, tmp_path, dataset=data, normalize_rewards=True)
+    with pytest.raises(ValueError, match=r"normalize_rewards is on, but no two .*: switch it off"):
+        make_algorithm(recipe).check()
+
+
+def test_named_recipes_have_the_settings_of_the_papers():
+    tasks = ("halfcheetah", "hopper", "walker2d")
+    kinds = ("medium", "medium-replay", "medium-expert")
+    networks = ("mlp", "enhanced-tit", "vanilla-tit")
+    for algorithm in ("bc", "iql", "td3bc"):
+        names = {f"{algorithm}/{t}-{k}-v2/{n}" for t in tasks for k in kinds for n in networks}
+        assert {name for name in RECIPES if name.startswith(f"{algorithm}/")} == names
+    iql = get_recipe("iql/hopper-medium-replay-v2/mlp")
+    assert isinstance(iql, IQL)
+    assert (iql.expectile, iql.temperature, iql.tau, iql.gamma) == (0.7, 3.0, 0.005, 0.99)
+    assert (iql.learning_rate, iql.decay_learning_rate, iql.normalize_rewards) == (3e-4, True, True)
+    td3bc = get_recipe("td3bc/walker2d-medium-v2/enhanced-tit")
+    assert isinstance(td3bc, TD3BC)
+    assert (td3bc.alpha, td3bc.policy_delay, td3bc.tau) == (2.5, 2, 0.005)
+    assert (td3bc.policy_noise, td3bc.noise_clip) == (0.2, 0.5)
+    assert (td3bc.actor_learning_rate, td3bc.critic_learning_rate) == (3e-4, 3e-4)
+    assert td3bc.normalize_observations
+    for recipe in (iql, td3bc):
+        assert (recipe.critic_hidden, recipe.batch_size) == ((256, 256), 256)
+        assert (recipe.final_step, recipe.evaluation_interval) == (1_000_000, 5000)
+        assert recipe.evaluation_episodes == 10

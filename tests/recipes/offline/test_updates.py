@@ -1,0 +1,202 @@
+"""Updates of behaviour cloning, IQL and TD3+BC, against their formulas in float64."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict.nn import set_skip_existing
+from torch.nn import functional as F
+from torchrl.objectives import BCLoss
+
+from tests.recipes.offline.offline_runs import BC, IQL, TD3BC, double, make
+
+
+def value(loss, network, td, params=None):
+    """What a value network says of states, and of their actions if it reads them; [critics, B]."""
+    weights = getattr(loss, f"{params or network}_params")
+    module = getattr(loss, network)
+
+    def of(single):
+        with single.data.to_module(module):
+            out = module(td.select(*module.in_keys).clone())
+        return out[module.out_keys[-1]].detach()
+
+    if weights.ndim:
+        return torch.stack([of(single) for single in weights.unbind(0)]).squeeze(-1)
+    return of(weights).squeeze(-1)
+
+
+def weights_of(loss, keep=False):
+    """The weights, or copies of them, without the bounds of actions."""
+    weights = {n: w for n, w in loss.state_dict().items() if not n.endswith(("low", "high"))}
+    return weights if keep else {name: weight.clone() for name, weight in weights.items()}
+
+
+def moved(before, after, prefix):
+    return any(not torch.equal(after[n], before[n]) for n in before if n.startswith(prefix))
+
+
+def assert_follows(before, after, network, tau):
+    """Targets step towards the weights as they are after the update."""
+    names = [
+        n for n in before if n.startswith(f"target_{network}") and before[n].is_floating_point()
+    ]
+    assert names
+    for name in names:
+        expected = (1 - tau) * before[name] + tau * after[name.removeprefix("target_")]
+        torch.testing.assert_close(after[name], expected)
+
+
+@pytest.mark.parametrize("env", ["Hopper-v5", "CartPole-v1"])
+def test_behaviour_cloning(tmp_path, env):
+    algorithm, batch = double(make(BC, tmp_path, env=env), tmp_path)
+    weights = weights_of(algorithm.loss)
+    by_shape = {tuple(w.shape): w for n, w in weights.items() if n.startswith("actor")}
+    with torch.no_grad():
+        features = algorithm.policy(batch.clone())["features"]
+    if env == "CartPole-v1":
+        logits = F.linear(features, by_shape[2, 8], by_shape[2,])
+        expected = F.cross_entropy(logits, batch["action"])
+    else:
+        mean = F.linear(features, by_shape[3, 8], bias_of(weights, 3)).tanh()
+        std = torch.ones(3, dtype=torch.float64)  # exp(0) at the start
+        normal = (batch["action"] - mean) ** 2 / (2 * std**2) + std.log()
+        expected = (normal + math.log(2 * math.pi) / 2).sum(-1).mean()
+        with set_skip_existing(True):  # TorchRL's, which is right for actions that are floats
+            theirs = BCLoss(algorithm.policy)(batch.clone())["loss_bc"]
+        torch.testing.assert_close(theirs, expected)
+    terms = algorithm.update(batch, 0)
+    torch.testing.assert_close(terms["loss_bc"], expected)
+    assert moved(weights, algorithm.loss.state_dict(), "actor")
+
+
+def bias_of(weights, size):
+    """The bias of a linear layer, which is not the logarithm of the standard deviation."""
+    (bias,) = (w for n, w in weights.items() if tuple(w.shape) == (size,) and n.endswith("bias"))
+    return bias
+
+
+@pytest.mark.parametrize("env", ["Hopper-v5", "CartPole-v1"])
+def test_iql(tmp_path, env):
+    discrete = env == "CartPole-v1"
+    recipe = make(IQL, tmp_path, env=env, tau=0.1, gamma=0.9, expectile=0.8, temperature=2.0)
+    algorithm, batch = double(recipe, tmp_path)
+    loss = algorithm.loss
+    with torch.no_grad():  # targets of their own, and advantages that are not all small
+        for name, weight in weights_of(loss, keep=True).items():
+            if name.startswith("target_"):
+                weight.add_(0.3 * torch.randn_like(weight))
+    batch["next", "terminated"][::2] = True
+    batch["action"] *= 1 if discrete else 0.9
+    action = batch["action"]
+
+    def chosen(values):
+        return (
+            values.gather(-1, action.expand(2, -1).unsqueeze(-1)).squeeze(-1)
+            if discrete
+            else values
+        )
+
+    q = chosen(value(loss, "qvalue_network", batch))
+    worst = chosen(value(loss, "qvalue_network", batch, "target_qvalue_network")).min(0).values
+    v, following = (value(loss, "value_network", td) for td in (batch, batch["next"]))
+    with torch.no_grad():  # so that advantages have both signs
+        shift = (worst - v).median()
+        loss.value_network_params["module", "0", "module", "2", "bias"].add_(shift)
+    v, following = v + shift, following + shift
+    difference = worst - v
+    assert (difference > 0).any()
+    assert (difference < 0).any()
+    expected = {"loss_value": torch.where(difference > 0, 0.8, 0.2).mul(difference**2).mean()}
+    alive = 1 - batch["next", "terminated"].squeeze(-1).double()
+    target = batch["next", "reward"].squeeze(-1) + 0.9 * alive * following
+    expected["loss_qvalue"] = (q - target).square().sum(0).mean()
+    log_prob = algorithm.policy.get_dist(batch.clone()).log_prob(action).detach()
+    weight = (2.0 * difference).exp().clamp(max=100)
+    expected["loss_actor"] = -(weight * log_prob).mean()
+    expected["nll"] = -log_prob.mean()
+
+    before = weights_of(loss)
+    terms = algorithm.update(batch, 6)
+    torch.testing.assert_close(dict(terms), expected)
+    after = loss.state_dict()
+    assert_follows(before, after, "qvalue_network", 0.1)
+    for network in ("actor_network", "qvalue_network", "value_network"):
+        assert moved(before, after, network)
+    # A third of the way down a cosine; the others' rate stays.
+    actor, others = (group["lr"] for group in algorithm.optimizer.param_groups)
+    assert actor == pytest.approx(recipe.learning_rate * 0.75)
+    assert others == recipe.learning_rate
+
+
+def test_iql_scales_rewards(tmp_path):
+    recipe = make(IQL, tmp_path, normalize_rewards=True)
+    algorithm, _ = double(recipe, tmp_path)
+    scaled = algorithm.load_data()
+    returns = scaled.returns[scaled.finished]
+    assert (returns.max() - returns.min()).item() == pytest.approx(1000, rel=1e-4)
+
+
+def test_td3bc(tmp_path):
+    recipe = make(TD3BC, tmp_path, tau=0.1, gamma=0.9, policy_noise=0.4)
+    algorithm, batch = double(recipe, tmp_path)
+    loss = algorithm.loss
+    with torch.no_grad():
+        for name, weight in weights_of(loss, keep=True).items():
+            if name.startswith("target_"):
+                weight.add_(0.1 * torch.randn_like(weight))
+    batch["next", "terminated"][::2] = True
+    torch.manual_seed(5)
+    noise = (torch.randn_like(batch["action"]) * 0.4).clamp(-0.5, 0.5)
+    assert (noise.abs() == 0.5).any()
+
+    def act(td, params):
+        with getattr(loss, params).data.to_module(loss.actor_network):
+            return loss.actor_network(td.clone())["action"].detach()
+
+    following = batch["next"].clone()
+    following["action"] = (act(following, "target_actor_network_params") + noise).clamp(-1, 1)
+    worst = value(loss, "qvalue_network", following, "target_qvalue_network").min(0).values
+    alive = 1 - batch["next", "terminated"].squeeze(-1).double()
+    target = batch["next", "reward"].squeeze(-1) + 0.9 * alive * worst
+    expected = (value(loss, "qvalue_network", batch) - target).square().sum(0).mean()
+
+    before = weights_of(loss)
+    torch.manual_seed(5)
+    terms = dict(algorithm.update(batch, 0))
+    torch.testing.assert_close(terms["loss_qvalue"], expected)
+    after = weights_of(loss)
+    for network in ("actor_network", "qvalue_network"):
+        assert moved(before, after, network)
+        assert_follows(before, after, network, 0.1)
+    # The actor's loss saw the critics after their step, and the actor before its own.
+    own = batch.clone()
+    old = {n: w for n, w in before.items() if n.startswith("actor")}
+    loss.load_state_dict({**after, **old})
+    own["action"] = act(batch, "actor_network_params")
+    q = value(loss, "qvalue_network", own)[0]
+    cloning = (own["action"] - batch["action"]).square().mean()
+    torch.testing.assert_close(terms["loss_bc"].double(), cloning, rtol=1e-6, atol=1e-6)
+    actor = -2.5 * q.mean() / q.abs().mean() + cloning
+    torch.testing.assert_close(terms["loss_actor"].double(), actor, rtol=1e-6, atol=1e-6)
+
+    # Every second step is one of the critics alone, which reports the actor's last terms.
+    loss.load_state_dict(after)
+    again = algorithm.update(batch, 1)
+    last = loss.state_dict()
+    assert moved(after, last, "qvalue_network")
+    assert not moved(after, last, "actor_network")
+    assert not moved(after, last, "target_")
+    assert again["loss_actor"] == terms["loss_actor"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "term"), [(BC, "loss_bc"), (IQL, "loss_qvalue"), (TD3BC, "loss_qvalue")]
+)
+def test_a_loss_that_is_not_finite_stops_the_run(tmp_path, kind, term):
+    algorithm, batch = double(make(kind, tmp_path), tmp_path)
+    batch["action" if kind is BC else ("next", "reward")][0] = torch.nan
+    with pytest.raises(FloatingPointError, match=f"{term} became nan"):
+        algorithm.update(batch, 0)
