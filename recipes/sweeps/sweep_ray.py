@@ -6,7 +6,6 @@ sweep polls the actor until the run has ended.
 
 from __future__ import annotations
 
-import logging
 import os
 import platform
 import runpy
@@ -21,43 +20,6 @@ from typing import Any
 
 from ..interrupt import raise_on_signals
 from .sweep import PROGRAM, Job
-
-_PATIENCE = 30.0  # seconds that a cluster has to answer; it needs two or three
-
-
-def connect(address: str) -> None:
-    """Connects this process to a Ray cluster.
-
-    Args:
-        address: "auto" or ``HOST:PORT`` on a machine of the cluster, ``ray://HOST:PORT`` elsewhere.
-
-    Raises:
-        ValueError: if Ray is missing, or no cluster answers there.
-    """
-    try:
-        import ray
-    except ImportError as error:
-        raise ValueError("sweep --ray needs Ray: pip install 'torchrl-tit[ray]'") from error
-    # Ray itself waits for ten minutes or more if no cluster answers.
-    program = "import sys, ray; ray.init(sys.argv[1], log_to_driver=False)"
-    try:
-        subprocess.run(
-            [sys.executable, "-c", program, address],
-            check=True,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=_PATIENCE,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise ValueError(
-            f"no Ray cluster answered at {address!r} in {_PATIENCE:.0f} seconds: is it the address "
-            "that `ray start --head` printed, or ray://HOST:10001 from outside the cluster?"
-        ) from error
-    except subprocess.CalledProcessError as error:
-        reason = error.stderr.strip().splitlines()[-1:]
-        raise ValueError(f"no connection to Ray at {address!r}: {' '.join(reason)}") from error
-    ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
 
 
 def find_unmet_needs(jobs: Iterable[Job]) -> list[str]:

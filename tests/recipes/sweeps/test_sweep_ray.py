@@ -1,24 +1,24 @@
 """Sweeps on a Ray cluster: two machines, which are both this one."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 
 import pytest
 
+from recipes import ray_cluster
 from recipes.cli import main
 from recipes.metrics import read_metrics
+from recipes.ray_cluster import ask_for_machines
 from recipes.sweeps import sweep_ray
 from recipes.sweeps.sweep import Job, run_jobs
-from recipes.sweeps.sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
+from recipes.sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
 from tests.recipes.sweeps.sweep_runs import TINY, begin
 from torchrl_tit.checkpoint import checkpoint_steps
 
@@ -31,33 +31,12 @@ import sys
 from pathlib import Path
 from recipes.run import Run
 from recipes.sweeps.sweep import Job, run_jobs
-from recipes.sweeps.sweep_ray import RayWorker, connect
+from recipes.ray_cluster import connect
+from recipes.sweeps.sweep_ray import RayWorker
 
 connect(sys.argv[1])
 run_jobs([Job(Run.open(Path(f)).recipe, Path(f)) for f in sys.argv[2:]], 9, RayWorker)
 """
-
-
-@pytest.fixture(scope="module")
-def cluster() -> Iterator[str]:
-    """The address of a cluster of two machines with a CPU each; this process is connected to it."""
-    ray = pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    folder = tempfile.mkdtemp(prefix="ray-")  # pytest's is too long a name for sockets
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_TMPDIR", folder)
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        patch.setenv("RAY_worker_niceness", "0")  # not 15: other tests run beside these
-        machines = Cluster(
-            initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False}
-        )
-        machines.add_node(num_cpus=1)
-        ray.init(machines.address, log_to_driver=False)
-        yield machines.address
-        ray.shutdown()
-        machines.shutdown()
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 def meanwhile(act: Callable[[], None]) -> None:
@@ -175,9 +154,9 @@ def test_without_ray_the_message_says_what_to_install(tmp_path, monkeypatch, cap
 )
 def test_addresses_without_a_cluster_are_refused(monkeypatch, address, reason):
     pytest.importorskip("ray")
-    monkeypatch.setattr(sweep_ray, "_PATIENCE", 30.0 if address == "nowhere" else 2.0)
+    monkeypatch.setattr(ray_cluster, "_PATIENCE", 30.0 if address == "nowhere" else 2.0)
     with pytest.raises(ValueError, match=reason):
-        connect(address)
+        ask_for_machines(address)
 
 
 def test_a_machine_that_does_not_see_the_folder_says_so(tmp_path):
