@@ -1,1 +1,50 @@
-"""Experiments: settings, algorithms, one training loop, and a command line."""
+"""Experiments: settings, algorithms, one training loop, and a command line.
+
+Installed, this package is ``torchrl_tit.recipes``, the name to import it by.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from .one_name import share_modules
+
+share_modules(__name__)
+
+_HOMES = {
+    "Algorithm": "algorithm",
+    "Callback": "callback",
+    "CollectorState": "stateful",
+    "DatasetAlgorithm": "dataset_algorithm",
+    "DatasetRecipe": "dataset_recipe",
+    "NotFiniteError": "algorithm",
+    "Outcome": "outcomes",
+    "Recipe": "recipe",
+    "Run": "run",
+    "check_finite": "algorithm",
+    "evaluate": "runner",
+    "find_recipe": "registry",
+    "get_recipe": "registry",
+    "load_trained": "runner",
+    "make_algorithm": "algorithm",
+    "make_task": "task",
+    "recipe_from_json": "recipe_json",
+    "recipe_to_json": "recipe_json",
+    "register_recipes": "registry",
+    "train": "runner",
+    "weights_from": "initial_weights",
+}
+"""Where the public names live: PyTorch is loaded with the first of them that needs it."""
+
+__all__ = [*_HOMES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

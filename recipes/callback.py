@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
+from .outcomes import Outcome
+
 
 class Callback:
-    """Hooks that the training loop calls; by default they do nothing."""
+    """Hooks that the training loop calls; by default they do nothing.
+
+    For each batch they are called in the order in which they stand here. Of several callbacks, each
+    hook is called in the order of the callbacks. A resumed run calls them from the batch after its
+    checkpoint on. What raises in a hook ends the run, as a kill would.
+
+    Example:
+        >>> class Steps(Callback):
+        ...     def updated(self, step, policy):
+        ...         print("step", step)
+        ...         return step >= 1000  # ends training
+    """
 
     def collected(self, step: int, batch: Any) -> None:
         """Called with each batch, before the update.
@@ -19,7 +33,7 @@ class Callback:
                 tensordict [envs, time] with unclipped rewards.
         """
 
-    def updated(self, step: int, policy: TensorDictModuleBase) -> bool:
+    def updated(self, step: int, policy: TensorDictModuleBase) -> bool | None:
         """Called with the policy after each update.
 
         Args:
@@ -31,8 +45,23 @@ class Callback:
         """
         return False
 
+    def evaluated(self, step: int, outcomes: Sequence[Outcome]) -> None:
+        """Called after each evaluation, that of a complete run included.
+
+        Args:
+            step: number of steps that the policy was trained for.
+            outcomes: the returns of the episodes, for each target return if there are any.
+        """
+
     def saving(self, step: int) -> None:
         """Called before a checkpoint is saved, to write other files that a resumed run needs.
+
+        Args:
+            step: number of steps so far, which is the checkpoint's number.
+        """
+
+    def saved(self, step: int) -> None:
+        """Called once a checkpoint is complete.
 
         Args:
             step: number of steps so far, which is the checkpoint's number.

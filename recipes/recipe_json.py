@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -28,11 +28,14 @@ def recipe_to_json(recipe: Recipe) -> str:
 def settings_to_dict(settings: Any) -> dict[str, Any]:
     """Turns nested settings into dictionaries, with the name of a part under "encoder"."""
     fields = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
-    values = {
-        name: settings_to_dict(value) if dataclasses.is_dataclass(value) else value
-        for name, value in fields.items()
-    }
+    values = {name: _to_json(value) for name, value in fields.items()}
     return {_ENCODER: settings.name, **values} if isinstance(settings, Part) else values
+
+
+def _to_json(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: settings_to_dict(part) for key, part in value.items()}
+    return settings_to_dict(value) if dataclasses.is_dataclass(value) else value
 
 
 def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
@@ -51,7 +54,7 @@ def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
             raise ValueError("expected an object with the recipe's fields")
         return _convert(get_recipe_class(fields.pop("algorithm", None)), fields)
     except (RecursionError, ValueError) as error:  # json.JSONDecodeError is one
-        raise ValueError(f"{source} is not a recipe: {error}") from error
+        raise ValueError(f"{source} cannot be read as a recipe: {error}") from error
 
 
 def _convert(kind: type[T], fields: Any, prefix: str = "") -> T:
@@ -85,7 +88,13 @@ def _convert_part(kind: type[Part], value: Any, name: str) -> Part:
         part = kind.get(fields.pop(_ENCODER, None))
     except ValueError as error:
         raise ValueError(f"field {name + '.' + _ENCODER!r}: {error}") from error
-    return _convert(part, fields, f"{name}.")
+    return _convert(part, part.from_older(fields), f"{name}.")
+
+
+def _convert_parts(kind: Any, value: Any, name: str) -> dict[str, Part]:
+    if not isinstance(value, dict):
+        raise ValueError(f"field {name!r}: expected an object, not {value!r}")
+    return {key: _convert_part(FrameSettings, part, f"{name}.{key}") for key, part in value.items()}
 
 
 def _convert_network(kind: type[Network], value: Any, name: str) -> Network:
@@ -99,6 +108,7 @@ def _convert_network(kind: type[Network], value: Any, name: str) -> Network:
 
 _READERS: dict[Any, Callable[[Any, Any, str], Any]] = {
     FrameSettings: _convert_part,
+    Mapping[str, FrameSettings]: _convert_parts,
     HistorySettings: _convert_part,
     Network: _convert_network,
 }

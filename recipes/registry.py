@@ -1,52 +1,93 @@
-"""The named recipes: the paper's experiments as data."""
+"""The named recipes: the paper's experiments as data, and those of packages of users' own."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
-from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.names import Names
 
 from .presets.cql import CQL_RECIPES
 from .presets.decision_transformer import DT_RECIPES
+from .presets.dqn import DQN_RECIPES
+from .presets.offline import OFFLINE_RECIPES
+from .presets.ppo_any_task import ANY_TASK_RECIPES
 from .presets.ppo_arrays import ARRAY_RECIPES
 from .presets.ppo_atari import ATARI_RECIPES
 from .presets.ppo_no_velocity import NO_VELOCITY_RECIPES
 from .presets.sac import SAC_RECIPES
 from .recipe import Recipe
+from .recipe_file import is_recipe_file, recipe_from_file
 from .recipe_json import recipe_from_json
 
-RECIPES: dict[str, Recipe] = {
-    **ARRAY_RECIPES,
-    **NO_VELOCITY_RECIPES,
-    **ATARI_RECIPES,
-    **SAC_RECIPES,
-    **CQL_RECIPES,
-    **DT_RECIPES,
-}
+RECIPES: Names[Recipe] = Names("recipe")
 """Every named recipe."""
 
 
-def get_recipe(name: str) -> Recipe:
-    """Looks up a recipe.
+def register_recipes(*recipes: Recipe) -> None:
+    """Adds named recipes, which ``list`` prints and every command takes by name.
+
+    A package of your own calls it in the module that its entry point, or ``--import``, names.
 
     Raises:
-        ValueError: if no recipe has that name; the message suggests similar names.
+        ValueError: if a recipe has no name, or that of a recipe from another module.
+
+    Example:
+        >>> from dataclasses import replace
+        >>> register_recipes(replace(get_recipe("ppo/cartpole/mlp"), name="mine/first"))
+        >>> get_recipe("mine/first").env
+        'CartPole-v1'
+    """
+    home = sys._getframe(1).f_globals["__name__"]  # the module that calls, for messages
+    for recipe in recipes:
+        if not recipe.name:
+            raise ValueError(
+                "a recipe needs a name to be registered: set its field 'name', such as "
+                "ppo/cartpole/mine"
+            )
+        RECIPES.add(recipe.name, recipe, home)
+
+
+for _named in (
+    ANY_TASK_RECIPES,
+    ARRAY_RECIPES,
+    NO_VELOCITY_RECIPES,
+    ATARI_RECIPES,
+    SAC_RECIPES,
+    DQN_RECIPES,
+    CQL_RECIPES,
+    OFFLINE_RECIPES,
+    DT_RECIPES,
+):
+    register_recipes(*_named.values())
+
+
+def get_recipe(name: str) -> Recipe:
+    """Looks up a recipe, in installed plugins too.
+
+    Raises:
+        ValueError: if no recipe, or more than one, has that name; the message suggests similar
+            names.
 
     Example:
         >>> get_recipe("ppo/cartpole/enhanced-tit").env
         'CartPole-v1'
     """
-    if name not in RECIPES:
-        raise ValueError(f"unknown recipe {name!r}: {nearest(name, RECIPES)}")
-    return RECIPES[name]
+    return RECIPES.find(name)
 
 
 def find_recipe(name: str) -> Recipe:
-    """Looks up a recipe by name, or reads it from a JSON file such as a run's ``recipe.json``.
+    """Looks up a recipe by name, or reads it from a file.
+
+    Args:
+        name: the name; a JSON file such as a run's ``recipe.json``; or a Python file, which is
+            run, as ``FILE.py`` or ``FILE.py:NAME``.
 
     Raises:
-        ValueError: if no recipe has that name, the file holds no recipe, or it is a folder.
-        FileNotFoundError: if there is no such file.
+        ValueError: if no recipe has that name, the file holds no recipe or several, or it is a
+            folder.
+        FileNotFoundError: if there is no such JSON file.
+        ImportError: if the Python file cannot be run.
 
     Example:
         >>> find_recipe("ppo/pong/enhanced-tit").env
@@ -60,4 +101,6 @@ def find_recipe(name: str) -> Recipe:
         )
     if path.suffix == ".json":
         return recipe_from_json(path.read_bytes(), path)
+    if is_recipe_file(name):
+        return recipe_from_file(name)
     return get_recipe(name)

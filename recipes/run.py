@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,12 +20,16 @@ from torchrl_tit.checkpoint import (
     save_checkpoint,
 )
 from torchrl_tit.files import write_text_atomic
+from torchrl_tit.settings.imports import allowed_modules
 
 from .metrics import Metrics
 from .recipe import Recipe
 from .recipe_json import recipe_to_json
 from .registry import find_recipe
 
+_IMPORTS = "imports.json"
+_WEIGHTS = "initial_weights"
+_WRITTEN_BEFORE = ("versions.json", _IMPORTS, _WEIGHTS)
 _PACKAGES = ["torchrl-tit", "torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy"]
 
 
@@ -32,7 +37,9 @@ class Run:
     """The folder of one training run.
 
         recipe.json        the recipe, from which the run can be repeated
+        initial_weights/   the weights that it took from another run, if it did
         versions.json      the versions of Python and packages that it ran with
+        imports.json       the modules of the user's own that it was started with
         metrics.csv        one row of numbers a batch
         tensorboard/       the same for TensorBoard
         checkpoints/       numbered by step; the newest complete one is loaded
@@ -52,8 +59,16 @@ class Run:
         self._lock = filelock.FileLock(folder / ".lock", timeout=0)
 
     @classmethod
-    def create(cls, folder: Path, recipe: Recipe) -> Run:
+    def create(
+        cls, folder: Path, recipe: Recipe, initial_weights: dict[str, Any] | None = None
+    ) -> Run:
         """Makes a new run folder.
+
+        Args:
+            folder: the folder.
+            recipe: the settings.
+            initial_weights: weights to start from, by their names in the algorithm's networks;
+                see :func:`~recipes.initial_weights.weights_from`.
 
         Raises:
             FileExistsError: if the folder exists already and is not empty.
@@ -61,6 +76,10 @@ class Run:
         cls.check_new(folder)
         folder.mkdir(parents=True, exist_ok=True)
         write_text_atomic(folder / "versions.json", json.dumps(package_versions(), indent=2) + "\n")
+        if modules := allowed_modules():
+            write_text_atomic(folder / _IMPORTS, json.dumps(modules) + "\n")
+        if initial_weights is not None:
+            save_checkpoint(folder / _WEIGHTS, 0, initial_weights)
         write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
         return cls(folder, recipe)
 
@@ -71,7 +90,8 @@ class Run:
         if folder.exists() and (
             not folder.is_dir()
             or any(
-                path.name != "versions.json" and path.name[0] != "." for path in folder.iterdir()
+                path.name not in _WRITTEN_BEFORE and path.name[0] != "."
+                for path in folder.iterdir()
             )
         ):
             raise FileExistsError(
@@ -90,7 +110,10 @@ class Run:
         path = folder / "recipe.json"
         if not path.is_file():
             raise FileNotFoundError(f"{folder} is not a run folder: there is no {path}")
-        return cls(folder, find_recipe(str(path)))
+        try:
+            return cls(folder, find_recipe(str(path)))
+        except ValueError as error:
+            raise ValueError(f"{error}{_import_hint(folder)}") from error
 
     def __enter__(self) -> Run:
         try:
@@ -128,6 +151,15 @@ class Run:
                 "torchrl-tit, whose networks had other parts: train the run again"
             )
         return step, state
+
+    def load_initial_weights(self) -> dict[str, Any]:
+        """Loads the weights of another run that this one starts from; empty if there are none.
+
+        Raises:
+            CheckpointError: if they are damaged.
+        """
+        folder = self.folder / _WEIGHTS
+        return load_checkpoint(folder, 0)[1] if checkpoint_steps(folder) else {}
 
     def load_trained(self) -> tuple[int, dict[str, Any]]:
         """Loads the newest checkpoint of a run that has been trained: (step, state).
@@ -185,6 +217,17 @@ class Run:
             return []
         now = package_versions()
         return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
+
+
+def _import_hint(folder: Path) -> str:
+    """Names what the user imported when the run began; nothing is imported on a file's word."""
+    try:
+        began_with = json.loads((folder / _IMPORTS).read_text(encoding="utf-8"))
+        missing = [str(module) for module in began_with if module not in allowed_modules()]
+    except (OSError, ValueError, TypeError):
+        return ""
+    options = " ".join(f"--import {shlex.quote(module)}" for module in missing)
+    return f"; the run began with `{options}`" if options else ""
 
 
 def package_versions() -> dict[str, str]:

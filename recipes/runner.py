@@ -33,7 +33,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     Args:
         recipe: the settings.
         run: an open run folder.
-        callbacks: hooks on batches, updates and checkpoints; they can end training.
+        callbacks: hooks on batches, updates, evaluations and checkpoints; they can end training.
 
     Raises:
         FloatingPointError: if a loss, a gradient or a weight is not finite.
@@ -45,6 +45,10 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     torch.manual_seed(recipe.seed)
     algorithm = make_algorithm(recipe)
     step = saved_step = max(checkpoint_steps(run.checkpoints), default=0)
+    if step == 0 and (weights := run.load_initial_weights()):
+        with run.restoring(step):
+            networks = algorithm.networks()
+            networks.load_state_dict({**networks.state_dict(), **weights})
     algorithm.prepare(step, run.folder)
     with ExitStack() as stack:
         stack.enter_context(closing(algorithm))
@@ -69,17 +73,22 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
 
             evaluation_due = recipe.evaluation_due(step)
             # Intervals count from the start, so a resumed run logs and saves at the same steps.
-            if evaluation_due or step // recipe.log_interval > before // recipe.log_interval:
+            log_due = step // recipe.log_interval > before // recipe.log_interval
+            if log_due or evaluation_due:
                 with _naming(step, saved_step):
                     record.check()
-                if evaluation_due:
-                    record.outcomes += algorithm.play(step)
+            enough = any([callback.updated(step, algorithm.policy) for callback in callbacks])
+            if evaluation_due:
+                outcomes = algorithm.play(step)
+                record.outcomes += outcomes
+                for callback in callbacks:
+                    callback.evaluated(step, outcomes)
+            if log_due or evaluation_due:
                 row = record.take_row(step)
                 metrics.log(step, **row)
                 if not math.isnan(row["return_mean"]):
                     progress.set_postfix_str(f"return {row['return_mean']:.1f}")
 
-            enough = any([callback.updated(step, algorithm.policy) for callback in callbacks])
             interval = recipe.checkpoint_interval
             due = step // interval > before // interval or step >= recipe.final_step
             if due or evaluation_due or enough or interrupt.requested:
@@ -89,6 +98,8 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
                     callback.saving(step)
                 _save(run, step, parts)
                 saved_step = step
+                for callback in callbacks:
+                    callback.saved(step)
             if interrupt.requested:
                 raise KeyboardInterrupt
             if enough:
@@ -200,7 +211,9 @@ def load_trained(run: Run, recipe: Recipe | None = None) -> tuple[int, Algorithm
     return step, algorithm, state
 
 
-def evaluate(run: Run, recipe: Recipe | None = None) -> dict[str, Any]:
+def evaluate(
+    run: Run, recipe: Recipe | None = None, callbacks: Sequence[Callback] = ()
+) -> dict[str, Any]:
     """Evaluates a run's newest checkpoint: full episodes, the most likely action, raw rewards.
 
     Episodes already played with these weights and seeds are not played again.
@@ -208,6 +221,7 @@ def evaluate(run: Run, recipe: Recipe | None = None) -> dict[str, Any]:
     Args:
         run: a run folder with a checkpoint.
         recipe: the run's recipe, if some of its settings are overridden.
+        callbacks: hooks that are given the outcomes.
 
     Returns:
         See :func:`~recipes.outcomes.summarize`, and the "seed" of the first episode.
@@ -232,6 +246,8 @@ def evaluate(run: Run, recipe: Recipe | None = None) -> dict[str, Any]:
     ]
     if len(now) < len(targets):
         now = algorithm.play(step)
+    for callback in callbacks:
+        callback.evaluated(step, now)
     return {**summarize(now, outcomes, recipe), "seed": recipe.evaluation_seed}
 
 

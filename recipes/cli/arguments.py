@@ -12,10 +12,16 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..recipe import Recipe
+from .imports import HELP, OPTION
 
 
 class Parser(argparse.ArgumentParser):
     """A parser that reports errors as the rest of the command line does."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        # For the help: the option itself is read before the command is known.
+        self.add_argument(OPTION, metavar="MODULE", help=HELP)
 
     def error(self, message: str) -> NoReturn:
         """Ends the program with one line that says what is wrong with the arguments."""
@@ -54,7 +60,7 @@ def parse_fields(
                 tyro.conf.AvoidSubcommands[settings],  # type: ignore[misc, valid-type]
                 args=arguments,
                 prog=f"{program()} {command}",
-                description=description,
+                description=f"{description}\n\n{OPTION} MODULE: {HELP}.",
             )
     except SystemExit as stop:
         if stop.code:
@@ -66,8 +72,13 @@ def _unboxed(message: str) -> str:
     """Turns tyro's box into one sentence: the reason, and similar options if there are any."""
     lines = [line.strip("│ ") for line in message.splitlines()]
     reason = " ".join(takewhile(lambda line: line[:1] not in "─╰", lines[1:]))
-    similar = [line.split()[0] for line in lines if line.startswith("--") and line != "--help"]
-    hint = f"; did you mean {' or '.join(similar)}?" if "Perhaps you meant" in message else ""
+    words = [line.split()[0] for line in lines if line.startswith("--") and line != "--help"]
+    similar = [word for word in words if not word.endswith((".", ","))]  # those are in a help text
+    hint = (
+        f"; did you mean {' or '.join(similar)}?"
+        if similar and "Perhaps you meant" in message
+        else ""
+    )
     return (reason or message) + hint
 
 

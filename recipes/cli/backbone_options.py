@@ -1,5 +1,7 @@
 """The options that choose a network by names: ``--backbone.frame``, ``.history`` and ``.network``.
 
+And ``--backbone.frames.KEY``, for one of several observations.
+
 They are read before all others, because the other options include the fields of the chosen parts.
 """
 
@@ -13,8 +15,9 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from torchrl_tit.settings import NETWORKS, FrameSettings, HistorySettings, Part
+from torchrl_tit.settings import NETWORKS, FrameSettings, HistorySettings, Part, PerKey
 from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.plugins import load_plugins
 
 from ..recipe import Recipe, field_types
 
@@ -28,6 +31,9 @@ _OPTIONS: dict[str, Iterable[str]] = {
 }
 """The options and the names that each takes."""
 
+_PER_KEY = "backbone.frames."
+"""The options for one observation, whose name follows, begin so."""
+
 
 def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
     """Returns the recipe with the network that the arguments name.
@@ -35,7 +41,8 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
     ``--backbone.network`` replaces the network by one of the paper's, with as many frames as
     before. ``--backbone.frame`` and ``--backbone.history`` then replace an encoder. A new encoder
     inherits the old one's non-default values in fields that both have; its other fields have their
-    defaults.
+    defaults. ``--backbone.frames.KEY`` names the frame encoder of one of several observations,
+    which also inherits the width; ``--backbone.frames.KEY.FIELD`` alone takes the recipe's.
 
     The result is not checked: arguments that are read later may be needed for it to be valid, such
     as ``--backbone.num-frames``.
@@ -67,6 +74,15 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
     if "backbone.history" in names:
         history = HistorySettings.get(names["backbone.history"])
         network = _replace_unchecked(network, history=_replace_part(network.history, history))
+    frames = dict(network.frames)
+    for key in _keys_with_fields(arguments):
+        frames.setdefault(key, network.frame)
+    for option, name in names.items():
+        if option.startswith(_PER_KEY):
+            key = option.removeprefix(_PER_KEY)
+            old = frames.get(key, network.frame)
+            frames[key] = _with_width_of(old, _replace_part(old, FrameSettings.get(name)))
+    network = _replace_unchecked(network, frames=PerKey(frames))
     return _replace_unchecked(recipe, backbone=network)
 
 
@@ -78,7 +94,9 @@ def check_recipe(recipe: RecipeT) -> RecipeT:
     """
     backbone = recipe.backbone
     frame, history = replace(backbone.frame), replace(backbone.history)
-    return replace(recipe, backbone=replace(backbone, frame=frame, history=history))
+    frames = {key: replace(part) for key, part in backbone.frames.items()}
+    backbone = replace(backbone, frame=frame, frames=frames, history=history)
+    return replace(recipe, backbone=backbone)
 
 
 def option_fields(recipe: Recipe) -> list[tuple[str, Any, str]]:
@@ -88,7 +106,8 @@ def option_fields(recipe: Recipe) -> list[tuple[str, Any, str]]:
     """
     help_texts = {
         "backbone.network": "A network of the paper by name, with the recipe's number of frames.",
-        "backbone.frame": "Frame encoder; its fields are --backbone.frame.FIELD.",
+        "backbone.frame": "Frame encoder; its fields are --backbone.frame.FIELD. Of one of several "
+        "observations: --backbone.frames.KEY, with the fields --backbone.frames.KEY.FIELD.",
         "backbone.history": "History encoder; its fields are --backbone.history.FIELD.",
     }
     defaults = {
@@ -96,22 +115,32 @@ def option_fields(recipe: Recipe) -> list[tuple[str, Any, str]]:
         "backbone.frame": recipe.backbone.frame.name,
         "backbone.history": recipe.backbone.history.name,
     }
+    for key, frame in recipe.backbone.frames.items():
+        help_texts[_PER_KEY + key] = f"Frame encoder of the observation {key}."
+        defaults[_PER_KEY + key] = frame.name
     return [
         (
-            option.replace(".", "_"),
+            f"option_{number}",
             Annotated[
                 str,
                 tyro.conf.arg(
                     name=option,
                     help=help_texts[option],
-                    metavar="{" + ",".join(choices) + "}",
+                    metavar="{" + ",".join(_choices(option)) + "}",
                     help_behavior_hint=None if defaults[option] else "",
                 ),
             ],
             defaults[option],
         )
-        for option, choices in _OPTIONS.items()
+        for number, option in enumerate(defaults)
     ]
+
+
+def _choices(option: str) -> Iterable[str]:
+    """The names that an option takes; none if there is no such option."""
+    if option.startswith(_PER_KEY) and "." not in option.removeprefix(_PER_KEY):
+        return FrameSettings.registered
+    return _OPTIONS.get(option, ())
 
 
 def _read(arguments: list[str]) -> dict[str, str]:
@@ -119,16 +148,28 @@ def _read(arguments: list[str]) -> dict[str, str]:
     names = {}
     for argument, after in pairwise([*arguments, ""]):
         option, equals, name = argument.removeprefix("--").partition("=")
-        if not argument.startswith("--") or option not in _OPTIONS:
+        choices = _choices(option)
+        if not argument.startswith("--") or not choices:
             continue
         name = name if equals else after
-        choices = _OPTIONS[option]
         if not name or name.startswith("-"):
             raise ValueError(f"--{option} needs a name: {nearest('', choices)}")
+        failures = load_plugins() if name not in choices else []
         if name not in choices:
-            raise ValueError(f"--{option} has no choice {name!r}: {nearest(name, choices)}")
+            reason = (
+                f"--{option} has no choice {name!r}: {nearest(name, choices)} (one of your own "
+                "needs `--import MODULE`)"
+            )
+            raise ValueError("; ".join([reason, *failures]))
         names[option] = name
     return names
+
+
+def _keys_with_fields(arguments: list[str]) -> list[str]:
+    """The observations that have an option ``--backbone.frames.KEY.FIELD``."""
+    options = (a.removeprefix(f"--{_PER_KEY}") for a in arguments if a.startswith(f"--{_PER_KEY}"))
+    keys = (option.partition("=")[0].rpartition(".")[0] for option in options)
+    return [key for key in keys if key]
 
 
 def _replace_part(old: Part, new: type[Any]) -> Any:
@@ -142,6 +183,13 @@ def _replace_part(old: Part, new: type[Any]) -> Any:
         if getattr(old, field.name) != field.default
     }
     return new(**{n: v for n, v in chosen.items() if new_types.get(n) == old_types[n]})
+
+
+def _with_width_of(old: Part, new: Any) -> Any:
+    """Returns settings with the width of other ones: tokens of all observations have the same."""
+    if "embed_dim" in field_types(type(old)) and "embed_dim" in field_types(type(new)):
+        return _replace_unchecked(new, embed_dim=getattr(old, "embed_dim"))  # noqa: B009
+    return new
 
 
 def _replace_unchecked(settings: T, **values: Any) -> T:

@@ -14,6 +14,7 @@ from typing import Annotated
 import tyro
 
 from torchrl_tit.settings import resolve
+from torchrl_tit.settings.imports import import_options
 
 from ..collect import Collection
 from .arguments import Parser, parse_fields, program
@@ -39,10 +40,10 @@ def _collect(arguments: list[str]) -> None:
         "data collect",
         Collection.__doc__,
     )
-    command = shlex.join([*program().split(), "data", "collect", *arguments])
+    words = [*program().split(), "data", "collect", *arguments, *import_options()]
     try:
         collect = resolve(f"{__package__}.data_sets:collect")
-        lines = collect(parsed.collection, parsed.out, command)
+        lines = collect(parsed.collection, parsed.out, shlex.join(words))
     except KeyboardInterrupt:
         print("stopped; the same command resumes", file=sys.stderr)
         raise

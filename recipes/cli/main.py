@@ -7,6 +7,7 @@ import sys
 from torchrl_tit.settings import resolve
 
 from .arguments import fail, program
+from .imports import import_what_is_typed
 
 COMMANDS = {
     "list": "named_recipes:list_recipes",
@@ -27,8 +28,9 @@ usage: {program} COMMAND ...
 
   list [PATTERN]              list the named recipes whose name contains PATTERN
   show NAME                   print a recipe's settings as JSON
-  train NAME [--FIELD VALUE]  train a named recipe, or one in a JSON file;
-                              `train NAME --help` explains every field
+  train NAME [--FIELD VALUE]  train a named recipe, or one in a JSON or Python file (FILE.py:NAME;
+                              the file is run); `train NAME --help` explains every field
+  train NAME --init-from RUN  start from the weights of another run
   train --resume RUN          resume a run that was stopped or killed
   evaluate RUN                evaluate a run's newest checkpoint
   render RUN --out FILE       film a run's agent: a GIF or MP4
@@ -41,6 +43,7 @@ usage: {program} COMMAND ...
   data collect TASK           make medium, mixed, expert and random data sets, as D4RL does
 
 Common options: --seed, --out, --device, --threads where they apply; see COMMAND --help.
+Every command takes --import MODULE, for recipes, encoders, algorithms and tasks of your own.
 """
 
 
@@ -50,7 +53,17 @@ def main(arguments: list[str] | None = None) -> None:
     Args:
         arguments: the arguments after the program's name; those of this process if None.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        _run(import_what_is_typed(sys.argv[1:] if arguments is None else arguments))
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # `list | head`: the reader is gone
+        sys.stdout = None
+    except (ValueError, OSError, RuntimeError, FloatingPointError, ImportError) as error:
+        fail(str(error))
+
+
+def _run(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE.format(program=program()))
         return
@@ -58,11 +71,4 @@ def main(arguments: list[str] | None = None) -> None:
     if name not in COMMANDS:
         print(USAGE.format(program=program()), file=sys.stderr)
         fail(f"unknown command {name!r}: choose from {', '.join(COMMANDS)}")
-    try:
-        resolve(f"{__package__}.{COMMANDS[name]}")(rest)
-    except KeyboardInterrupt:
-        sys.exit(130)
-    except BrokenPipeError:  # `list | head`: the reader is gone
-        sys.stdout = None
-    except (ValueError, OSError, RuntimeError, FloatingPointError) as error:
-        fail(str(error))
+    resolve(f"{__package__}.{COMMANDS[name]}")(rest)

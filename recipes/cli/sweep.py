@@ -17,7 +17,8 @@ def sweep(arguments: list[str]) -> None:
     parser.add_argument(
         "names",
         nargs="+",
-        help="names of recipes, patterns such as 'ppo/*/mlp', or JSON files with a recipe",
+        help="names of recipes, patterns such as 'ppo/*/mlp', JSON files with a recipe, or Python "
+        "files with recipes",
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each recipe")
     parser.add_argument(
@@ -38,7 +39,8 @@ def sweep(arguments: list[str]) -> None:
             failed = run_jobs(jobs, options.workers or 1)
         else:
             # Not at the top: Ray is an extra.
-            from ..sweeps.sweep_ray import RayWorker, connect, count_begun, find_unmet_needs
+            from ..ray_cluster import connect
+            from ..sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
 
             connect(options.ray)
             for note in find_unmet_needs(jobs):
@@ -57,7 +59,7 @@ def sweep(arguments: list[str]) -> None:
 def tune(arguments: list[str]) -> None:
     """Searches for the best values of a recipe's fields."""
     parser = Parser(f"{program()} tune")
-    parser.add_argument("name", help="name of a recipe, or a JSON file")
+    parser.add_argument("name", help="name of a recipe, or a JSON or Python file")
     parser.add_argument("--space", type=Path, help="JSON file with the search space")
     parser.add_argument("--trials", type=int, default=50, help="trials of the whole search")
     parser.add_argument("--workers", type=int, default=1, help="trials at a time, each a process")

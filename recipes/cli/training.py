@@ -7,8 +7,12 @@ import sys
 import time
 from pathlib import Path
 
+from torchrl_tit.settings.imports import import_options
+
 from .. import runner
 from ..algorithm import make_algorithm
+from ..chosen_frames import with_chosen_frames
+from ..initial_weights import weights_from
 from ..recipe import Recipe
 from ..results.plot import plot_run
 from ..run import Run
@@ -16,15 +20,24 @@ from .arguments import override, program
 from .evaluate import one_line
 
 
-def start(recipe: Recipe, folder: Path | None) -> None:
+def start(recipe: Recipe, folder: Path | None, init_from: Path | None = None) -> None:
     """Starts a run; writes nothing if its recipe cannot be run.
 
     Args:
         recipe: the recipe.
         folder: the run folder to make; runs/NAME/seed-SEED-DATE if None.
+        init_from: the run whose weights to start from, if any.
     """
-    make_algorithm(recipe).check()
-    _finish(Run.create(folder or _make_folder(recipe), recipe))
+    algorithm = make_algorithm(recipe)
+    algorithm.check()
+    weights = None
+    if init_from is not None:
+        weights, report = weights_from(init_from, algorithm)
+        print(report)
+    recipe, chosen = with_chosen_frames(recipe, algorithm)
+    if chosen:
+        print(f"frames chosen by kind of observation: {chosen}")
+    _finish(Run.create(folder or _make_folder(recipe), recipe, weights))
 
 
 def resume(folder: Path, device: str | None = None, threads: int | None = None) -> None:
@@ -53,8 +66,8 @@ def _finish(run: Run) -> None:
             runner.train(recipe, run)
             evaluation = runner.evaluate(run)
         except KeyboardInterrupt:
-            command = f"{program()} train --resume {shlex.quote(str(folder))}"
-            print(f"stopped; to resume: {command}", file=sys.stderr)
+            words = [*program().split(), "train", "--resume", str(folder), *import_options()]
+            print(f"stopped; to resume: {shlex.join(words)}", file=sys.stderr)
             raise
         run.save_evaluation(evaluation)
         plot_run(run)

@@ -8,7 +8,9 @@ import filelock
 import torch
 from gymnasium.spaces import Box, Discrete
 
-from torchrl_tit.datasets import task_spaces
+from torchrl_tit.datasets import TaskSpaces, task_spaces
+from torchrl_tit.envs.actions import ActionWriter
+from torchrl_tit.envs.spaces import ObservationReader
 
 from .find_agent import find_agent
 from .output_folder import claim_folder
@@ -51,10 +53,11 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
     """
     torch.set_num_threads(settings.threads)
     task = task_spaces(settings.env)
-    if not (isinstance(task.observation, Box) and isinstance(task.action, Box | Discrete)):
+    if not _is_recorded_as_it_is(task):
         raise ValueError(
             f"{settings.env} has observations {task.observation} and actions {task.action}, but "
-            "data can be collected of one array (Box) and of an array or one choice (Discrete)"
+            "data can be collected of one array or image (a Box of floats or uint8, channels "
+            "first) and of a vector (a Box of floats) or one choice (Discrete, from 0)"
         )
     agent = find_agent(settings, folder / "training", task.action)
     folder.mkdir(parents=True, exist_ok=True)
@@ -68,3 +71,22 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
         raise RuntimeError(
             f"{folder} is in use by another process: wait for it, or stop it"
         ) from error
+
+
+def _is_recorded_as_it_is(task: TaskSpaces) -> bool:
+    """Whether tensordicts hold the observations and the actions that the task writes and reads."""
+    if not (isinstance(task.observation, Box) and isinstance(task.action, Box | Discrete)):
+        return False
+    if task.observation.dtype.kind != "f" and task.observation.dtype != "uint8":
+        return False
+    try:
+        observation = ObservationReader(task.observation).spec
+        action = ActionWriter(task.action, clip=False).spec
+    except (TypeError, ValueError):  # an image whose layout is not known, say
+        return False
+    return (
+        observation.shape == task.observation.shape
+        and action.shape == task.action.shape
+        and task.action.dtype.kind == ("i" if isinstance(task.action, Discrete) else "f")
+        and getattr(task.action, "start", 0) == 0
+    )

@@ -19,6 +19,9 @@ from .agent import Agent, FinishedRun
 from .agent_in_training import AgentInTraining
 from .settings import Collection
 
+_CHANGES = ("env_settings", "wrappers", "observation_keys")
+"""Fields of a recipe with which observations, actions or rewards are not those of the task."""
+
 
 def find_agent(settings: Collection, folder: Path, action_space: Space) -> Agent | None:
     """Finds the agent that the settings name, and checks that it fits the task.
@@ -57,7 +60,7 @@ def _default_sac(settings: Collection) -> SAC:
 def _adapted(recipe: Recipe, settings: Collection) -> Recipe:
     """The recipe with the collection's seed, threads and checkpoints, and a single collector."""
     # With several collectors, batches do not continue one another.
-    single: dict[str, Any] = {"collectors": 1, "async_collection": False}
+    single: dict[str, Any] = {"collectors": 1, "async_collection": False, "ray": None}
     names = {field.name for field in fields(recipe)}
     return replace(
         recipe,
@@ -77,6 +80,8 @@ def _check(recipe: Recipe, env: str) -> None:
         problem = f"is of the task {recipe.env}, not {env}"
     elif getattr(recipe, "hide_velocities", False):
         problem = "hides the velocities, which the data should have"
+    elif changed := [name for name in _CHANGES if getattr(recipe, name)]:
+        problem = f"changes the task with {' and '.join(changed)}, so its data are of another"
     if problem:
         name = recipe.name or f"of {recipe.algorithm}"
         raise ValueError(

@@ -35,14 +35,18 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
     Raises:
         FileExistsError: If there is such a file already.
         FileNotFoundError: If there is no checkpoint.
-        ValueError: If the file is of another kind, ``episodes`` is less than 1, or something that
-            rendering needs is missing: a package, or OpenGL for a MuJoCo task.
+        ValueError: If the file is of another kind, ``episodes`` is less than 1, the task cannot be
+            rendered, or something that rendering needs is missing: a package, or OpenGL for a
+            MuJoCo task.
     """
     if video.suffix not in _SUFFIXES:
         raise ValueError(f"a film is one of {', '.join(_SUFFIXES)}, not {video.name!r}")
     _, algorithm, _ = load_trained(run, recipe)
     policy = algorithm.policy
-    env = algorithm.make_env(1, render_mode="rgb_array")
+    try:
+        env = algorithm.make_env(1, render_mode="rgb_array")
+    except ValueError as error:  # the task has no such setting
+        raise ValueError(f"{run.folder} cannot be rendered: {error}") from error
     base = env.base_env  # transforms have no pictures
     try:
         with (
@@ -69,8 +73,8 @@ def _picture(env: Any, run: Run) -> Any:
         return env.render()[0]
     except Exception as error:  # each task renders in its own way and has its own errors
         raise ValueError(
-            f"{run.folder} cannot be rendered: {error}; for MuJoCo without a screen, set the "
-            "environment variable MUJOCO_GL to egl or osmesa"
+            f"{run.folder} cannot be rendered: {str(error).rstrip('.')}; for MuJoCo without a "
+            "screen, set the environment variable MUJOCO_GL to egl or osmesa"
         ) from error
 
 

@@ -11,8 +11,9 @@ from typing import Annotated, Any
 import msgspec
 import optuna
 
-from torchrl_tit.settings import Inner, Outer, PairedOuter
+from torchrl_tit.settings import Inner
 from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.histories import OuterSettings
 
 from ..recipe import Recipe
 from ..recipe_json import recipe_from_json, recipe_to_json
@@ -20,7 +21,7 @@ from ..recipe_json import recipe_from_json, recipe_to_json
 Number = float | int
 
 # Fields that define the search, so it cannot vary them. A search has its own seeds.
-_FIXED = {"algorithm", "name", "seed", "backbone.frame.encoder", "backbone.history.encoder"}
+_FIXED = {"algorithm", "name", "seed"}
 
 
 class Categorical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="categorical"):
@@ -131,7 +132,11 @@ def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Reci
         Inner(num_heads=1, ...embed_dim=64...)
     """
     fields = json.loads(recipe_to_json(recipe))
-    owners = {name: owner for name, owner in _owners(fields).items() if name not in _FIXED}
+    owners = {
+        name: owner
+        for name, owner in _owners(fields).items()
+        if name not in _FIXED and not name.endswith(".encoder")
+    }
     for name, value in values.items():
         if name not in owners:
             raise ValueError(
@@ -157,7 +162,7 @@ def _default_space(recipe: Recipe) -> str:
             "pass it with --space (docs/recipes.md shows how)"
         )
     network = recipe.backbone
-    if not (isinstance(network.frame, Inner) and isinstance(network.history, Outer | PairedOuter)):
+    if not (isinstance(network.frame, Inner) and isinstance(network.history, OuterSettings)):
         return "ppo"
     return "tit-images" if recipe.env.startswith("ALE/") else "tit-arrays"
 

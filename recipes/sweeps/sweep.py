@@ -16,10 +16,14 @@ from typing import Any, Protocol
 from tqdm import tqdm
 
 from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.imports import import_options
+from torchrl_tit.settings.plugins import load_plugins
 
 from ..algorithm import make_algorithm
+from ..chosen_frames import with_chosen_frames
 from ..interrupt import raise_on_signals
 from ..recipe import Recipe
+from ..recipe_file import is_recipe_file, recipes_from_file
 from ..registry import RECIPES, find_recipe
 from ..run import Run
 
@@ -34,7 +38,7 @@ class Job:
     recipe: Recipe
     folder: Path
     source: str = ""
-    """A JSON file that holds the recipe; empty for a named recipe."""
+    """The file that holds the recipe, as the command line takes it; empty for a named recipe."""
 
     @property
     def log(self) -> Path:
@@ -42,9 +46,12 @@ class Job:
         return self.folder.with_name(self.folder.name + ".log")
 
     def arguments(self) -> list[str]:
-        """Returns the arguments of the command that starts or resumes the run."""
+        """Returns the arguments of the command that starts or resumes the run.
+
+        It imports the modules that the user named for this process.
+        """
         if self._exists():
-            return ["train", "--resume", str(self.folder)]
+            return ["train", "--resume", str(self.folder), *import_options()]
         return [
             "train",
             self.source or self.recipe.name,
@@ -52,6 +59,7 @@ class Job:
             str(self.recipe.seed),
             "--out",
             str(self.folder),
+            *import_options(),
         ]
 
     def is_complete(self) -> bool:
@@ -84,8 +92,8 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
     """Lists the runs of a sweep, and checks all of them before any begins.
 
     Args:
-        patterns: names of recipes, patterns such as ``ppo/*/mlp``, or JSON files that hold a
-            recipe, such as ``tune``'s ``best.json``.
+        patterns: names of recipes, patterns such as ``ppo/*/mlp``, JSON files that hold a
+            recipe, such as ``tune``'s ``best.json``, or Python files, which are run.
         seeds: seeds to run every recipe with.
         out: folder of the sweep; a run's folder is ``out/NAME/seed-SEED``.
 
@@ -111,7 +119,9 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
                 )
     jobs = []
     for recipe, source in found.values():
-        make_algorithm(recipe).check()
+        algorithm = make_algorithm(recipe)
+        algorithm.check()
+        recipe, _ = with_chosen_frames(recipe, algorithm)
         for seed in dict.fromkeys(seeds):
             folder = out / recipe.name / f"seed-{seed}"
             job = Job(replace(recipe, seed=seed), folder, source)
@@ -121,7 +131,9 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
 
 
 def _find(pattern: str) -> list[tuple[Recipe, str]]:
-    """Returns the recipes that a pattern matches, or the one in a JSON file, each with its file."""
+    """Returns the recipes that a pattern matches, or those in a file, each with its source."""
+    if is_recipe_file(pattern):
+        return [(recipe, source) for source, recipe in recipes_from_file(pattern).items()]
     if pattern.endswith(".json"):
         recipe = find_recipe(pattern)
         if not recipe.name:
@@ -129,9 +141,11 @@ def _find(pattern: str) -> list[tuple[Recipe, str]]:
                 f"the recipe in {pattern} has no name, which the folders of its runs need"
             )
         return [(recipe, pattern)]
+    failures = load_plugins() if pattern not in RECIPES else []
     fitting = [(recipe, "") for name, recipe in RECIPES.items() if fnmatchcase(name, pattern)]
     if not fitting:
-        raise ValueError(f"no recipe is called {pattern!r}: {nearest(pattern, RECIPES)}")
+        reasons = [f"no recipe is called {pattern!r}: {nearest(pattern, RECIPES)}", *failures]
+        raise ValueError("; ".join(reasons))
     return fitting
 
 

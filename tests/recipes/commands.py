@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from recipes.cli import main
@@ -23,7 +24,7 @@ class Command:
         errors: file for what it writes to standard error.
     """
 
-    def __init__(self, words: list[object], errors: Path) -> None:
+    def __init__(self, words: Sequence[object], errors: Path) -> None:
         self.errors = errors
         # Not a daemon: it may have processes of its own.
         self._process = _CONTEXT.Process(target=_run, args=([str(word) for word in words], errors))

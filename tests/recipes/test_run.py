@@ -252,7 +252,7 @@ def test_a_damaged_recipe_is_named(text, tmp_path, capsys):
     (run.folder / "recipe.json").write_bytes(text)
     before = contents(run.folder)
     for words in (["train", "--resume"], ["evaluate"]):
-        assert "recipe.json is not a recipe" in fails(capsys, *words, run.folder)
+        assert "recipe.json cannot be read as a recipe" in fails(capsys, *words, run.folder)
     assert contents(run.folder) == before
 
 

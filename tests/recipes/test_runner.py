@@ -273,6 +273,44 @@ def test_what_is_not_finite_is_neither_logged_nor_saved(tmp_path, value, bad_ste
     assert ToyAlgorithm.log[-1] == ("close",)
 
 
+class Hooks(Callback):
+    """Writes down which hook was called, with which step."""
+
+    def __init__(self, name, calls, checkpoints):
+        self.name, self.calls, self.checkpoints = name, calls, checkpoints
+
+    def collected(self, step, batch):
+        self.calls.append((self.name, "collected", step))
+
+    def updated(self, step, policy):
+        self.calls.append((self.name, "updated", step))
+
+    def evaluated(self, step, outcomes):
+        self.calls.append((self.name, "evaluated", step, outcomes[0].returns))
+
+    def saving(self, step):
+        self.calls.append((self.name, "saving", step))
+
+    def saved(self, step):
+        self.calls.append((self.name, "saved", step, checkpoint_steps(self.checkpoints)[-1]))
+
+
+def test_hooks_are_called_in_their_order_and_from_the_checkpoint_on(tmp_path):
+    calls: list[Any] = []
+    hooks = [Hooks(name, calls, tmp_path / "run" / "checkpoints") for name in "ab"]
+    recipe = replace(SMALL, total_steps=3, evaluation_interval=3)
+    start(recipe, tmp_path / "run", *hooks)
+    steps = [(hook, n) for n in (1, 2, 3) for hook in ("collected", "updated")]
+    end = [("evaluated", 3, [3, 4]), ("saving", 3), ("saved", 3, 3)]
+    assert calls == [(n, *call) for call in [*steps, *end] for n in "ab"]
+    calls.clear()
+    run = start(replace(recipe, total_steps=4), tmp_path / "run", *hooks)
+    evaluate(run, callbacks=hooks[:1])
+    four = [(n, *call) for call in [("collected", 4), ("updated", 4)] for n in "ab"]
+    saved = [(n, *call) for call in [("saving", 4), ("saved", 4, 4)] for n in "ab"]
+    assert calls == [*four, *saved, ("a", "evaluated", 4, [4, 5])]
+
+
 def test_evaluations_are_played_once(tmp_path):
     run = start(replace(SMALL, total_steps=20), tmp_path / "run")
     log = ToyAlgorithm.log

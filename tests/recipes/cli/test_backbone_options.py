@@ -15,6 +15,8 @@ from torchrl_tit.settings import (
     FrameSettings,
     HistorySettings,
     Inner,
+    Linear,
+    NatureCNNFrames,
     Outer,
     PairedOuter,
     ResNetFrames,
@@ -58,6 +60,35 @@ def test_a_network_by_name_reads_as_many_frames_as_before():
     assert choose_network(PONG, both).backbone == replace(catformer(4), frame=Flat())
 
 
+def test_one_of_several_observations():
+    words = ["--backbone.frames.image", "nature-cnn", "--backbone.frames.arm/left=linear"]
+    backbone = choose_network(PONG, words).backbone
+    # The widths of tokens are the same.
+    expected = {"image": NatureCNNFrames(embed_dim=64), "arm/left": Linear(embed_dim=64)}
+    assert backbone.frames == expected
+    assert replace(backbone, frames={}) == PONG.backbone
+    again = replace(PONG, backbone=backbone)
+    assert choose_network(again, ["--backbone.frames.image=inner"]).backbone.frames == {
+        **expected, "image": Inner(embed_dim=64)
+    }  # fmt: skip
+    only_a_field = choose_network(PONG, ["--backbone.frames.image.patch-size", "3"])
+    assert only_a_field.backbone.frames == {"image": PONG.backbone.frame}
+
+
+def test_fields_of_one_of_several_observations(monkeypatch, capsys):
+    monkeypatch.setattr("recipes.cli.training.start", lambda recipe, *_: print(recipe.backbone))
+    words = ["--backbone.frames.image", "inner", "--backbone.frames.image.patch-size", "7"]
+    words += ["--backbone.frames.arm/left_x.patch-size", "auto"]
+    main(["train", "ppo/pong/enhanced-tit", *words])
+    frame = PONG.backbone.frame
+    assert isinstance(frame, Inner)
+    frames = {
+        "image": replace(frame, patch_size=7),
+        "arm/left_x": replace(frame, patch_size="auto"),
+    }
+    assert repr(replace(PONG.backbone, frames=frames)) in capsys.readouterr().out
+
+
 def test_every_name_is_a_choice():
     for name in NETWORKS:
         assert choose_network(PONG, ["--backbone.network", name]).backbone.num_frames == 4
@@ -83,7 +114,7 @@ def test_a_pair_trains_and_resumes(tmp_path, capsys):
 def test_what_only_fits_with_a_later_option(tmp_path, monkeypatch, capsys):
     """CoBERL needs several frames, and only CoBERL has a contrastive loss."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("recipes.cli.training.start", lambda recipe, folder: print(recipe.backbone))
+    monkeypatch.setattr("recipes.cli.training.start", lambda recipe, *_: print(recipe.backbone))
     coberl = ["--backbone.network", "coberl", "--backbone.num-frames", "2"]
     main(["train", "ppo/cartpole/mlp", *coberl])
     assert "CoBERL(" in capsys.readouterr().out
@@ -99,6 +130,15 @@ def test_what_only_fits_with_a_later_option(tmp_path, monkeypatch, capsys):
         (["frame", "resnt"], "--backbone.frame has no choice 'resnt': did you mean resnet"),
         (["history", "out"], "did you mean outer"),
         (["network", "enhanced"], "did you mean enhanced-tit"),
+        (
+            ["frames.image", "innr"],
+            "--backbone.frames.image has no choice 'innr': did you mean inn",
+        ),
+        (["frames.image.patch-size", "x"], "Error parsing --backbone.frames.image.patch-size"),
+        (
+            ["frames.image", "inner"],
+            "frames names the observation 'image', which the task does not",
+        ),
         (["history"], "--backbone.history needs a name: choose from outer, paired-outer"),
         (["history", "--num-envs"], "--backbone.history needs a name"),
         (["frame", "resnet"], "for arrays take inner or linear frames"),  # CartPole has no images

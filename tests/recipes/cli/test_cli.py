@@ -110,7 +110,7 @@ def test_bad_words_are_one_line_and_leave_nothing(words, message, capsys, tmp_pa
 
 
 def test_list_takes_names_as_gymnasium_writes_them(capsys):
-    main(["list", "CartPole/MLP"])
+    main(["list", "PPO/CartPole/MLP"])
     assert capsys.readouterr().out == "ppo/cartpole/mlp\n"
 
 
@@ -164,5 +164,5 @@ def test_json_with_wrong_fields_is_refused(change, message):
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"algorithm": 1}'])
 def test_text_that_is_no_recipe_is_refused(text):
-    with pytest.raises(ValueError, match=r"here\.json is not a recipe"):
+    with pytest.raises(ValueError, match=r"here\.json cannot be read as a recipe"):
         recipe_from_json(text, "here.json")

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box, Discrete, MultiDiscrete, Space
 
 from recipes.cli import main
 from recipes.collect import Collection
@@ -22,7 +23,7 @@ from tests.recipes.collect.collected import (
     read,
 )
 from torchrl_tit.checkpoint import checkpoint_steps
-from torchrl_tit.datasets import task_spaces
+from torchrl_tit.datasets import TaskSpaces, task_spaces
 from torchrl_tit.settings.networks import mlp
 
 
@@ -78,11 +79,42 @@ def test_impossible_settings_are_refused_before_anything_is_made(
     assert not (tmp_path / "c").exists()
 
 
+VECTOR, CHOICE = Box(-1, 1, (4,)), Discrete(2)
+
+
+@pytest.mark.parametrize(
+    ("observation", "action", "supported"),
+    [
+        (VECTOR, Box(-1, 1, (2,)), True),
+        (Box(0, 255, (1, 8, 8), np.uint8), CHOICE, True),
+        (Box(0, 255, (8, 8, 3), np.uint8), CHOICE, False),
+        (Box(0, 255, (8, 8, 8), np.uint8), CHOICE, False),
+        (Box(0, 9, (4,), np.int64), CHOICE, False),
+        (VECTOR, Discrete(2, start=1), False),
+        (VECTOR, Box(-1, 1, (2, 2)), False),
+        (VECTOR, Box(0, 3, (2,), np.int64), False),
+        (VECTOR, MultiDiscrete([2, 3]), False),
+    ],
+)
+def test_what_is_recorded_as_the_task_has_it(
+    observation: Space[Any], action: Space[Any], supported: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spaces = TaskSpaces(observation, action, "Some-v0")
+    monkeypatch.setattr("recipes.collect.collect.task_spaces", lambda name: spaces)
+    words = "unknown recipe" if supported else "data can be collected of one array or image"
+    with pytest.raises(ValueError, match=words):
+        collect(replace(PENDULUM, agent="absent"), Path("absent"))
+
+
 def test_recipes_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     recipe = replace(CARTPOLE_RECIPE, hide_velocities=True)
     (tmp_path / "hides.json").write_text(recipe_to_json(recipe))
     with pytest.raises(ValueError, match="hides the velocities"):
         collect(replace(CARTPOLE, agent=str(tmp_path / "hides.json")), tmp_path / "c")
+    recipe = replace(CARTPOLE_RECIPE, env_settings=("max_episode_steps=9",))
+    (tmp_path / "other.json").write_text(recipe_to_json(recipe))
+    with pytest.raises(ValueError, match="changes the task with env_settings"):
+        collect(replace(CARTPOLE, agent=str(tmp_path / "other.json")), tmp_path / "c")
     with pytest.raises(FileNotFoundError, match="absent"):
         collect(replace(CARTPOLE, agent=str(tmp_path / "absent.json")), tmp_path / "c")
     assert not (tmp_path / "c").exists()

@@ -10,7 +10,7 @@ from functools import partial
 import pytest
 
 from recipes import runner
-from recipes.cli import main
+from recipes.cli import main, training
 from recipes.recipe_json import recipe_to_json
 from recipes.registry import RECIPES
 from recipes.results.plot import plot_run
@@ -22,7 +22,8 @@ from tests.recipes.sweeps.sweep_runs import TINY, begin
 
 def test_patterns_and_seeds_make_the_runs(tmp_path):
     jobs = sweep.make_jobs(["ppo/*/mlp", "ppo/cartpole/mlp"], [3, 3, 4], tmp_path)
-    fitting = [name for name in RECIPES if name.startswith("ppo/") and name.endswith("/mlp")]
+    names = [name for name in RECIPES if name.count("/") == 2]
+    fitting = [name for name in names if name.startswith("ppo/") and name.endswith("/mlp")]
     assert len(jobs) == 2 * len(fitting)
     assert {job.recipe.seed for job in jobs} == {3, 4}
     assert all(job.folder == tmp_path / job.recipe.name / f"seed-{job.recipe.seed}" for job in jobs)
@@ -51,6 +52,19 @@ def test_a_file_with_the_name_of_another_recipe_is_refused(order, tmp_path):
         sweep.make_jobs([str(file)], [0], tmp_path)
     with pytest.raises(FileNotFoundError, match=r"yours\.json"):
         sweep.make_jobs([str(tmp_path / "yours.json")], [0], tmp_path)
+
+
+def test_a_run_whose_frame_encoders_were_chosen_by_kind_is_the_sweeps(tmp_path, monkeypatch):
+    """The run names them, the recipe that is swept does not."""
+    pytest.importorskip("minigrid")
+    file = tmp_path / "grid.json"
+    recipe = replace(TINY, name="ppo/grid/mlp", env="MiniGrid-Empty-5x5-v0")
+    file.write_text(recipe_to_json(recipe))
+    [job] = sweep.make_jobs([str(file)], [0], tmp_path)
+    monkeypatch.setattr(training, "_finish", lambda run: None)
+    main(job.arguments())
+    assert Run.open(job.folder).recipe.backbone.frames
+    assert sweep.make_jobs([str(file)], [0], tmp_path) == [job]
 
 
 @pytest.mark.slow

@@ -1,0 +1,100 @@
+"""The first weights of a run, taken from another run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+from torchrl.objectives.value import ValueEstimatorBase
+
+from .algorithm import Algorithm, Stateful
+from .run import Run
+
+_IN_A_BACKBONE = re.compile(r"(.*?)(frame_encoders?|history_encoder)\.")
+
+
+def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Tensor], str]:
+    """Takes the weights of another run's newest checkpoint that fit an algorithm's networks.
+
+    Weights fit if they have the same name and shape. Of a run of another algorithm, only the
+    policy's backbone is taken, by the names within it. Hyperparameters that a loss keeps among its
+    tensors, such as the discount, are the recipe's own.
+
+    Args:
+        folder: the other run's folder.
+        algorithm: the algorithm that is to start with them.
+
+    Returns:
+        The weights by their names in ``algorithm.networks()``, and a line that says which were
+        taken, and names those that were not.
+
+    Raises:
+        FileNotFoundError: if the folder holds no run, or no checkpoint.
+        ValueError: if no weights fit.
+    """
+    run = Run.open(folder)
+    step, checkpoint = run.load_trained()
+    theirs = _tensors(checkpoint["networks"])
+    own = _tensors(algorithm.networks().state_dict())
+    names = {name: name for name in own.keys() - _hyperparameters(algorithm.networks())}
+    if run.recipe.algorithm == algorithm.recipe.algorithm:
+        unexpected = theirs.keys() - own.keys()
+    else:
+        prefix, their_prefix = _policy_backbone(own), _policy_backbone(theirs)
+        names = {
+            name: their_prefix + name.removeprefix("target_").removeprefix(prefix)
+            for name in names
+            if name.removeprefix("target_").startswith(prefix)
+        }
+        theirs = {name: theirs[name] for name in theirs if name.startswith(their_prefix)}
+        unexpected = theirs.keys() - set(names.values())
+    taken = {
+        name: theirs[other]
+        for name, other in names.items()
+        if other in theirs and theirs[other].shape == own[name].shape
+    }
+    reshaped = [
+        f"{name} {list(theirs[other].shape)} instead of {list(own[name].shape)}"
+        for name, other in names.items()
+        if other in theirs and name not in taken
+    ]
+    missing = [name for name, other in names.items() if other not in theirs]
+    source = f"{folder} ({run.recipe.algorithm}, step {step})"
+    rest = "".join(
+        f"; {what}: {', '.join(sorted(which))}"
+        for what, which in [
+            ("missing there", missing),
+            ("unexpected", unexpected),
+            ("of other shapes", reshaped),
+        ]
+        if which
+    )
+    if not taken:
+        raise ValueError(f"no weights of {source} fit these networks{rest}")
+    return taken, f"initial weights: {len(taken)} of {len(names)} tensors from {source}{rest}"
+
+
+def _tensors(state: Mapping[str, Any]) -> dict[str, Tensor]:
+    return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+
+
+def _hyperparameters(networks: Stateful) -> set[str]:
+    """Names of tensors that are not weights: those that losses hold themselves."""
+    if not isinstance(networks, nn.Module):
+        return set()
+    return {
+        f"{prefix}.{name}".lstrip(".")
+        for prefix, module in networks.named_modules()
+        if isinstance(module, LossModule | ValueEstimatorBase)
+        for name, _ in module.named_buffers(recurse=False)
+    }
+
+
+def _policy_backbone(names: Iterable[str]) -> str:
+    """What the names of the first backbone begin with, which is the policy's."""
+    matches = map(_IN_A_BACKBONE.match, names)
+    return next((match[1] for match in matches if match), "no backbone")

@@ -1,0 +1,131 @@
+"""Tasks of every kind are trained, evaluated, resumed and rendered from the command line."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import imageio.v3 as imageio
+import pytest
+import torch
+
+from recipes import runner
+from recipes.cli import main
+from recipes.cql import DiscreteCQL
+from recipes.ppo import PPO
+from recipes.recipe_json import recipe_from_json, recipe_to_json
+from recipes.run import Run
+from recipes.sac import SAC
+from recipes.task import make_task, task_limit
+from torchrl_tit.settings.networks import mlp
+
+BATCH = 32
+OPTIONS = [
+    *("train", "ppo/cartpole/enhanced-tit"),
+    *("--total-steps", 2 * BATCH, "--steps-per-batch", BATCH, "--minibatch-size", 16),
+    *("--num-envs", 2, "--epochs", 1, "--checkpoint-interval", BATCH),
+    *("--evaluation-episodes", 2, "--backbone.num-frames", 2, "--backbone.frame.embed-dim", 8),
+    *("--backbone.frame.num-blocks", 1, "--backbone.head.features-dim", 8),
+]
+SHORT = "max_episode_steps=12"
+TASKS = {
+    "minigrid": [
+        *("--env", "MiniGrid-Empty-5x5-v0", "--env-settings", SHORT),
+        *("--wrappers", "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=2)"),
+        *("--observation-keys", "image", "direction"),
+    ],
+    "frozen-lake": ["--env", "FrozenLake-v1", "--env-settings", SHORT, "is_slippery=False"],
+    "taxi": ["--env", "Taxi-v4", "--env-settings", SHORT, "--mask-actions"],
+    "repeat-previous": ["--env", "popgym-RepeatPreviousEasy-v0", "--env-settings", SHORT],
+    # Pixels, numbers, categories; several discrete actions, with masks.
+    "robot": [
+        *("--env", "tests.envs.tasks:Robot-v0", "--env-settings", SHORT, "--mask-actions"),
+        *("--observation-keys", "arm", "camera", "contacts", "wheels"),
+    ],
+    # TorchRL's own, with transforms.
+    "corridor": [
+        *("--env", "tests.envs.tasks:Corridor", "--env-settings", SHORT, "half=2"),
+        *("--wrappers", "torchrl.envs:RewardScaling(loc=1.0, scale=2.0)"),
+    ],
+}
+
+
+def weights(run):
+    loaded = run.load()
+    assert loaded is not None
+    return loaded[1]["networks"]
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_trains_evaluates_resumes_and_renders(name, tmp_path, capsys):
+    for module in {"minigrid": ["minigrid", "pygame"], "repeat-previous": ["popgym"]}.get(
+        name, ["pygame"]
+    ):
+        pytest.importorskip(module)
+    main([str(word) for word in [*OPTIONS, *TASKS[name], "--out", tmp_path / "whole"]])
+    whole = Run.open(tmp_path / "whole")
+    recipe = whole.recipe
+    assert isinstance(recipe, PPO)
+    (tmp_path / "stopped").mkdir()
+    for steps in (BATCH, 2 * BATCH):
+        part = replace(recipe, total_steps=steps)
+        with Run(tmp_path / "stopped", part) as stopped:
+            runner.train(part, stopped)
+        if steps == BATCH:
+            early = weights(stopped)
+    expected, late = weights(whole), weights(stopped)
+    assert any(not torch.equal(early[key], late[key]) for key in late)
+    assert all(torch.equal(expected[key], late[key]) for key in expected)
+
+    capsys.readouterr()
+    main(["evaluate", str(whole.folder)])
+    assert "2 episodes" in capsys.readouterr().out
+    film = tmp_path / "film.gif"
+    render = ["render", str(whole.folder), "--out", str(film)]
+    if name == "repeat-previous":
+        with pytest.raises(SystemExit):
+            main(render)
+        assert "cannot be rendered: Task 'popgym" in capsys.readouterr().err
+    else:
+        main(render)
+        assert imageio.imread(film).shape[-1] == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--env-settings", "slippery"], "expected NAME=VALUE, such as is_slippery=False"),
+        (["--env-settings", "num_frames=3"], "num_frames is none: it is a field of the recipe"),
+        (["--env-settings", "depth=3"], "'CartPole-v1' cannot be made: TypeError: .*'depth'"),
+        (["--wrappers", "gymnasium.wrappers:Flat"], "gymnasium.wrappers has no 'Flat'"),
+        (["--wrappers", "no_such_module:Flat"], "there is no module 'no_such_module'"),
+        (["--wrappers", "gymnasium.wrappers:Flat(n=m)"], "n=m in .* is no literal"),
+        (["--mask-actions"], "no mask of its actions"),
+        (["--observation-keys", "speed"], "no observation 'speed', .* only observation"),
+        (["--env", "no_such_module:Task-v0"], "there is no module 'no_such_module'"),
+        (["--env", "tests.envs.tasks:Nothing"], "'Nothing' after importing .* has no such name"),
+    ],
+)
+def test_one_line_says_what_is_wrong(options, words, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "ppo/cartpole/mlp", *options, "--out", str(tmp_path / "run")])
+    error = capsys.readouterr().err
+    assert re.search(words, error)
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+
+
+def test_settings_for_every_algorithm():
+    scaled = "torchrl.envs:ObservationNorm(loc=0.0, scale=2.0, in_keys=['observation'])"
+    settings: Any = {
+        "env": "CartPole-v1",
+        "backbone": mlp(),
+        "env_settings": (SHORT,),
+        "wrappers": (scaled,),
+    }
+    for recipe in (PPO(**settings), SAC(**settings), DiscreteCQL(dataset="none", **settings)):
+        assert hash(recipe) == hash(recipe_from_json(recipe_to_json(recipe), "here"))
+        env = make_task(recipe, 2, seed=0)
+        plain = make_task(replace(recipe, wrappers=()), 2, seed=0)
+        assert torch.equal(env.reset(seed=1)["history"], 2 * plain.reset(seed=1)["history"])
+        assert task_limit(recipe) == 12
+        assert env.rollout(20)["next", "truncated"].shape[1] <= 12
