@@ -163,7 +163,8 @@ def test_unknown_names_are_refused(tmp_path):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_stops_every_worker(tmp_path, number):
     out, path = tmp_path / "sweep", tmp_path / "recipe.json"
-    path.write_text(recipe_to_json(replace(TINY, total_steps=10**6, checkpoint_interval=10**6)))
+    long = replace(TINY, total_steps=10**6, checkpoint_interval=10**6, compile="off")
+    path.write_text(recipe_to_json(long))
     job = sweep.make_jobs([str(path)], [0], out)[0]
     process = Command(["sweep", path, "--out", out], tmp_path / "errors")
     metrics = job.folder / "metrics.csv"
