@@ -32,6 +32,12 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
+@pytest.fixture(autouse=True)
+def _imports(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test allows to be imported stays its own."""
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", "")
+
+
 @pytest.fixture
 def float64() -> Iterator[None]:
     """Networks and inputs are made in float64, where rounding hides no mistake."""
@@ -46,7 +52,6 @@ def own_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     """A current directory for modules of a user's own; what they register is forgotten again."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
-    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", "")
     monkeypatch.setattr(plugins, "_failures", None)
     tables: list[Names[Any]] = [FrameSettings.registered, HistorySettings.registered]
     tables += [Recipe.registered, RECIPES]

@@ -64,7 +64,7 @@ def test_a_run_in_processes_is_the_run_in_one(tmp_path, monkeypatch):
             made.append(recipe.vectorization_mode)
             super().__init__(*arguments, **options)
 
-    monkeypatch.setattr("torchrl_tit.envs.factory.AsyncVectorEnv", Processes)
+    monkeypatch.setattr("torchrl_tit.envs.gymnasium_tasks.AsyncVectorEnv", Processes)
     for mode in ("sync", "async"):
         recipe = replace(recipe, vectorization_mode=mode)
         with Run.create(tmp_path / mode, recipe) as run:
