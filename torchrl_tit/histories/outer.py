@@ -89,7 +89,9 @@ class PairedOuterTransformer(OuterTransformer):
         torch.Size([8, 64])
     """
 
-    def __init__(self, settings: settings.PairedOuter, shape: HistoryShape) -> None:
+    def __init__(
+        self, settings: settings.PairedOuter | settings.ChainedOuter, shape: HistoryShape
+    ) -> None:
         super().__init__(
             settings,
             shape,
@@ -110,7 +112,7 @@ class PairedOuterTransformer(OuterTransformer):
         return [weights.reshape(*leading, *weights.shape[1:]) for weights in maps]
 
 
-class ChainedOuterTransformer(OuterTransformer):
+class ChainedOuterTransformer(PairedOuterTransformer):
     """The outer blocks of Enhanced_TIT, each also on the output of the one before it.
 
     Outer block l reads, at all K frames, the sum of token l (the output of inner block l) and the
@@ -136,14 +138,6 @@ class ChainedOuterTransformer(OuterTransformer):
         >>> outer(torch.randn(8, 4, 2, 32)).shape
         torch.Size([8, 64])
     """
-
-    def __init__(self, settings: settings.ChainedOuter, shape: HistoryShape) -> None:
-        super().__init__(
-            settings,
-            shape,
-            num_blocks=shape.num_tokens,
-            out_features=shape.num_tokens * shape.width,
-        )
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., L * D]."""
