@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -19,8 +20,10 @@ from torchrl.objectives.value import GAE
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.evaluation import evaluate, finished_returns
-from torchrl_tit.layers import init_orthogonal_
+from torchrl_tit.frames.normalized import NormalizedFrames
+from torchrl_tit.layers import init_orthogonal_, scale_residual_branches_
 from torchrl_tit.modules import Backbone, history_keys, make_actor, make_value
+from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.networks import build_network, masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 
@@ -32,7 +35,9 @@ from ..stateful import CollectorState
 from ..task import make_task
 from .collectors import make_collector, with_state
 from .flat_parameters import FlatParameters
+from .learning_rate import KLAdaptiveRate
 from .rollout import Rollout
+from .scaling import ReturnScale, ValueHead, normalize_advantages
 from .settings import PPO
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
@@ -53,14 +58,18 @@ class Agent(nn.Module):
         observation = observation_specs(env)
         separate = recipe.backbone.trunks == "separate"
         keys = ["policy_features", "value_features"] if separate else ["features"]
+        network = build_network(recipe.backbone, observation)
         self.backbone = Backbone(
-            build_network(recipe.backbone, observation),
+            network,
             in_keys=history_keys(observation),
             out_keys=keys,
             padding=recipe.padding,
         )
         if recipe.initialization == "orthogonal":
             init_orthogonal_(self.backbone)
+        scale_residual_branches_(self.backbone, recipe.residual_gain)
+        if recipe.normalize_observations:
+            normalize_frames(network)
         features_dim = self.backbone.features_dim
         self.mask_key = MASK if recipe.mask_actions else None
         self.actor = make_actor(
@@ -69,8 +78,11 @@ class Agent(nn.Module):
             in_key=keys[0],
             mask_key=self.mask_key,
             batch_dims=0,
+            gain=recipe.policy_gain,
         )
         self.critic = make_value(features_dim, in_key=keys[-1])
+        if recipe.normalize_values or recipe.value_gradient != 1:
+            self.critic.module = ValueHead(self.critic.module, gradient=recipe.value_gradient)
 
     def encode(self, samples: TensorDictBase) -> TensorDictBase:
         """Writes the features of single steps [N], or of sequences [N, time]."""
@@ -96,6 +108,17 @@ class Agent(nn.Module):
         results = ["action", "action_log_prob", "advantage", "value_target"]
         return [*self.state_keys, *masks, *results]
 
+    def update_statistics(self, frames: Sequence[Tensor]) -> None:
+        """Adds a batch to the statistics by which observations are normalised.
+
+        Args:
+            frames: of each observation, [R, *observation_shape].
+        """
+        for trunk in trunks_of(self.backbone.module).values():
+            for encoder, table in zip(trunk.frame_encoders.values(), frames, strict=True):
+                if isinstance(encoder, NormalizedFrames):
+                    encoder.update(table)
+
     @property
     def policy(self) -> TensorDictModuleBase:
         """History in; features, action, its log-probability and the state's value out."""
@@ -117,7 +140,17 @@ class PPOAlgorithm(Algorithm[PPO]):
         self.agent.backbone.autocast = autocast_type(recipe.precision, self.device)
         contrastive = ["loss_contrastive"] if recipe.contrastive_coeff else []
         self.terms = [*TERMS, *contrastive, "gradient_norm"]
-        self.columns = ["learning_rate", "feature_spread", *self.terms]
+        self.columns = [
+            "learning_rate",
+            "feature_spread",
+            "explained_variance",
+            "policy_gradient",
+            "value_gradient",
+            "epochs",
+            *self.terms,
+        ]
+        self.return_scale = ReturnScale(recipe.gamma)
+        self.rate = KLAdaptiveRate(recipe.target_kl or math.inf)
 
     @property
     def policy(self) -> TensorDictModuleBase:
@@ -142,7 +175,7 @@ class PPOAlgorithm(Algorithm[PPO]):
             entropy_coeff=recipe.entropy_coeff,
             critic_coeff=recipe.critic_coeff,
             loss_critic_type="l2",
-            normalize_advantage=True,
+            normalize_advantage=not recipe.advantage_floor,
             log_explained_variance=False,
             functional=False,
         )
@@ -165,7 +198,12 @@ class PPOAlgorithm(Algorithm[PPO]):
 
     def state(self) -> Mapping[str, Stateful]:
         """Optimizer, collector and environment."""
-        return {"optimizer": self.optimizer, "collector": self.collector_state}
+        return {
+            "optimizer": self.optimizer,
+            "collector": self.collector_state,
+            "return_scale": self.return_scale,
+            "rate": self.rate,
+        }
 
     def batches(self) -> Iterator[TensorDictBase]:
         """Yields collected batches, [envs, time]."""
@@ -184,27 +222,47 @@ class PPOAlgorithm(Algorithm[PPO]):
     def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
         """Estimates advantages, then takes a gradient step on each minibatch of each epoch."""
         recipe, agent = self.recipe, self.agent
-        learning_rate = recipe.learning_rate_at(step)
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate
+        learning_rate = recipe.learning_rate_at(step) * self.rate.factor
+        self._set_learning_rate(learning_rate)
         if recipe.decay_clip_epsilon:
             self.loss.clip_epsilon.fill_(recipe.clip_epsilon * (1 - step / recipe.final_step))
         reward = batch["next", "reward"]
         reward = reward.sign() if recipe.clip_rewards else reward
         batch["next", "reward"] = reward * recipe.reward_scale
+        if recipe.normalize_rewards:
+            scale = self.return_scale.update(batch["next", "reward"], batch["next", "done"])
+            batch["next", "reward"] = batch["next", "reward"] / (scale + 1e-4)
         rollout = agent.rollout(batch)
+        agent.update_statistics(rollout.frames)
         with torch.no_grad():
             add_advantages(batch, rollout, agent, self.gae, recipe.bootstrap_time_limit)
+        target, value = batch["value_target"], batch["state_value"]
+        if recipe.normalize_values:
+            agent.critic.module.update(target)
+            self.loss.critic_coeff.fill_(recipe.critic_coeff / agent.critic.module.std**2)
         agent.train()
         steps: list[Tensor] = []
+        kl = TERMS.index("kl_approx")
+        per_epoch = math.ceil(batch.numel() / recipe.minibatch_size)
         for minibatch in minibatches(batch, rollout, agent, recipe):
+            if recipe.advantage_floor:
+                advantage = normalize_advantages(minibatch["advantage"], recipe.advantage_floor)
+                minibatch["advantage"] = advantage
             try:
                 steps.append(self._step(minibatch))
             except RuntimeError:  # TorchRL draws samples where an entropy is not finite
                 self._check_update(steps, minibatch)
                 raise
+            if recipe.target_kl is not None and len(steps) % per_epoch == 0:
+                moved = torch.stack(steps[-per_epoch:])[:, kl].mean().item()
+                if recipe.at_target_kl == "adapt":
+                    self.rate.update(moved)
+                    self._set_learning_rate(recipe.learning_rate_at(step) * self.rate.factor)
+                elif moved > recipe.target_kl:
+                    break
         agent.eval()
         self._check_update(steps, minibatch)
+        policy_gradient, value_gradient = self._gradient_norms(minibatch)
         terms = torch.stack(steps)  # [gradient steps, terms]
         if recipe.collectors > 1 or recipe.ray is not None:
             self.collector.update_policy_weights_()
@@ -214,6 +272,10 @@ class PPOAlgorithm(Algorithm[PPO]):
         return {
             "learning_rate": learning_rate,
             "feature_spread": features.std(0).mean(),
+            "explained_variance": 1 - (target - value).var() / target.var().clamp(min=1e-12),
+            "policy_gradient": policy_gradient,
+            "value_gradient": value_gradient,
+            "epochs": len(steps) / per_epoch,
             **dict(zip(self.terms, terms.mean(0), strict=True)),
         }
 
@@ -245,6 +307,23 @@ class PPOAlgorithm(Algorithm[PPO]):
         norm = nn.utils.clip_grad_norm_(self.parameters, self.recipe.max_grad_norm)
         self.optimizer.step()
         return torch.cat([values, norm.unsqueeze(0)])
+
+    def _set_learning_rate(self, learning_rate: float) -> None:
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate
+
+    def _gradient_norms(self, minibatch: TensorDict) -> list[Tensor]:
+        """Norms of the gradients of the policy's and the value's loss on the backbone's weights."""
+        self.agent.encode(minibatch)
+        terms = self.loss(minibatch)
+        weights = list(self.agent.backbone.parameters())
+        norms = []
+        for name in ("loss_objective", "loss_critic"):
+            gradients = torch.autograd.grad(
+                terms[name], weights, retain_graph=True, allow_unused=True
+            )
+            norms.append(nn.utils.get_total_norm([g for g in gradients if g is not None]))
+        return norms
 
     def _objective(self, minibatch: TensorDict) -> tuple[Tensor, Tensor]:
         """The loss, float [], and its terms, float [terms]."""
@@ -278,6 +357,16 @@ class PPOAlgorithm(Algorithm[PPO]):
         value = self.agent.critic(self.agent.encode(samples))["state_value"].mean()
         weights = nn.utils.get_total_norm(self.parameters)
         check_finite(["weights", "value"], torch.stack([weights, value]))
+
+
+def normalize_frames(network: nn.Module) -> None:
+    """Puts a :class:`NormalizedFrames` in front of each frame encoder that reads floats."""
+    for trunk in trunks_of(network).values():
+        names = list(trunk.frame_encoders)
+        seen = zip(names, trunk.frames, trunk.observations.values(), strict=True)
+        for key, encoder, observation in seen:
+            if observation.is_float:
+                trunk.frame_encoders[key] = NormalizedFrames(encoder)
 
 
 def add_advantages(

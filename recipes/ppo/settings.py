@@ -9,8 +9,9 @@ from typing import Literal
 from torchrl_tit.settings import CoBERL
 from torchrl_tit.settings.checks import check_at_least, check_at_most, check_positive
 
+from ..online_recipe import OnlineRecipe
 from ..ray_cluster import check_address
-from ..recipe import Compile, Padding, Precision, Recipe
+from ..recipe import Compile, Padding, Precision
 
 VectorizationMode = Literal["sync", "async"]
 
@@ -19,7 +20,7 @@ _LONGEST = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm"):
+class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm"):
     """Proximal policy optimisation (arXiv 1707.06347) with Stable-Baselines3's settings.
 
     The defaults are those of the paper's runs on arrays (arXiv 2212.14538, appendix).
@@ -76,6 +77,32 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
     """Factor on the rewards for training. If policy and value share a backbone, values in the tens
     or hundreds make its features the same in all states (docs/results/classic_control.md).
     Reported returns are always unscaled."""
+    normalize_rewards: bool = False
+    """Whether rewards are divided by the running standard deviation of the discounted return, as
+    in VecNormalize of Stable-Baselines3 (arXiv 2005.12729, "reward scaling")."""
+    advantage_floor: float = 0.0
+    """Least standard deviation by which a minibatch's advantages are divided. With 0, advantages
+    that are all but noise, as of a task that is solved, move the policy as far as any others. With
+    normalize_rewards, 1 is the deviation of the discounted return (DreamerV3 divides by at least 1
+    in the same way, arXiv 2301.04104)."""
+    normalize_values: bool = False
+    """Whether the critic learns values with the running mean 0 and standard deviation 1 (PopArt,
+    arXiv 1602.07714; arXiv 2006.05990, "value function normalization")."""
+    value_gradient: float = 1.0
+    """Factor on the gradient of the value loss where it enters a backbone that policy and value
+    share; 0 trains the backbone on the policy's loss alone (arXiv 2009.04416 compares)."""
+    normalize_observations: bool = False
+    """Whether the network reads observations with the running mean 0 and standard deviation 1 (as
+    in VecNormalize; arXiv 2006.05990, "observation normalization"). Images are only scaled to
+    0..1."""
+    target_kl: float | None = None
+    """KL divergence that an update should have; see at_target_kl."""
+    at_target_kl: Literal["stop", "adapt"] = "stop"
+    """With a target_kl: "stop" ends an update after the epoch that exceeds it (as in OpenAI's
+    Spinning Up), "adapt" follows it with the learning rate (as in rl_games and skrl)."""
+    residual_gain: float = 1.0
+    """Factor on the initial output weights of attention and FFN in each block; 0 makes every block
+    the identity at the start (arXiv 1901.09321, 2003.04887)."""
     gamma: float = 0.99
     """Discount factor."""
     gae_lambda: float = 0.95
@@ -86,6 +113,8 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
     initialization: Literal["orthogonal", "own"] = "orthogonal"
     """Initialisation of the backbone: orthogonal, as in Stable-Baselines3 and so in the paper's
     online runs, or the network's own (TIT: normal with a standard deviation of 0.02)."""
+    policy_gain: float = 0.01
+    """Gain of the initial weights of the policy's last layer."""
     checkpoint_interval: int = 10_240
     """Environment steps between checkpoints."""
     collectors: int = 1
@@ -124,6 +153,10 @@ class PPO(Recipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm
             max_grad_norm=0,
             clip_epsilon=0,
             reward_scale=0,
+            advantage_floor=0,
+            value_gradient=0,
+            residual_gain=0,
+            policy_gain=0,
             gamma=0,
             gae_lambda=0,
         )

@@ -1,4 +1,4 @@
-"""The patch size "auto": at most 16 patches of an array, about 49 of an image."""
+"""The patch size "auto": an array as a whole, 16 patches of categories, about 49 of an image."""
 
 import pytest
 
@@ -12,12 +12,8 @@ from torchrl_tit.settings import Inner, StackedInner
     ("shape", "patch_size"),
     [
         ((1,), 1),
-        ((16,), 1),
-        ((18,), 2),
-        ((27,), 3),
-        ((105,), 7),
-        ((17,), 17),  # nothing divides it
-        ((376,), 47),
+        ((17,), 17),
+        ((376,), 376),
         ((7, 7), 1),
         ((3, 84, 84), 12),
         ((3, 56, 56), 8),
@@ -32,6 +28,18 @@ def test_auto(shape, patch_size):
     assert find_patch_size(shape, "auto") == patch_size
     auto = build_frame(Inner(embed_dim=4, patch_size="auto"), Observation(shape))
     named = build_frame(Inner(embed_dim=4, patch_size=patch_size), Observation(shape))
+    assert str(auto) == str(named)
+
+
+@pytest.mark.parametrize(
+    ("entries", "patch_size"),
+    [(1, 1), (16, 1), (18, 2), (27, 3), (105, 7), (17, 17), (376, 47)],  # nothing divides 17
+)
+def test_auto_of_categories(entries, patch_size):
+    assert find_patch_size((entries,), "auto", categories=True) == patch_size
+    observation = Observation((entries,), categories=(3,) * entries)
+    auto = build_frame(Inner(embed_dim=4, patch_size="auto"), observation)
+    named = build_frame(Inner(embed_dim=4, patch_size=patch_size), observation)
     assert str(auto) == str(named)
 
 

@@ -63,10 +63,11 @@ class InnerTransformer(FrameEncoder):
         self.every_block = settings.every_block
         self.patch_embedding = make_patch_embedding(
             shape,
-            find_patch_size(shape, settings.patch_size),
+            find_patch_size(shape, settings.patch_size, categories=categories is not None),
             settings.embed_dim,
             num_frames=num_frames or 1,
             categories=categories,
+            own_weights=settings.patch_weights == "own",
         )
         self.class_token = nn.Parameter(torch.empty(1, 1, settings.embed_dim))
         self.positions = (

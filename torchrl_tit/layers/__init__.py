@@ -5,7 +5,11 @@ from torchrl_tit.layers.block import TransformerBlock
 from torchrl_tit.layers.dropout import Dropout
 from torchrl_tit.layers.gated_block import GatedTransformerBlock, GRUGate
 from torchrl_tit.layers.gpt2_block import GPT2Block
-from torchrl_tit.layers.initialization import init_normal_, init_orthogonal_
+from torchrl_tit.layers.initialization import (
+    init_normal_,
+    init_orthogonal_,
+    scale_residual_branches_,
+)
 from torchrl_tit.layers.patches import ArrayPatchEmbedding, ImagePatchEmbedding
 from torchrl_tit.layers.positions import RelativeBias, Rotary
 from torchrl_tit.layers.relative_attention import RelativeSelfAttention
@@ -24,4 +28,5 @@ __all__ = [
     "TransformerBlock",
     "init_normal_",
     "init_orthogonal_",
+    "scale_residual_branches_",
 ]

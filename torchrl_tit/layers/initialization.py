@@ -6,6 +6,7 @@ import math
 
 from torch import nn
 
+from torchrl_tit.layers.block import TransformerBlock
 from torchrl_tit.layers.patches import ImagePatchEmbedding
 
 
@@ -58,3 +59,19 @@ def init_orthogonal_(module: nn.Module, gain: float = math.sqrt(2)) -> None:
             bias = getattr(child, "bias", None)
             if bias is not None:
                 nn.init.zeros_(bias)
+
+
+def scale_residual_branches_(module: nn.Module, factor: float) -> None:
+    """Scales the last weights of attention and FFN in all transformer blocks.
+
+    With 0, every block is the identity at the start (arXiv 1901.09321, 2003.04887).
+
+    Args:
+        module: the network, changed in place.
+        factor: factor on the weights.
+    """
+    for child in module.modules():
+        if isinstance(child, TransformerBlock):
+            for layer in (child.attention.out_proj, child.ffn[2]):
+                assert isinstance(layer, nn.Linear)
+                layer.weight.data.mul_(factor)

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from torchrl_tit.layers.categories import CategoryPatchEmbedding
 
-_MOST_ARRAY_PATCHES = 16
+_MOST_CATEGORY_PATCHES = 16
 _IMAGE_PATCHES = 49  # of the paper's Atari games: 84 pixels in patches of 12
 _MOST_IMAGE_PATCHES = 1024
 
@@ -29,23 +29,37 @@ class ArrayPatchEmbedding(nn.Module):
         patch_size: entries P of a patch.
         embed_dim: width of a token.
         channels: arrays that are stacked in one observation (frames, say); 1 for a plain one.
+        own_weights: whether each patch has weights of its own, and a bias.
 
     Example:
         >>> ArrayPatchEmbedding(size=11, patch_size=4, embed_dim=32)(torch.randn(8, 1, 11)).shape
         torch.Size([8, 3, 32])
     """
 
-    def __init__(self, size: int, patch_size: int, embed_dim: int, *, channels: int = 1) -> None:
+    def __init__(
+        self,
+        size: int,
+        patch_size: int,
+        embed_dim: int,
+        *,
+        channels: int = 1,
+        own_weights: bool = False,
+    ) -> None:
         super().__init__()
         self.patch_size = patch_size
         self.num_patches = math.ceil(size / patch_size)
         self.padding = math.ceil((self.num_patches * patch_size - size) / 2)
-        self.weight = nn.Parameter(torch.empty(embed_dim, channels, patch_size))
+        own = (self.num_patches,) if own_weights else ()
+        self.weight = nn.Parameter(torch.empty(*own, embed_dim, channels, patch_size))
+        self.bias = nn.Parameter(torch.empty(*own, embed_dim)) if own_weights else None
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises as ``nn.Conv1d`` does."""
-        nn.init.kaiming_uniform_(self.weight, a=math.sqrt(5))
+        """Initialises as ``nn.Conv1d`` does, and a bias like the token of an entry of size 1."""
+        bound = 1 / math.sqrt(self.weight.shape[-2:].numel())
+        nn.init.uniform_(self.weight, -bound, bound)
+        if self.bias is not None:
+            nn.init.uniform_(self.bias, -1, 1)
 
     def extra_repr(self) -> str:
         """Shows the shape of the weight: width, channels, P."""
@@ -57,7 +71,10 @@ class ArrayPatchEmbedding(nn.Module):
             x = F.pad(x, (self.padding, self.padding))
         x = x[..., : self.num_patches * self.patch_size]  # padding both ends may leave a remainder
         x = x.unflatten(-1, (self.num_patches, self.patch_size))  # [N, C, patches, P]
-        return embed(x.transpose(1, 2).flatten(2), self.weight)
+        patches = x.transpose(1, 2).flatten(2)  # [N, patches, C * P]
+        if self.bias is None:
+            return embed(patches, self.weight)
+        return torch.einsum("npe,pde->npd", patches, self.weight.flatten(2)) + self.bias
 
 
 class ImagePatchEmbedding(nn.Module):
@@ -131,23 +148,30 @@ def embed(patches: Tensor, weight: Tensor) -> Tensor:
 
 
 def find_patch_size(
-    observation_shape: Sequence[int], patch_size: int | Literal["auto"] | None
+    observation_shape: Sequence[int],
+    patch_size: int | Literal["auto"] | None,
+    *,
+    categories: bool = False,
 ) -> int:
     """Finds the patch size that settings leave open.
 
     Args:
         observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
         patch_size: a number, which is returned; None for the whole observation; or "auto". Of
-            arrays and categories that is 1 for up to 16 entries, else the smallest divisor of the
-            entries that leaves at most 16 patches. Of images it is the side of the square patch
-            that divides them into the number of patches nearest to 49, the paper's for Atari games.
+            arrays that is the whole observation. Of categories it is 1 for up to 16 entries, else
+            the smallest divisor of the entries that leaves at most 16 patches. Of images it is the
+            side of the square patch that divides them into the number of patches nearest to 49, the
+            paper's for Atari games.
+        categories: whether the entries count categories.
 
     Raises:
         ValueError: if no patch divides an image into fewer than 1025.
 
     Example:
-        >>> [find_patch_size(shape, "auto") for shape in [(4,), (27,), (17,), (3, 84, 84), (7, 7)]]
-        [1, 3, 17, 12, 1]
+        >>> [find_patch_size(shape, "auto") for shape in [(4,), (27,), (3, 84, 84), (7, 7)]]
+        [4, 27, 12, 1]
+        >>> find_patch_size((27,), "auto", categories=True)
+        3
     """
     if patch_size is None:
         return observation_shape[-1]
@@ -155,7 +179,9 @@ def find_patch_size(
         return patch_size
     if len(observation_shape) == 1:
         (size,) = observation_shape
-        smallest = math.ceil(size / _MOST_ARRAY_PATCHES)
+        if not categories:
+            return size
+        smallest = math.ceil(size / _MOST_CATEGORY_PATCHES)
         return next(p for p in range(smallest, size + 1) if size % p == 0)
     height, width = observation_shape[-2:]
     counts = {p: height * width // p**2 for p in _common_divisors(height, width)}
@@ -181,6 +207,7 @@ def make_patch_embedding(
     *,
     num_frames: int = 1,
     categories: Sequence[int] | None = None,
+    own_weights: bool = False,
 ) -> ArrayPatchEmbedding | ImagePatchEmbedding | CategoryPatchEmbedding:
     """Builds the patch embedding that fits an observation.
 
@@ -190,6 +217,7 @@ def make_patch_embedding(
         embed_dim: width of a token.
         num_frames: observations stacked as channels; 1 of categories.
         categories: of categories, the number of values of each entry.
+        own_weights: whether each patch of an array has weights of its own.
 
     Example:
         >>> make_patch_embedding((84, 84), patch_size=12, embed_dim=64, num_frames=4).weight.shape
@@ -198,7 +226,13 @@ def make_patch_embedding(
     if categories is not None:
         return CategoryPatchEmbedding(categories, patch_size, embed_dim)
     if len(observation_shape) == 1:
-        return ArrayPatchEmbedding(observation_shape[0], patch_size, embed_dim, channels=num_frames)
+        return ArrayPatchEmbedding(
+            observation_shape[0],
+            patch_size,
+            embed_dim,
+            channels=num_frames,
+            own_weights=own_weights,
+        )
     channels = num_frames * (observation_shape[0] if len(observation_shape) == 3 else 1)
     height, width = observation_shape[-2:]
     return ImagePatchEmbedding(channels, (height, width), patch_size, embed_dim)

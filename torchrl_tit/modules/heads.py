@@ -35,6 +35,7 @@ def make_actor(
     action_key: NestedKey = "action",
     mask_key: NestedKey | None = None,
     batch_dims: int | None = None,
+    gain: float = 0.01,
 ) -> ProbabilisticActor:
     """Builds the policy head for an action space.
 
@@ -52,8 +53,8 @@ def make_actor(
 
     An action has the shape and dtype of the spec, and one log-probability and one entropy: the sums
     over its components. Gaussian actions are neither squashed nor clipped, so the environment
-    should clip them (as :func:`~torchrl_tit.envs.make_env` does). The weights start orthogonal with
-    gain 0.01, as in Stable-Baselines3, which trained the paper's agents.
+    should clip them (as :func:`~torchrl_tit.envs.make_env` does). The weights start orthogonal, by
+    default with gain 0.01, as in Stable-Baselines3, which trained the paper's agents.
 
     Args:
         features_dim: size of the features.
@@ -65,6 +66,8 @@ def make_actor(
         batch_dims: number of batch dimensions of ``action_spec``, whose others are those of an
             action. By default, those before the last dimension of ``OneHot``, ``MultiOneHot`` and
             ``MultiCategorical`` specs, all of a ``Categorical`` spec, none of others.
+        gain: of the initial weights. Small ones start with almost the same probabilities in all
+            states (arXiv 2006.05990 recommends that); 1 starts with a policy that differs by state.
 
     Returns:
         A :class:`~torchrl.modules.ProbabilisticActor` that writes the action and its
@@ -100,7 +103,7 @@ def make_actor(
         parts = _switches(features_dim, action_spec, shape)
     else:
         parts = _gaussian(features_dim, action_spec, shape)
-    init_orthogonal_(parts.network, gain=0.01)
+    init_orthogonal_(parts.network, gain=gain)
     in_keys = [in_key] if mask_key is None else [in_key, mask_key]
     return ProbabilisticActor(
         TensorDictModule(parts.network, in_keys=in_keys, out_keys=list(parts.parameters.values())),

@@ -64,10 +64,14 @@ class PatchTransformerSettings(TransformerSettings):
 
     patch_size: int | Literal["auto"] | None = 1
     """Entries of an array's patch, or pixels along a side of an image's; the whole observation
-    (of an image, which must be square) if not given. "auto" makes at most 16 patches of an array,
-    and about 49 of an image."""
+    (of an image, which must be square) if not given. "auto" takes an array as one patch, makes at
+    most 16 patches of categories, and about 49 of an image."""
     embed_dim: int = 32
     """Width D of a token."""
+    patch_weights: Literal["shared", "own"] = "shared"
+    """Whether all patches of an array share the weights of their embedding, which has no bias, or
+    each has weights and a bias of its own, of one size (the feature tokenizer of arXiv 2106.11959).
+    A shared patch of one entry reaches the attention as little more than the entry's sign."""
     num_blocks: int = 2
     """Number of blocks."""
     position_encoding: bool = True

@@ -45,6 +45,8 @@ class Head:
     """Activation after the linear layer."""
     norm: bool = True
     """Whether to add a LayerNorm before the linear layer and another one after the activation."""
+    final_norm: bool = True
+    """Whether that second LayerNorm is there."""
 
     def __post_init__(self) -> None:
         if self.features_dim is not None:
@@ -90,6 +92,7 @@ def vanilla_tit(
     num_frames: int = 1,
     *,
     patch_size: int | Literal["auto"] | None = 1,
+    patch_weights: Literal["shared", "own"] = "shared",
     embed_dim: int = 32,
     num_blocks: int = 2,
     num_heads_inner: int = 1,
@@ -117,6 +120,8 @@ def vanilla_tit(
         patch_size: entries of an array's patch, or pixels along a side of an image's; the whole
             observation if None; "auto" chooses (see
             :func:`~torchrl_tit.layers.patches.find_patch_size`).
+        patch_weights: whether all patches of an array share their weights, or each has its "own"
+            weights and bias.
         embed_dim: width D of a token.
         num_blocks: number L of inner blocks and of outer blocks.
         num_heads_inner: attention heads of an inner block; must divide the width.
@@ -139,6 +144,7 @@ def vanilla_tit(
     return Network(
         frame=Inner(
             patch_size=patch_size,
+            patch_weights=patch_weights,
             embed_dim=embed_dim,
             num_blocks=num_blocks,
             num_heads=num_heads_inner,

@@ -1,0 +1,250 @@
+"""Settings that keep PPO's updates of one size, whatever the task's rewards and observations."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from recipes.algorithm import make_algorithm
+from recipes.metrics import read_metrics
+from recipes.ppo import PPO, algorithm
+from recipes.ppo.learning_rate import KLAdaptiveRate
+from recipes.ppo.scaling import ReturnScale, ValueHead
+from recipes.run import Run
+from recipes.runner import load_trained, train
+from tests.recipes.states import assert_same
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.frames.normalized import NormalizedFrames
+from torchrl_tit.settings.networks import enhanced_tit, mlp
+
+RECIPE = PPO(
+    env="CartPole-v1",
+    backbone=enhanced_tit(2, embed_dim=8, features_dim=8),
+    total_steps=256,
+    steps_per_batch=64,
+    num_envs=2,
+    minibatch_size=32,
+    epochs=2,
+    checkpoint_interval=64,
+    evaluation_episodes=2,
+)
+
+
+def run_of(recipe, folder):
+    with Run.create(folder, recipe) as run:
+        train(recipe, run)
+    return run
+
+
+def normalized_frames(networks):
+    return [m for m in networks.modules() if isinstance(m, NormalizedFrames)]
+
+
+def test_return_scale_is_the_deviation_of_discounted_returns():
+    torch.manual_seed(0)
+    rewards, done = torch.randn(3, 40, 1), torch.rand(3, 40, 1) < 0.2
+    expected = []
+    for env in range(3):
+        total = 0.0
+        for t in range(40):
+            total = rewards[env, t].item() + 0.9 * total
+            expected.append((t, total))
+            if done[env, t]:
+                total = 0.0
+    scale = ReturnScale(gamma=0.9)
+    for start in (0, 10):  # episodes continue in the next batch
+        stop = 10 if start == 0 else 40
+        found = scale.update(rewards[:, start:stop], done[:, start:stop])
+        seen = torch.tensor([value for t, value in expected if t < stop], dtype=torch.float64)
+        assert found.item() == pytest.approx(seen.std(unbiased=False).item(), rel=1e-5)
+
+
+def test_value_head_keeps_its_values_when_their_scale_changes():
+    torch.manual_seed(0)
+    head, features = ValueHead(nn.Linear(8, 1)), torch.randn(64, 8)
+    before = head(features)
+    for mean, std in ((-90.0, 3.0), (4.0, 200.0), (0.0, 1e-3)):
+        head.update(mean + std * torch.randn(256))
+        torch.testing.assert_close(head(features), before, rtol=1e-4, atol=1e-3)
+
+
+def test_value_head_follows_the_targets():
+    head = ValueHead(nn.Linear(8, 1))
+    targets = 50 + 20 * torch.randn(10_000)
+    head.update(targets)  # the first batch counts alone
+    assert head.mean.item() == pytest.approx(targets.mean().item(), rel=1e-4)
+    assert head.std.item() == pytest.approx(targets.std().item(), rel=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
+def test_value_head_passes_a_share_of_its_gradient(share):
+    linear = nn.Linear(8, 1)
+    features = torch.randn(4, 8, requires_grad=True)
+    whole, weight = torch.autograd.grad(linear(features).sum(), [features, linear.weight])
+    head = ValueHead(linear, gradient=share)
+    value = head(features)
+    torch.testing.assert_close(value, linear(features))
+    passed, head_weight = torch.autograd.grad(value.sum(), [features, linear.weight])
+    torch.testing.assert_close(passed, share * whole)
+    torch.testing.assert_close(head_weight, weight)
+
+
+def test_learning_rate_follows_the_divergence():
+    rate = KLAdaptiveRate(0.01)
+    factors = []
+    for kl in (0.05, 0.015, 0.001, 0.001):
+        rate.update(kl)
+        factors.append(rate.factor)
+    assert factors == pytest.approx([1 / 1.5, 1 / 1.5, 1, 1.5])
+    for _ in range(100):
+        rate.update(1.0)
+    assert rate.factor == rate.smallest
+
+
+def test_rewards_are_divided_by_the_deviation_of_returns(tmp_path, monkeypatch):
+    """With gamma 0 the value's target is the reward, and CartPole's are all 1."""
+    batches = []
+    original = algorithm.add_advantages
+
+    def recording(batch, *args):
+        batches.append(batch["next", "reward"].clone())
+        original(batch, *args)
+
+    monkeypatch.setattr(algorithm, "add_advantages", recording)
+    recipe = replace(RECIPE, normalize_rewards=True, reward_scale=100.0)
+    run = run_of(recipe, tmp_path / "run")
+    _, state = load_checkpoint(run.checkpoints)
+    count, _, squares = state["return_scale"]["statistics"]
+    assert count == 256
+    deviation = (squares / count).sqrt().item()
+    assert batches[-1].unique().item() == pytest.approx(100 / (deviation + 1e-4), rel=1e-5)
+    assert read_metrics(run.folder / "metrics.csv")[-1]["return_mean"] > 5  # not scaled
+
+
+def test_advantages_are_divided_by_a_floor_at_least(tmp_path, monkeypatch):
+    """A floor below every deviation changes nothing; one above it makes updates smaller."""
+    seen = []
+    original = algorithm.normalize_advantages
+
+    def recording(advantage, floor):
+        seen.append((advantage, original(advantage, floor)))
+        return seen[-1][1]
+
+    monkeypatch.setattr(algorithm, "normalize_advantages", recording)
+    recipe = replace(RECIPE, total_steps=64, epochs=1)
+    runs = {
+        floor: run_of(replace(recipe, advantage_floor=floor), tmp_path / f"{floor}")
+        for floor in (0.0, 1e-6, 1e6)
+    }
+    states = {floor: load_checkpoint(run.checkpoints)[1] for floor, run in runs.items()}
+    for name, weight in states[0.0]["networks"].items():
+        torch.testing.assert_close(weight, states[1e-6]["networks"][name], rtol=1e-4, atol=1e-5)
+    for raw, normal in seen[: len(seen) // 2]:
+        torch.testing.assert_close(normal, (raw - raw.mean()) / raw.std(), rtol=1e-4, atol=1e-5)
+    for raw, normal in seen[len(seen) // 2 :]:
+        torch.testing.assert_close(normal, (raw - raw.mean()) / 1e6)
+    objective = [
+        read_metrics(run.folder / "metrics.csv")[-1]["policy_gradient"] for run in runs.values()
+    ]
+    assert objective[2] < 1e-3 * objective[0]
+
+
+@pytest.mark.parametrize("backbone", [RECIPE.backbone, mlp()])
+def test_observations_are_normalized_in_training_and_evaluation(tmp_path, monkeypatch, backbone):
+    frames = []
+    original = algorithm.Rollout.__init__
+
+    def recording(rollout, *args):
+        original(rollout, *args)
+        frames.extend(rollout.frames)
+
+    monkeypatch.setattr(algorithm.Rollout, "__init__", recording)
+    run = run_of(replace(RECIPE, normalize_observations=True, backbone=backbone), tmp_path / "run")
+    _, trained, _ = load_trained(run)
+    seen = torch.cat(frames)
+    encoders = normalized_frames(trained.networks())
+    for normalized in encoders:
+        torch.testing.assert_close(normalized.mean, seen.mean(0), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(normalized.variance, seen.var(0, unbiased=False))
+        normal = normalized.normalize(seen)
+        torch.testing.assert_close(normal.std(0), torch.ones(4), rtol=1e-2, atol=0)
+    assert len(encoders) == (2 if backbone == mlp() else 1)
+
+
+def test_images_are_not_normalized():
+    pytest.importorskip("ale_py")
+    recipe = replace(
+        RECIPE,
+        env="ALE/Pong-v5",
+        normalize_observations=True,
+        backbone=enhanced_tit(2, patch_size=42, embed_dim=8, features_dim=8),
+    )
+    assert not normalized_frames(make_algorithm(recipe).networks())
+
+
+def test_an_update_ends_at_the_target_divergence(tmp_path):
+    recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=1e-4)
+    rows = read_metrics(run_of(recipe, tmp_path / "run").folder / "metrics.csv")
+    assert min(row["epochs"] for row in rows) < 8
+
+
+def test_the_learning_rate_follows_the_target_divergence(tmp_path):
+    recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=1e-4, at_target_kl="adapt")
+    rows = read_metrics(run_of(recipe, tmp_path / "run").folder / "metrics.csv")
+    assert rows[0]["learning_rate"] == 0.01
+    assert rows[-1]["learning_rate"] < 0.005
+    assert all(row["epochs"] == 8 for row in rows)
+
+
+def test_a_run_with_all_of_them_resumes_bit_for_bit(tmp_path):
+    recipe = replace(
+        RECIPE,
+        normalize_rewards=True,
+        normalize_values=True,
+        value_gradient=0.5,
+        normalize_observations=True,
+        target_kl=0.01,
+        at_target_kl="adapt",
+    )
+    whole = run_of(recipe, tmp_path / "whole")
+    with Run.create(tmp_path / "half", recipe) as run:
+        train(replace(recipe, total_steps=128), run)
+        train(recipe, run)
+    states = [load_checkpoint(run.checkpoints)[1] for run in (whole, run)]
+    assert_same(states[0]["networks"], states[1]["networks"])
+    assert_same(states[0]["return_scale"], states[1]["return_scale"])
+    assert_same(states[0]["rate"], states[1]["rate"])
+
+
+def test_collectors_of_other_processes_get_the_statistics(tmp_path, monkeypatch):
+    differences = []
+    original = algorithm.PPOAlgorithm.update
+
+    def recording(self, batch, step):
+        rollout = algorithm.Rollout(batch.clone(), 1, "same")
+        histories = rollout.histories(torch.arange(batch.numel()))
+        with torch.no_grad():
+            features = self.agent.backbone.module(*histories)
+        differences.append((features - batch["features"].flatten(0, 1)).abs().max().item())
+        return original(self, batch, step)
+
+    monkeypatch.setattr(algorithm.PPOAlgorithm, "update", recording)
+    backbone = enhanced_tit(1, embed_dim=8, features_dim=8)
+    recipe = replace(
+        RECIPE, backbone=backbone, collectors=2, normalize_observations=True, learning_rate=0.0
+    )
+    run_of(recipe, tmp_path / "run")
+    assert len(differences) == 4
+    assert max(differences) < 1e-4
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
+def test_the_policy_starts_with_its_gain(env):
+    for gain in (0.01, 0.5):
+        agent = make_algorithm(replace(RECIPE, env=env, policy_gain=gain)).networks()
+        assert isinstance(agent, algorithm.Agent)
+        actor = agent.actor
+        (weight,) = (p for p in actor.parameters() if p.ndim == 2)
+        size = weight.norm(dim=1)
+        torch.testing.assert_close(size, torch.full_like(size, gain))

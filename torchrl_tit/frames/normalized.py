@@ -1,0 +1,69 @@
+"""Observations with the running mean 0 and standard deviation 1, in front of a frame encoder."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchrl_tit.frames.encoder import FrameEncoder
+
+
+class NormalizedFrames(FrameEncoder):
+    """A frame encoder that reads observations divided by their running standard deviation.
+
+    Each entry has a mean and a standard deviation of its own, as in `VecNormalize` of
+    Stable-Baselines3; results beyond +-``limit`` are clipped. The statistics are buffers of the
+    network, so checkpoints, evaluation, copies and exports have them, and a frame's tokens stay the
+    same while a batch is collected. TorchRL's `VecNormV2` is a transform of the environment: its
+    statistics change with each step, so that a history would hold frames of several scales, and a
+    network without that environment would read observations of a scale that it does not know.
+
+    Args:
+        encoder: the frame encoder.
+        limit: what normalised entries are clipped to.
+
+    Example:
+        >>> from torchrl_tit import settings
+        >>> frames = NormalizedFrames(settings.Linear().build((4,)))
+        >>> frames.update(torch.randn(64, 4) * 100)
+        >>> frames(torch.randn(2, 8, 4)).shape
+        torch.Size([2, 8, 1, 32])
+    """
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, encoder: FrameEncoder, limit: float = 10.0) -> None:
+        super().__init__(
+            encoder.observation_shape, num_tokens=encoder.num_tokens, width=encoder.width
+        )
+        self.encoder = encoder
+        self.limit = limit
+        self.register_buffer("count", torch.zeros(()))
+        self.register_buffer("mean", torch.zeros(encoder.observation_shape))
+        self.register_buffer("variance", torch.ones(encoder.observation_shape))
+
+    @torch.no_grad()
+    def update(self, observations: Tensor) -> None:
+        """Adds observations to the statistics, [N, *observation_shape]."""
+        size = observations.shape[0]
+        total = self.count + size
+        shift = observations.mean(0) - self.mean
+        squares = self.variance * self.count + observations.var(0, unbiased=False) * size
+        self.variance.copy_((squares + shift.square() * self.count * size / total) / total)
+        self.mean.add_(shift * size / total)
+        self.count.copy_(total)
+
+    def normalize(self, observation: Tensor) -> Tensor:
+        """Normalises observations, float [..., *observation_shape]."""
+        normal = (observation - self.mean) * (self.variance + 1e-8).rsqrt()
+        return normal.clamp(-self.limit, self.limit)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """See :meth:`FrameEncoder.forward`."""
+        return self.encoder(self.normalize(observation))
+
+    def attention_maps(self, observation: Tensor) -> list[Tensor]:
+        """See :meth:`FrameEncoder.attention_maps`."""
+        return self.encoder.attention_maps(self.normalize(observation))
