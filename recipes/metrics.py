@@ -18,7 +18,8 @@ from torchrl_tit.files import write_text_atomic
 class Metrics:
     """One row of numbers at a time, in ``metrics.csv`` and in ``tensorboard/``.
 
-    The CSV is the record: its first two columns are ``step`` and ``time`` (seconds since 1970).
+    The CSV is the record: its first columns are ``step``, ``time`` (seconds since 1970) and
+    ``steps_per_second`` since the row before, or since the start.
     TensorBoard's files are rewritten from it when a run is resumed, so that neither holds a row of
     work that was lost.
 
@@ -30,7 +31,8 @@ class Metrics:
 
     def __init__(self, folder: Path, columns: list[str], last_step: int) -> None:
         self.path = folder / "metrics.csv"
-        self._columns = ["step", "time", *columns]
+        self._columns = ["step", "time", "steps_per_second", *columns]
+        self._last = (last_step, time.monotonic())
         kept = [row for row in read_metrics(self.path) if row["step"] <= last_step]
         # Written at once: a process that is killed here loses no row.
         lines = [self._line(self._columns), *(self._line(self._cells(row)) for row in kept)]
@@ -43,7 +45,10 @@ class Metrics:
 
     def log(self, step: int, **values: float) -> None:
         """Adds a row; NaN stands for a number that does not exist at this step."""
-        row = {"step": step, "time": time.time(), **values}
+        before, then = self._last
+        self._last = (step, time.monotonic())
+        speed = (step - before) / max(self._last[1] - then, 1e-9)
+        row = {"step": step, "time": time.time(), "steps_per_second": speed, **values}
         self._file.write(self._line(self._cells(row)))
         self._file.flush()
         self._draw(row)

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 from torchrl_tit.settings.checks import check_at_least, check_at_most
 
+from .online_recipe import OnlineRecipe
 from .ray_cluster import check_address
-from .recipe import Padding, Recipe
+from .recipe import Padding
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayRecipe(Recipe):
+class ReplayRecipe(OnlineRecipe):
     """Settings of every recipe that learns online from a replay buffer."""
 
     padding: Padding = "same"

@@ -44,7 +44,8 @@ class Run:
         tensorboard/       the same for TensorBoard
         checkpoints/       numbered by step; the newest complete one is loaded
         learning_curve.png
-        evaluation.json    returns of the evaluation episodes
+        evaluation.json    returns of the evaluation episodes, with the last weights
+        evaluation_best.json   the same with the best ones, if they were evaluated
 
     Use :meth:`create` or :meth:`open`, and the folder as a context: one process at a time.
 

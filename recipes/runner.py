@@ -17,6 +17,7 @@ from tqdm import tqdm
 from torchrl_tit.checkpoint import checkpoint_steps, global_rng_state, set_global_rng_state
 
 from .algorithm import Algorithm, NotFiniteError, Stateful, check_finite, make_algorithm
+from .best import EPISODES, Best
 from .callback import Callback
 from .interrupt import Interrupt
 from .outcomes import Outcome, summarize
@@ -53,7 +54,13 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     with ExitStack() as stack:
         stack.enter_context(closing(algorithm))
         record = Record(recipe, algorithm)
-        parts = {"networks": algorithm.networks(), **algorithm.state(), "record": record}
+        best = Best(algorithm.networks())
+        parts = {
+            "networks": algorithm.networks(),
+            **algorithm.state(),
+            "record": record,
+            "best": best,
+        }
         _load(run, parts)
         metrics = stack.enter_context(closing(run.metrics(record.columns, last_step=step)))
         unit = " updates" if recipe.offline else " steps"
@@ -67,11 +74,14 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             before, step = step, step + algorithm.size(batch)
             for callback in callbacks:
                 callback.collected(step, batch)
+            returns = algorithm.returns(batch)
+            if returns is not None:
+                best.add_episodes(before, returns.flatten().tolist())
             with _naming(step, saved_step):
-                record.add(algorithm.returns(batch), algorithm.update(batch, before))
+                record.add(returns, algorithm.update(batch, before))
             progress.update(step - before)
 
-            evaluation_due = recipe.evaluation_due(step)
+            evaluation_due = recipe.evaluation_due(before, step)
             # Intervals count from the start, so a resumed run logs and saves at the same steps.
             log_due = step // recipe.log_interval > before // recipe.log_interval
             if log_due or evaluation_due:
@@ -81,6 +91,8 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             if evaluation_due:
                 outcomes = algorithm.play(step)
                 record.outcomes += outcomes
+                if recipe.offline:
+                    best.offer(step, max(outcome.mean for outcome in outcomes))
                 for callback in callbacks:
                     callback.evaluated(step, outcomes)
             if log_due or evaluation_due:
@@ -188,31 +200,49 @@ class Record:
         self._returns = list(state_dict["returns"])
 
 
-def load_trained(run: Run, recipe: Recipe | None = None) -> tuple[int, Algorithm[Any], Any]:
+def load_trained(
+    run: Run, recipe: Recipe | None = None, *, best: bool = False
+) -> tuple[int, Algorithm[Any], Any]:
     """Loads the networks of a run's newest checkpoint.
 
     Args:
         run: a run folder with a checkpoint.
         recipe: the run's recipe, if some of its settings are overridden.
+        best: whether to load the weights with the highest return in training (see
+            :class:`~recipes.best.Best`) instead of the last ones.
 
     Returns:
         The steps that it was trained for, the algorithm with its weights, and the whole checkpoint.
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
+        ValueError: if the checkpoint has no best weights yet.
     """
     recipe = recipe or run.recipe
     step, state = run.load_trained()
     torch.set_num_threads(recipe.threads)
     algorithm = make_algorithm(recipe)
     with run.restoring(step):
-        algorithm.networks().load_state_dict(state["networks"])
+        weights = state["networks"]
+        if best:
+            step, weights = state["best"]["step"], state["best"]["networks"]
+    if step is None:
+        raise ValueError(
+            f"{run.folder} has no best weights yet: fewer than {EPISODES} training episodes ended, "
+            "or none was evaluated; evaluate the last ones (without --best)"
+        )
+    with run.restoring(step):
+        algorithm.networks().load_state_dict(weights)
     algorithm.policy.eval()  # without dropout
     return step, algorithm, state
 
 
 def evaluate(
-    run: Run, recipe: Recipe | None = None, callbacks: Sequence[Callback] = ()
+    run: Run,
+    recipe: Recipe | None = None,
+    callbacks: Sequence[Callback] = (),
+    *,
+    best: bool = False,
 ) -> dict[str, Any]:
     """Evaluates a run's newest checkpoint: full episodes, the most likely action, raw rewards.
 
@@ -222,15 +252,18 @@ def evaluate(
         run: a run folder with a checkpoint.
         recipe: the run's recipe, if some of its settings are overridden.
         callbacks: hooks that are given the outcomes.
+        best: whether to evaluate the best weights of the checkpoint instead of the last ones.
 
     Returns:
-        See :func:`~recipes.outcomes.summarize`, and the "seed" of the first episode.
+        See :func:`~recipes.outcomes.summarize`, the "seed" of the first episode, and which
+        "weights" they are of: "last" or "best".
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
+        ValueError: if the checkpoint has no best weights yet.
     """
     recipe = recipe or run.recipe
-    step, algorithm, state = load_trained(run, recipe)
+    step, algorithm, state = load_trained(run, recipe, best=best)
     with run.restoring(step):
         record = state["record"]
         outcomes = [Outcome(**outcome) for outcome in record["outcomes"]]
@@ -248,7 +281,11 @@ def evaluate(
         now = algorithm.play(step)
     for callback in callbacks:
         callback.evaluated(step, now)
-    return {**summarize(now, outcomes, recipe), "seed": recipe.evaluation_seed}
+    return {
+        **summarize(now, outcomes, recipe),
+        "seed": recipe.evaluation_seed,
+        "weights": "best" if best else "last",
+    }
 
 
 @contextmanager

@@ -56,7 +56,7 @@ class TransitionRecipe(DatasetRecipe):
         """Gradient steps of the whole run."""
         return self.total_updates
 
-    def evaluation_due(self, step: int) -> bool:
+    def evaluation_due(self, before: int, step: int) -> bool:
         """Returns whether to evaluate after a number of gradient steps."""
         return step % self.evaluation_interval == 0 or step == self.total_updates
 

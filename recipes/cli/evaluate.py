@@ -10,12 +10,21 @@ from .arguments import Parser, add_machine_options, fail, override, program
 
 
 def evaluate(arguments: list[str]) -> None:
-    """Evaluates the newest checkpoint of a run."""
+    """Evaluates the newest checkpoint of a run: its last weights, or its best ones."""
     parser = Parser(f"{program()} evaluate")
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("--episodes", type=int, help="episodes; default: the recipe's")
     parser.add_argument("--seed", type=int, help="seed of the first episode; default: the recipe's")
-    parser.add_argument("--out", type=Path, help="file to write; default: RUN/evaluation.json")
+    parser.add_argument(
+        "--best",
+        action="store_true",
+        help="the weights with the highest return in training, not the last ones",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help="file to write; default: RUN/evaluation.json, or RUN/evaluation_best.json",
+    )
     add_machine_options(parser)
     options = parser.parse_args(arguments)
     from .. import runner  # not at the top: help needs no PyTorch
@@ -31,8 +40,9 @@ def evaluate(arguments: list[str]) -> None:
     )
     if options.out is not None and not options.out.absolute().parent.is_dir():
         fail(f"--out {options.out} cannot be written: there is no folder {options.out.parent}")
-    evaluation = runner.evaluate(run, recipe)
-    path = run.save_evaluation(evaluation, options.out)
+    evaluation = runner.evaluate(run, recipe, best=options.best)
+    out = options.out or (run.folder / "evaluation_best.json" if options.best else None)
+    path = run.save_evaluation(evaluation, out)
     print(f"{one_line(recipe, evaluation)}\nwritten to {path}")
 
 
@@ -40,7 +50,8 @@ def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
     """Returns an evaluation in one line."""
     return (
         f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
-        f"{evaluation['episodes']} episodes after {evaluation['steps']} steps"
+        f"{evaluation['episodes']} episodes after {evaluation['steps']} steps "
+        f"({evaluation['weights']} weights)"
     )
 
 

@@ -77,7 +77,7 @@ class SequenceRecipe(DatasetRecipe):
         return self.backbone.history
 
     @property
-    def target_columns(self) -> dict[float, str]:
+    def target_columns(self) -> dict[float | None, str]:
         """Columns of metrics that hold the mean return for each target return."""
         return {target: f"return_{target:g}" for target in self.target_returns}
 
@@ -112,7 +112,7 @@ class DT(SequenceRecipe, algorithm="dt", builds=f"{__package__}.dt:DTAlgorithm")
         """Gradient steps of the whole run."""
         return self.iterations * self.updates_per_iteration
 
-    def evaluation_due(self, step: int) -> bool:
+    def evaluation_due(self, before: int, step: int) -> bool:
         """Returns whether an iteration ends at a gradient step."""
         return step % self.updates_per_iteration == 0
 
@@ -196,7 +196,7 @@ class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorit
         """Gradient steps of the whole run."""
         return self.pretraining_updates + self.rounds * self.updates_per_round
 
-    def evaluation_due(self, step: int) -> bool:
+    def evaluation_due(self, before: int, step: int) -> bool:
         """Returns whether pre-training or an evaluation interval ends at a gradient step."""
         rounds, within = divmod(step - self.pretraining_updates, self.updates_per_round)
         due = rounds % self.evaluation_interval == 0 or rounds == self.rounds

@@ -12,7 +12,7 @@ from recipes.metrics import read_metrics
 from recipes.recipe import Recipe
 from recipes.run import Run
 from tests.datasets.rollouts import roll, write
-from tests.recipes.states import assert_same
+from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 
 
@@ -45,7 +45,7 @@ def assert_same_run(run: Run, other: Run) -> None:
     assert_same(load_checkpoint(run.checkpoints), load_checkpoint(other.checkpoints))
     rows, expected = (
         [
-            {name: str(value) for name, value in row.items() if name != "time"}
+            {name: str(value) for name, value in row.items() if name not in TIMES}
             for row in read_metrics(one.folder / "metrics.csv")
         ]
         for one in (run, other)

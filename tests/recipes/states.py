@@ -4,6 +4,9 @@ from typing import Any
 
 import torch
 
+TIMES = ("time", "steps_per_second")
+"""Columns of metrics that differ from run to run."""
+
 
 def assert_same(left: Any, right: Any) -> None:
     assert type(left) is type(right)

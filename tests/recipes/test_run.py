@@ -113,7 +113,7 @@ def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch,
     monkeypatch.setattr(time, "strftime", lambda _: "20260101-000000")
     monkeypatch.setattr(runner, "train", lambda *_: None)
     monkeypatch.setattr("recipes.cli.training.plot_run", lambda run: None)
-    evaluation = {"mean": 0, "std": 0, "episodes": 1, "steps": 0}
+    evaluation = {"mean": 0, "std": 0, "episodes": 1, "steps": 0, "weights": "last"}
     monkeypatch.setattr(runner, "evaluate", lambda *_: evaluation)
     for _ in range(3):
         main(["train", "ppo/cartpole/enhanced-tit"])
@@ -289,12 +289,12 @@ def test_a_task_that_cannot_be_saved_starts_anew_at_each_checkpoint(tmp_path):
     for name, weight in expected["networks"].items():
         assert torch.equal(state["networks"][name], weight), name
     rows, expected_rows = (
-        [list(row.values())[2:] for row in read_metrics(run.folder / "metrics.csv")]
+        [list(row.values())[3:] for row in read_metrics(run.folder / "metrics.csv")]
         for run in (parts, whole)
     )
     np.testing.assert_array_equal(rows, expected_rows)
     # Each checkpoint has a seed of its own: batches do not repeat.
-    assert len({tuple(row[3:]) for row in rows}) == len(rows)
+    assert len({tuple(row[2:]) for row in rows}) == len(rows)
 
 
 def test_no_episode_ends_at_all(tmp_path):

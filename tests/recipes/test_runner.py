@@ -46,7 +46,7 @@ class Toy(Recipe):
     def final_step(self) -> int:
         return self.total_steps
 
-    def evaluation_due(self, step: int) -> bool:
+    def evaluation_due(self, before: int, step: int) -> bool:
         return step % self.evaluation_interval == 0
 
 
@@ -183,7 +183,14 @@ def test_rows_evaluations_and_checkpoints_come_at_their_steps(tmp_path, batch, r
 
 def test_rows_hold_means_and_episodes_since_the_last(tmp_path):
     rows = read_metrics(start(SMALL, tmp_path / "run").folder / "metrics.csv")
-    assert list(rows[0]) == ["step", "time", "return_mean", "episodes", *ToyAlgorithm.columns]
+    assert list(rows[0]) == [
+        "step",
+        "time",
+        "steps_per_second",
+        "return_mean",
+        "episodes",
+        *ToyAlgorithm.columns,
+    ]
     # Batches 0 to 4 end with 0, 1, 2, 0, 1 episodes, which return 0; 0, 1; 0.
     assert (rows[0]["episodes"], rows[0]["return_mean"]) == (4, 0.25)
     assert all(math.isnan(row["rare"]) for row in rows)

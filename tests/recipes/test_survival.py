@@ -20,7 +20,7 @@ from recipes.registry import RECIPES
 from recipes.results.plot import plot_run
 from recipes.run import Run
 from tests.recipes.commands import Command
-from tests.recipes.states import assert_same
+from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import CheckpointError, latest_step, load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit
 
@@ -78,7 +78,7 @@ def test_killed_and_resumed_is_bit_for_bit_the_same(recipe, tmp_path):
     assert_same(state["optimizer"], expected["optimizer"])
     assert torch.equal(state["rng"]["torch"], expected["rng"]["torch"])
     rows, expected_rows = (
-        [{k: str(v) for k, v in row.items() if k != "time"} for row in read_metrics(path)]
+        [{k: str(v) for k, v in row.items() if k not in TIMES} for row in read_metrics(path)]
         for path in (killed / "metrics.csv", tmp_path / "whole" / "metrics.csv")
     )
     assert rows == expected_rows

@@ -22,7 +22,7 @@ from recipes.registry import RECIPES, get_recipe
 from recipes.run import Run
 from recipes.runner import train
 from tests.recipes.cql.cql_runs import tit
-from tests.recipes.states import assert_same
+from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import lstm, mlp
 
@@ -178,7 +178,7 @@ def test_resumed_is_bit_for_bit_the_same(changes: dict[str, Any], tmp_path: Path
     for name in ("networks", "optimizer", "exploration", "record", "rng"):
         assert_same(state[name], expected[name])
     rows, expected_rows = (
-        [{n: str(v) for n, v in row.items() if n != "time"} for row in read_metrics(path)]
+        [{n: str(v) for n, v in row.items() if n not in TIMES} for row in read_metrics(path)]
         for path in (tmp_path / name / "metrics.csv" for name in ("stopped", "whole"))
     )
     assert rows == expected_rows

@@ -41,7 +41,7 @@ def test_trains_and_resumes_bit_for_bit(tmp_path, kind, settings):
     make_algorithm(recipe).check()
     assert_resumes_bit_for_bit(recipe, tmp_path)
     rows = read_metrics(tmp_path / "whole" / "metrics.csv")
-    assert list(rows[0]) == ["step", "time", "return_mean", *COLUMNS[kind]]
+    assert list(rows[0]) == ["step", "time", "steps_per_second", "return_mean", *COLUMNS[kind]]
     assert all(np.isfinite(row[name]) for row in rows for name in COLUMNS[kind])
     assert np.isfinite(rows[-1]["return_mean"])
 

@@ -20,6 +20,7 @@ from recipes.runner import evaluate, train
 from recipes.sac import SAC
 from recipes.sac import algorithm as sac
 from recipes.sac.algorithm import SACAlgorithm
+from tests.recipes.states import TIMES
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.modules import Backbone
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
@@ -107,7 +108,7 @@ def test_resumed_is_bit_for_bit_the_same(backbone: Any, critic: Any, tmp_path: P
     for name in ("networks", "optimizer", "collector", "rng"):
         assert_same(state[name], expected[name])
     rows, expected_rows = (
-        [{name: str(value) for name, value in row.items() if name != "time"} for row in metrics]
+        [{name: str(value) for name, value in row.items() if name not in TIMES} for row in metrics]
         for metrics in (
             read_metrics(folder / "metrics.csv") for folder in (run.folder, tmp_path / "whole")
         )
