@@ -23,7 +23,7 @@ help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: $(VENV)/installed-run  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 5 minutes) into runs/
-	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit-tuned --out $(OUT) $(ARGS)
+	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit --out $(OUT) $(ARGS)
 
 test: lint types numerics unit  ## Check style, types and behaviour: all that must pass
 

@@ -152,7 +152,7 @@ def run_ours(
     setting: Setting, seed: int, compile: Compile, timers: Timers | None = None
 ) -> Outcome:
     """Trains the recipe as the command line does, with checkpoints and metrics."""
-    named = get_recipe("ppo/cartpole/enhanced-tit")
+    named = get_recipe("ppo/cartpole/enhanced-tit-protocol")
     assert isinstance(named, ppo.PPO)
     recipe = replace(
         named,

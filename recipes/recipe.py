@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
 
@@ -120,13 +120,37 @@ class Recipe:
         raise NotImplementedError
 
     @property
-    def target_columns(self) -> dict[float, str]:
+    def target_columns(self) -> dict[float | None, str]:
         """Columns of metrics for each target return of the evaluations."""
         return {}
 
-    def evaluation_due(self, step: int) -> bool:
-        """Returns whether to evaluate at a step, in addition to the evaluation at the end."""
+    def evaluation_due(self, before: int, step: int) -> bool:
+        """Returns whether to evaluate after a batch, in addition to the evaluation at the end.
+
+        Args:
+            before: number of steps before the batch.
+            step: number of steps after it.
+        """
         return False
+
+
+_OF_THE_MACHINE = ("device", "threads", "compile", "checkpoint_interval")
+
+
+def experiment_of(recipe: Recipe) -> Recipe:
+    """Returns what runs of one experiment have in common: all settings but seed and machine.
+
+    Example:
+        >>> from torchrl_tit.settings.networks import mlp
+        >>> from recipes.ppo import PPO
+        >>> recipe = PPO(env="CartPole-v1", backbone=mlp(), seed=3, threads=2, compile="off")
+        >>> experiment_of(recipe) == PPO(env="CartPole-v1", backbone=mlp())
+        True
+    """
+    defaults: dict[str, Any] = {
+        f.name: f.default for f in fields(recipe) if f.name in _OF_THE_MACHINE
+    }
+    return replace(recipe, seed=0, **defaults)
 
 
 def check_types(settings: object, prefix: str = "") -> None:

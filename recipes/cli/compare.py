@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 from torchrl_tit.files import write_text_atomic
 
-from ..recipe import Recipe
+from ..recipe import Recipe, experiment_of
 from ..results.plot import plot_comparison, plot_table
 from ..results.table import make_table, to_csv, to_markdown
 from ..run import Run
@@ -26,7 +25,7 @@ def compare(arguments: list[str]) -> None:
         fail(f"--out {options.out} must end in .png: the figure is a PNG")
     seeds: dict[Recipe, list[Path]] = {}  # runs of the same settings
     for folder in dict.fromkeys(options.runs):
-        seeds.setdefault(replace(Run.open(folder).recipe, seed=0), []).append(folder)
+        seeds.setdefault(experiment_of(Run.open(folder).recipe), []).append(folder)
     offline = {recipe.offline for recipe in seeds}
     if len(offline) > 1:
         fail(

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from torchrl_tit.settings import Network
-from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp, vanilla_tit
+from torchrl_tit.settings.networks import lstm, mlp
 
 from ..ppo import PPO
+from .ppo_settings import PPO_SETTINGS, reliable_tit
 
 # Patches, and the encoders of several observations, follow from the task.
 _NETWORKS: dict[str, Network] = {
-    "enhanced-tit": enhanced_tit(4, patch_size="auto"),
-    "vanilla-tit": vanilla_tit(4, patch_size="auto"),
+    "enhanced-tit": reliable_tit("enhanced-tit", 4),
+    "vanilla-tit": reliable_tit("vanilla-tit", 4),
     "mlp": mlp(),
     "lstm": lstm(),
 }
 
 ANY_TASK_RECIPES: dict[str, PPO] = {
-    f"ppo/{network}": PPO(name=f"ppo/{network}", env="CartPole-v1", num_envs=8, backbone=backbone)
+    f"ppo/{network}": PPO(
+        name=f"ppo/{network}", env="CartPole-v1", backbone=backbone, **PPO_SETTINGS
+    )
     for network, backbone in _NETWORKS.items()
 }
 """The recipes by name; without ``--env`` they train on CartPole."""

@@ -1,14 +1,18 @@
-"""The named recipes of classic control and MuJoCo (arXiv 2212.14538, table 2)."""
+"""The named recipes of classic control and MuJoCo (arXiv 2212.14538, table 2).
+
+All networks train with one set of settings. Those whose names end in "-protocol" have the paper's
+and its release's settings instead.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 from torchrl_tit.settings import Network
-from torchrl_tit.settings.networks import d2rl, enhanced_tit, mlp, ofenet, vanilla_tit
+from torchrl_tit.settings.networks import d2rl, enhanced_tit, lstm, mlp, ofenet, vanilla_tit
 
 from ..ppo import PPO
-from .ppo_tuned import TUNED_TIT
+from .ppo_settings import PPO_SETTINGS, reliable_tit
 
 # Task name: environment and steps (arXiv 2212.14538, appendix). The paper ran MuJoCo's v3.
 _TASKS = {
@@ -20,17 +24,22 @@ _TASKS = {
     "hopper": ("Hopper-v5", 1_000_000),
     "walker2d": ("Walker2d-v5", 1_000_000),
 }
+_BASELINES: dict[str, Network] = {"mlp": mlp(), "ofenet": ofenet(), "d2rl": d2rl()}
+_NETWORKS: dict[str, Network] = {
+    **_BASELINES,
+    "lstm": lstm(),
+    "vanilla-tit": reliable_tit("vanilla-tit"),
+    "enhanced-tit": reliable_tit("enhanced-tit"),
+}
 # The paper leaves open which settings of TIT were used where, within patch 1, width 32 or 64, two
 # blocks; these are the networks' defaults.
-_ARRAY_NETWORKS: dict[str, Network] = {
-    "mlp": mlp(),
-    "ofenet": ofenet(),
-    "d2rl": d2rl(),
+_PROTOCOL: dict[str, Network] = {
+    **_BASELINES,
     "vanilla-tit": vanilla_tit(),
     "enhanced-tit": enhanced_tit(),
 }
 # Published by the authors for this task alone.
-_MOUNTAINCAR_NETWORKS: dict[str, Network] = {
+_MOUNTAINCAR_PROTOCOL: dict[str, Network] = {
     "vanilla-tit": vanilla_tit(embed_dim=32, num_heads_inner=4, num_heads_outer=8, features_dim=64),
     "enhanced-tit": enhanced_tit(
         embed_dim=16, num_heads_inner=4, num_heads_outer=8, features_dim=128
@@ -38,22 +47,19 @@ _MOUNTAINCAR_NETWORKS: dict[str, Network] = {
 }
 
 
-def _named() -> dict[str, PPO]:
-    recipes: dict[str, PPO] = {}
+def _named() -> list[PPO]:
+    recipes = []
     for task, (env, total_steps) in _TASKS.items():
-        networks = _ARRAY_NETWORKS | (_MOUNTAINCAR_NETWORKS if task == "mountaincar" else {})
-        for network, backbone in networks.items():
+        published = _MOUNTAINCAR_PROTOCOL if task == "mountaincar" else {}
+        for network, backbone in _NETWORKS.items():
             name = f"ppo/{task}/{network}"
             recipe = PPO(name=name, env=env, total_steps=total_steps, backbone=backbone)
-            recipes[name] = recipe
-            if network.endswith("tit"):
-                name += "-tuned"
-                tuned = TUNED_TIT[task]
-                recipes[name] = replace(
-                    recipe, name=name, backbone=tuned.adapt(backbone), **tuned.fields
-                )
+            recipes.append(replace(recipe, **PPO_SETTINGS))
+            if network in _PROTOCOL:
+                backbone = (_PROTOCOL | published)[network]
+                recipes.append(replace(recipe, name=f"{name}-protocol", backbone=backbone))
     return recipes
 
 
-ARRAY_RECIPES: dict[str, PPO] = _named()
+ARRAY_RECIPES: dict[str, PPO] = {recipe.name: recipe for recipe in _named()}
 """The recipes by name."""

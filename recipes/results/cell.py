@@ -33,8 +33,8 @@ class Cell:
     high: float
     """Upper end."""
     paper_mean: float
-    """The paper's value; NaN if it has none. A tuned recipe is compared with the plain one's
-    value."""
+    """The paper's value; NaN if it has none. Recipes with other settings (-protocol, -tuned) have
+    that of the plain one."""
     paper_std: float
     changes: str = ""
     """Fields in which the runs differ from the recipe of that name, with the runs' values."""

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import bootstrap, trim_mean
 
 from ..dataset_recipe import DatasetRecipe
-from ..recipe import Recipe
+from ..recipe import Recipe, experiment_of
 from ..recipe_json import recipe_to_json
 from ..registry import RECIPES
 from ..run import Run
@@ -66,7 +66,7 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         asked = run.recipe.evaluation_episodes
         if (episodes := evaluation.get("episodes", asked)) != asked:  # `evaluate --episodes`
             notes.append(f"{run.folder} was evaluated over {episodes} episodes, not {asked}")
-        groups.setdefault(replace(run.recipe, seed=0), []).append((run, evaluation))
+        groups.setdefault(experiment_of(run.recipe), []).append((run, evaluation))
     if not groups:
         raise ValueError(
             f"no evaluated run in {', '.join(map(str, folders))}" + "".join(f"; {n}" for n in notes)
@@ -201,13 +201,17 @@ def _stem(dataset: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """The plain recipe that a tuned one belongs to, or the name itself."""
-    return name if name in paper_results() else name.removesuffix("-tuned")
+    """The paper's name of a recipe that has other settings."""
+    if name in paper_results():
+        return name
+    return name.removesuffix("-tuned").removesuffix("-protocol")
 
 
 def _changes(named: Recipe, settings: Recipe) -> str:
     """Names the fields in which settings differ: "backbone.frame.embed_dim 64"."""
-    before, now = (_fields(json.loads(recipe_to_json(recipe))) for recipe in (named, settings))
+    before, now = (
+        _fields(json.loads(recipe_to_json(experiment_of(recipe)))) for recipe in (named, settings)
+    )
     changed = [k for k in now if k != "seed" and (k not in before or before[k] != now[k])]
     return ", ".join(f"{field} {now[field]}" for field in changed)
 

@@ -90,7 +90,7 @@ def test_help_explains_every_field(capsys):
         (["train", "NAME", "--env", "CartPole-v7"], "CartPole-v1"),
         (["train", "NAME", "--backbone.num-frames", "0"], "num_frames must be at least 1, not 0"),
         (["train", "NAME", "--backbone.frame.num-heads", "3"], "width 32"),
-        (["train", "NAME", "--num-envs", "3"], "num_envs 3 does not divide steps_per_batch 2048"),
+        (["train", "NAME", "--num-envs", "3"], "num_envs 3 does not divide steps_per_batch 1024"),
         (["train", "NAME", "--critic-coeff", "0"], "critic_coeff must be positive, not 0.0"),
         (["train", "."], ". is a folder, not a recipe"),
         (["train", "NAME", "--backbone.frame.patch-size", "0"], "patch_size"),
@@ -111,7 +111,7 @@ def test_bad_words_are_one_line_and_leave_nothing(words, message, capsys, tmp_pa
 
 def test_list_takes_names_as_gymnasium_writes_them(capsys):
     main(["list", "PPO/CartPole/MLP"])
-    assert capsys.readouterr().out == "ppo/cartpole/mlp\n"
+    assert capsys.readouterr().out == "ppo/cartpole/mlp\nppo/cartpole/mlp-protocol\n"
 
 
 @pytest.mark.parametrize(

@@ -161,9 +161,9 @@ def test_a_broken_plugin_is_a_note_of_list(own_modules, capsys):
     sys.path += [str(own_modules / "site"), str(own_modules)]
     main(["show", "ppo/cartpole/mlp"])
     assert capsys.readouterr().err == ""
-    main(["list", "ppo/cartpole/mlp"])
+    main(["list", "ppo/cartpole/lstm"])
     assert capsys.readouterr() == (
-        "ppo/cartpole/mlp\n",
+        "ppo/cartpole/lstm\n",
         "note: the entry point 'parts' of the package broken failed: module 'raises' cannot be "
         "imported: ZeroDivisionError: division by zero\n",
     )

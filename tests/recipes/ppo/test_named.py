@@ -1,5 +1,6 @@
-"""The recipes of the paper's tables on arrays: the protocol's settings, in every cell."""
+"""The recipes of the paper's tables on arrays: one set of settings, and the protocol's."""
 
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -7,8 +8,8 @@ import pytest
 
 from recipes.algorithm import make_algorithm
 from recipes.ppo import PPO
+from recipes.presets.ppo_settings import PPO_SETTINGS
 from recipes.registry import RECIPES
-from torchrl_tit.settings import Inner
 from torchrl_tit.settings.networks import d2rl, enhanced_tit, mlp, ofenet, vanilla_tit
 
 TASKS = {
@@ -41,7 +42,7 @@ MOUNTAINCAR = {"vanilla-tit": (32, 8, 4, 64), "enhanced-tit": (16, 8, 4, 128)}
 
 @pytest.mark.parametrize(("task", "network"), list(product(TASKS, NETWORKS)))
 def test_every_cell_has_the_settings_of_the_protocol(task, network):
-    recipe = RECIPES[f"ppo/{task}/{network}"]
+    recipe = RECIPES[f"ppo/{task}/{network}-protocol"]
     assert isinstance(recipe, PPO)
     assert (recipe.env, recipe.total_steps) == TASKS[task]
     assert {name: getattr(recipe, name) for name in SETTINGS} == SETTINGS
@@ -62,7 +63,7 @@ def test_settings_of_tit(task, network):
         "activation_head": "tanh", "attention_dropout_inner": 0.0, "attention_dropout_outer": 0.0,
         "ffn_dropout_inner": 0.0, "ffn_dropout_outer": 0.0,
     }  # fmt: skip
-    assert RECIPES[f"ppo/{task}/{network}"].backbone == NETWORKS[network](1, **expected)
+    assert RECIPES[f"ppo/{task}/{network}-protocol"].backbone == NETWORKS[network](1, **expected)
 
 
 @pytest.mark.parametrize(("task", "network"), list(product(TASKS, ["mlp", "ofenet", "d2rl"])))
@@ -73,13 +74,48 @@ def test_the_trunks_have_two_tanh_layers_of_64(task, network):
     assert (backbone.trunks, backbone.head.features_dim) == ("separate", None)
 
 
-@pytest.mark.parametrize("task", ["ant", "halfcheetah", "hopper", "walker2d"])
-@pytest.mark.parametrize("network", ["vanilla-tit", "enhanced-tit"])
-def test_tuned_locomotion_takes_the_whole_observation_for_one_patch(task, network):
-    recipe = RECIPES[f"ppo/{task}/{network}-tuned"]
-    assert isinstance(recipe, PPO)
-    algorithm = make_algorithm(recipe)
+def test_all_tasks_and_networks_train_with_one_set_of_settings():
+    """Only the task, the number of steps and what the network reads differ."""
+    recipes = [
+        recipe
+        for name, recipe in RECIPES.items()
+        if isinstance(recipe, PPO) and not name.endswith("-protocol") and "ALE" not in recipe.env
+    ]
+    assert len({recipe.env for recipe in recipes}) == 7
+    one = PPO(env="one", backbone=mlp(), **PPO_SETTINGS)
+    same: dict[str, Any] = {
+        "env": "one",
+        "backbone": mlp(),
+        "total_steps": one.total_steps,
+        "name": "",
+        "hide_velocities": False,
+    }
+    assert {replace(recipe, **same) for recipe in recipes} == {one}
+
+
+def test_all_tit_networks_differ_only_in_frames_and_positions():
+    no_positions: dict[str, Any] = {"temporal_positions": "none"}
+    networks = {
+        replace(
+            recipe.backbone,
+            num_frames=1,
+            history=replace(recipe.backbone.history, **no_positions),
+        )
+        for name, recipe in RECIPES.items()
+        if isinstance(recipe, PPO)
+        and "enhanced-tit" in name
+        and not name.endswith("-protocol")
+        and "wo-outer" not in name
+        and "ALE" not in recipe.env
+    }
+    assert networks == {enhanced_tit(patch_size="auto", patch_weights="own")}
+
+
+@pytest.mark.parametrize("task", ["ant", "cartpole", "hopper"])
+def test_the_whole_observation_is_one_patch(task):
+    algorithm = make_algorithm(RECIPES[f"ppo/{task}/enhanced-tit"])
     algorithm.check()
-    env = algorithm.make_env(1, seed=0)
-    assert isinstance(recipe.backbone.frame, Inner)
-    assert recipe.backbone.frame.patch_size == env.observation_spec["history"].shape[-1]
+    (frames,) = algorithm.policy[0].module.frames
+    (size,) = frames.observation_shape
+    assert frames.encoder.patch_embedding.num_patches == 1
+    assert frames.encoder.patch_embedding.weight.shape[-1] == size

@@ -36,9 +36,9 @@ def runs(tmp_path):
     name = "ppo/acrobot/enhanced-tit"
     for seed, mean in enumerate([-80, -90, -500, -85, -81]):
         write_run(tmp_path / name / str(seed), name, seed, [mean - 10.0, mean + 10.0])
-    tuned = "ppo/cartpole/vanilla-tit-tuned"
-    write_run(tmp_path / tuned / "0", tuned, 0, [500.0, 400.0])
-    write_run(tmp_path / tuned / "1", tuned, 1, None)
+    protocol = "ppo/cartpole/vanilla-tit-protocol"
+    write_run(tmp_path / protocol / "0", protocol, 0, [500.0, 400.0])
+    write_run(tmp_path / protocol / "1", protocol, 1, None)
     hidden = "ppo/cartpole-no-velocity/mlp"
     write_run(tmp_path / hidden / "0", hidden, 0, [40.0])
     return tmp_path
@@ -54,12 +54,12 @@ def test_numbers(runs):
     assert acrobot.iqm == pytest.approx((-81 - 85 - 90) / 3)  # a quarter is cut at both ends
     assert acrobot.low < acrobot.iqm < acrobot.high
     assert (acrobot.paper_mean, acrobot.paper_std) == (-81, 17)
-    # The tuned recipe stands beside the paper's value of the plain one.
+    # A recipe with other settings stands beside the paper's value of the plain one.
     assert (cartpole.paper_mean, cartpole.table) == (500, "online, arrays")
     assert np.isnan([cartpole.low, cartpole.high, hidden.paper_mean]).all()
     assert hidden.table == "not in the paper"
     (note,) = notes
-    assert "vanilla-tit-tuned/1 is left out: it has no evaluation yet" in note
+    assert "vanilla-tit-protocol/1 is left out: it has no evaluation yet" in note
 
 
 def test_scores_count_where_there_are_some(tmp_path):
@@ -168,7 +168,7 @@ def test_what_was_changed_is_named(tmp_path):
 
 def test_another_encoder_is_named_with_its_fields(tmp_path):
     network = enhanced_tit(dense=False)
-    write_run(tmp_path / "0", "ppo/cartpole/enhanced-tit", 0, [20.0], backbone=network)
+    write_run(tmp_path / "0", "ppo/cartpole/enhanced-tit-protocol", 0, [20.0], backbone=network)
     ((cell,), _) = make_table([tmp_path])
     assert cell.changes == "backbone.frame.every_block False"
     linear = replace(network, frame=Linear(embed_dim=8))
@@ -220,4 +220,12 @@ def test_folders_without_runs(tmp_path, runs):
     with pytest.raises(ValueError, match=r"empty holds no run folder"):
         make_table([tmp_path / "empty"])
     with pytest.raises(ValueError, match=r"no evaluated run in .*has no evaluation yet"):
-        make_table([runs / "ppo/cartpole/vanilla-tit-tuned/1"])
+        make_table([runs / "ppo/cartpole/vanilla-tit-protocol/1"])
+
+
+def test_runs_of_other_machines_are_of_one_experiment(tmp_path):
+    name = "ppo/cartpole/mlp"
+    write_run(tmp_path / "0", name, 0, [20.0], threads=2, compile="on")
+    write_run(tmp_path / "1", name, 1, [30.0], compile="off", checkpoint_interval=2048)
+    ((cell,), _) = make_table([tmp_path])
+    assert (cell.runs, cell.mean, cell.changes) == (2, 25.0, "")

@@ -1,0 +1,42 @@
+"""The one set of PPO settings with which transformers, and all other networks here, learn reliably.
+
+docs/results/ppo_settings.md says how it was found, what each setting does, and what it reaches.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl_tit.settings import Network
+from torchrl_tit.settings.networks import enhanced_tit, vanilla_tit
+
+PPO_SETTINGS: dict[str, Any] = {
+    "num_envs": 8,
+    "steps_per_batch": 1024,
+    "minibatch_size": 256,
+    "decay_learning_rate": True,
+    # Observations, rewards and so values of size 1, whatever the task.
+    "normalize_observations": True,
+    "normalize_rewards": True,
+    # Once a task is solved, advantages are noise, and as they are they move the policy little.
+    "advantage_floor": 0.3,
+}
+"""Fields of the recipe; the others have their defaults, which are Stable-Baselines3's."""
+
+_TIT: dict[str, Any] = {"patch_size": "auto", "patch_weights": "own"}
+
+
+def reliable_tit(name: str, num_frames: int = 1, **settings: Any) -> Network:
+    """Returns a TIT network that goes with these settings.
+
+    An array is one patch, which has a bias; of an image, "auto" chooses the patch. Where several
+    frames are read, they are told apart.
+
+    Args:
+        name: enhanced-tit or vanilla-tit.
+        num_frames: number K of observations.
+        **settings: further settings of the network.
+    """
+    make = {"enhanced-tit": enhanced_tit, "vanilla-tit": vanilla_tit}[name]
+    positions = {"temporal_positions": "learned"} if num_frames > 1 else {}
+    return make(num_frames, **{**_TIT, **positions, **settings})
