@@ -30,7 +30,7 @@ def cart_pole() -> EnvBase:
     return GymEnv("CartPole-v1")
 
 
-def not_an_env() -> str:
+def not_an_env() -> EnvBase:
     return "no"
 
 

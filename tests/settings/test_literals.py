@@ -57,3 +57,10 @@ def test_calls(given, target, arguments):
 def test_calls_that_are_none(given, words):
     with pytest.raises(ValueError, match=words):
         parse_call(given)
+
+
+@pytest.mark.parametrize("bomb", ["-" * 100_000 + "1", "(" * 100_000], ids=["minus", "open"])
+def test_what_is_nested_too_deeply_is_no_literal(bomb):
+    assert parse_assignments([f"a={bomb}"]) == {"a": bomb}
+    with pytest.raises(ValueError, match="are not closed, or not those of one call"):
+        parse_call(f"a:C(n={bomb})")

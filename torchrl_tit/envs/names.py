@@ -3,12 +3,12 @@
 import difflib
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any
+from typing import Any, get_type_hints
 
 import gymnasium
 from torchrl.envs import EnvBase
 
-from torchrl_tit.settings.imports import import_if_allowed
+from torchrl_tit.settings.imports import import_if_allowed, is_named
 from torchrl_tit.settings.plugins import load_plugins
 
 # The packages that register names with these beginnings, and the extras that install them.
@@ -21,7 +21,8 @@ def find_task(name: str) -> str | Callable[..., EnvBase]:
     Args:
         name: A name that Gymnasium has registered; one of a package that this library knows, such
             as "MiniGrid-Empty-5x5-v0"; "module:Name-v0", where the module registers the name; or
-            "module:Name", a class in the module, or a function, that makes a TorchRL environment.
+            "module:Name", a class in the module, or a function, that makes a TorchRL environment. A
+            function says so (``-> EnvBase``), unless the user named its module.
 
     Returns:
         The name for `gymnasium.make`, or the class or function.
@@ -104,9 +105,22 @@ def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
         if issubclass(made, gymnasium.Env):
             hint = "; a Gymnasium task needs a name, with gymnasium.register in the module"
     elif callable(made):
-        return made
+        # Any function of any loaded module has a name, those that start programs too: a file may
+        # name those only that say what they make.
+        if is_named(module.__name__) or _says_that_it_makes_an_env(made):
+            return made
+        found = "has a function of that name, which does not say that it makes an EnvBase"
+        hint = "; annotate the function with `-> EnvBase`"
     raise ValueError(
         f"Task {name!r}: Gymnasium knows no {own!r} after importing {module.__name__}, which "
         f"{found}; expected a registered name, or a class or function that makes a TorchRL "
         f"EnvBase{hint}."
     )
+
+
+def _says_that_it_makes_an_env(made: Any) -> bool:
+    try:
+        returned = get_type_hints(made).get("return")
+    except Exception:  # a builtin, or annotations that cannot be read
+        return False
+    return isinstance(returned, type) and issubclass(returned, EnvBase)

@@ -50,6 +50,11 @@ def allowed_modules() -> list[str]:
     return list(filter(None, os.environ.get(_VARIABLE, "").split(os.pathsep)))
 
 
+def is_named(module: str) -> bool:
+    """Returns whether the user named a module, or a package around it (:func:`allow`)."""
+    return any(f"{module}.".startswith(f"{_module_name(name)}.") for name in allowed_modules())
+
+
 def import_options() -> list[str]:
     """Returns the same as options of the command line: ``--import MODULE`` for each."""
     return [word for module in allowed_modules() for word in ("--import", module)]
@@ -147,8 +152,4 @@ def _module_name(module: str) -> str:
 
 
 def _is_allowed(module: str) -> bool:
-    return (
-        module in sys.modules
-        or module.partition(".")[0] in TRUSTED
-        or any(f"{module}.".startswith(f"{_module_name(name)}.") for name in allowed_modules())
-    )
+    return module in sys.modules or module.partition(".")[0] in TRUSTED or is_named(module)

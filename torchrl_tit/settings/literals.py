@@ -33,7 +33,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
             raise ValueError(f"{name} is set twice, the second time by {assignment!r}")
         try:
             values[name] = ast.literal_eval(text.strip())
-        except (SyntaxError, ValueError):
+        except (SyntaxError, ValueError, MemoryError, RecursionError):  # too deep is no literal
             values[name] = text.strip()
     return values
 
@@ -62,7 +62,7 @@ def parse_call(text: str) -> tuple[str, dict[str, Any]]:
         return f"{module}:{name}", {}
     try:
         call = ast.parse(f"f({rest}", mode="eval").body
-    except SyntaxError:
+    except (SyntaxError, MemoryError, RecursionError):
         call = None
     if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
         raise ValueError(f"the arguments in {text!r} are not closed, or not those of one call")
