@@ -37,19 +37,24 @@ def conditions() -> dict[str, Any]:
         "date": datetime.date.today().isoformat(),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        **{package: importlib.metadata.version(package) for package in _PACKAGES},
         **{
             package: importlib.metadata.version(package)
-            for package in _BESIDE
-            if find_spec(package)
+            for package in [*_PACKAGES, *_BESIDE]
+            if find_spec(package.replace("-", "_"))
         },
     }
 
 
-def publish(name: str, markdown: str, numbers: dict[str, Any], out: Path | None) -> None:
+def publish(
+    name: str,
+    markdown: str,
+    numbers: dict[str, Any],
+    out: Path | None,
+    command: str | None = None,
+) -> None:
     """Prints the Markdown; writes Markdown and numbers if a folder is given."""
     facts = conditions()
-    command = f"python -m benchmarks {name}"
+    command = command or f"python -m benchmarks {name}"
     listed = ", ".join(f"{key} {value}" for key, value in facts.items())
     markdown += f"\nMeasured with `{command}`: {listed}.\n"
     print(markdown)

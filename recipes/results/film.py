@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import imageio.v2 as imageio
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.files import whole_or_not_at_all
@@ -39,15 +42,46 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
             rendered, or something that rendering needs is missing: a package, or OpenGL for a
             MuJoCo task.
     """
+    check_film(video)
+    _, algorithm, _ = load_trained(run, recipe)
+    seed = recipe.evaluation_seed
+    return film_policy(algorithm.make_env, algorithm.policy, run.folder, video, episodes, seed)
+
+
+def check_film(video: Path) -> None:
+    """Raises ValueError if a file is not to be a GIF or MP4."""
     if video.suffix not in _SUFFIXES:
         raise ValueError(f"a film is one of {', '.join(_SUFFIXES)}, not {video.name!r}")
-    _, algorithm, _ = load_trained(run, recipe)
-    policy = algorithm.policy
-    try:
-        env = algorithm.make_env(1, render_mode="rgb_array")
-    except ValueError as error:  # the task has no such setting
-        raise ValueError(f"{run.folder} cannot be rendered: {error}") from error
-    base = env.base_env  # transforms have no pictures
+
+
+def film_policy(
+    make_env: Callable[..., EnvBase],
+    policy: TensorDictModuleBase,
+    name: str | Path,
+    video: Path,
+    episodes: int = 1,
+    seed: int = 0,
+) -> list[float]:
+    """Films a policy while it plays with its most likely actions.
+
+    Args:
+        make_env: Makes the task, given the number of copies and ``render_mode``.
+        policy: The policy.
+        name: What it is called in messages.
+        video: As that of :func:`film`.
+        episodes: Number of episodes, one after the other in one film.
+        seed: Seed of the first episode; episode i begins from ``seed + i``.
+
+    Returns:
+        The return of each episode.
+
+    Raises:
+        FileExistsError: If there is such a file already.
+        ValueError: As :func:`film`.
+    """
+    check_film(video)
+    env = make_rendered(make_env, name)
+    base: Any = env.base_env  # transforms have no pictures
     try:
         with (
             whole_or_not_at_all(video) as hidden,
@@ -55,31 +89,40 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
             TemporaryDirectory(prefix=".", dir=video.absolute().parent) as folder,
         ):
             reel = Path(folder, video.name)
-            with _writer(reel, base.render_fps) as pictures:
+            with open_film(reel, base.render_fps) as pictures:
 
                 def filmed(tensordict: TensorDictBase) -> TensorDictBase:
-                    pictures.append_data(_picture(base, run))
+                    pictures.append_data(take_picture(base, name))
                     return policy(tensordict)
 
-                returns = evaluate(env, filmed, episodes, seed=recipe.evaluation_seed)
+                returns = evaluate(env, filmed, episodes, seed=seed)
             reel.rename(hidden)
     finally:
         env.close()
     return returns.tolist()
 
 
-def _picture(env: Any, run: Run) -> Any:
+def make_rendered(make_env: Callable[..., EnvBase], name: str | Path) -> EnvBase:
+    """Makes one copy of a task that can be rendered; raises ValueError if it cannot."""
+    try:
+        return make_env(1, render_mode="rgb_array")
+    except ValueError as error:  # the task has no such setting
+        raise ValueError(f"{name} cannot be rendered: {error}") from error
+
+
+def take_picture(env: Any, name: str | Path) -> Any:
+    """Renders a task, uint8 [height, width, 3]; raises ValueError if it cannot be rendered."""
     try:
         return env.render()[0]
     except Exception as error:  # each task renders in its own way and has its own errors
         raise ValueError(
-            f"{run.folder} cannot be rendered: {str(error).rstrip('.')}; for MuJoCo without a "
+            f"{name} cannot be rendered: {str(error).rstrip('.')}; for MuJoCo without a "
             "screen, set the environment variable MUJOCO_GL to egl or osmesa"
         ) from error
 
 
-def _writer(video: Path, fps: int) -> Any:
-    """Takes pictures one by one, so that a long film needs no memory."""
+def open_film(video: Path, fps: float) -> Any:
+    """Opens a GIF or MP4 that takes pictures one by one, so that a long film needs no memory."""
     if video.suffix == ".gif":
         return imageio.get_writer(video, format="GIF", mode="I", duration=1000 / fps, loop=0)
     if importlib.util.find_spec("imageio_ffmpeg") is None:

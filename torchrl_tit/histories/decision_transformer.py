@@ -6,6 +6,7 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
@@ -136,6 +137,36 @@ class DecisionTransformer(HistoryEncoder):
         """
         return self._encode(tokens, action, return_to_go, timestep, mask, read=_STATES)
 
+    def attention_maps(  # type: ignore[override]
+        self,
+        tokens: Tensor,
+        action: Tensor,
+        return_to_go: Tensor,
+        timestep: Tensor,
+        mask: Tensor | None = None,
+    ) -> list[Tensor]:
+        """Returns what each step's state reads of each step, float [..., heads, K, K].
+
+        A step counts with its return to go, its state and its action together.
+
+        Args:
+            tokens: as in ``forward``.
+            action: as in ``forward``.
+            return_to_go: as in ``forward``.
+            timestep: as in ``forward``.
+            mask: as in ``forward``.
+        """
+        leading = tokens.shape[:-3]
+        x, visible = self._sequence(tokens, action, return_to_go, timestep, mask)
+        maps = []
+        for block in self.blocks:
+            assert isinstance(block, GPT2Block)
+            weights = F.pad(block.attention_weights(x, visible)[..., _STATES, :], (0, 1))
+            weights = weights.unflatten(-1, (-1, 3)).sum(-1)  # [N, heads, K, K]
+            maps.append(weights.reshape(*leading, *weights.shape[1:]))
+            x = block(x, visible)
+        return maps
+
     def _encode(
         self,
         tokens: Tensor,
@@ -146,6 +177,22 @@ class DecisionTransformer(HistoryEncoder):
         read: slice,
     ) -> Tensor:
         """Features of the positions ``read`` of the sequence, float [..., positions, D]."""
+        leading = tokens.shape[:-3]
+        x, visible = self._sequence(tokens, action, return_to_go, timestep, mask)
+        for block in self.blocks[:-1]:
+            x = block(x, visible)
+        x = self.blocks[-1](x, visible, read)
+        return self.norm(x).reshape(*leading, x.shape[1], x.shape[2])
+
+    def _sequence(
+        self,
+        tokens: Tensor,
+        action: Tensor,
+        return_to_go: Tensor,
+        timestep: Tensor,
+        mask: Tensor | None,
+    ) -> tuple[Tensor, Tensor]:
+        """The tokens of the blocks, float [N, 3K - 1, D], and which see which, bool [...]."""
         state = self.one_token(tokens)  # [..., K, D]
         *leading, steps, width = state.shape
         action = self._as_vectors(action, (*leading, steps)).to(state.dtype)
@@ -167,11 +214,7 @@ class DecisionTransformer(HistoryEncoder):
             # Padding sees itself: a softmax over nothing would be NaN.
             itself = torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
             visible = (visible & valid) | itself
-        x = self.dropout(self.embedding_norm(x))
-        for block in self.blocks[:-1]:
-            x = block(x, visible)
-        x = self.blocks[-1](x, visible, read)
-        return self.norm(x).reshape(*leading, x.shape[1], width)
+        return self.dropout(self.embedding_norm(x)), visible
 
     def _as_vectors(self, action: Tensor, steps_shape: tuple[int, ...]) -> Tensor:
         """Turns discrete actions [..., K] into one-hot vectors; leaves others unchanged."""

@@ -147,10 +147,15 @@ class SelfAttention(nn.Module):
         mixed = weights[:, :1] * own + (weights[:, 1:] * other).sum(dim=1, keepdim=True)
         return self.out_proj(mixed.flatten(2))
 
-    def weights(self, x: Tensor) -> Tensor:
-        """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1."""
+    def weights(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1.
+
+        Args:
+            x: tokens, as in ``forward``.
+            mask: as in ``forward``.
+        """
         query, key, _ = self._heads(x, READ_SLICES["all"])
-        return self._weights(query, key, self._mask(x, None, self.causal))
+        return self._weights(query, key, self._mask(x, mask, self.causal and mask is None))
 
     def extra_repr(self) -> str:
         """Shows what the parameters' shapes do not."""

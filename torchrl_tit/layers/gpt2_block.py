@@ -76,3 +76,7 @@ class GPT2Block(nn.Module):
         read = read or slice(None)
         x = x[:, read] + self.dropout(self.attention(self.norm1(x), read, mask))
         return x + self.ffn(self.norm2(x))
+
+    def attention_weights(self, x: Tensor, mask: Tensor) -> Tensor:
+        """Returns the attention weights of this block, float [N, heads, S, S]; see ``forward``."""
+        return self.attention.weights(self.norm1(x), mask)

@@ -228,18 +228,20 @@ class HistoryNetwork(nn.Module):
             return tokens.to(weights_dtype(self)) / 255
         return tokens
 
-    def attention_maps(self, *histories: Tensor) -> AttentionMaps:
+    def attention_maps(self, *inputs: Tensor) -> AttentionMaps:
         """Returns the attention weights of every inner and outer block.
 
         This is a separate pass, because the usual one does not compute all attention weights.
 
         Args:
-            *histories: as in ``forward``.
+            *inputs: as in ``forward``.
         """
+        count = len(self.frame_encoders)
+        histories, context = inputs[:count], inputs[count:]
         tokens = self.as_floats(self.encode_frames(*histories))
         pairs = zip(self.frames, histories, strict=True)
         inner = [maps for encoder, history in pairs for maps in encoder.attention_maps(history)]
-        outer = self.history_encoder.attention_maps(tokens)
+        outer = self.history_encoder.attention_maps(tokens, *context)
         if self.history_encoder.reads_frames:  # its blocks are inner ones
             return AttentionMaps([*inner, *outer], [])
         return AttentionMaps(inner, outer)
@@ -467,5 +469,7 @@ def _make_head(in_features: int, head: settings.Head) -> tuple[nn.Module, int]:
         return nn.Identity(), in_features
     layers = [nn.Linear(in_features, head.features_dim), make_activation(head.activation)]
     if head.norm:
-        layers = [nn.LayerNorm(in_features), *layers, nn.LayerNorm(head.features_dim)]
+        layers = [nn.LayerNorm(in_features), *layers]
+        if head.final_norm:
+            layers.append(nn.LayerNorm(head.features_dim))
     return nn.Sequential(*layers), head.features_dim

@@ -1,0 +1,66 @@
+"""`explain`: what a trained agent looks at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .arguments import Parser, check_seed, program
+
+_MAPS = ("grad-cam", "integrated-gradients", "attention")
+
+
+def explain(arguments: list[str]) -> None:
+    """Films what a trained agent looks at, or draws one step of it."""
+    parser = Parser(f"{program()} explain")
+    parser.add_argument(
+        "agent",
+        metavar="AGENT",
+        help="run folder, or what `play` takes: name, folder of an agent, hf:user/name",
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, help="new file: a film (.gif, .mp4) or a picture (.png)"
+    )
+    parser.add_argument("--seed", type=int, help="seed of the episode; default: the evaluation's")
+    parser.add_argument("--step", type=int, help="of a picture: which step; default: 0, the first")
+    parser.add_argument("--max-steps", type=int, help="of a film: stop after so many steps")
+    parser.add_argument(
+        "--target",
+        choices=["action", "value"],
+        default="action",
+        help="what is explained: the chosen action, or the value; default: action",
+    )
+    parser.add_argument(
+        "--map",
+        choices=_MAPS,
+        help="how; default: grad-cam of images, integrated-gradients of arrays",
+    )
+    parser.add_argument(
+        "--layer", help="layer of grad-cam; default: the last that is laid out over the image"
+    )
+    options = parser.parse_args(arguments)
+    check_seed(options.seed)
+    import torch  # not at the top: help needs no PyTorch
+
+    from torchrl_tit import load_agent
+
+    from ..results.explanation import check_explanation, explain_policy
+
+    check_explanation(options.out, options.step, options.max_steps)
+    agent = load_agent(options.agent)
+    torch.set_num_threads(agent.recipe["threads"])
+    seed = agent.first_seed if options.seed is None else options.seed
+    shown = explain_policy(
+        agent.make_env,
+        agent.policy,
+        agent.name,
+        options.out,
+        seed=seed,
+        step=options.step,
+        max_steps=options.max_steps,
+        title=agent.recipe["name"],
+        target=options.target,
+        kind=options.map,
+        layer=options.layer,
+    )
+    steps = f"{shown} steps" if shown > 1 else "1 step"
+    print(f"{steps} of the episode of seed {seed}\nwritten to {options.out}")

@@ -1,0 +1,269 @@
+"""The paper's claims about its pictures as numbers, of trained runs on images."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.stats import bootstrap, trim_mean
+from tensordict import TensorDictBase, lazy_stack
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_tit.analysis import (
+    Target,
+    find_objects,
+    grad_cam,
+    map_change,
+    outer_attention,
+    share_on_objects,
+)
+from torchrl_tit.analysis.layers import image_layers
+from torchrl_tit.analysis.map_measures import Background
+from torchrl_tit.analysis.targets import find_network, histories_of
+from torchrl_tit.evaluation import evaluate
+
+from ..recipe import Recipe, experiment_of
+from ..run import Run
+from ..runner import load_trained
+
+_BATCH = 32
+
+
+@dataclass(frozen=True)
+class FigureClaims:
+    """What the paper reads off its pictures, measured on one run (arXiv 2212.14538, appendix)."""
+
+    share_on_objects: float
+    """Share of the newest frame's Grad-CAM map that lies on objects, mean over steps."""
+    area_of_objects: float
+    """The share that a uniform map has there, mean over the same steps."""
+    change: float
+    """Share of the map that lies elsewhere in the next frame of the episode, mean over steps."""
+    change_of_any: float
+    """The same between frames at random, mean: what a map changes that follows nothing."""
+    empty_maps: float
+    """Share of the steps whose map is 0 everywhere, which the other means leave out."""
+    attention: list[float] | None
+    """How much the newest step reads of each of the K steps, the oldest first: mean over steps,
+    blocks and heads; None without attention over time, or with one frame."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An interquartile mean over runs, and its 95% interval; NaN of a single run."""
+
+    iqm: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        """As "0.31 [0.28, 0.35]"."""
+        if np.isnan(self.low):
+            return f"{self.iqm:.3f}"
+        return f"{self.iqm:.3f} [{self.low:.3f}, {self.high:.3f}]"
+
+
+def measure_figure_claims(
+    run: Run,
+    *,
+    steps: int = 500,
+    seed: int | None = None,
+    background: Background = "place",
+    target: Target = "action",
+) -> FigureClaims:
+    """Measures the paper's claims about its pictures on a trained run.
+
+    The agent plays episodes with its most likely actions until there are enough steps. Objects are
+    what differs from the background of these frames.
+
+    Args:
+        run: a run on a task whose observation, or one of them, is an image.
+        steps: number of steps to look at.
+        seed: seed of the first episode; by default the evaluation's.
+        background: see :func:`~torchrl_tit.analysis.find_objects`.
+        target: what maps explain; see :data:`~torchrl_tit.analysis.targets.Target`.
+
+    Raises:
+        FileNotFoundError: if there is no checkpoint.
+        ValueError: if the network reads no image that Grad-CAM can map, or ``steps`` is less than
+            2.
+    """
+    if steps < 2:
+        raise ValueError(f"steps must be at least 2, not {steps}: change needs a next frame")
+    _, algorithm, _ = load_trained(run)
+    policy = algorithm.policy
+    network = find_network(policy, target)
+    image = next(iter(image_layers(network)), None)
+    if image is None:
+        raise ValueError(f"{run.folder}: its network reads no image that Grad-CAM can map")
+    index = list(network.observations).index(image)
+    seed = run.recipe.evaluation_seed if seed is None else seed
+    states, episode = _play(algorithm.make_env, policy, steps, seed)
+    maps, frames, shares = [], [], []
+    for start in range(0, len(states), _BATCH):
+        batch = lazy_stack(states[start : start + _BATCH]).contiguous()
+        histories = histories_of(policy, batch)
+        maps.append(grad_cam(policy, batch, target=target)[image][:, -1])
+        frames.append(histories[index][:, -1])
+        with suppress(ValueError):  # no attention over time
+            shares.append(outer_attention(network, *histories).mean((1, 2)))
+    seen = torch.cat(maps).double()
+    objects = find_objects(torch.cat(frames), background=background)
+    on_objects, area = share_on_objects(seen, objects)
+    mapped = seen.flatten(1).any(1)
+    return FigureClaims(
+        share_on_objects=float(on_objects[mapped].mean()),
+        area_of_objects=float(area[mapped].mean()),
+        change=float(map_change(seen)[episode.diff() == 0].nanmean()),
+        change_of_any=float(map_change(seen[_shuffled(len(seen))]).nanmean()),
+        empty_maps=float((~mapped).double().mean()),
+        attention=_attention(shares, episode, network.num_frames),
+    )
+
+
+def summarize(values: Sequence[float]) -> Interval:
+    """Summarises a number of each run, as the tables of results do.
+
+    Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv
+    2108.13264.
+
+    Args:
+        values: one of each run (seed).
+
+    Example:
+        >>> summarize([1.0, 2.0, 3.0, 10.0]).iqm
+        2.5
+    """
+    x = np.array(values, dtype=float)
+    low = high = float("nan")
+    if len(x) > 1:
+        found = bootstrap((x,), _iqm, n_resamples=10_000, method="percentile", rng=0)
+        low, high = map(float, found.confidence_interval)
+    return Interval(float(_iqm(x)), low, high)
+
+
+def group_runs(
+    runs: Sequence[Run], measured: Sequence[FigureClaims]
+) -> dict[str, list[FigureClaims]]:
+    """Puts the runs of the same settings together, whatever their seed.
+
+    Args:
+        runs: the runs.
+        measured: what was measured on each.
+
+    Returns:
+        What was measured by the recipe's name; a number tells those apart whose settings differ.
+
+    Raises:
+        ValueError: if two runs have the same settings and seed.
+    """
+    groups: dict[Recipe, dict[int, tuple[Run, FigureClaims]]] = {}
+    for run, claims in zip(runs, measured, strict=True):
+        seeds = groups.setdefault(experiment_of(run.recipe), {})
+        seed = run.recipe.seed
+        if seed in seeds:
+            raise ValueError(
+                f"{seeds[seed][0].folder} and {run.folder} are the same run, with seed {seed}: "
+                "name one of them only"
+            )
+        seeds[seed] = run, claims
+    named: dict[str, list[FigureClaims]] = {}
+    for recipe, seeds in groups.items():
+        name, number = recipe.name, 2
+        while name in named:
+            name, number = f"{recipe.name} ({number})", number + 1
+        named[name] = [claims for _, claims in seeds.values()]
+    return named
+
+
+def to_markdown(groups: dict[str, list[FigureClaims]]) -> str:
+    """Writes what was measured as Markdown: a table of maps, and one of attention over time."""
+    lines = [
+        "| recipe | runs | share of the map on objects | objects' share of the area "
+        "| change to the next frame | change between any frames | empty maps |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, claims in groups.items():
+        columns = [
+            summarize([getattr(claim, field) for claim in claims])
+            for field in (
+                "share_on_objects",
+                "area_of_objects",
+                "change",
+                "change_of_any",
+                "empty_maps",
+            )
+        ]
+        lines.append(f"| {name} | {len(claims)} | " + " | ".join(map(str, columns)) + " |")
+    text = "\n".join(lines) + "\n"
+    attentive = {
+        name: [claim.attention for claim in claims if claim.attention is not None]
+        for name, claims in groups.items()
+    }
+    frames = {len(shares) for found in attentive.values() for shares in found}
+    for count in sorted(frames):
+        ages = [f"{step - count + 1} steps" for step in range(count - 1)]
+        text += "\n| recipe | runs | " + " | ".join([*ages, "newest"]) + " |\n"
+        text += "|---" * (count + 2) + "|\n"
+        for name, found in attentive.items():
+            rows = [shares for shares in found if len(shares) == count]
+            if rows:
+                cells = [summarize(column) for column in zip(*rows, strict=True)]
+                text += f"| {name} | {len(rows)} | " + " | ".join(map(str, cells)) + " |\n"
+    return text
+
+
+class _Enough(Exception):
+    """There are as many steps as were asked for."""
+
+
+def _play(
+    make_env: Callable[[int], EnvBase], policy: TensorDictModuleBase, steps: int, seed: int
+) -> tuple[list[TensorDictBase], Tensor]:
+    """Plays until there are so many steps: what the policy read and wrote, and their episodes."""
+    states: list[TensorDictBase] = []
+    episodes: list[int] = []
+    env = make_env(1)
+    try:
+        for number in itertools.count():
+
+            def acted(tensordict: TensorDictBase, number: int = number) -> TensorDictBase:
+                outputs = policy(tensordict)
+                states.append(outputs[0].clone())
+                episodes.append(number)
+                if len(states) == steps:
+                    raise _Enough
+                return outputs
+
+            evaluate(env, acted, 1, seed=seed + number)
+    except _Enough:
+        return states, torch.tensor(episodes)
+    finally:
+        env.close()
+    raise AssertionError
+
+
+def _attention(shares: list[Tensor], episode: Tensor, num_frames: int) -> list[float] | None:
+    """The mean attention to each of the K steps, of windows that lie within their episode."""
+    if not shares or num_frames == 1:
+        return None
+    # Before that, an episode's first observation or zeros stand for what was not there.
+    within = torch.zeros(len(episode), dtype=torch.bool)
+    within[num_frames - 1 :] = episode[num_frames - 1 :] == episode[: len(episode) - num_frames + 1]
+    if not within.any():
+        return None
+    return torch.cat(shares)[within].double().mean(0).tolist()
+
+
+def _shuffled(count: int) -> Tensor:
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))
+
+
+def _iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
+    return trim_mean(x, 0.25, axis=axis)

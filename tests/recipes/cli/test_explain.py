@@ -1,0 +1,191 @@
+"""`explain`: films and pictures of what an agent looks at."""
+
+import sys
+from dataclasses import replace
+from typing import Any
+
+import imageio.v3 as imageio
+import numpy as np
+import pytest
+
+from recipes.cli import main
+from recipes.ppo import PPO
+from recipes.run import Run
+from recipes.runner import load_trained
+from tests.recipes.cql.cql_runs import make_discrete_cql
+from tests.recipes.decision_transformer.sequence_runs import SMALL as SMALL_DT
+from tests.recipes.decision_transformer.sequence_runs import make_dt
+from tests.recipes.untrained import untrained
+from torchrl_tit.evaluation import evaluate
+from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, lstm, mlp
+
+TIT: dict[str, Any] = {"patch_size": "auto", "embed_dim": 8, "num_blocks": 1, "features_dim": 8}
+PAGE = (432, 768, 3)
+
+
+def make_ppo(env, backbone, **fields):
+    return PPO(name="explained", env=env, backbone=backbone, total_steps=64, **fields)
+
+
+@pytest.fixture(scope="module")
+def cartpole(tmp_path_factory):
+    recipe = make_ppo("CartPole-v1", enhanced_tit(3, **TIT))
+    return untrained(tmp_path_factory.mktemp("run") / "cartpole", recipe)
+
+
+def explain(*words):
+    main(["explain", *map(str, words)])
+
+
+def error(capsys, *words):
+    with pytest.raises(SystemExit):
+        explain(*words)
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
+    return line
+
+
+def test_a_film_of_an_array_task(cartpole, tmp_path, capsys):
+    pytest.importorskip("pygame")
+    pytest.importorskip("captum")
+    film = tmp_path / "film.gif"
+    explain(cartpole.folder, "--out", film, "--seed", 5, "--max-steps", 3)
+    assert capsys.readouterr().out.splitlines() == [
+        "3 steps of the episode of seed 5",
+        f"written to {film}",
+    ]
+    pictures = imageio.imread(film)
+    assert pictures.shape == (3, *PAGE)
+    assert all((pictures[i] != pictures[i + 1]).any() for i in range(2))
+    assert [path.name for path in tmp_path.iterdir()] == [film.name]
+
+
+def test_a_whole_episode_and_a_picture_of_a_step_of_it(cartpole, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("pygame")
+    pytest.importorskip("captum")
+    # As fast as pages of one pixel.
+    drawn = []
+
+    class Small:
+        def __init__(self, step, title):
+            drawn.append(title)
+
+        def draw(self, step, pictures, values, number):
+            drawn.append((number, len(pictures), len(values), step.attention.shape))
+            return np.full((2, 2, 3), number, np.uint8)
+
+    monkeypatch.setattr("recipes.results.explanation.Page", Small)
+    _, algorithm, _ = load_trained(cartpole)
+    (length,) = evaluate(algorithm.make_env, algorithm.policy, 1, seed=7).int().tolist()
+    explain(cartpole.folder, "--out", tmp_path / "film.gif", "--seed", 7)
+    assert drawn[0] == "explained"
+    numbers = [(n, min(n + 1, 3), n + 1, (1, 1, 3)) for n in range(length)]
+    assert drawn[1:] == numbers
+
+    drawn.clear()
+    explain(cartpole.folder, "--out", tmp_path / "step.png", "--seed", 7, "--step", length - 1)
+    assert drawn[1:] == numbers[-1:], "a picture is that of the film"
+    capsys.readouterr()
+    line = error(
+        capsys, cartpole.folder, "--out", tmp_path / "no.png", "--seed", 7, "--step", length
+    )
+    assert f"the episode of seed 7 has {length} steps, so there is no step {length}" in line
+    assert {path.name for path in tmp_path.iterdir()} == {"film.gif", "step.png"}
+
+
+def test_an_image_task(tmp_path):
+    pytest.importorskip("ale_py")
+    backbone = enhanced_tit(2, **{**TIT, "patch_size": 42})
+    run = untrained(tmp_path / "run", make_ppo("ALE/Pong-v5", backbone, num_envs=2))
+    pictures: dict[object, np.ndarray] = {}
+    for words in (
+        ["--step", 1],
+        ["--step", 1, "--target", "value"],
+        ["--step", 1, "--map", "attention"],
+    ):
+        out = tmp_path / f"{len(pictures)}.png"
+        explain(run.folder, "--out", out, *words)
+        pictures[words[-1]] = imageio.imread(out)
+        assert pictures[words[-1]].shape == PAGE
+    assert (pictures[1] != pictures["value"]).any()
+    assert (pictures[1] != pictures["attention"]).any()
+
+
+def test_several_observations_and_a_recurrent_state(tmp_path):
+    pytest.importorskip("minigrid")
+    pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("captum")  # a linear layer reads the image
+    recipe = make_ppo(
+        "MiniGrid-Empty-5x5-v0",
+        lstm(embed_dim=8, hidden_dim=8, features_dim=8),
+        observation_keys=("image", "direction"),
+    )
+    run = untrained(tmp_path / "run", recipe)
+    explain(run.folder, "--out", tmp_path / "a.mp4", "--max-steps", 2)
+    assert imageio.imread(tmp_path / "a.mp4").shape == (2, *PAGE)
+
+
+def make_cartpole_dt(folder):
+    return make_dt(
+        folder,
+        env="CartPole-v1",
+        target_returns=(20.0,),
+        backbone=decision_transformer(**SMALL_DT),
+        action_space="discrete",
+    )
+
+
+def make_pendulum(folder):
+    return make_ppo("Pendulum-v1", mlp())
+
+
+@pytest.mark.parametrize("make", [make_discrete_cql, make_cartpole_dt, make_pendulum])
+def test_other_policies(make, tmp_path):
+    pytest.importorskip("pygame")
+    pytest.importorskip("captum")
+    run = untrained(tmp_path / "run", make(tmp_path))
+    explain(run.folder, "--out", tmp_path / "a.png", "--step", 1)
+    assert imageio.imread(tmp_path / "a.png").shape == PAGE
+
+
+def test_files_and_steps_that_cannot_be(cartpole, tmp_path, capsys):
+    run, png, gif = cartpole.folder, tmp_path / "a.png", tmp_path / "a.gif"
+    assert "a picture of one step (.png), not 'a.avi'" in error(
+        capsys, run, "--out", tmp_path / "a.avi"
+    )
+    assert "step 3 is one step" in error(capsys, run, "--out", gif, "--step", 3)
+    assert "max_steps 3 is the length of a film" in error(
+        capsys, run, "--out", png, "--max-steps", 3
+    )
+    assert "there is no step -1" in error(capsys, run, "--out", png, "--step", -1)
+    assert "max_steps must be at least 1" in error(capsys, run, "--out", gif, "--max-steps", 0)
+    assert "is neither an agent nor a run" in error(capsys, tmp_path, "--out", png)
+    assert "--seed must be from 0" in error(capsys, run, "--out", png, "--seed", -1)
+    assert "there is no folder" in error(capsys, run, "--out", tmp_path / "no" / "a.png")
+    png.write_bytes(b"mine")
+    assert "exists already" in error(capsys, run, "--out", png)
+    assert png.read_bytes() == b"mine"
+    empty = Run.create(tmp_path / "run", cartpole.recipe)
+    assert "holds no checkpoint" in error(capsys, empty.folder, "--out", gif)
+    assert not gif.exists()
+
+
+def test_maps_that_a_network_does_not_have(cartpole, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("pygame")
+    out = tmp_path / "a.png"
+
+    def fails(run, *words):
+        line = error(capsys, run.folder, "--out", out, *words)
+        assert not out.exists()
+        return line
+
+    assert "nothing for Grad-CAM to map" in fails(cartpole, "--map", "grad-cam")
+    assert "no layer 'blocks.9' in this network" in fails(cartpole, "--layer", "blocks.9")
+    assert "a layer is for grad-cam, not for attention" in fails(
+        cartpole, "--layer", "head.0", "--map", "attention"
+    )
+    recipe = replace(cartpole.recipe, backbone=mlp())
+    run = untrained(tmp_path / "run", recipe)
+    assert "no attention over the parts of an observation" in fails(run, "--map", "attention")
+    monkeypatch.setitem(sys.modules, "captum.attr", None)
+    assert "need captum: pip install 'torchrl-tit[explain]'" in fails(cartpole)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -1,0 +1,133 @@
+"""The paper's claims about its pictures, measured on runs."""
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from benchmarks.figure_claims import main
+from recipes.ppo import PPO
+from recipes.results.figure_claims import (
+    FigureClaims,
+    group_runs,
+    measure_figure_claims,
+    summarize,
+    to_markdown,
+)
+from recipes.run import Run
+from tests.recipes.untrained import untrained
+from torchrl_tit.settings.networks import enhanced_tit, mlp, resnet
+
+TIT: dict[str, Any] = {"patch_size": 8, "embed_dim": 8, "num_blocks": 1, "features_dim": 8}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    pytest.importorskip("minigrid")
+    folder = tmp_path_factory.mktemp("runs")
+    recipe = PPO(
+        name="tit",
+        env="MiniGrid-Empty-5x5-v0",
+        env_settings=("max_episode_steps=6",),
+        wrappers=(
+            "minigrid.wrappers:RGBImgObsWrapper(tile_size=8)",
+            "minigrid.wrappers:ImgObsWrapper",
+        ),
+        backbone=enhanced_tit(3, **TIT),
+        initialization="orthogonal",
+    )
+    cnn = replace(recipe, name="resnet", backbone=resnet(3, features_dim=8))
+    recipes = [recipe, replace(recipe, seed=1), cnn]
+    return [untrained(folder / str(i), made) for i, made in enumerate(recipes)]
+
+
+def raised(outputs):
+    return outputs["state_value"]
+
+
+def lowered(outputs):
+    return -outputs["state_value"]
+
+
+@pytest.mark.parametrize("index", [0, 2])
+def test_measured(runs, index):
+    # Without training a map can be 0 everywhere; then what lowers the value is not.
+    # Agents may stand still, so objects are what has another colour than the walls.
+    found = [
+        measure_figure_claims(runs[index], steps=14, target=target, background="colour")
+        for target in (raised, lowered)
+    ]
+    claims = min(found, key=lambda claims: claims.empty_maps)
+    assert claims.empty_maps < 1
+    assert 0 < claims.area_of_objects < 0.6
+    assert 0 <= claims.share_on_objects <= 1
+    assert 0 <= claims.change <= 1
+    assert 0 <= claims.change_of_any <= 1
+    if index == 0:
+        assert claims.attention is not None
+        assert len(claims.attention) == 3
+        assert math.isclose(sum(claims.attention), 1, rel_tol=1e-5)
+    else:
+        assert claims.attention is None
+
+
+def test_command(runs, tmp_path, capsys):
+    main([*(str(run.folder) for run in runs), "--steps", "4", "--out", str(tmp_path)])
+    written = json.loads((tmp_path / "figure_claims.json").read_text())
+    assert {name: len(found) for name, found in written["runs"].items()} == {"tit": 2, "resnet": 1}
+    text = (tmp_path / "figure_claims.md").read_text()
+    assert text in capsys.readouterr().out
+    assert "| tit | 2 | " in text
+    assert "Measured with `python -m benchmarks.figure_claims RUN ... --steps 4 " in text
+
+
+def claims(share, attention):
+    return FigureClaims(share, 0.1, 0.2, 0.3, 0.0, attention)
+
+
+def test_tables():
+    groups = {
+        "tit": [claims(0.5, [0.3, 0.1, 0.6]), claims(0.7, [0.5, 0.1, 0.4])],
+        "cnn": [claims(0.25, None)],
+    }
+    maps, attention = to_markdown(groups).split("\n\n")
+    assert "| tit | 2 | 0.600 [0.500, 0.700] | 0.100 [0.100, 0.100] |" in maps
+    assert "| cnn | 1 | 0.250 | 0.100 | 0.200 | 0.300 | 0.000 |" in maps
+    assert attention.splitlines()[0] == "| recipe | runs | -2 steps | -1 steps | newest |"
+    assert "| tit | 2 | 0.400 [0.300, 0.500] | 0.100 [0.100, 0.100] | 0.500" in attention
+    assert "cnn" not in attention
+    assert summarize([0.0, 1.0, 2.0, 100.0]).iqm == 1.5
+
+
+def test_runs_of_the_same_settings(tmp_path):
+    recipe = PPO(name="a", env="CartPole-v1", backbone=mlp())
+    one = Run(tmp_path / "0", recipe)
+    other = Run(tmp_path / "1", replace(recipe, seed=1, device="cpu"))
+    third = Run(tmp_path / "2", replace(recipe, learning_rate=0.1))
+    measured = [claims(i, None) for i in range(3)]
+    groups = group_runs([one, other, third], measured)
+    assert {name: [c.share_on_objects for c in found] for name, found in groups.items()} == {
+        "a": [0, 1],
+        "a (2)": [2],
+    }
+    with pytest.raises(ValueError, match="are the same run, with seed 0"):
+        group_runs([one, Run(tmp_path / "3", recipe)], measured[:2])
+
+
+def test_bad_input(runs, tmp_path, capsys):
+    def error(*words):
+        with pytest.raises(SystemExit):
+            main([str(word) for word in words])
+        return capsys.readouterr().err
+
+    assert "steps must be at least 2" in error(runs[0].folder, "--steps", 1)
+    assert "is not a run folder" in error(tmp_path)
+    (tmp_path / "file").touch()
+    assert "is a file: name a folder" in error(runs[0].folder, "--out", tmp_path / "file")
+    recipe = PPO(env="CartPole-v1", backbone=mlp())
+    assert "reads no image that Grad-CAM can map" in error(
+        untrained(tmp_path / "run", recipe).folder
+    )
+    assert "holds no checkpoint" in error(Run.create(tmp_path / "empty", recipe).folder)

@@ -1,0 +1,38 @@
+"""What a trained network looks at: maps on observations, attention, and flows of information.
+
+Grad-CAM on images, integrated gradients on arrays, attention of inner and outer blocks, and the
+paper's table of information flows (arXiv 2212.14538, appendices on visualization and information
+flow). docs/analysis.md says how to read them.
+"""
+
+from torchrl_tit.analysis.attention import (
+    inner_attention,
+    map_attention,
+    outer_attention,
+    roll_out,
+)
+from torchrl_tit.analysis.counted_flows import Flows, count_flows
+from torchrl_tit.analysis.flow_table import flow_table
+from torchrl_tit.analysis.grad_cam import grad_cam
+from torchrl_tit.analysis.integrated_gradients import integrated_gradients
+from torchrl_tit.analysis.map_measures import find_objects, map_change, share_on_objects
+from torchrl_tit.analysis.measured_flows import MeasuredFlows, measure_flows
+from torchrl_tit.analysis.targets import Target
+
+__all__ = [
+    "Flows",
+    "MeasuredFlows",
+    "Target",
+    "count_flows",
+    "find_objects",
+    "flow_table",
+    "grad_cam",
+    "inner_attention",
+    "integrated_gradients",
+    "map_attention",
+    "map_change",
+    "measure_flows",
+    "outer_attention",
+    "roll_out",
+    "share_on_objects",
+]

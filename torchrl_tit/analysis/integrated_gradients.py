@@ -1,0 +1,125 @@
+"""Integrated gradients: what each entry of an observation contributes to a target."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_tit.analysis.targets import (
+    Target,
+    as_batch,
+    check_gradient,
+    compute_target,
+    evaluating,
+    find_backbone,
+    find_network,
+    run_policy,
+)
+
+
+def integrated_gradients(
+    policy: TensorDictModuleBase,
+    tensordict: TensorDictBase,
+    *,
+    target: Target = "action",
+    baselines: Mapping[str, Tensor] | None = None,
+    steps: int = 32,
+) -> dict[str, Tensor]:
+    """Attributes a target to the entries of observations, with captum's integrated gradients.
+
+    The attributions of a state add up to the difference that its observations make to the target,
+    compared with a baseline: gradients are averaged on the straight line from the one to the other
+    (Sundararajan et al., "Axiomatic Attribution for Deep Networks", arXiv 1703.01365). The chosen
+    action, recurrent states and categories, which have no gradient, stay as they are.
+
+    Args:
+        policy: a policy with a :class:`~torchrl_tit.modules.Backbone`; dropout is off.
+        tensordict: what the policy reads, [N] or []; its "action", if there is one, is the chosen
+            one.
+        target: what is explained; see :data:`~torchrl_tit.analysis.targets.Target`.
+        baselines: observations to compare with by name, to be broadcast to [N, K, *observation];
+            zeros for those that it leaves out. Bytes count as 0..1, as networks read them.
+        steps: points on the line. More make the sum more exact.
+
+    Returns:
+        Attributions by the name of the observation, float [N, K, *observation], of arrays and
+        images.
+
+    Raises:
+        ValueError: if captum is missing, the network reads only categories, a baseline belongs to
+            no observation, or the policy does not compute the target.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import TensorDictSequential
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_tit import Backbone, EnhancedTIT
+        >>> from torchrl_tit.modules import make_actor
+        >>> tit = EnhancedTIT((4,), num_frames=8)
+        >>> policy = TensorDictSequential(Backbone(tit), make_actor(64, Categorical(2)))
+        >>> state = TensorDict({"history": torch.randn(2, 8, 4)}, [2])
+        >>> integrated_gradients(policy, state)["observation"].shape
+        torch.Size([2, 8, 4])
+    """
+    network, backbone = find_network(policy, target), find_backbone(policy)
+    keys = {
+        name: key
+        for (name, seen), key in zip(
+            network.observations.items(), backbone.history_keys, strict=False
+        )
+        if seen.kind != "categories"
+    }
+    if not keys:
+        raise ValueError(
+            "this network reads categories only, which have no gradient to integrate: look at its "
+            "attention"
+        )
+    baselines = {} if baselines is None else baselines
+    if unknown := set(baselines) - set(keys):
+        raise ValueError(
+            f"a baseline for {sorted(unknown)[0]!r}, which is no array and no image that this "
+            f"network reads: name one of {', '.join(keys)}"
+        )
+    method = _captum()
+    state = as_batch(tensordict)
+    if state.get("action", None) is None:
+        with evaluating(policy), torch.no_grad():
+            state = state.copy().set("action", run_policy(policy, state)[0]["action"])
+    inputs = {name: _as_floats(state[key]) for name, key in keys.items()}
+    starts = tuple(
+        torch.zeros_like(x) if name not in baselines else baselines[name].to(x).expand_as(x)
+        for name, x in inputs.items()
+    )
+
+    def compute(*histories: Tensor) -> Tensor:
+        repeats = len(histories[0]) // len(state)
+        states = state.expand(repeats, len(state)).reshape(-1).copy()
+        for key, history in zip(keys.values(), histories, strict=True):
+            states.set(key, history)
+        value = compute_target(policy, states, target)
+        check_gradient(value, target)
+        return value
+
+    with evaluating(policy), torch.enable_grad():
+        shares = method(compute).attribute(tuple(inputs.values()), starts, n_steps=steps)
+    return {name: share.detach() for name, share in zip(inputs, shares, strict=True)}
+
+
+def _as_floats(history: Tensor) -> Tensor:
+    """Bytes as 0..1, which is how networks read them."""
+    return history.float() / 255 if history.dtype == torch.uint8 else history
+
+
+def _captum() -> type[Any]:
+    try:
+        from captum.attr import IntegratedGradients  # an optional extra
+    except ImportError as error:
+        raise ValueError(
+            "integrated gradients need captum: pip install 'torchrl-tit[explain]'"
+        ) from error
+    return IntegratedGradients

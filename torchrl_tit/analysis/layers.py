@@ -1,0 +1,140 @@
+"""Where in a network the image is still an image: the layers of Grad-CAM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor, nn
+
+from torchrl_tit.frames.inner import InnerTransformer
+from torchrl_tit.networks import HistoryNetwork
+from torchrl_tit.settings.checks import nearest
+
+
+@dataclass(frozen=True)
+class ImageLayer:
+    """A layer whose output is laid out over an image."""
+
+    name: str
+    """Its name in the network."""
+    module: nn.Module
+    """The layer."""
+    grid: tuple[int, int] | None
+    """Rows and columns of the patches, if it puts out tokens; None of convolutions."""
+
+    def lay_out(self, output: Tensor) -> Tensor:
+        """Lays a layer's output over the image: patches row by row, without the class token.
+
+        Args:
+            output: float [M, C, h, w], or tokens [M, S, D].
+
+        Returns:
+            float [M, C or D, h, w].
+
+        Raises:
+            ValueError: if it has no place for each patch.
+        """
+        if output.ndim == 4:
+            return output
+        if self.grid is not None and output.ndim == 3:
+            rows, columns = self.grid
+            patches = rows * columns
+            if output.shape[1] in (patches, patches + 1):
+                tokens = output[:, -patches:]
+                return tokens.transpose(1, 2).unflatten(2, (rows, columns))
+        found = list(output.shape)
+        raise ValueError(
+            f"the output of the layer {self.name!r} has the shape {found}, which is no image "
+            "[N, C, h, w] and no row of patches: choose a convolution, or the input "
+            "normalisation of a block (norm1)"
+        )
+
+
+def image_layers(network: HistoryNetwork) -> dict[str, ImageLayer]:
+    """Finds the layer of Grad-CAM for each image that a network reads.
+
+    Of transformers it is the input normalisation of the last inner block: after it the last block
+    computes the class token only, so patches get no gradient. Of convolutions it is the last one.
+
+    Returns:
+        The layers by the name of the observation; images without such a layer are left out.
+    """
+    layers = {}
+    names = {module: name for name, module in network.named_modules()}
+    for (name, observation), encoder in zip(
+        network.observations.items(), network.frames, strict=True
+    ):
+        if observation.kind != "image":
+            continue
+        layer = _find(encoder) or _find(network.history_encoder)
+        if layer is not None:
+            module, grid = layer
+            layers[name] = ImageLayer(names[module], module, grid)
+    return layers
+
+
+def named_layer(network: HistoryNetwork, layer: str) -> tuple[str, ImageLayer]:
+    """Finds a layer by its name.
+
+    Returns:
+        The name of the observation that it belongs to, and the layer.
+
+    Raises:
+        ValueError: if there is no such layer, or it belongs to no image; the message names similar
+            ones.
+    """
+    modules = dict(network.named_modules())
+    if layer not in modules or not layer:
+        usual = " or ".join(found.name for found in image_layers(network).values())
+        hint = f"; {usual} is the usual one" if usual else ""
+        known = [name for name in modules if name]
+        raise ValueError(
+            f"there is no layer {layer!r} in this network{hint}: {nearest(layer, known)}"
+        )
+    images = [name for name, seen in network.observations.items() if seen.kind == "image"]
+    owners = dict(zip(network.observations, network.frame_encoders, strict=True))
+    inside = [name for name in images if layer.startswith(f"frame_encoders.{owners[name]}.")]
+    if not inside and layer.startswith("history_encoder.") and len(owners) == 1:
+        inside = images
+    if not inside:
+        raise ValueError(f"the layer {layer!r} reads no image: choose one of a frame encoder of it")
+    inner = [
+        module
+        for name, module in modules.items()
+        if isinstance(module, InnerTransformer) and layer.startswith(f"{name}.")
+    ]
+    grid = getattr(inner[-1].patch_embedding, "grid", None) if inner else None
+    return inside[0], ImageLayer(layer, modules[layer], grid)
+
+
+def patch_grid(network: HistoryNetwork, observation: str) -> tuple[int, int]:
+    """Returns rows and columns of the patches of an observation; an array has one row.
+
+    Raises:
+        ValueError: if no inner transformer reads it.
+    """
+    index = list(network.observations).index(observation)
+    for part in (network.frames[index], network.history_encoder):
+        inner = _inner(part)
+        if inner is not None:
+            patches = inner.patch_embedding
+            return getattr(patches, "grid", None) or (1, patches.num_patches)
+    raise ValueError(
+        f"no inner transformer reads {observation!r}, so there are no patches: this network has no "
+        "attention over them"
+    )
+
+
+def _find(part: nn.Module) -> tuple[nn.Module, tuple[int, int] | None] | None:
+    """The layer in a part of the network, and the grid of its patches."""
+    inner = _inner(part)
+    if inner is not None:
+        last = inner.blocks[(inner.num_blocks - 1) % len(inner.blocks)]
+        grid = getattr(inner.patch_embedding, "grid", None)
+        return (last.get_submodule("norm1"), grid) if grid is not None else None
+    convolutions = [module for module in part.modules() if isinstance(module, nn.Conv2d)]
+    return (convolutions[-1], None) if convolutions else None
+
+
+def _inner(part: nn.Module) -> InnerTransformer | None:
+    return next((m for m in part.modules() if isinstance(m, InnerTransformer)), None)

@@ -1,0 +1,188 @@
+"""What is explained: a number for each state that a policy computes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Literal, TypeAlias
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import (
+    ProbabilisticTensorDictModule,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
+from torch import Tensor, distributions, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import set_recurrent_mode
+
+from torchrl_tit.modules import Backbone
+from torchrl_tit.modules.backbone import trunks_of
+from torchrl_tit.networks import HistoryNetwork
+
+Target: TypeAlias = Literal["action", "value"] | Callable[[TensorDictBase], Tensor]
+"""What is explained, a number for each state [N].
+
+"action" is the chosen action's log-probability. The log-probability of a continuous action has no
+gradient where the action is the mean, as it is while evaluating, so of continuous actions it is
+their size: the sum of the sizes of the entries of the policy's deterministic action. Of policies
+that take the action of the highest value, it is that value.
+
+"value" is the state's value, or the chosen action's if the policy computes those.
+
+A function is given what the policy writes, and returns float [N].
+"""
+
+
+def find_backbone(policy: nn.Module) -> Backbone:
+    """Returns the backbone of a policy.
+
+    Raises:
+        ValueError: if there is none, or its network is not of this library.
+    """
+    backbones = (module for module in policy.modules() if isinstance(module, Backbone))
+    backbone = next(backbones, None)
+    if backbone is None or not trunks_of(backbone.module):
+        raise ValueError(
+            f"{type(policy).__name__} has no torchrl_tit.Backbone around a network of this "
+            "library, so there is nothing to explain: give it a policy that has one"
+        )
+    return backbone
+
+
+def find_network(policy: nn.Module, target: Target = "action") -> HistoryNetwork:
+    """Returns the network that computes a target: of two trunks, the policy's or the value's.
+
+    Raises:
+        ValueError: as :func:`find_backbone`.
+    """
+    trunks = trunks_of(find_backbone(policy).module)
+    key = "value_" if target == "value" else "policy_"
+    return trunks[key] if key in trunks else trunks[""]
+
+
+def histories_of(policy: nn.Module, tensordict: TensorDictBase) -> list[Tensor]:
+    """Returns what the policy's network reads, as its ``forward`` takes it.
+
+    Raises:
+        ValueError: as :func:`find_backbone`.
+        KeyError: if the tensordict lacks some of it.
+    """
+    return [tensordict[key] for key in find_backbone(policy).history_keys]
+
+
+def run_policy(
+    policy: TensorDictModuleBase, tensordict: TensorDictBase
+) -> tuple[TensorDictBase, distributions.Distribution | None]:
+    """Runs a policy on single steps, with gradients where they are enabled.
+
+    Args:
+        policy: any policy; the deterministic action is taken.
+        tensordict: what it reads, [N]; it is left as it is.
+
+    Returns:
+        All that the policy writes, and the distribution of actions, if there is one.
+    """
+    outputs, distribution = tensordict.copy(), None
+    with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(False):
+        for module in _parts(policy):
+            if isinstance(module, ProbabilisticTensorDictModule):
+                distribution = module.get_dist(outputs)
+            outputs = module(outputs)
+    return outputs, distribution
+
+
+def compute_target(
+    policy: TensorDictModuleBase, tensordict: TensorDictBase, target: Target
+) -> Tensor:
+    """Computes a target.
+
+    Args:
+        policy: the policy.
+        tensordict: what it reads, [N], and "action" if that is not the deterministic one.
+        target: see :data:`Target`.
+
+    Returns:
+        float [N].
+
+    Raises:
+        ValueError: if the policy does not compute it, or there is no such target.
+    """
+    outputs, distribution = run_policy(policy, tensordict)
+    if callable(target):
+        return target(outputs).reshape(len(tensordict))
+    if target == "value":
+        for key in ("state_value", "chosen_action_value"):
+            value = outputs.get(key, None)
+            if value is not None:
+                return value.reshape(len(tensordict))
+        raise ValueError(
+            "this policy computes actions only, no values (state_value or chosen_action_value): "
+            "explain its action"
+        )
+    if target != "action":
+        raise ValueError(f"a target is 'action', 'value' or a function, not {target!r}")
+    best = outputs["action"]
+    if best.is_floating_point():
+        return best.abs().flatten(1).sum(1)
+    action = tensordict.get("action", None)
+    action = best if action is None else action
+    if distribution is not None:
+        return distribution.log_prob(action).reshape(len(tensordict))
+    values = outputs["action_value"]  # [N, actions]
+    return values.gather(-1, action.reshape(-1, 1)).squeeze(-1)
+
+
+@contextmanager
+def evaluating(policy: nn.Module) -> Iterator[None]:
+    """Switches dropout off, and each module back to its mode at the end."""
+    modes = [(module, module.training) for module in policy.modules()]
+    try:
+        policy.eval()
+        yield
+    finally:
+        for module, mode in modes:
+            module.training = mode
+
+
+def as_batch(tensordict: TensorDictBase) -> TensorDictBase:
+    """Returns states with one batch dimension, [N].
+
+    Raises:
+        ValueError: if they have several.
+    """
+    if tensordict.ndim > 1:
+        raise ValueError(
+            f"states are explained one by one, [N], not {list(tensordict.batch_size)}: flatten them"
+        )
+    return tensordict if tensordict.ndim else tensordict.unsqueeze(0)
+
+
+def check_gradient(value: Tensor, target: Target) -> None:
+    """Raises ValueError if a target depends on nothing."""
+    if not value.requires_grad:
+        name = target if isinstance(target, str) else getattr(target, "__name__", "the target")
+        raise ValueError(f"{name} does not depend on what the network reads: choose another target")
+
+
+def _parts(policy: nn.Module) -> Iterator[TensorDictModuleBase]:
+    """The modules of a policy, in order."""
+    if isinstance(policy, TensorDictSequential):
+        for module in policy.module:
+            yield from _parts(module)
+    else:
+        assert isinstance(policy, TensorDictModuleBase | ProbabilisticTensorDictModule)
+        yield policy
+
+
+def gradients(value: Tensor, inputs: list[Tensor]) -> list[Tensor | None]:
+    """The gradient of the sum of a target by each input; None where it does not depend on it.
+
+    The states of a batch do not depend on each other, so this is the gradient of each.
+    """
+    return list(
+        torch.autograd.grad(
+            [value], inputs, grad_outputs=[torch.ones_like(value)], allow_unused=True
+        )
+    )
