@@ -10,7 +10,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from torchrl_tit.settings import resolve
@@ -77,6 +77,13 @@ class Algorithm(ABC, Generic[RecipeT]):
     @abstractmethod
     def networks(self) -> Stateful:
         """Returns the networks with all weights, for evaluation and checkpoints."""
+
+    def acting_networks(self) -> nn.Module:
+        """Returns those that acting needs, for trained agents: by default the policy.
+
+        Override it if :meth:`make_env` has weights or statistics too.
+        """
+        return self.policy
 
     @abstractmethod
     def prepare(self, step: int, folder: Path) -> None:

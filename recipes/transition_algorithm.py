@@ -85,6 +85,12 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
             return self.loss
         return nn.ModuleDict({"loss": self.loss, "statistics": self.statistics})
 
+    def acting_networks(self) -> nn.Module:
+        """The policy, and the statistics of normalised observations."""
+        if not self.recipe.normalize_observations:
+            return self.policy
+        return nn.ModuleDict({"policy": self.policy, "statistics": self.statistics})
+
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories, and with normalised observations if requested."""
         env = self._make_task(num_envs, seed, **settings)

@@ -88,6 +88,10 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         """Network and head, with the statistics of the data."""
         return self.agent
 
+    def acting_networks(self) -> nn.Module:
+        """The same: the environments normalise observations."""
+        return self.agent
+
     def make_env(
         self,
         num_envs: int,

@@ -1,0 +1,154 @@
+"""Agents that act, from the files of an agent or from a run folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from torchrl_tit.agents import AgentError, TrainedAgent
+from torchrl_tit.agents.folder import EVALUATION, RECIPE, AgentFiles, check_evaluation
+from torchrl_tit.checkpoint import latest_step
+
+from ..algorithm import Algorithm, make_algorithm
+from ..decision_transformer.settings import SequenceRecipe
+from ..recipe import Recipe
+from ..recipe_json import recipe_from_json, recipe_to_json
+from ..run import Run
+from ..runner import load_trained
+from .named_parts import check_named_parts
+
+Device = Literal["cpu", "cuda", "auto"]
+
+
+def agent_from_files(files: AgentFiles, name: str, device: Device) -> TrainedAgent:
+    """Builds an agent from its files.
+
+    Args:
+        files: what they hold.
+        name: the agent's name.
+        device: of the policy and of the environments.
+
+    Raises:
+        AgentError: if the weights do not fit the recipe.
+        ValueError: if the recipe cannot be read, or its task or networks cannot be built.
+    """
+    recipe = recipe_from_json(files.recipe, files.folder / RECIPE)
+    check_named_parts(recipe)
+    try:
+        algorithm = make_algorithm(_acting(recipe, files.evaluation, device))
+    except (MemoryError, RuntimeError) as error:  # networks larger than the memory
+        raise AgentError(
+            f"the agent {files.folder} cannot be used: its networks cannot be built "
+            f"({' '.join(str(error).split())})"
+        ) from error
+    networks = algorithm.acting_networks()
+    try:
+        _check_weights(files.weights, networks.state_dict())
+        networks.load_state_dict(files.weights)
+    except (RuntimeError, ValueError) as error:
+        raise AgentError(
+            f"the agent {files.folder} cannot be used: its weights do not fit {RECIPE} in this "
+            f"version of torchrl-tit ({' '.join(str(error).split())})"
+        ) from error
+    return _agent(name, recipe, algorithm, files.steps, files.evaluation, files.versions)
+
+
+def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
+    """Builds an agent from a run's newest checkpoint.
+
+    Args:
+        folder: the run folder.
+        device: of the policy and of the environments.
+
+    Raises:
+        FileNotFoundError: if there is no run or no checkpoint.
+        CheckpointError: if it cannot be used.
+        ValueError: as :func:`agent_from_files`.
+    """
+    run = Run.open(folder)
+    check_named_parts(run.recipe)
+    evaluation = read_evaluation(folder, latest_step(run.checkpoints))
+    recipe = _acting(run.recipe, evaluation, device)
+    # Loading sets the number of PyTorch's threads, which is the caller's here.
+    steps, algorithm, _ = load_trained(run, replace(recipe, threads=torch.get_num_threads()))
+    versions = read_json(folder / "versions.json")
+    return _agent(str(folder), run.recipe, algorithm, steps, evaluation, versions)
+
+
+def read_evaluation(folder: Path, steps: int | None) -> dict[str, Any]:
+    """Reads a run's evaluation; empty if there is none, or none of the checkpoint of a step."""
+    evaluation = read_json(folder / EVALUATION)
+    with suppress(ValueError):
+        check_evaluation(evaluation)
+        if evaluation.get("steps") == steps:
+            return evaluation
+    return {}
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """Reads a JSON object that a run wrote; empty if it is lost or damaged."""
+    with suppress(OSError, ValueError):
+        found = json.loads(file.read_bytes())
+        if isinstance(found, dict):
+            return found
+    return {}
+
+
+def _check_weights(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+    """Raises ValueError if weights are of another type than those of the networks, or not finite.
+
+    Loading itself compares names and shapes, but converts types.
+    """
+    for name, weight in weights.items():
+        if name in expected and weight.dtype != expected[name].dtype:
+            raise ValueError(f"{name} is {weight.dtype}, not {expected[name].dtype}")
+        if not weight.isfinite().all():
+            raise ValueError(f"{name} has entries that are not finite")
+
+
+def _acting(recipe: Recipe, evaluation: Mapping[str, Any], device: Device) -> Recipe:
+    """The recipe with the device to act on, and the better of several target returns."""
+    recipe = replace(recipe, device=device)
+    if isinstance(recipe, SequenceRecipe):
+        targets, better = recipe.target_returns, evaluation.get("target_return")
+        recipe = replace(recipe, target_returns=(better if better in targets else targets[0],))
+    return recipe
+
+
+def _agent(
+    name: str,
+    recipe: Recipe,
+    algorithm: Algorithm[Any],
+    steps: int,
+    evaluation: Mapping[str, Any],
+    versions: Mapping[str, Any],
+) -> TrainedAgent:
+    policy = algorithm.policy
+    return TrainedAgent(
+        name=name,
+        policy=policy.eval(),
+        make_env=algorithm.make_env,
+        recipe=json.loads(recipe_to_json(recipe)),
+        steps=steps,
+        evaluation=evaluation,
+        versions=versions,
+        plays=_plays(algorithm, steps),
+    )
+
+
+def _plays(algorithm: Algorithm[Any], steps: int) -> Callable[[int, int], list[float]]:
+    """Plays episodes as the evaluation of its algorithm does."""
+    recipe = algorithm.recipe
+
+    def plays(episodes: int, seed: int) -> list[float]:
+        algorithm.recipe = replace(recipe, evaluation_episodes=episodes, evaluation_seed=seed)
+        return algorithm.play(steps)[0].returns
+
+    return plays

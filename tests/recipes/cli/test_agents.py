@@ -1,0 +1,93 @@
+"""`play` and `share` on the command line."""
+
+import json
+
+import imageio.v3 as imageio
+import pytest
+
+from recipes.cli import main
+from recipes.run import Run
+from tests.agents.runs import make_run
+from torchrl_tit.agents import agent_names, load_agent
+from torchrl_tit.agents.folder import CARD, WEIGHTS
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+def failure(capsys, *words):
+    """What a command that fails prints: one line."""
+    with pytest.raises(SystemExit) as stop:
+        main([str(word) for word in words])
+    assert stop.value.code == 2
+    [line] = capsys.readouterr().err.splitlines()
+    return line
+
+
+def test_the_list_of_agents(capsys):
+    main(["play"])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines] == agent_names()
+    [cartpole] = [line for line in lines if line.startswith("cartpole:")]
+    assert "CartPole-v1, return 500.0 ± 0.0 over 100 episodes" in cartpole
+
+
+def test_an_agent_plays_and_is_filmed(run, tmp_path, capsys):
+    pytest.importorskip("pygame")
+    main(["share", str(run), "--out", str(tmp_path / "agent")])
+    assert capsys.readouterr().out.startswith(f"written to {tmp_path / 'agent'}: 0.0")
+    evaluation = json.loads((run / "evaluation.json").read_text())
+    for source in (tmp_path / "agent", run):
+        main(["play", str(source), "--episodes", "3"])
+        [line] = capsys.readouterr().out.splitlines()
+        mean = f"{evaluation['mean']:.1f} ± {evaluation['std']:.1f} over 3"
+        expected = f"return {mean} episodes of CartPole-v1; its evaluation: {mean}"
+        assert line == f"{source}: {expected}"
+    film = tmp_path / "film.gif"
+    main(["play", str(tmp_path / "agent"), "--out", str(film), "--seed", "6"])
+    returned = evaluation["returns"][1]  # of the second episode, whose seed is 5 + 1
+    assert f"return {returned:.1f} ± 0.0 over 1 episode of" in capsys.readouterr().out
+    shown = [imageio.immeta(film, index=i)["duration"] for i in range(len(imageio.imread(film)))]
+    assert sum(shown) == 20 * returned  # a picture a step, at 50 a second
+    assert f"{film} exists already" in failure(capsys, "play", run, "--out", film)
+
+
+def test_the_name_on_the_card(run, tmp_path, capsys):
+    main(["share", str(run), "--out", str(tmp_path / "some_agent"), "--license", "mit"])
+    card = (tmp_path / "some_agent" / CARD).read_text()
+    assert "\n# some_agent\n" in card
+    assert "\nlicense: mit\n" in card
+    main(["share", str(run), "--out", str(tmp_path / "other"), "--name", "mine"])
+    card = (tmp_path / "other" / CARD).read_text()
+    assert "\n# mine\n" in card
+    assert "license" not in card
+    assert load_agent(tmp_path / "other").steps == 7
+
+
+def test_what_cannot_be_played_or_shared(run, tmp_path, capsys):
+    empty = Run.create(tmp_path / "empty", Run.open(run).recipe).folder
+    agent = tmp_path / "agent"
+    main(["share", str(run), "--out", str(agent)])
+    capsys.readouterr()
+    before = sorted(tmp_path.rglob("*"))
+    for words, reason in (
+        (["play", "cart"], "no agent or folder 'cart': did you mean cartpole"),
+        (["play", empty], "holds no checkpoint: train the run first"),
+        (["play", agent, "--episodes", "0"], "--episodes must be at least 1, not 0"),
+        (["play", agent, "--episodes", 10**30], "--episodes must be at most 1000000, not 1000"),
+        (["play", agent, "--seed", "-1"], "--seed must be from 0 to 2147483648, not -1"),
+        (["play", agent, "--out", tmp_path / "film.txt"], "a film is one of .gif, .mp4"),
+        (["share", run], "share needs REPO, such as me/cartpole, or --out FOLDER"),
+        (["share", empty, "--out", tmp_path / "b"], "holds no checkpoint: train the run first"),
+        (["share", tmp_path / "no", "--out", tmp_path / "b"], "there is no agent or folder"),
+        (["share", run, "--out", agent], "exists already"),
+        (["share", run, "--out", tmp_path / "no" / "b"], "cannot be written: there is no folder"),
+        (["share", run, "--out", tmp_path / "a b"], "name must be letters"),
+    ):
+        assert reason in failure(capsys, *words)
+    content = (agent / WEIGHTS).read_bytes()
+    (agent / WEIGHTS).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    assert "model.safetensors was changed after it was written" in failure(capsys, "play", agent)
+    assert sorted(tmp_path.rglob("*")) == before  # nothing was written

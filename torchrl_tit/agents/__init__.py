@@ -1,0 +1,11 @@
+"""Trained agents: a policy with its weights, its task, and how well it did.
+
+An agent is a folder of six files (:mod:`~torchrl_tit.agents.folder`): in this package, anywhere on
+the disk, or in a repository of the Hugging Face Hub. Reading one executes nothing.
+"""
+
+from torchrl_tit.agents.folder import AgentError
+from torchrl_tit.agents.loading import agent_names, load_agent
+from torchrl_tit.agents.trained_agent import TrainedAgent
+
+__all__ = ["AgentError", "TrainedAgent", "agent_names", "load_agent"]

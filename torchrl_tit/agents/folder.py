@@ -1,0 +1,278 @@
+"""The six files of an agent, written whole and checked when they are read.
+
+folder/
+    README.md            a model card, with the metadata that the Hugging Face Hub shows
+    recipe.json          the settings of the training run: network, task, algorithm
+    model.safetensors    the weights that acting needs
+    evaluation.json      the returns of whole episodes
+    versions.json        the packages that it was trained with
+    agent.json           the format, and size and SHA-256 of each of the files above
+
+The checksums tell a file that was damaged or edited. They are no signature: who can change a file
+can change its checksum too. Therefore nothing in these files is ever executed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load
+from torch import Tensor
+
+from torchrl_tit.files import whole_or_not_at_all
+
+CARD = "README.md"
+RECIPE = "recipe.json"
+WEIGHTS = "model.safetensors"
+EVALUATION = "evaluation.json"
+VERSIONS = "versions.json"
+MANIFEST = "agent.json"
+
+CONTENTS = (CARD, RECIPE, WEIGHTS, EVALUATION, VERSIONS)
+"""The files that the manifest lists."""
+
+_EVALUATION: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "env": ("a text", lambda x: isinstance(x, str)),
+    "episodes": ("a whole number from 1", lambda x: _is_whole(x) and x >= 1),
+    "seed": ("a whole number from 0 to 2147483648", lambda x: _is_whole(x) and x <= 2**31),
+    "returns": ("a list of numbers", lambda x: isinstance(x, list) and all(map(_is_number, x))),
+    "mean": ("a number", lambda x: _is_number(x)),
+    "std": ("a number", lambda x: _is_number(x)),
+}
+"""What others rely on, and whether it is."""
+
+# Far beyond any agent: so that no file fills the memory before it is checked.
+_MOST_BYTES = {WEIGHTS: 2**32}
+_MOST_BYTES_OF_TEXT = 2**24
+_FORMAT = "torchrl-tit agent"
+_VERSION = 1
+
+
+class AgentError(ValueError):
+    """An agent does not exist or cannot be used; the message says why and what to do.
+
+    Example:
+        >>> issubclass(AgentError, ValueError)
+        True
+    """
+
+
+@dataclass(frozen=True)
+class AgentFiles:
+    """What the files of an agent hold, after all checks.
+
+    Args:
+        folder: where they are.
+        steps: the steps that the agent was trained for.
+        card: the model card, in Markdown.
+        recipe: the recipe, as JSON.
+        weights: tensors by name, on the CPU.
+        evaluation: the returns of its episodes; see :func:`check_evaluation`.
+        versions: of packages, by name.
+    """
+
+    folder: Path
+    steps: int
+    card: str
+    recipe: bytes
+    weights: dict[str, Tensor]
+    evaluation: dict[str, Any]
+    versions: dict[str, Any]
+
+
+def is_agent(folder: str | os.PathLike[str]) -> bool:
+    """Returns whether a folder says that it is an agent's.
+
+    Example:
+        >>> is_agent("nowhere")
+        False
+    """
+    return Path(folder, MANIFEST).is_file()
+
+
+def write_agent(folder: str | os.PathLike[str], contents: Mapping[str, bytes], steps: int) -> None:
+    """Writes the folder of an agent, completely or not at all.
+
+    Args:
+        folder: the folder to make; its parent must exist.
+        contents: each of ``CONTENTS`` as it is to be written.
+        steps: the steps that the agent was trained for.
+
+    Raises:
+        FileExistsError: if there is such a folder already.
+        FileNotFoundError: if there is no parent folder.
+        OSError: if it cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from safetensors.torch import save
+        >>> folder = Path(tempfile.mkdtemp(), "agent")
+        >>> contents = {**dict.fromkeys(CONTENTS, b"{}"), WEIGHTS: save({})}
+        >>> write_agent(folder, contents, steps=100)
+        >>> len(list(folder.iterdir()))
+        6
+    """
+    listed = {
+        name: {
+            "bytes": len(contents[name]),
+            "sha256": hashlib.sha256(contents[name]).hexdigest(),
+        }
+        for name in CONTENTS
+    }
+    manifest = {"format": _FORMAT, "version": _VERSION, "steps": steps, "files": listed}
+    manifest["sha256"] = _sha256_of_manifest(manifest)
+    with whole_or_not_at_all(folder) as hidden:
+        hidden.mkdir()
+        for name in CONTENTS:
+            (hidden / name).write_bytes(contents[name])
+        (hidden / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+
+
+def read_agent(folder: str | os.PathLike[str]) -> AgentFiles:
+    """Reads the folder of an agent, and checks every file against its checksum.
+
+    Other files in the folder are not read.
+
+    Args:
+        folder: the folder.
+
+    Returns:
+        What its files hold. Nothing in them was executed.
+
+    Raises:
+        AgentError: if a file is missing, was changed after it was written, or is of another program
+            or version. The message names the file.
+    """
+    folder = Path(folder)
+    try:
+        manifest = _read_manifest(folder)
+        contents = {name: _read(folder, name, manifest["files"][name]) for name in CONTENTS}
+        evaluation = _parse(contents[EVALUATION], EVALUATION)
+        check_evaluation(evaluation)
+        return AgentFiles(
+            folder,
+            manifest["steps"],
+            _text(contents[CARD], CARD),
+            contents[RECIPE],
+            _tensors(contents[WEIGHTS]),
+            evaluation,
+            _parse(contents[VERSIONS], VERSIONS),
+        )
+    except (MemoryError, OSError, RecursionError, ValueError) as error:
+        raise AgentError(f"the agent {folder} cannot be used: {error}") from error
+
+
+def check_evaluation(evaluation: Mapping[str, Any]) -> None:
+    """Raises ValueError if an evaluation lacks what others rely on, or has something else there.
+
+    That is the task ``env``, the number of ``episodes``, the ``seed`` of the first, their
+    ``returns``, and ``mean`` and ``std`` of these. The command ``evaluate`` writes them.
+
+    Example:
+        >>> numbers = {"episodes": 1, "seed": 0, "mean": 9.0, "std": 0.0}
+        >>> check_evaluation({"env": "CartPole-v1", "returns": [9.0], **numbers})
+        >>> check_evaluation({"env": "CartPole-v1", "returns": "many", **numbers})
+        Traceback (most recent call last):
+        ...
+        ValueError: evaluation.json has no 'returns' that is a list of numbers
+    """
+    for name, (expected, is_right) in _EVALUATION.items():
+        if not is_right(evaluation.get(name)):
+            raise ValueError(f"{EVALUATION} has no {name!r} that is {expected}")
+    if len(evaluation["returns"]) != evaluation["episodes"]:
+        raise ValueError(f"{EVALUATION} does not have a return for each of its 'episodes'")
+
+
+def _read_manifest(folder: Path) -> dict[str, Any]:
+    if not is_agent(folder):
+        raise ValueError(f"there is no {MANIFEST}")
+    _check_size(MANIFEST, folder.joinpath(MANIFEST).stat().st_size)
+    manifest = _parse(folder.joinpath(MANIFEST).read_bytes(), MANIFEST)
+    if manifest.get("format") != _FORMAT:
+        raise ValueError(f"{MANIFEST} does not say that it is a {_FORMAT}")
+    if manifest.get("version") != _VERSION:
+        raise ValueError(
+            f"it has version {manifest.get('version')!r}, and this torchrl-tit reads {_VERSION}"
+        )
+    if manifest.pop("sha256", None) != _sha256_of_manifest(manifest):
+        raise ValueError(f"{MANIFEST} was changed after it was written (wrong checksum)")
+    if not _is_whole(manifest.get("steps")):
+        raise ValueError(f"{MANIFEST} has no 'steps' that is a whole number from 0")
+    files = manifest.get("files")
+    for name in CONTENTS:
+        listed = files.get(name) if isinstance(files, dict) else None
+        if not isinstance(listed, dict) or not {"bytes", "sha256"} <= set(listed):
+            raise ValueError(f"{MANIFEST} does not list {name} with its 'bytes' and 'sha256'")
+    return manifest
+
+
+def _read(folder: Path, name: str, listed: dict[str, Any]) -> bytes:
+    """Reads a file once, so that what is used is what was checked."""
+    path = folder / name
+    if not path.is_file():
+        raise ValueError(f"{name} is missing")
+    if path.stat().st_size != listed["bytes"]:
+        raise ValueError(
+            f"{name} was changed after it was written ({path.stat().st_size} bytes instead of "
+            f"{listed['bytes']})"
+        )
+    _check_size(name, path.stat().st_size)
+    content = path.read_bytes()
+    if hashlib.sha256(content).hexdigest() != listed["sha256"]:
+        raise ValueError(f"{name} was changed after it was written (wrong checksum)")
+    return content
+
+
+def _tensors(content: bytes) -> dict[str, Tensor]:
+    try:
+        return load(content)
+    except (SafetensorError, LookupError) as error:  # a type that PyTorch lacks
+        raise ValueError(f"{WEIGHTS} is not a file of safetensors ({error})") from error
+
+
+def _parse(content: bytes, name: str) -> dict[str, Any]:
+    try:
+        parsed = json.loads(content)
+    except (RecursionError, ValueError) as error:
+        raise ValueError(f"{name} is not valid JSON ({error})") from error
+    if not isinstance(parsed, dict):
+        raise ValueError(f"{name} is not a JSON object")
+    return parsed
+
+
+def _text(content: bytes, name: str) -> str:
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{name} is not text in UTF-8 ({error})") from error
+
+
+def _check_size(name: str, size: int) -> None:
+    most = _MOST_BYTES.get(name, _MOST_BYTES_OF_TEXT)
+    if size > most:
+        raise ValueError(f"{name} has {size} bytes, more than the {most} that an agent's may have")
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a finite number; JSON has NaN, and integers that no float holds."""
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and abs(value) <= sys.float_info.max
+    )
+
+
+def _sha256_of_manifest(manifest: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(manifest).encode()).hexdigest()

@@ -1,0 +1,130 @@
+"""Agents in repositories of the Hugging Face Hub."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+from torchrl_tit.agents.folder import CONTENTS, MANIFEST, AgentError, is_agent
+
+PREFIX = "hf:"
+"""What names of agents on the Hub begin with."""
+
+_FILES = [*CONTENTS, MANIFEST]
+_REPOSITORY = re.compile(r"\w[\w.-]*/\w[\w.-]*")
+
+
+def download(source: str) -> Path:
+    """Downloads the files of an agent into huggingface_hub's cache, unless they are there.
+
+    All of them come from one commit. Other files of the repository are left.
+
+    Args:
+        source: ``"hf:user/name"`` or ``"hf:user/name@revision"``.
+
+    Returns:
+        Their folder; its files are not checked yet.
+
+    Raises:
+        AgentError: if the name has another form, there is no such repository or revision or it
+            holds no agent, the Hub cannot be reached, or huggingface_hub is missing.
+    """
+    repository, _, revision = source.removeprefix(PREFIX).partition("@")
+    check_repository(repository)
+    hub = import_hub()
+    with _in_one_line(hub, repository, revision):
+        folder = Path(
+            hub.snapshot_download(repository, revision=revision or None, allow_patterns=_FILES)
+        )
+    if not is_agent(folder):
+        raise AgentError(f"{source} is not an agent: the repository holds no {MANIFEST}")
+    return folder
+
+
+def upload(folder: Path, repository: str, *, private: bool = False) -> str:
+    """Uploads the folder of an agent, in one commit; makes the repository if there is none.
+
+    Args:
+        folder: the folder, whose files were checked.
+        repository: ``"user/name"``.
+        private: whether a repository that is made here is private.
+
+    Returns:
+        The address of the commit.
+
+    Raises:
+        AgentError: if the name has another form, the Hub refuses it or cannot be reached, nobody is
+            logged in, or huggingface_hub is missing.
+    """
+    check_repository(repository)
+    hub = import_hub()
+    with _in_one_line(hub, repository):
+        api = hub.HfApi()
+        api.create_repo(repository, private=private, exist_ok=True)
+        commit = api.upload_folder(
+            repo_id=repository,
+            folder_path=folder,
+            allow_patterns=_FILES,
+            commit_message="Upload a trained agent of torchrl-tit",
+        )
+    return str(commit.commit_url)
+
+
+def check_repository(name: str) -> None:
+    """Raises AgentError if a name is not of the form ``user/name``.
+
+    Example:
+        >>> check_repository("me/cartpole")
+        >>> check_repository("cartpole")
+        Traceback (most recent call last):
+        ...
+        torchrl_tit.agents.folder.AgentError: 'cartpole' is not the name of a repository of the...
+    """
+    if not _REPOSITORY.fullmatch(name):
+        raise AgentError(
+            f"{name!r} is not the name of a repository of the Hugging Face Hub: expected user/name"
+        )
+
+
+def import_hub() -> ModuleType:
+    """Imports huggingface_hub.
+
+    Raises:
+        AgentError: if it is missing.
+    """
+    try:
+        import huggingface_hub.errors  # an optional extra
+    except ImportError as error:
+        raise AgentError(
+            "model cards and the Hugging Face Hub need huggingface_hub: "
+            'pip install "torchrl-tit[share]"'
+        ) from error
+    return huggingface_hub
+
+
+@contextmanager
+def _in_one_line(hub: ModuleType, repository: str, revision: str = "") -> Iterator[None]:
+    """Says in one line what went wrong on the Hub."""
+    errors = hub.errors
+    try:
+        yield
+    except errors.RevisionNotFoundError as error:
+        raise AgentError(f"{PREFIX}{repository} has no revision {revision!r}") from error
+    except errors.RepositoryNotFoundError as error:
+        raise AgentError(
+            f"there is no repository {repository!r} on the Hugging Face Hub, or you may not see "
+            "it: check the name, or log in with `hf auth login`"
+        ) from error
+    except errors.LocalEntryNotFoundError as error:
+        raise AgentError(
+            f"{PREFIX}{repository} is not on this machine yet, and the Hugging Face Hub cannot be "
+            "reached: check the connection"
+        ) from error
+    except Exception as error:  # those of its HTTP client too, which differ between versions
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise AgentError(
+            f"the request to the Hugging Face Hub for {PREFIX}{repository} failed: {reason}"
+        ) from error

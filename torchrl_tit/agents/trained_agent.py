@@ -1,0 +1,100 @@
+"""A trained agent, ready to act."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import Compose, EnvBase
+
+_EPISODES = 100
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedAgent:
+    """A trained policy, the task that it was trained on, and what it reads.
+
+    :func:`~torchrl_tit.agents.load_agent` makes it.
+
+    Args:
+        name: where it is from.
+        policy: a TensorDict module in evaluation mode. It reads what the transforms write (for most
+            agents ``"history"``) and writes ``"action"``, a sample or the most likely one as
+            TorchRL's exploration type says. :func:`~torchrl_tit.modules.acting` makes it encode
+            each observation once.
+        make_env: makes its task with everything that the policy reads: ``make_env(num_envs, seed)``
+            and further settings of the task, such as ``render_mode="rgb_array"``. For a Decision
+            Transformer also ``target_return``.
+        recipe: the settings of its training run, as in ``recipe.json``.
+        steps: the steps that it was trained for.
+        evaluation: the returns of its episodes, as in ``evaluation.json``; empty for a run whose
+            newest checkpoint has not been evaluated.
+        versions: of the packages that it was trained with, by name.
+        plays: plays episodes; :meth:`evaluate` calls it.
+    """
+
+    name: str
+    policy: TensorDictModuleBase
+    make_env: Callable[..., EnvBase]
+    recipe: Mapping[str, Any]
+    steps: int
+    evaluation: Mapping[str, Any]
+    versions: Mapping[str, Any]
+    plays: Callable[[int, int], Sequence[float]] = field(repr=False)
+
+    @property
+    def first_seed(self) -> int:
+        """Seed of the first episode of its evaluation; episode i has this seed + i."""
+        return int(self.evaluation.get("seed", self.recipe["evaluation_seed"]))
+
+    def make_transforms(self) -> Compose:
+        """Makes the transforms that write what the policy reads, for an environment of your own.
+
+        They are those of :attr:`make_env`: histories, the statistics that normalise observations,
+        the return that a Decision Transformer aims for, the state of a recurrent network. Each call
+        makes new ones, because transforms belong to one environment.
+
+        Example:
+            >>> from torchrl.envs import GymEnv, TransformedEnv
+            >>> from torchrl_tit import load_agent
+            >>> agent = load_agent("cartpole")
+            >>> env = GymEnv("CartPole-v1", categorical_action_encoding=True)
+            >>> env = TransformedEnv(env, agent.make_transforms())
+            >>> env.rollout(10, agent.policy)["action"].shape
+            torch.Size([10])
+        """
+        with closing(self.make_env(1)) as env:
+            transforms = env.transform
+            transforms.reset_parent()
+        return transforms
+
+    def evaluate(self, episodes: int | None = None, *, seed: int | None = None) -> Tensor:
+        """Plays whole episodes with the most likely actions, as the agent's evaluation did.
+
+        Args:
+            episodes: number of episodes; by default as many as in its evaluation, or 100.
+            seed: seed of the first episode, episode i has ``seed + i``; by default that of its
+                evaluation, so its first episodes are repeated.
+
+        Returns:
+            The undiscounted return of each episode; float64 [episodes].
+
+        Raises:
+            ValueError: if ``episodes`` is less than 1.
+
+        Example:
+            >>> from torchrl_tit import load_agent
+            >>> load_agent("cartpole").evaluate(episodes=2).shape
+            torch.Size([2])
+        """
+        if episodes is None:
+            episodes = int(self.evaluation.get("episodes", _EPISODES))
+        if episodes < 1:
+            raise ValueError(f"episodes must be at least 1, but is {episodes}.")
+        returns = self.plays(episodes, self.first_seed if seed is None else seed)
+        return torch.tensor(returns, dtype=torch.float64)
