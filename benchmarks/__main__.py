@@ -19,6 +19,7 @@ BENCHMARKS = [
     "rollouts",
     "decision_transformer",
     "history_windows",
+    "export",
     "ppo_cartpole",
 ]
 

@@ -26,43 +26,46 @@ class ActionWriter:
     """
 
     def __init__(self, space: Space, *, clip: bool) -> None:
-        self._start: int | NDArray | None = None
-        self._bounds: tuple[NDArray, NDArray] | None = None
-        # Of a task's action, where they are not those of the spec:
-        self._shape: tuple[int, ...] | None = None
-        self._dtype: np.dtype | None = None
+        self.start: int | NDArray | None = None
+        """What is added to integers; None for nothing."""
+        self.bounds: tuple[NDArray, NDArray] | None = None
+        """What actions are clipped to; None if they are not."""
+        self.shape: tuple[int, ...] | None = None
+        """The shape of a task's action; None if it is that of the spec."""
+        self.dtype: np.dtype | None = None
+        """The integers that floats are rounded to; None if they are not."""
         if isinstance(space, Discrete):
             self.spec: TensorSpec = Categorical(int(space.n), dtype=torch.int64)
-            self._start = int(space.start) or None
+            self.start = int(space.start) or None
         elif isinstance(space, MultiDiscrete):
             self.spec = categories_spec(space.nvec.flatten().tolist())
-            self._start = space.start.flatten() if space.start.any() else None
+            self.start = space.start.flatten() if space.start.any() else None
         elif isinstance(space, MultiBinary):
             size = int(np.prod(space.shape))
             self.spec = Binary(size, shape=(size,), dtype=torch.int8)
         elif isinstance(space, Box) and space.dtype.kind in "fiu":
             low, high = (np.asarray(x).reshape(-1) for x in (space.low, space.high))
-            self._bounds = (low, high) if clip else None
+            self.bounds = (low, high) if clip else None
             self.spec = box_action_spec(low, high, clip=clip)
             if space.dtype.kind != "f":
-                self._dtype = space.dtype
+                self.dtype = space.dtype
         else:
             raise ValueError(
                 f"Actions of the kind {space} are not supported, only Discrete, MultiDiscrete, "
                 "MultiBinary and Box; a wrapper of the task can convert them."
             )
         if self.spec.shape != space.shape:
-            self._shape = space.shape
+            self.shape = space.shape
 
     def __call__(self, actions: NDArray) -> NDArray:
         """Converts actions [N, *spec] to those of the tasks, [N, *space]."""
-        if self._bounds is not None:
-            actions = actions.clip(*self._bounds)
-        if self._start is not None:
-            actions = actions + self._start
-        if self._dtype is not None:
-            actions = np.rint(actions).astype(self._dtype)
-        return actions if self._shape is None else actions.reshape(len(actions), *self._shape)
+        if self.bounds is not None:
+            actions = actions.clip(*self.bounds)
+        if self.start is not None:
+            actions = actions + self.start
+        if self.dtype is not None:
+            actions = np.rint(actions).astype(self.dtype)
+        return actions if self.shape is None else actions.reshape(len(actions), *self.shape)
 
 
 def box_action_spec(low: NDArray, high: NDArray, *, clip: bool) -> TensorSpec:

@@ -175,6 +175,11 @@ class GymVectorEnv(EnvBase):
         return {}
 
     @property
+    def action_writer(self) -> ActionWriter:
+        """What brings actions of the tensordict to the tasks."""
+        return self._write
+
+    @property
     def render_fps(self) -> int:
         """The task's frames per second."""
         return int(self._env.metadata.get("render_fps", 30))

@@ -129,6 +129,12 @@ class RecurrentEncoder(HistoryEncoder):
         """
         raise NotImplementedError
 
+    def single_step(
+        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """As :meth:`step` of single steps, for `torch.export`, which cannot follow every step."""
+        return self.step(tokens, state, is_init)
+
 
 class OneToken(nn.Module):
     """Merges the L tokens of a frame into one with a linear layer; does nothing if L = 1.

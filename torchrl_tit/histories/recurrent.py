@@ -66,6 +66,23 @@ class _TorchRLEncoder(RecurrentEncoder):
         outcome = self.memory(TensorDict(entries, tokens.shape[:-2]))
         return outcome["memory"], {key: outcome["next", key] for key in self.state}
 
+    def single_step(
+        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """As :meth:`step` of single steps; TorchRL's module branches on values and batch sizes."""
+        x = self.one_token(tokens)  # [*B, D]
+        first = is_init.reshape(-1, 1, 1)
+        before = [state[key].reshape(-1, 1, self.out_features) for key in self.state]
+        hidden = [x.masked_fill(first, 0).transpose(0, 1).contiguous() for x in before]
+        given = tuple(hidden) if len(hidden) > 1 else hidden[0]
+        outputs, after = self._layers(x.reshape(-1, 1, x.shape[-1]), given)
+        states = after if len(hidden) > 1 else (after,)
+        leading = tokens.shape[:-2]
+        return outputs.reshape(*leading, self.out_features), {
+            key: value.transpose(0, 1).reshape(*leading, 1, self.out_features)
+            for key, value in zip(self.state, states, strict=True)
+        }
+
     @property
     def _layers(self) -> nn.Module:
         layers = getattr(self.memory, self.layer_name)

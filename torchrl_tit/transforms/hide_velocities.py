@@ -47,7 +47,8 @@ class HideEntries(ObservationTransform):
         if len(set(hidden)) < len(hidden):
             raise ValueError(f"Each entry can be hidden only once, but hidden is {list(hidden)}.")
         super().__init__(in_keys=list(in_keys), out_keys=list(in_keys))
-        self._hidden = list(hidden)
+        self.hidden = list(hidden)
+        """Indices of the entries that are removed."""
 
     def _apply_transform(self, observation: Tensor) -> Tensor:
         return observation[..., self._seen(observation.shape[-1])]
@@ -82,11 +83,11 @@ class HideEntries(ObservationTransform):
 
     def _seen(self, size: int) -> list[int]:
         """Returns the indices of the entries that are left."""
-        seen = [i for i in range(size) if i not in self._hidden]
-        if not seen or len(seen) + len(self._hidden) != size:
+        seen = [i for i in range(size) if i not in self.hidden]
+        if not seen or len(seen) + len(self.hidden) != size:
             raise ValueError(
                 f"An observation has the entries 0 to {size - 1}, and one must be left, so "
-                f"{self._hidden} cannot be hidden."
+                f"{self.hidden} cannot be hidden."
             )
         return seen
 
@@ -125,9 +126,9 @@ class HideVelocities(HideEntries):
 
     def _seen(self, size: int) -> list[int]:
         # In every one of these tasks the last entry is a velocity.
-        if size - 1 != self._hidden[-1]:
+        if size - 1 != self.hidden[-1]:
             raise ValueError(
-                f"An observation of {self._task!r} has {self._hidden[-1] + 1} entries, not {size}; "
+                f"An observation of {self._task!r} has {self.hidden[-1] + 1} entries, not {size}; "
                 "use HideEntries with the indices of the velocities."
             )
         return super()._seen(size)

@@ -1,0 +1,214 @@
+"""Files of exported policies: PyTorch's .pt2 and ONNX."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import json
+import logging
+import re
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_tit.export.program import Program
+
+FACTS = "torchrl_tit.json"
+"""Under this name a .pt2 file holds the facts about its policy."""
+METADATA = "torchrl_tit"
+"""Under this name an ONNX file holds them."""
+
+Run = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
+"""From inputs by name to outputs by name."""
+
+
+class Format(ABC):
+    """A kind of files."""
+
+    suffix: ClassVar[str]
+
+    @abstractmethod
+    def write(
+        self, program: torch.export.ExportedProgram, facts: Mapping[str, Any], path: Path
+    ) -> None:
+        """Writes a program to a file.
+
+        Args:
+            program: the program.
+            facts: what to say about it; their "inputs" and "outputs" name its tensors in order.
+            path: the file.
+
+        Raises:
+            ValueError: if the format cannot express it, or a package is missing.
+        """
+
+    @abstractmethod
+    def read(self, path: Path) -> Run:
+        """Reads a file; returns the function from inputs to outputs by name."""
+
+    def check_installed(self) -> None:
+        """Raises ValueError if a package that it needs is missing."""
+        return
+
+
+class PT2(Format):
+    """PyTorch's own: `torch.export.load` reads it, into any device and AOTInductor."""
+
+    suffix = ".pt2"
+
+    def write(
+        self, program: torch.export.ExportedProgram, facts: Mapping[str, Any], path: Path
+    ) -> None:
+        """See :meth:`Format.write`."""
+        with path.open("wb") as file:
+            torch.export.save(program, file, extra_files={FACTS: json.dumps(facts)})
+
+    def read(self, path: Path) -> Run:
+        """See :meth:`Format.read`."""
+        with path.open("rb") as file:
+            module = torch.export.load(file).module()
+        return lambda inputs: module(**inputs)
+
+
+class ONNX(Format):
+    """ONNX, by PyTorch's exporter of exported programs; any ONNX runtime reads it."""
+
+    suffix = ".onnx"
+
+    def check_installed(self) -> None:
+        """See :meth:`Format.check_installed`."""
+        packages = ("onnx", "onnxscript", "onnxruntime")
+        missing = [name for name in packages if importlib.util.find_spec(name) is None]
+        if missing:
+            raise ValueError(
+                f"ONNX needs {', '.join(missing)}: pip install 'torchrl-tit[onnx]', or export to "
+                ".pt2"
+            )
+
+    def write(
+        self, program: torch.export.ExportedProgram, facts: Mapping[str, Any], path: Path
+    ) -> None:
+        """See :meth:`Format.write`."""
+        try:
+            with _quiet():
+                converted = torch.onnx.export(
+                    program,
+                    input_names=list(facts["inputs"]),
+                    output_names=list(facts["outputs"]),
+                    verbose=False,
+                )
+        except Exception as error:  # the exporter's own errors, which have no public base
+            raise ValueError(f"{_missing_operator(error)}: export to .pt2 instead") from error
+        assert converted is not None
+        converted.model.metadata_props[METADATA] = json.dumps(facts)
+        converted.save(path, external_data=False)
+
+    def read(self, path: Path) -> Run:
+        """See :meth:`Format.read`."""
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()
+        try:
+            session = onnxruntime.InferenceSession(
+                path.read_bytes(), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # its errors have no public base
+            raise ValueError(
+                f"ONNX Runtime cannot run this policy ({_first_line(error)}): export to .pt2 "
+                "instead"
+            ) from error
+        names = [output.name for output in session.get_outputs()]
+
+        def run(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            arrays = session.run(names, {name: x.numpy() for name, x in inputs.items()})
+            return {
+                name: torch.from_numpy(array) for name, array in zip(names, arrays, strict=True)
+            }
+
+        return run
+
+
+FORMATS: dict[str, Format] = {"pt2": PT2(), "onnx": ONNX()}
+
+
+def trace(program: Program) -> torch.export.ExportedProgram:
+    """Traces a policy with a free batch size.
+
+    Raises:
+        ValueError: if `torch.export` cannot follow it.
+    """
+    batch = torch.export.Dim("batch")
+    examples = program.examples(2)
+    try:
+        with _quiet(), torch.no_grad():
+            exported = torch.export.export(
+                _Named(program, list(examples)),
+                (),
+                examples,
+                dynamic_shapes={name: {0: batch} for name in examples},
+            )
+    except Exception as error:  # each of torch.export's layers has its own
+        raise ValueError(f"torch.export cannot trace this policy: {_first_line(error)}") from error
+    exported.example_inputs = None
+    for node in exported.graph.nodes:  # half of a small file, with the paths of this machine
+        for note in ("nn_module_stack", "source_fn_stack", "stack_trace", "torch_fn"):
+            node.meta.pop(note, None)
+    return exported
+
+
+class _Named(nn.Module):
+    """Takes the inputs of a policy as arguments of these names."""
+
+    def __init__(self, program: Program, names: Sequence[str]) -> None:
+        super().__init__()
+        self.program = program
+        kind = inspect.Parameter.KEYWORD_ONLY
+        signature = inspect.Signature([inspect.Parameter(name, kind) for name in names])
+
+        def forward(**inputs: Tensor) -> dict[str, Tensor]:
+            return program(inputs)
+
+        forward.__signature__ = signature  # type: ignore[attr-defined]  # what torch.export reads
+        self.forward = forward
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Hides what the exporters tell about themselves."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+def _missing_operator(error: BaseException) -> str:
+    """Says what of a program ONNX lacks, as far as the exporter tells."""
+    messages: list[str] = []
+    cause: BaseException | None = error
+    while cause is not None:
+        messages.append(str(cause))
+        cause = cause.__cause__ or cause.__context__
+    found = re.search(
+        r"No ONNX function found for <OpOverload\(op='([\w:.]+)'", "\n".join(messages)
+    )
+    if found:
+        return f"ONNX has no operator for {found[1]}"
+    return f"this policy cannot be expressed in ONNX ({_first_line(error)})"
+
+
+def _first_line(error: BaseException) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), repr(error))

@@ -1,0 +1,201 @@
+"""Writes a policy to a file that acts without this library, and checks that it does."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, TargetReturn
+
+from torchrl_tit.export.comparison import COPIES, compare
+from torchrl_tit.export.formats import FORMATS, Format, trace
+from torchrl_tit.export.observed import Entry, transforms_of
+from torchrl_tit.export.program import (
+    Parts,
+    Program,
+    RecurrentSteps,
+    TokenSteps,
+    Windows,
+    read_parts,
+)
+from torchrl_tit.export.sequences import SequenceSteps, SequenceWindows
+from torchrl_tit.files import whole_or_not_at_all
+
+VERSION = 1
+"""Of the facts in a file."""
+
+
+def export_policy(
+    policy: TensorDictModuleBase,
+    make_env: Callable[[int], EnvBase],
+    path: Path | str,
+    *,
+    format: str | None = None,
+    step_by_step: bool = False,
+    sample: bool = False,
+    facts: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Writes a policy to a file that needs neither this library nor TorchRL.
+
+    The file holds everything between the task's observation and its action: normalisation, hidden
+    velocities, the network, the choice of an action and its clipping. The batch size is free, and
+    weights are float32, on a CPU. Of a policy that reads K > 1 observations there are two forms:
+
+    - by default it reads the last K observations, ``history`` [N, K, *obs], and carries nothing;
+    - ``step_by_step`` it reads the newest ``observation`` [N, *obs], whether an episode begins
+      (``is_init`` bool [N]) and the tokens of the K - 1 frames before it, and writes the tokens to
+      pass on. So each frame is encoded once.
+
+    A recurrent policy is always the second, with its state instead of tokens. A policy of one
+    observation reads that, in both forms.
+
+    After writing, the file is read again and compared with the live policy on 100 observations of
+    episodes that it plays.
+
+    Args:
+        policy: a :class:`~torchrl_tit.modules.Backbone` and the modules behind it, in evaluation
+            mode and on a CPU.
+        make_env: makes the environment that the policy acts in, given the number of copies.
+        path: the file to write, which must not exist yet.
+        format: "pt2" (`torch.export`) or "onnx"; by default what the file's name ends with.
+        step_by_step: whether each frame is to be encoded once.
+        sample: whether actions are drawn, from an input "noise", instead of being the most likely.
+        facts: further entries of the facts that the file holds.
+
+    Returns:
+        The facts: "inputs" and "outputs" by name with "shape" (without the batch) and "dtype",
+        "state" (the inputs to be passed on, whose new values are the outputs "next_NAME"), "noise"
+        (what to draw it with, by the name of NumPy's generator), "num_frames", and the "difference"
+        that was found.
+
+    Raises:
+        FileExistsError: if the file exists already.
+        ValueError: if the policy is of another kind, the format cannot express it, a package is
+            missing, or the file acts differently. Then no file is left.
+
+    Example:
+        >>> import tempfile
+        >>> from tensordict.nn import TensorDictSequential
+        >>> from torchrl.data import Categorical
+        >>> from torchrl_tit import Backbone, EnhancedTIT
+        >>> from torchrl_tit.envs import make_env
+        >>> from torchrl_tit.modules import make_actor
+        >>> tit = EnhancedTIT(observation_shape=(4,), num_frames=8, num_blocks=1)
+        >>> policy = TensorDictSequential(Backbone(tit), make_actor(64, Categorical(2))).eval()
+        >>> path = tempfile.mkdtemp() + "/policy.pt2"
+        >>> task = lambda copies: make_env("CartPole-v1", copies, num_frames=8)
+        >>> facts = export_policy(policy, task, path, step_by_step=True)
+        >>> list(facts["inputs"]), facts["state"]
+        (['observation', 'is_init', 'tokens'], ['tokens'])
+        >>> exported = torch.export.load(path).module()
+        >>> first = torch.ones(1, dtype=torch.bool)
+        >>> outputs = exported(
+        ...     observation=torch.zeros(1, 4), is_init=first, tokens=torch.zeros(1, 7, 1, 32)
+        ... )
+        >>> outputs["action"].shape, outputs["next_tokens"].shape
+        (torch.Size([1]), torch.Size([1, 7, 1, 32]))
+    """
+    path = Path(path)
+    kind = find_format(path, format)
+    kind.check_installed()
+    with whole_or_not_at_all(path) as hidden, closing(make_env(COPIES)) as env:
+        parts = read_parts(policy, env)
+        precision, parts.backbone.autocast = parts.backbone.autocast, None
+        try:
+            program = make_program(parts, step_by_step=step_by_step, sample=sample)
+            # A copy: tracing touches the weights of some layers, such as nn.LSTM's.
+            exported = trace(copy.deepcopy(program))
+            said = {**describe(program, env), **(facts or {})}
+            kind.write(exported, said, hidden)
+            with torch.random.fork_rng(devices=[]):  # seeding an environment seeds PyTorch
+                difference = compare(kind.read(hidden), program, policy, env)
+        finally:
+            parts.backbone.autocast = precision
+    return {**said, "difference": difference}
+
+
+def find_format(path: Path, format: str | None = None) -> Format:
+    """Returns the format of a file.
+
+    Args:
+        path: the file.
+        format: its name; by default, the file's suffix tells.
+
+    Raises:
+        ValueError: if it is unknown.
+
+    Example:
+        >>> find_format(Path("agent.onnx")).suffix
+        '.onnx'
+    """
+    name = path.suffix.removeprefix(".") if format is None else format
+    if name not in FORMATS:
+        known = ", ".join(FORMATS)
+        raise ValueError(
+            f"unknown format {name!r}: choose one of {known}"
+            if format is not None
+            else f"the name {path.name!r} tells no format: end it with "
+            f"{' or '.join(known.suffix for known in FORMATS.values())}, or choose one with "
+            "--format"
+        )
+    return FORMATS[name]
+
+
+def make_program(parts: Parts, *, step_by_step: bool = False, sample: bool = False) -> Program:
+    """Makes a policy a function of plain tensors.
+
+    Args:
+        parts: the policy.
+        step_by_step: whether each frame is to be encoded once.
+        sample: whether actions are drawn.
+
+    Raises:
+        ValueError: if its history encoder reads what is not known, or there is nothing to draw.
+    """
+    trunk = parts.trunk
+    program: Program
+    if trunk.history_encoder.context:
+        if parts.sequence is None or len(parts.observed) != 1:
+            raise ValueError(
+                f"{type(trunk.history_encoder).__name__} reads "
+                f"{', '.join(trunk.history_encoder.context)} beside observations, which only a "
+                "Decision Transformer on a SequenceHistory can be exported with"
+            )
+        kind = SequenceSteps if step_by_step else SequenceWindows
+        program = kind(parts, sample=sample)
+    elif trunk.carries_state:
+        program = RecurrentSteps(parts, sample=sample)
+    elif step_by_step and trunk.num_frames > 1:
+        program = TokenSteps(parts, sample=sample)
+    else:
+        program = Windows(parts, sample=sample)
+    return program.complete().eval()
+
+
+def describe(program: Program, env: EnvBase) -> dict[str, Any]:
+    """Says what a program reads and writes, as JSON can hold it."""
+    examples = program.examples(1)
+    with torch.no_grad():
+        outputs = program(examples)
+    made = {name: Entry(tuple(x.shape[1:]), x.dtype) for name, x in outputs.items()}
+    said: dict[str, Any] = {
+        "version": VERSION,
+        "inputs": {name: _written(entry) for name, entry in program.inputs.items()},
+        "outputs": {name: _written(entry) for name, entry in made.items()},
+        "state": program.state,
+        "noise": program.noise,
+        "num_frames": program.trunk.num_frames,
+        "padding": program.parts.observed[0].padding,
+        "torch": torch.__version__,
+    }
+    targets = [t.target_return for t in transforms_of(env) if isinstance(t, TargetReturn)]
+    return {**said, **({"target_return": float(targets[0])} if targets else {})}
+
+
+def _written(entry: Entry) -> dict[str, Any]:
+    return {"shape": list(entry.shape), "dtype": str(entry.dtype).removeprefix("torch.")}
