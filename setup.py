@@ -14,6 +14,7 @@ setup(
     package_dir={"torchrl_tit.recipes": "recipes"},
     package_data={
         "torchrl_tit": ["py.typed"],
+        "torchrl_tit.agents": ["*/*.json", "*/*.md", "*/*.safetensors"],
         "torchrl_tit.recipes": ["*/*.csv", "*/*.json"],
     },
 )

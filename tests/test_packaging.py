@@ -52,13 +52,20 @@ def test_wheel_holds_every_module_once_and_nothing_beside_the_library(wheel: Pat
         for p in (ROOT / "torchrl_tit").rglob("*")
         if p.suffix in (".py", ".pyi")
     }
+    agents = {
+        p.relative_to(ROOT).as_posix()
+        for p in (ROOT / "torchrl_tit" / "agents").glob("*/*")
+        if p.parent.name != "__pycache__"
+    }
     recipes = {
         p.relative_to(ROOT).as_posix()
         for p in (ROOT / "recipes").rglob("*")
         if p.suffix in (".py", ".csv", ".json")  # with the paper's results and search spaces
     }
 
-    assert names == library | {f"torchrl_tit/{n}" for n in recipes} | {"torchrl_tit/py.typed"}
+    assert "torchrl_tit/agents/cartpole/model.safetensors" in agents
+    library |= agents | {"torchrl_tit/py.typed"}
+    assert names == library | {f"torchrl_tit/{n}" for n in recipes}
 
 
 def test_installed_wheel_starts_the_command_without_a_top_level_recipes(

@@ -17,6 +17,7 @@ _HOMES = {
     "Outer": "torchrl_tit.settings",
     "PairedOuter": "torchrl_tit.settings",
     "VanillaTIT": "torchrl_tit.networks",
+    "load_agent": "torchrl_tit.agents",
 }
 """Where the public names live: PyTorch is loaded with the first of them that needs it."""
 

@@ -1,3 +1,4 @@
+from torchrl_tit.agents import load_agent as load_agent
 from torchrl_tit.modules import Backbone as Backbone
 from torchrl_tit.networks import EnhancedTIT as EnhancedTIT
 from torchrl_tit.networks import HistoryNetwork as HistoryNetwork

@@ -34,6 +34,12 @@ def add_machine_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, help="default: the recipe's")
 
 
+def check_seed(seed: int | None) -> None:
+    """Ends the program if a seed is none that environments take; None is."""
+    if seed is not None and not 0 <= seed <= 2**31:
+        fail(f"--seed must be from 0 to 2147483648, not {seed}")
+
+
 def override(recipe: Recipe, **fields: Any) -> Recipe:
     """Returns the recipe with the given fields replaced; None leaves a field unchanged."""
     return replace(recipe, **{key: value for key, value in fields.items() if value is not None})

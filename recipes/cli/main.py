@@ -15,8 +15,12 @@ COMMANDS = {
     "train": "train:train",
     "evaluate": "evaluate:evaluate",
     "render": "evaluate:render",
+    "explain": "explain:explain",
     "sweep": "sweep:sweep",
     "tune": "sweep:tune",
+    "play": "agents:play",
+    "share": "agents:share",
+    "export": "export:export",
     "compare": "compare:compare",
     "table": "compare:table",
     "data": "data:data",
@@ -34,6 +38,12 @@ usage: {program} COMMAND ...
   train --resume RUN          resume a run that was stopped or killed
   evaluate RUN                evaluate a run's newest checkpoint
   render RUN --out FILE       film a run's agent: a GIF or MP4
+  explain AGENT --out FILE    film what a trained agent looks at, or draw one step of it as PNG
+  play [AGENT]                let a trained agent play, or list those that come with torchrl-tit
+  share RUN REPO              make an agent of a run and upload it to the Hugging Face Hub; with
+                              --out FOLDER, write it to a folder
+  export AGENT --out FILE     write its policy as .pt2 (torch.export) or .onnx, which act without
+                              torchrl-tit
   sweep NAME [NAME ...]       train many recipes and seeds at once; names can be patterns
   tune NAME --out FOLDER      search for the best values of a recipe's fields, with Optuna
   compare RUN [RUN ...]       plot learning curves of several runs, a recipe's seeds as one band
