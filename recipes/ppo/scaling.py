@@ -23,7 +23,7 @@ class ReturnScale:
         >>> scale = ReturnScale(gamma=0.5)
         >>> reward, done = torch.ones(1, 4, 1), torch.zeros(1, 4, 1, dtype=torch.bool)
         >>> scale.update(reward, done)  # of 1, 1.5, 1.75 and 1.875
-        tensor(0.3340)
+        tensor(0.3351)
     """
 
     def __init__(self, gamma: float) -> None:

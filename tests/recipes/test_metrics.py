@@ -62,7 +62,7 @@ def test_a_torn_last_row_is_no_row(tmp_path):
     assert [row["loss"] for row in read_metrics(tmp_path / "metrics.csv")] == [1.0, 5.0]
 
 
-@pytest.mark.parametrize("row", ["128,1.0", "128,1.0,high,3", "128,1.0,2,3,4"])
+@pytest.mark.parametrize("row", ["128,1.0", "128,1.0,high,3", "128,1.0,2,3,4,5"])
 def test_a_damaged_row_is_named(row, tmp_path):
     write(tmp_path, [(64, 1.0, 2.0)])
     path = tmp_path / "metrics.csv"
@@ -73,10 +73,10 @@ def test_a_damaged_row_is_named(row, tmp_path):
 
 def test_metrics_of_another_run_are_refused_and_stay(tmp_path):
     path = tmp_path / "metrics.csv"
-    path.write_text("step,time,loss\n64,1.0,2.0\n")
+    path.write_text("step,time,steps_per_second,loss\n64,1.0,9.0,2.0\n")
     with pytest.raises(ValueError, match=r"no column 'return'"):
         Metrics(tmp_path, ["loss", "return"], last_step=64)
-    assert path.read_text() == "step,time,loss\n64,1.0,2.0\n"
+    assert path.read_text() == "step,time,steps_per_second,loss\n64,1.0,9.0,2.0\n"
 
 
 def test_no_file_is_no_rows(tmp_path):

@@ -108,7 +108,9 @@ def test_rows_past_the_checkpoint_are_cut(tmp_path):
         metrics = run.metrics(["return_mean"], last_step=10**6)
         metrics.close()
         path = run.folder / "metrics.csv"
-        path.write_text("step,time,return_mean\n64,1.0,5.0\n128,2.0,6.0\n192,3.0,7.0\n256,4.")
+        path.write_text(
+            "step,time,steps_per_second,return_mean\n64,1.0,9,5.0\n128,2.0,9,6.0\n192,3.0,9,7.0\n256,4."
+        )
         metrics = run.metrics(["return_mean"], last_step=128)
         metrics.log(192, return_mean=9.0)
         metrics.close()
