@@ -21,7 +21,7 @@ Padding = Literal["same", "constant"]
 ImageLayout = Literal["auto", "HWC", "CHW"]
 
 # NumPy takes 32 bits, and environments are seeded with this seed and those that follow.
-_MAX_SEED = 2**31
+MAX_SEED = 2**31
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +100,7 @@ class Recipe:
             evaluation_episodes=1,
             evaluation_seed=0,
         )
-        check_at_most(self, seed=_MAX_SEED, evaluation_seed=_MAX_SEED)
+        check_at_most(self, seed=MAX_SEED, evaluation_seed=MAX_SEED)
         parse_assignments(self.env_settings)
         for wrapper in self.wrappers:
             parse_call(wrapper)

@@ -11,7 +11,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..recipe import Recipe
+from ..recipe import MAX_SEED, Recipe
 from .imports import HELP, OPTION
 
 
@@ -36,8 +36,8 @@ def add_machine_options(parser: argparse.ArgumentParser) -> None:
 
 def check_seed(seed: int | None) -> None:
     """Ends the program if a seed is none that environments take; None is."""
-    if seed is not None and not 0 <= seed <= 2**31:
-        fail(f"--seed must be from 0 to 2147483648, not {seed}")
+    if seed is not None and not 0 <= seed <= MAX_SEED:
+        fail(f"--seed must be from 0 to {MAX_SEED}, not {seed}")
 
 
 def override(recipe: Recipe, **fields: Any) -> Recipe:

@@ -18,7 +18,7 @@ PPO_SETTINGS: dict[str, Any] = {
     # Observations, rewards and so values of size 1, whatever the task.
     "normalize_observations": True,
     "normalize_rewards": True,
-    # Once a task is solved, advantages are noise, and as they are they move the policy little.
+    # Once a task is solved, advantages are mostly noise, which must not count as much as a signal.
     "advantage_floor": 0.3,
 }
 """Fields of the recipe; the others have their defaults, which are Stable-Baselines3's."""

@@ -7,9 +7,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from scipy.stats import bootstrap, trim_mean
 from tensordict import TensorDictBase, lazy_stack
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -31,6 +29,7 @@ from torchrl_tit.evaluation import evaluate
 from ..recipe import Recipe, experiment_of
 from ..run import Run
 from ..runner import load_trained
+from .interval import interval_of
 
 _BATCH = 32
 
@@ -52,21 +51,6 @@ class FigureClaims:
     attention: list[float] | None
     """How much the newest step reads of each of the K steps, the oldest first: mean over steps,
     blocks and heads; None without attention over time, or with one frame."""
-
-
-@dataclass(frozen=True)
-class Interval:
-    """An interquartile mean over runs, and its 95% interval; NaN of a single run."""
-
-    iqm: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        """As "0.31 [0.28, 0.35]"."""
-        if np.isnan(self.low):
-            return f"{self.iqm:.3f}"
-        return f"{self.iqm:.3f} [{self.low:.3f}, {self.high:.3f}]"
 
 
 def measure_figure_claims(
@@ -127,27 +111,6 @@ def measure_figure_claims(
     )
 
 
-def summarize(values: Sequence[float]) -> Interval:
-    """Summarises a number of each run, as the tables of results do.
-
-    Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv
-    2108.13264.
-
-    Args:
-        values: one of each run (seed).
-
-    Example:
-        >>> summarize([1.0, 2.0, 3.0, 10.0]).iqm
-        2.5
-    """
-    x = np.array(values, dtype=float)
-    low = high = float("nan")
-    if len(x) > 1:
-        found = bootstrap((x,), _iqm, n_resamples=10_000, method="percentile", rng=0)
-        low, high = map(float, found.confidence_interval)
-    return Interval(float(_iqm(x)), low, high)
-
-
 def group_runs(
     runs: Sequence[Run], measured: Sequence[FigureClaims]
 ) -> dict[str, list[FigureClaims]]:
@@ -191,7 +154,7 @@ def to_markdown(groups: dict[str, list[FigureClaims]]) -> str:
     ]
     for name, claims in groups.items():
         columns = [
-            summarize([getattr(claim, field) for claim in claims])
+            interval_of([getattr(claim, field) for claim in claims])
             for field in (
                 "share_on_objects",
                 "area_of_objects",
@@ -214,7 +177,7 @@ def to_markdown(groups: dict[str, list[FigureClaims]]) -> str:
         for name, found in attentive.items():
             rows = [shares for shares in found if len(shares) == count]
             if rows:
-                cells = [summarize(column) for column in zip(*rows, strict=True)]
+                cells = [interval_of(column) for column in zip(*rows, strict=True)]
                 text += f"| {name} | {len(rows)} | " + " | ".join(map(str, cells)) + " |\n"
     return text
 
@@ -263,7 +226,3 @@ def _attention(shares: list[Tensor], episode: Tensor, num_frames: int) -> list[f
 
 def _shuffled(count: int) -> Tensor:
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))
-
-
-def _iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
-    return trim_mean(x, 0.25, axis=axis)

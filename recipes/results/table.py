@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import bootstrap, trim_mean
 
 from ..dataset_recipe import DatasetRecipe
 from ..recipe import Recipe, experiment_of
@@ -21,6 +20,7 @@ from ..recipe_json import recipe_to_json
 from ..registry import RECIPES
 from ..run import Run
 from .cell import Cell
+from .interval import interval_of
 
 OTHER = "not in the paper"
 
@@ -159,16 +159,7 @@ def _cell(settings: Recipe, named: Recipe, runs: Sequence[tuple[Run, dict]]) -> 
     evaluations = [evaluation for _, evaluation in runs]
     values = np.array([_value(evaluation) for evaluation in evaluations])
     spreads = [evaluation.get("score_std", evaluation["std"]) for evaluation in evaluations]
-
-    def iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
-        return trim_mean(x, 0.25, axis=axis)
-
-    low = high = float("nan")
-    if len(values) > 1:
-        interval = bootstrap(
-            (values,), iqm, n_resamples=10_000, method="percentile", rng=0
-        ).confidence_interval
-        low, high = float(interval.low), float(interval.high)
+    interval = interval_of(values)
     paper = _paper_result(settings)
     return Cell(
         table=paper.table if paper else OTHER,
@@ -178,9 +169,9 @@ def _cell(settings: Recipe, named: Recipe, runs: Sequence[tuple[Run, dict]]) -> 
         mean=float(values.mean()),
         std=float(values.std()),
         std_episodes=float(np.mean(spreads)),
-        iqm=float(iqm(values)),
-        low=low,
-        high=high,
+        iqm=interval.iqm,
+        low=interval.low,
+        high=interval.high,
         paper_mean=paper.mean if paper else float("nan"),
         paper_std=paper.std if paper else float("nan"),
         changes=_changes(named, settings) if settings.name else "",

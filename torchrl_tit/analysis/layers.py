@@ -115,7 +115,7 @@ def patch_grid(network: HistoryNetwork, observation: str) -> tuple[int, int]:
     """
     index = list(network.observations).index(observation)
     for part in (network.frames[index], network.history_encoder):
-        inner = _inner(part)
+        inner = inner_of(part)
         if inner is not None:
             patches = inner.patch_embedding
             return getattr(patches, "grid", None) or (1, patches.num_patches)
@@ -127,7 +127,7 @@ def patch_grid(network: HistoryNetwork, observation: str) -> tuple[int, int]:
 
 def _find(part: nn.Module) -> tuple[nn.Module, tuple[int, int] | None] | None:
     """The layer in a part of the network, and the grid of its patches."""
-    inner = _inner(part)
+    inner = inner_of(part)
     if inner is not None:
         last = inner.blocks[(inner.num_blocks - 1) % len(inner.blocks)]
         grid = getattr(inner.patch_embedding, "grid", None)
@@ -136,5 +136,6 @@ def _find(part: nn.Module) -> tuple[nn.Module, tuple[int, int] | None] | None:
     return (convolutions[-1], None) if convolutions else None
 
 
-def _inner(part: nn.Module) -> InnerTransformer | None:
+def inner_of(part: nn.Module) -> InnerTransformer | None:
+    """Returns the inner transformer in a part of a network, if there is one."""
     return next((m for m in part.modules() if isinstance(m, InnerTransformer)), None)

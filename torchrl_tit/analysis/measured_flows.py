@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeAlias
 import torch
 from torch import Tensor, nn
 
+from torchrl_tit.analysis.layers import inner_of
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.inner import InnerTransformer
 from torchrl_tit.histories.catformer import Catformer
@@ -160,7 +161,7 @@ def _watch(network: HistoryNetwork) -> list[_Call]:
 
 def _frame_group(encoder: FrameEncoder) -> _Group:
     """The spatial units of a frame encoder."""
-    inner = _inner(encoder)
+    inner = inner_of(encoder)
     if inner is None:
         return _Group("spatial", [encoder], frames_dim=1)
     return _Group("spatial", _blocks(inner), frames_dim=0)
@@ -168,7 +169,7 @@ def _frame_group(encoder: FrameEncoder) -> _Group:
 
 def _history_groups(encoder: HistoryEncoder) -> list[_Group]:
     """The units of a history encoder."""
-    inner = _inner(encoder)
+    inner = inner_of(encoder)
     if inner is not None:  # it sees all frames as one image
         return [_Group("spatial", _blocks(inner))]
     if isinstance(encoder, Catformer):
@@ -203,10 +204,6 @@ def _blocks(inner: InnerTransformer) -> list[nn.Module]:
 
         block.read_first = read_first  # type: ignore[method-assign]
     return blocks
-
-
-def _inner(part: nn.Module) -> InnerTransformer | None:
-    return next((m for m in part.modules() if isinstance(m, InnerTransformer)), None)
 
 
 def _require_gradient(module: nn.Module, inputs: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -13,9 +13,9 @@ from recipes.results.figure_claims import (
     FigureClaims,
     group_runs,
     measure_figure_claims,
-    summarize,
     to_markdown,
 )
+from recipes.results.interval import interval_of
 from recipes.run import Run
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp, resnet
@@ -98,7 +98,7 @@ def test_tables():
     assert attention.splitlines()[0] == "| recipe | runs | -2 steps | -1 steps | newest |"
     assert "| tit | 2 | 0.400 [0.300, 0.500] | 0.100 [0.100, 0.100] | 0.500" in attention
     assert "cnn" not in attention
-    assert summarize([0.0, 1.0, 2.0, 100.0]).iqm == 1.5
+    assert interval_of([0.0, 1.0, 2.0, 100.0]).iqm == 1.5
 
 
 def test_runs_of_the_same_settings(tmp_path):

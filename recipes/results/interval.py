@@ -1,0 +1,49 @@
+"""Interquartile means over runs, and their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import bootstrap, trim_mean
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An interquartile mean over runs, and its 95% interval; NaN of a single run."""
+
+    iqm: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        """As "0.31 [0.28, 0.35]"."""
+        if np.isnan(self.low):
+            return f"{self.iqm:.3f}"
+        return f"{self.iqm:.3f} [{self.low:.3f}, {self.high:.3f}]"
+
+
+def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
+    """Summarises a number of each run, as the tables of results do.
+
+    Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv
+    2108.13264.
+
+    Args:
+        values: one of each run (seed).
+
+    Example:
+        >>> interval_of([1.0, 2.0, 3.0, 10.0]).iqm
+        2.5
+    """
+    x = np.array(values, dtype=float)
+    low = high = float("nan")
+    if len(x) > 1:
+        found = bootstrap((x,), _iqm, n_resamples=10_000, method="percentile", rng=0)
+        low, high = map(float, found.confidence_interval)
+    return Interval(float(_iqm(x)), low, high)
+
+
+def _iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
+    return trim_mean(x, 0.25, axis=axis)
