@@ -10,7 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.report import publish
-from recipes.results.figure_claims import group_runs, measure_figure_claims, to_markdown
+from recipes.results.experiments import group_runs
+from recipes.results.figure_claims import FigureClaims, measure_figure_claims, to_markdown
 from recipes.run import Run
 
 
@@ -34,18 +35,20 @@ def main(arguments: list[str] | None = None) -> None:
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         parser.error(f"--out {options.out} is a file: name a folder")
     try:
-        runs = [Run.open(folder) for folder in options.runs]
-        measured = [
-            measure_figure_claims(
-                run,
-                steps=options.steps,
-                seed=options.seed,
-                background=options.background,
-                target=options.target,
-            )
-            for run in runs
-        ]
-        groups = group_runs(runs, measured)
+        experiments = group_runs(Run.open(folder) for folder in options.runs)
+        groups: dict[str, list[FigureClaims]] = {
+            experiment.label: [
+                measure_figure_claims(
+                    run,
+                    steps=options.steps,
+                    seed=options.seed,
+                    background=options.background,
+                    target=options.target,
+                )
+                for run in experiment.runs
+            ]
+            for experiment in experiments
+        }
     except (ValueError, OSError, RuntimeError) as error:
         parser.error(" ".join(str(error).split()))
     settings = {

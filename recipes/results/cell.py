@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from .experiments import label
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -42,4 +44,4 @@ class Cell:
     @property
     def label(self) -> str:
         """The recipe's name, and the changed fields."""
-        return f"{self.recipe} ({self.changes})" if self.changes else self.recipe
+        return label(self.recipe, self.changes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -26,7 +26,6 @@ from torchrl_tit.analysis.map_measures import Background
 from torchrl_tit.analysis.targets import find_network, histories_of
 from torchrl_tit.evaluation import evaluate
 
-from ..recipe import Recipe, experiment_of
 from ..run import Run
 from ..runner import load_trained
 from .interval import interval_of
@@ -109,40 +108,6 @@ def measure_figure_claims(
         empty_maps=float((~mapped).double().mean()),
         attention=_attention(shares, episode, network.num_frames),
     )
-
-
-def group_runs(
-    runs: Sequence[Run], measured: Sequence[FigureClaims]
-) -> dict[str, list[FigureClaims]]:
-    """Puts the runs of the same settings together, whatever their seed.
-
-    Args:
-        runs: the runs.
-        measured: what was measured on each.
-
-    Returns:
-        What was measured by the recipe's name; a number tells those apart whose settings differ.
-
-    Raises:
-        ValueError: if two runs have the same settings and seed.
-    """
-    groups: dict[Recipe, dict[int, tuple[Run, FigureClaims]]] = {}
-    for run, claims in zip(runs, measured, strict=True):
-        seeds = groups.setdefault(experiment_of(run.recipe), {})
-        seed = run.recipe.seed
-        if seed in seeds:
-            raise ValueError(
-                f"{seeds[seed][0].folder} and {run.folder} are the same run, with seed {seed}: "
-                "name one of them only"
-            )
-        seeds[seed] = run, claims
-    named: dict[str, list[FigureClaims]] = {}
-    for recipe, seeds in groups.items():
-        name, number = recipe.name, 2
-        while name in named:
-            name, number = f"{recipe.name} ({number})", number + 1
-        named[name] = [claims for _, claims in seeds.values()]
-    return named
 
 
 def to_markdown(groups: dict[str, list[FigureClaims]]) -> str:

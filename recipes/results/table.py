@@ -10,16 +10,14 @@ from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..dataset_recipe import DatasetRecipe
-from ..recipe import Recipe, experiment_of
-from ..recipe_json import recipe_to_json
-from ..registry import RECIPES
+from ..recipe import Recipe
 from ..run import Run
 from .cell import Cell
+from .experiments import Experiment, group_runs
 from .interval import interval_of
 
 OTHER = "not in the paper"
@@ -47,8 +45,8 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
     Raises:
         ValueError: if there is no evaluated run, or two of the same settings have the same seed.
     """
-    groups: dict[Recipe, list[tuple[Run, dict]]] = {}
-    notes = []
+    evaluations: dict[Path, dict] = {}
+    runs, notes = [], []
     for run in _runs(folders):
         try:
             text = (run.folder / "evaluation.json").read_text(encoding="utf-8")
@@ -66,15 +64,15 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         asked = run.recipe.evaluation_episodes
         if (episodes := evaluation.get("episodes", asked)) != asked:  # `evaluate --episodes`
             notes.append(f"{run.folder} was evaluated over {episodes} episodes, not {asked}")
-        groups.setdefault(experiment_of(run.recipe), []).append((run, evaluation))
-    if not groups:
+        evaluations[run.folder] = evaluation
+        runs.append(run)
+    if not runs:
         raise ValueError(
             f"no evaluated run in {', '.join(map(str, folders))}" + "".join(f"; {n}" for n in notes)
         )
-    named = dict(RECIPES)  # and each unknown name's first settings
     cells = [
-        _cell(settings, named.setdefault(settings.name, settings), runs)
-        for settings, runs in groups.items()
+        _cell(experiment, [evaluations[run.folder] for run in experiment.runs])
+        for experiment in group_runs(runs)
     ]
     order = {name: index for index, name in enumerate(paper_results())}
 
@@ -145,25 +143,14 @@ def _value(evaluation: dict) -> float:
     return float(evaluation["score"]["best"] if "score" in evaluation else evaluation["mean"])
 
 
-def _cell(settings: Recipe, named: Recipe, runs: Sequence[tuple[Run, dict]]) -> Cell:
-    name = settings.name or str(runs[0][0].folder)
-    seeds: dict[int, Run] = {}
-    for run, _ in runs:
-        if run.recipe.seed in seeds:
-            raise ValueError(
-                f"{seeds[run.recipe.seed].folder} and {run.folder} are the same run: {name} with "
-                f"seed {run.recipe.seed}; name one of them only"
-            )
-        seeds[run.recipe.seed] = run
-
-    evaluations = [evaluation for _, evaluation in runs]
+def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
     values = np.array([_value(evaluation) for evaluation in evaluations])
     spreads = [evaluation.get("score_std", evaluation["std"]) for evaluation in evaluations]
     interval = interval_of(values)
-    paper = _paper_result(settings)
+    paper = _paper_result(experiment.settings)
     return Cell(
         table=paper.table if paper else OTHER,
-        recipe=name,
+        recipe=experiment.name,
         runs=len(values),
         steps=min(evaluation["steps"] for evaluation in evaluations),
         mean=float(values.mean()),
@@ -174,7 +161,7 @@ def _cell(settings: Recipe, named: Recipe, runs: Sequence[tuple[Run, dict]]) -> 
         high=interval.high,
         paper_mean=paper.mean if paper else float("nan"),
         paper_std=paper.std if paper else float("nan"),
-        changes=_changes(named, settings) if settings.name else "",
+        changes=experiment.changes,
     )
 
 
@@ -196,24 +183,6 @@ def _plain(name: str) -> str:
     if name in paper_results():
         return name
     return name.removesuffix("-tuned").removesuffix("-protocol")
-
-
-def _changes(named: Recipe, settings: Recipe) -> str:
-    """Names the fields in which settings differ: "backbone.frame.embed_dim 64"."""
-    before, now = (
-        _fields(json.loads(recipe_to_json(experiment_of(recipe)))) for recipe in (named, settings)
-    )
-    changed = [k for k in now if k != "seed" and (k not in before or before[k] != now[k])]
-    return ", ".join(f"{field} {now[field]}" for field in changed)
-
-
-def _fields(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flattens settings and nested settings into one dictionary, by the full names of fields."""
-    fields: dict[str, Any] = {}
-    for name, value in settings.items():
-        nested = isinstance(value, dict)
-        fields |= _fields(value, f"{prefix}{name}.") if nested else {prefix + name: value}
-    return fields
 
 
 def _row(cell: Cell) -> str:

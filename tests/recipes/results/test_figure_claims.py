@@ -11,7 +11,6 @@ from benchmarks.figure_claims import main
 from recipes.ppo import PPO
 from recipes.results.figure_claims import (
     FigureClaims,
-    group_runs,
     measure_figure_claims,
     to_markdown,
 )
@@ -99,21 +98,6 @@ def test_tables():
     assert "| tit | 2 | 0.400 [0.300, 0.500] | 0.100 [0.100, 0.100] | 0.500" in attention
     assert "cnn" not in attention
     assert interval_of([0.0, 1.0, 2.0, 100.0]).iqm == 1.5
-
-
-def test_runs_of_the_same_settings(tmp_path):
-    recipe = PPO(name="a", env="CartPole-v1", backbone=mlp())
-    one = Run(tmp_path / "0", recipe)
-    other = Run(tmp_path / "1", replace(recipe, seed=1, device="cpu"))
-    third = Run(tmp_path / "2", replace(recipe, learning_rate=0.1))
-    measured = [claims(i, None) for i in range(3)]
-    groups = group_runs([one, other, third], measured)
-    assert {name: [c.share_on_objects for c in found] for name, found in groups.items()} == {
-        "a": [0, 1],
-        "a (2)": [2],
-    }
-    with pytest.raises(ValueError, match="are the same run, with seed 0"):
-        group_runs([one, Run(tmp_path / "3", recipe)], measured[:2])
 
 
 def test_bad_input(runs, tmp_path, capsys):

@@ -1,0 +1,99 @@
+"""Runs of the same settings, whatever their seed: what every comparison puts together."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from ..recipe import Recipe, experiment_of
+from ..recipe_json import recipe_to_json
+from ..registry import RECIPES
+from ..run import Run
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """All runs of the same settings."""
+
+    settings: Recipe
+    name: str
+    """The recipe's name; the first run's folder if it has none."""
+    changes: str
+    """Fields in which the runs differ from the recipe of that name, with the runs' values."""
+    runs: tuple[Run, ...]
+
+    @property
+    def label(self) -> str:
+        """The name, and the changed fields."""
+        return label(self.name, self.changes)
+
+
+def group_runs(runs: Iterable[Run]) -> list[Experiment]:
+    """Puts the runs of the same settings together, whatever their seed and machine.
+
+    Args:
+        runs: the runs.
+
+    Returns:
+        The experiments, in the order of their first runs. A name that is not registered belongs to
+        the first settings that have it.
+
+    Raises:
+        ValueError: if two runs have the same settings and seed.
+    """
+    groups: dict[Recipe, dict[int, Run]] = {}
+    for run in runs:
+        seeds = groups.setdefault(experiment_of(run.recipe), {})
+        same = seeds.setdefault(run.recipe.seed, run)
+        if same is not run:
+            raise ValueError(
+                f"{same.folder} and {run.folder} are the same run: "
+                f"{run.recipe.name or 'the same settings'} with seed {run.recipe.seed}; "
+                "name one of them only"
+            )
+    named = dict(RECIPES)
+    experiments = []
+    for settings, seeds in groups.items():
+        first = next(iter(seeds.values()))
+        name, changes = str(first.folder), ""
+        if settings.name:
+            name = settings.name
+            changes = changed_fields(named.setdefault(name, settings), settings)
+        experiments.append(Experiment(settings, name, changes, tuple(seeds.values())))
+    return experiments
+
+
+def label(name: str, changes: str) -> str:
+    """Writes a recipe's name, and the changed fields.
+
+    Example:
+        >>> label("ppo/cartpole/mlp", "num_envs 4")
+        'ppo/cartpole/mlp (num_envs 4)'
+    """
+    return f"{name} ({changes})" if changes else name
+
+
+def changed_fields(before: Recipe, after: Recipe) -> str:
+    """Names the fields in which settings differ, whatever their seed and machine.
+
+    Example:
+        >>> from recipes.registry import get_recipe
+        >>> from dataclasses import replace
+        >>> recipe = get_recipe("ppo/cartpole/mlp")
+        >>> changed_fields(recipe, replace(recipe, num_envs=4, seed=7))
+        'num_envs 4'
+    """
+    old, new = (_fields(json.loads(recipe_to_json(experiment_of(r)))) for r in (before, after))
+    changed = [field for field in new if field not in old or old[field] != new[field]]
+    return ", ".join(f"{field} {new[field]}" for field in changed)
+
+
+def _fields(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flattens settings and nested settings into one dictionary, by the full names of fields."""
+    fields: dict[str, Any] = {}
+    for name, value in settings.items():
+        nested = isinstance(value, dict)
+        fields |= _fields(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+    return fields
