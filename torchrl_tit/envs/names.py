@@ -11,8 +11,13 @@ from torchrl.envs import EnvBase
 from torchrl_tit.settings.imports import import_if_allowed, is_named
 from torchrl_tit.settings.plugins import load_plugins
 
-# The packages that register names with these beginnings, and the extras that install them.
-_PACKAGES = {"BabyAI-": "minigrid", "MiniGrid-": "minigrid", "popgym-": "popgym"}
+# The packages that register names with these beginnings; extras of these names install them.
+_PACKAGES = {
+    "BabyAI-": "minigrid",
+    "MiniGrid-": "minigrid",
+    "TMaze-": "torchrl_tit.tasks",
+    "popgym-": "popgym",
+}
 
 
 def find_task(name: str) -> str | Callable[..., EnvBase]:

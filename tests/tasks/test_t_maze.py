@@ -1,0 +1,80 @@
+"""The passive T-Maze: what decides its return."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from torchrl_tit.tasks import TMaze
+
+RIGHT, UP, LEFT, DOWN = range(4)
+
+
+def play(env, seed, actions):
+    """Plays actions, or until the end: the observations, and the rewards."""
+    observation, _ = env.reset(seed=seed)
+    observations, rewards, over = [observation], [], False
+    for action in actions:
+        assert not over
+        observation, reward, over, truncated, _ = env.step(action)
+        observations.append(observation)
+        rewards.append(reward)
+        assert not truncated
+    assert over
+    return np.array(observations), rewards
+
+
+def turn(cue):
+    return UP if cue > 0 else DOWN
+
+
+@pytest.mark.parametrize("length", [1, 2, 10])
+def test_whoever_remembers_gets_1(length):
+    env = TMaze(length)
+    cues = []
+    for seed in range(20):
+        cue = env.reset(seed=seed)[0][1]
+        observations, rewards = play(env, seed, [RIGHT] * length + [turn(cue)])
+        assert rewards == [0] * length + [1]
+        assert observations[:, 0].tolist() == [0] * length + [1, 1]
+        assert observations[1:-1, 1].tolist() == [0] * length  # the cue is seen once
+        assert observations[0, 1] == observations[-1, 1] == cue
+        cues.append(cue)
+        assert play(env, seed, [RIGHT] * length + [turn(-cue)])[1] == [0] * (length + 1)
+    assert set(cues) == {-1, 1}
+
+
+def test_falling_behind_costs_and_never_pays():
+    env = TMaze(4)
+    cue = env.reset(seed=1)[0][1]
+    for actions, falls in [
+        ([LEFT, RIGHT, RIGHT, RIGHT], 4),
+        ([RIGHT, RIGHT, UP, RIGHT], 2),
+        ([RIGHT, LEFT, DOWN, RIGHT], 3),
+    ]:
+        _, rewards = play(env, 1, [*actions, turn(cue)])
+        assert sum(rewards) == pytest.approx(-falls / 4)
+
+
+def test_turning_is_for_the_junction():
+    env = TMaze(3)
+    observations, _ = play(env, 0, [UP, UP, DOWN, UP])
+    assert not observations[1:].any()
+    observations, _ = play(env, 0, [RIGHT, RIGHT, RIGHT, RIGHT])
+    assert observations[-1].tolist() == [1, 0]
+
+
+def test_gymnasium_knows_it():
+    env = gymnasium.make("TMaze-v0", corridor_length=3, render_mode="rgb_array")
+    check_env(env.unwrapped)
+    env.reset(seed=0)
+    picture = env.render()
+    assert isinstance(picture, np.ndarray)
+    assert picture.shape == (40, 48, 3)
+    assert (TMaze(3).observation_space.shape, TMaze(3).render()) == ((2,), None)
+
+
+@pytest.mark.parametrize("length", [0, -1, 2.0, True])
+def test_bad_lengths(length):
+    with pytest.raises(ValueError, match=f"integer from 1 on, not {length}"):
+        TMaze(length)

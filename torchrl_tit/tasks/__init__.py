@@ -1,0 +1,10 @@
+"""Tasks whose solution needs a past, registered with Gymnasium, and what reads MiniGrid's."""
+
+import gymnasium
+
+from torchrl_tit.tasks.first_actions import FirstActions
+from torchrl_tit.tasks.t_maze import TMaze
+
+__all__ = ["FirstActions", "TMaze"]
+
+gymnasium.register("TMaze-v0", entry_point="torchrl_tit.tasks.t_maze:TMaze")

@@ -1,0 +1,41 @@
+"""The first actions of a task only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+from gymnasium import spaces
+
+
+class FirstActions(gymnasium.ActionWrapper[Any, Any, Any]):
+    """Leaves the first ``count`` actions of a Discrete task, since the others have no use.
+
+    MiniGrid gives every task the same seven actions. MiniGrid-Memory needs three: left, right and
+    forward.
+
+    Args:
+        env: a task with Discrete actions.
+        count: how many actions to leave.
+
+    Raises:
+        ValueError: if the task's actions are of another kind or fewer than ``count``.
+
+    Example:
+        >>> import gymnasium
+        >>> FirstActions(gymnasium.make("Taxi-v4"), count=4).action_space
+        Discrete(4)
+    """
+
+    def __init__(self, env: gymnasium.Env, count: int) -> None:
+        super().__init__(env)
+        space = env.action_space
+        if not isinstance(space, spaces.Discrete):
+            raise ValueError(f"FirstActions needs Discrete actions, not {space}")
+        if not 1 <= count <= space.n:
+            raise ValueError(f"count must be from 1 to {space.n}, the task's actions, not {count}")
+        self.action_space = spaces.Discrete(count, start=space.start)
+
+    def action(self, action: Any) -> Any:
+        """Returns the action as it is."""
+        return action

@@ -1,0 +1,99 @@
+"""The passive T-Maze: a cue at the first step decides where to turn at the last one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+_MOVES = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])  # right, up, left, down
+
+
+class TMaze(gymnasium.Env[np.ndarray, np.int64]):
+    """Remembers a cue while walking down a corridor, and turns to its side at the end.
+
+    The agent starts at one end of a corridor, where it sees on which side the goal is: up or down.
+    At the other end, the junction, it turns. An episode is as long as the shortest way to a goal,
+    so that nothing but memory decides between a return of 1 and one of 0: whoever walks straight on
+    and guesses gets 0.5. A step that falls behind the shortest way costs ``1 / corridor_length``.
+
+    Ni et al., "When Do Transformers Shine in RL? Decoupling Memory from Credit Assignment", arXiv
+    2307.03864, section 5.1, after Bakker, "Reinforcement Learning with Long Short-Term Memory",
+    NeurIPS 2001.
+
+    ===========  ===============  ==================================================================
+    observation  float32 [2]      1 from the junction on, else 0; at the first step the goal's side,
+                                  1 (up) or -1 (down), in the corridor 0, after the turn the agent's
+    action       Discrete(4)      right, up, left, down; against a wall the agent stays
+    reward       float            at the last step 1 at the goal, else 0; before it 0, or the cost
+    terminated   bool             after ``corridor_length + 1`` steps
+    ===========  ===============  ==================================================================
+
+    Args:
+        corridor_length: steps from the start to the junction, at least 1.
+
+    Raises:
+        ValueError: if the length is not a positive integer.
+
+    Example:
+        >>> import gymnasium
+        >>> env = gymnasium.make("TMaze-v0", corridor_length=2)
+        >>> observation, _ = env.reset(seed=0)
+        >>> up = observation[1] > 0
+        >>> for action in (0, 0, 1 if up else 3):
+        ...     observation, reward, terminated, _, _ = env.step(action)
+        >>> reward, terminated
+        (1.0, True)
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 15}  # noqa: RUF012
+
+    def __init__(self, corridor_length: int = 10, render_mode: str | None = None) -> None:
+        if type(corridor_length) is not int or corridor_length < 1:
+            raise ValueError(f"corridor_length must be an integer from 1 on, not {corridor_length}")
+        self.corridor_length = corridor_length
+        self.render_mode = render_mode
+        self.observation_space = spaces.Box(-1, 1, (2,), np.float32)
+        self.action_space = spaces.Discrete(4)
+        self._x = self._y = self._goal = self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Puts the agent at the start and draws the goal's side."""
+        super().reset(seed=seed)
+        self._x = self._y = self._steps = 0
+        self._goal = int(self.np_random.choice([-1, 1]))
+        return self._observe(), {}
+
+    def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Moves, unless there is a wall; the last step is rewarded at the goal."""
+        right, up = _MOVES[action]
+        self._steps += 1
+        at_junction = self._x == self.corridor_length
+        if right and self._y == 0:
+            self._x = min(max(self._x + int(right), 0), self.corridor_length)
+        elif up and at_junction:
+            self._y = min(max(self._y + int(up), -1), 1)
+        over = self._steps > self.corridor_length
+        if over:
+            reward = float(self._y == self._goal)
+        else:
+            reward = -float(self._x < self._steps) / self.corridor_length
+        return self._observe(), reward, over, False, {}
+
+    def render(self) -> np.ndarray | None:
+        """Draws the maze from above, the goal green and the agent red: uint8 [H, W, 3]."""
+        if self.render_mode is None:
+            return None
+        tiles = np.zeros((5, self.corridor_length + 3, 3), np.uint8)
+        tiles[2, 1:-1] = tiles[1:4, -2] = 255
+        tiles[2 - self._goal, -2] = (0, 160, 0)
+        tiles[2 - self._y, 1 + self._x] = (200, 0, 0)
+        return tiles.repeat(8, 0).repeat(8, 1)
+
+    def _observe(self) -> np.ndarray:
+        side = self._goal if self._steps == 0 else self._y
+        return np.array([self._x == self.corridor_length, side], np.float32)
