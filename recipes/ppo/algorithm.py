@@ -28,11 +28,18 @@ from torchrl_tit.networks import build_network, masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 
 from ..algorithm import Algorithm, Stateful, check_finite
-from ..compilation import STATIC_SHAPES, autocast_type, compile_and_time, should_compile
+from ..compilation import (
+    STATIC_SHAPES,
+    autocast_type,
+    check_compiler,
+    compile_and_time,
+    should_compile,
+)
 from ..outcomes import Outcome
 from ..ray_collector import check_cluster
 from ..stateful import CollectorState
 from ..task import make_task
+from .auxiliary import AuxiliaryLosses
 from .collectors import make_collector, with_state
 from .flat_parameters import FlatParameters
 from .learning_rate import KLAdaptiveRate
@@ -83,6 +90,7 @@ class Agent(nn.Module):
         self.critic = make_value(features_dim, in_key=keys[-1])
         if recipe.normalize_values or recipe.value_gradient != 1:
             self.critic.module = ValueHead(self.critic.module, gradient=recipe.value_gradient)
+        self.auxiliary = AuxiliaryLosses(recipe, self.backbone, env.action_spec_unbatched)
 
     def encode(self, samples: TensorDictBase) -> TensorDictBase:
         """Writes the features of single steps [N], or of sequences [N, time]."""
@@ -139,7 +147,8 @@ class PPOAlgorithm(Algorithm[PPO]):
         task.close()
         self.agent.backbone.autocast = autocast_type(recipe.precision, self.device)
         contrastive = ["loss_contrastive"] if recipe.contrastive_coeff else []
-        self.terms = [*TERMS, *contrastive, "gradient_norm"]
+        auxiliary = self.agent.auxiliary.weights
+        self.terms = [*TERMS, *contrastive, *auxiliary, "gradient_norm"]
         self.columns = [
             "learning_rate",
             "feature_spread",
@@ -180,7 +189,8 @@ class PPOAlgorithm(Algorithm[PPO]):
             functional=False,
         )
         self.gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
-        self.parameters = FlatParameters(list(agent.parameters())).flat
+        trained = [parameter for parameter in agent.parameters() if parameter.requires_grad]
+        self.parameters = FlatParameters(trained).flat
         self.optimizer = torch.optim.Adam(
             [self.parameters], lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
         )
@@ -288,7 +298,7 @@ class PPOAlgorithm(Algorithm[PPO]):
     def check(self) -> None:
         """Lets the policy act once in the task."""
         recipe = self.recipe
-        should_compile(recipe.compile, recipe.gradient_steps)
+        check_compiler(recipe.compile)
         check_cluster(recipe.ray, recipe.collectors, recipe.threads)
         env = self.make_env(1, recipe.seed, vectorization_mode=recipe.vectorization_mode)
         with closing(env), torch.no_grad():
@@ -306,6 +316,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.recipe.max_grad_norm)
         self.optimizer.step()
+        self.agent.auxiliary.update_targets(self.agent.backbone)
         return torch.cat([values, norm.unsqueeze(0)])
 
     def _set_learning_rate(self, learning_rate: float) -> None:
@@ -335,6 +346,10 @@ class PPOAlgorithm(Algorithm[PPO]):
             contrast = self._contrastive_loss(minibatch.flatten(0, minibatch.ndim - 1))
             total = total + self.recipe.contrastive_coeff * contrast
             values.append(contrast.detach())
+        if self.agent.auxiliary.weights:
+            loss, losses = self.agent.auxiliary(minibatch, self.agent.backbone)
+            total = total + loss
+            values += losses
         return total, torch.stack(values)
 
     def _contrastive_loss(self, steps: TensorDict) -> Tensor:

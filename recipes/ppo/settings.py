@@ -7,7 +7,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 from torchrl_tit.settings import CoBERL
-from torchrl_tit.settings.checks import check_at_least, check_at_most, check_positive
+from torchrl_tit.settings.checks import check_at_least
+from torchrl_tit.settings.numbers import (
+    Batch,
+    Copies,
+    Fraction,
+    Positive,
+    Rate,
+    Real,
+    Steps,
+    StepsOrNone,
+    Weight,
+)
 
 from ..online_recipe import OnlineRecipe
 from ..ray_cluster import check_address
@@ -32,55 +43,60 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     """Whether observations lack the velocities, so that one observation is not enough."""
     mask_actions: bool = False
     """Whether the policy chooses only actions that the task allows, by its action_mask."""
-    num_envs: int = 1
+    num_envs: Copies = 1
     """Number of environments; they share the steps of a batch."""
     vectorization_mode: VectorizationMode = "sync"
     """Whether environments run in this process or in one process each, for slow tasks."""
-    total_steps: int = 100_000
+    total_steps: Steps = 100_000
     """Environment steps to train for, rounded up to whole batches."""
-    steps_per_batch: int = 2048
+    steps_per_batch: Batch = 2048
     """Environment steps collected before each update; must be a multiple of num_envs."""
-    minibatch_size: int = 64
+    minibatch_size: Batch = 64
     """Steps in one gradient step."""
-    sequence_length: int | None = None
+    sequence_length: Batch | None = None
     """Length of the sequences of consecutive steps of which minibatches consist, for networks that
     read several frames or carry a state; others train on single steps. In a sequence each frame is
     encoded once for all steps that read it. Must divide minibatch_size and an environment's steps
     in a batch; by default the largest divisor of both and of 16."""
-    epochs: int = 10
+    epochs: Steps = 10
     """Passes over each batch."""
-    learning_rate: float = 3e-4
+    learning_rate: Rate = 3e-4
     """Learning rate of Adam, before it is scaled by warm-up and decay."""
     decay_learning_rate: bool = False
     """Whether the learning rate falls linearly to 0 over the run."""
-    warmup_steps: int = 0
+    warmup_steps: StepsOrNone = 0
     """Environment steps over which the learning rate rises linearly from 0."""
-    adam_eps: float = 1e-5
+    adam_eps: Weight = 1e-5
     """Epsilon of Adam."""
-    max_grad_norm: float = 0.5
+    max_grad_norm: Weight = 0.5
     """Gradients are scaled down to this norm."""
-    clip_epsilon: float = 0.2
+    clip_epsilon: Fraction = 0.2
     """Clipping range of the probability ratio, before it decays."""
     decay_clip_epsilon: bool = False
     """Whether the clipping range falls linearly to 0 over the run."""
-    entropy_coeff: float = 0.0
+    entropy_coeff: Real = 0.0
     """Weight of the entropy bonus."""
-    critic_coeff: float = 0.5
+    critic_coeff: Positive = 0.5
     """Weight of the mean squared value error."""
-    contrastive_coeff: float = 0.0
+    contrastive_coeff: Weight = 0.0
     """Weight of CoBERL's contrastive loss (arXiv 2107.05431 uses 1); 0 for other networks."""
-    masked_fraction: float = 0.15
+    masked_fraction: Fraction = 0.15
     """Share of the steps that the contrastive loss masks."""
+    next_frame_coeff: Weight = 0.0
+    """Weight of predicting the next observation's tokens from features and action (arXiv
+    2007.05929), for networks that train on sequences."""
+    reconstruction_coeff: Weight = 0.0
+    """Weight of reconstructing the observation from the features, for the same networks."""
     clip_rewards: bool = False
     """Whether to train on the signs of rewards; reported returns are always unclipped."""
-    reward_scale: float = 1.0
+    reward_scale: Weight = 1.0
     """Factor on the rewards for training. If policy and value share a backbone, values in the tens
     or hundreds make its features the same in all states (docs/results/classic_control.md).
     Reported returns are always unscaled."""
     normalize_rewards: bool = False
     """Whether rewards are divided by the running standard deviation of the discounted return, as
     in VecNormalize of Stable-Baselines3 (arXiv 2005.12729, "reward scaling")."""
-    advantage_floor: float = 0.0
+    advantage_floor: Weight = 0.0
     """Least standard deviation by which a minibatch's advantages are divided. With 0, advantages
     that are all but noise, as of a task that is solved, move the policy as far as any others. With
     normalize_rewards, 1 is the deviation of the discounted return (DreamerV3 divides by at least 1
@@ -88,24 +104,24 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     normalize_values: bool = False
     """Whether the critic learns values with the running mean 0 and standard deviation 1 (PopArt,
     arXiv 1602.07714; arXiv 2006.05990, "value function normalization")."""
-    value_gradient: float = 1.0
+    value_gradient: Weight = 1.0
     """Factor on the gradient of the value loss where it enters a backbone that policy and value
     share; 0 trains the backbone on the policy's loss alone (arXiv 2009.04416 compares)."""
     normalize_observations: bool = False
     """Whether the network reads observations with the running mean 0 and standard deviation 1 (as
     in VecNormalize; arXiv 2006.05990, "observation normalization"). Images are only scaled to
     0..1."""
-    target_kl: float | None = None
+    target_kl: Positive | None = None
     """KL divergence that an update should have; see at_target_kl."""
     at_target_kl: Literal["stop", "adapt"] = "stop"
     """With a target_kl: "stop" ends an update after the epoch that exceeds it (as in OpenAI's
     Spinning Up), "adapt" follows it with the learning rate (as in rl_games and skrl)."""
-    residual_gain: float = 1.0
+    residual_gain: Weight = 1.0
     """Factor on the initial output weights of attention and FFN in each block; 0 makes every block
     the identity at the start (arXiv 1901.09321, 2003.04887)."""
-    gamma: float = 0.99
+    gamma: Fraction = 0.99
     """Discount factor."""
-    gae_lambda: float = 0.95
+    gae_lambda: Fraction = 0.95
     """Lambda of generalised advantage estimation (arXiv 1506.02438)."""
     bootstrap_time_limit: bool = True
     """Whether the value of the last state continues an episode that a time limit truncated. The
@@ -113,11 +129,11 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     initialization: Literal["orthogonal", "own"] = "orthogonal"
     """Initialisation of the backbone: orthogonal, as in Stable-Baselines3 and so in the paper's
     online runs, or the network's own (TIT: normal with a standard deviation of 0.02)."""
-    policy_gain: float = 0.01
+    policy_gain: Weight = 0.01
     """Gain of the initial weights of the policy's last layer."""
-    checkpoint_interval: int = 10_240
+    checkpoint_interval: Steps = 10_240
     """Environment steps between checkpoints."""
-    collectors: int = 1
+    collectors: Copies = 1
     """Number of processes that collect, each with its share of the environments; 1 collects in the
     training process, if ray is not set. Several are for slow environments. A run with several can
     be resumed, but then draws other random numbers than an uninterrupted run."""
@@ -137,33 +153,9 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(
-            self,
-            num_envs=1,
-            collectors=1,
-            total_steps=1,
-            **({} if self.sequence_length is None else {"sequence_length": 1}),
-            minibatch_size=2,  # an advantage alone has no standard deviation
-            epochs=1,
-            learning_rate=0,
-            warmup_steps=0,
-            contrastive_coeff=0,
-            masked_fraction=0,
-            adam_eps=0,
-            max_grad_norm=0,
-            clip_epsilon=0,
-            reward_scale=0,
-            advantage_floor=0,
-            value_gradient=0,
-            residual_gain=0,
-            policy_gain=0,
-            gamma=0,
-            gae_lambda=0,
-        )
-        check_at_most(self, clip_epsilon=1, gamma=1, gae_lambda=1, masked_fraction=1)
-        check_positive(self, "critic_coeff")  # advantages need a critic that learns
         if self.steps_per_batch < 2:
             raise ValueError(f"steps_per_batch must be at least 2, not {self.steps_per_batch}")
+        check_at_least(self, minibatch_size=2)  # an advantage alone has no standard deviation
         _check_divides(self, "num_envs", "steps_per_batch", self.steps_per_batch)
         _check_divides(self, "collectors", "num_envs", self.num_envs)
         if self.contrastive_coeff and not isinstance(self.backbone.history, CoBERL):
@@ -171,6 +163,12 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
                 "contrastive_coeff is the weight of a loss that only coberl has: set it to 0 for "
                 "other history encoders"
             )
+        for name in ("next_frame_coeff", "reconstruction_coeff"):
+            if getattr(self, name) and not self.reads_sequences:
+                raise ValueError(
+                    f"{name} is the weight of a loss on sequences, which this network does not "
+                    "train on: set it to 0, or num_frames above 1"
+                )
         if self.reads_sequences and self.sequence_length is not None:
             steps = self.steps_per_batch // self.num_envs
             _check_divides(self, "sequence_length", "minibatch_size", self.minibatch_size)
@@ -214,6 +212,12 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
         """Gradient steps of the whole run."""
         batches = self.final_step // self.steps_per_batch
         return batches * self.epochs * math.ceil(self.steps_per_batch / self.minibatch_size)
+
+    @property
+    def schedules(self) -> tuple[str, ...]:
+        """The learning rate and the clipping range, where they fall to 0 at the end."""
+        fields = ("decay_learning_rate", "decay_clip_epsilon")
+        return tuple(field for field in fields if getattr(self, field))
 
     def learning_rate_at(self, step: int) -> float:
         """The learning rate of the update on the batch that begins at a step."""

@@ -85,10 +85,10 @@ class NextFrameLoss(nn.Module):
     def update_target(self, frames: Sequence[FrameEncoder]) -> None:
         """Moves the copy towards the frame encoders, after each gradient step."""
         encoders = nn.ModuleList(frames)
-        for old, new in zip(self.target.parameters(), encoders.parameters(), strict=True):
-            old.lerp_(new, 1 - self.decay)
-        for old, new in zip(self.target.buffers(), encoders.buffers(), strict=True):
-            old.copy_(new)
+        for copy, new in zip(self.target.parameters(), encoders.parameters(), strict=True):
+            copy.lerp_(new, 1 - self.decay)
+        for buffer, current in zip(self.target.buffers(), encoders.buffers(), strict=True):
+            buffer.copy_(current)
 
 
 class ReconstructionLoss(nn.Module):
