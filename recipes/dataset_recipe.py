@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from torchrl_tit.settings.checks import check_at_least
+from torchrl_tit.settings.numbers import Batch, Steps
 
 from .recipe import Recipe
 
@@ -22,23 +22,17 @@ class DatasetRecipe(Recipe):
     """A data set: a file in D4RL's layout, or the name of one of D4RL's or Minari's."""
     env: str
     """Name of the Gymnasium environment that the network is evaluated in."""
-    max_episode_steps: int | None = None
+    max_episode_steps: Steps | None = None
     """Time limit of the task, for data files that do not record it; see docs/datasets.md."""
     gaps: Gaps = "error"
     """What to do if the next observation of a step in a data file is not the observation that
     follows: "error" refuses the data, "cut" ends the episode there."""
-    batch_size: int = 64
+    batch_size: Batch = 64
     """Batch size of a gradient step."""
-    log_interval: int = 100
+    log_interval: Steps = 100
     """Gradient steps between rows of metrics."""
-    checkpoint_interval: int = 1000
+    checkpoint_interval: Steps = 1000
     """Gradient steps between checkpoints."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(self, batch_size=1)
-        if self.max_episode_steps is not None:
-            check_at_least(self, max_episode_steps=1)
 
     def reading(self) -> dict[str, Any]:
         """How the data are read: arguments of :func:`~torchrl_tit.datasets.load_episodes`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_tit.settings.checks import check_at_least
+from torchrl_tit.settings.numbers import Steps
 
 from .recipe import Recipe
 
@@ -13,14 +13,9 @@ from .recipe import Recipe
 class OnlineRecipe(Recipe):
     """Settings of every recipe that learns from steps it collects."""
 
-    evaluation_interval: int | None = None
+    evaluation_interval: Steps | None = None
     """Environment steps between evaluations during training, whose mean return is the column
     evaluation_return of the metrics. Without it, only the final weights are evaluated."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.evaluation_interval is not None:
-            check_at_least(self, evaluation_interval=1)
 
     @property
     def target_columns(self) -> dict[float | None, str]:

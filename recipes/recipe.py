@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields, replace
-from functools import cache
-from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin, get_type_hints
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
 
-import msgspec
 import tyro
 
-from torchrl_tit.settings import Network, Part, PerKey
-from torchrl_tit.settings.checks import check_at_least, check_at_most
+from torchrl_tit.settings import Network, PerKey
+from torchrl_tit.settings.fields import check_fields
 from torchrl_tit.settings.literals import parse_assignments, parse_call
 from torchrl_tit.settings.names import Names
+from torchrl_tit.settings.numbers import Episodes, Seed, Steps, Threads
 
 Compile = Literal["auto", "on", "off"]
 Precision = Literal["auto", "float32", "bfloat16"]
 Padding = Literal["same", "constant"]
 ImageLayout = Literal["auto", "HWC", "CHW"]
-
-# NumPy takes 32 bits, and environments are seeded with this seed and those that follow.
-MAX_SEED = 2**31
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +37,8 @@ class Recipe:
     """Whether it trains offline: steps are gradient steps, and returns are from evaluations."""
     supplies_actions: ClassVar[bool] = False
     """Whether networks read past actions and returns to go in addition to observations."""
+    length: ClassVar[str] = "total_steps"
+    """The field that says how long a run is, which ``train --resume RUN`` can raise."""
 
     name: Annotated[str, tyro.conf.Suppress] = ""
     """The recipe's name, such as ppo/cartpole/enhanced-tit."""
@@ -58,19 +56,19 @@ class Recipe:
     """Which observations are read, if the task has several; all by default."""
     image_layout: ImageLayout = "auto"
     """Order of an image's dimensions, where it cannot be told from their sizes."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the networks, the environments and the order of minibatches."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
     """Device of the networks; "auto" is the GPU if there is one."""
-    threads: int = 1
+    threads: Threads = 1
     """PyTorch's CPU threads; small networks are fastest with one."""
-    log_interval: int = 1
+    log_interval: Steps = 1
     """Steps between rows of metrics; at least one batch."""
-    checkpoint_interval: int = 10_000
+    checkpoint_interval: Steps = 10_000
     """Steps between checkpoints."""
-    evaluation_episodes: int = 100
+    evaluation_episodes: Episodes = 100
     """Number of episodes in an evaluation."""
-    evaluation_seed: int = 1_000_000
+    evaluation_seed: Seed = 1_000_000
     """Seed of the first evaluation episode; episode i has this seed + i."""
 
     def __init_subclass__(cls, *, algorithm: str | None = None, builds: str | None = None) -> None:
@@ -85,22 +83,12 @@ class Recipe:
                 f"field 'backbone' must be the settings of a network, such as "
                 f"torchrl_tit.settings.networks.mlp(), not {self.backbone!r}"
             )
-        check_types(self)
+        _check_all(self)
         if self.backbone.history.reads_actions and not self.supplies_actions:
             raise ValueError(
                 f"{self.backbone.history.name} reads actions and returns beside observations, "
                 f"which {self.algorithm} does not supply: use a dt or odt recipe"
             )
-        check_at_least(
-            self,
-            threads=1,
-            seed=0,
-            log_interval=1,
-            checkpoint_interval=1,
-            evaluation_episodes=1,
-            evaluation_seed=0,
-        )
-        check_at_most(self, seed=MAX_SEED, evaluation_seed=MAX_SEED)
         parse_assignments(self.env_settings)
         for wrapper in self.wrappers:
             parse_call(wrapper)
@@ -118,6 +106,16 @@ class Recipe:
     def final_step(self) -> int:
         """Environment steps, or gradient steps, at which training is complete."""
         raise NotImplementedError
+
+    @property
+    def schedules(self) -> tuple[str, ...]:
+        """The fields that are on and make training depend on how long the whole run is."""
+        return ()
+
+    @property
+    def unit(self) -> str:
+        """What its steps are: "updates" offline, else "steps" of the environment."""
+        return "updates" if self.offline else "steps"
 
     @property
     def target_columns(self) -> dict[float | None, str]:
@@ -153,52 +151,13 @@ def experiment_of(recipe: Recipe) -> Recipe:
     return replace(recipe, seed=0, **defaults)
 
 
-def check_types(settings: object, prefix: str = "") -> None:
-    """Raises ValueError if a field of settings, or of nested settings, has a wrong type.
-
-    Example:
-        >>> from torchrl_tit.settings import Inner
-        >>> check_types(Inner(patch_size=2.5))
-        Traceback (most recent call last):
-            ...
-        ValueError: field 'patch_size' is 2.5: Expected `int | str | null`, got `float`
-    """
-    for name, kind in field_types(type(settings)).items():
-        value = getattr(settings, name)
-        if hasattr(value, "__dataclass_fields__"):
-            if isinstance(kind, type) and not isinstance(value, kind):
-                raise ValueError(
-                    f"field {prefix + name!r} must be settings of type {kind.__name__}, not "
-                    f"{type(value).__name__}"
-                )
-            check_types(value, f"{prefix}{name}.")
-        elif isinstance(value, PerKey):  # has checked what it holds
-            for key, part in value.items():
-                check_types(part, f"{prefix}{name}.{key}.")
-        else:
-            checked(prefix + name, value, kind)
-
-
-def field_types(kind: type) -> dict[str, Any]:
-    """Returns the fields of a dataclass with their types."""
-    return _field_types(kind)
-
-
-@cache
-def _field_types(kind: type) -> dict[str, Any]:
-    hints = get_type_hints(kind)
-    return {field.name: hints[field.name] for field in fields(kind)}
-
-
-def checked(name: str, value: object, kind: Any) -> Any:
-    """Returns a value converted to a type, or raises ValueError if it has another type."""
-    if isinstance(kind, type) and issubclass(kind, Part | Network):
-        raise ValueError(f"field {name!r} must be settings of a {kind.__name__}, not {value!r}")
-    try:
-        return msgspec.convert(value, kind)
-    except msgspec.ValidationError as error:
-        choices = f", not one of {get_args(kind)}" if get_origin(kind) is Literal else ""
-        raise ValueError(f"field {name!r} is {value!r}{choices}: {error}") from error
+def _check_all(settings: object) -> None:
+    """Checks settings and those within: a part of a user's own need not have done so."""
+    check_fields(settings)
+    for value in vars(settings).values():
+        for part in value.values() if isinstance(value, PerKey) else [value]:
+            if is_dataclass(part):
+                _check_all(part)
 
 
 def get_recipe_class(algorithm: str) -> type[Recipe]:

@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 
 from torchrl_tit.settings import FrameSettings, HistorySettings, Network, Part
 from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.fields import checked, field_types
 
-from .recipe import Recipe, checked, field_types, get_recipe_class
+from .recipe import Recipe, get_recipe_class
 
 T = TypeVar("T")
 

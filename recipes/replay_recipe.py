@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from torchrl_tit.settings.checks import check_at_least, check_at_most
+from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps, Weight
 
 from .online_recipe import OnlineRecipe
 from .ray_cluster import check_address
@@ -20,49 +20,36 @@ class ReplayRecipe(OnlineRecipe):
     """What fills a history before the first observation: that observation, or zeros."""
     hide_velocities: bool = False
     """Whether observations lack the velocities, so that one observation is not enough."""
-    num_envs: int = 1
+    num_envs: Copies = 1
     """Number of environments; they share the steps of a batch."""
-    collectors: int = 1
+    collectors: Copies = 1
     """Number of collectors on a Ray cluster, each with its share of the environments."""
     ray: str | None = None
     """Address of a Ray cluster whose machines the collectors run on: auto, or HOST:PORT. See
     docs/recipes.md."""
-    total_steps: int = 1_000_000
+    total_steps: Steps = 1_000_000
     """Environment steps to train for, rounded up to whole batches."""
-    random_steps: int = 1000
+    random_steps: Steps = 1000
     """Steps at the start with uniformly random actions, during which nothing is learned; must be a
     multiple of steps_per_batch."""
-    steps_per_batch: int = 50
+    steps_per_batch: Batch = 50
     """Environment steps between two rounds of gradient steps; must be a multiple of num_envs."""
-    updates_per_step: float = 1.0
+    updates_per_step: Weight = 1.0
     """Gradient steps for each environment step."""
-    buffer_size: int = 1_000_000
+    buffer_size: Batch = 1_000_000
     """Steps in the replay buffer; when it is full, new ones take the place of the oldest."""
-    batch_size: int = 256
+    batch_size: Batch = 256
     """Transitions in one gradient step, sampled with replacement from the buffer."""
-    slice_length: int = 1
+    slice_length: Batch = 1
     """Consecutive steps that are drawn together, so that a backbone encodes their frames once; must
     divide batch_size. 1 draws transitions one by one."""
-    gamma: float = 0.99
+    gamma: Fraction = 0.99
     """Discount factor."""
-    log_interval: int = 1000
+    log_interval: Steps = 1000
     """Environment steps between rows of metrics."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(
-            self,
-            num_envs=1,
-            collectors=1,
-            total_steps=1,
-            random_steps=1,
-            steps_per_batch=1,
-            updates_per_step=0,
-            batch_size=1,
-            slice_length=1,
-            gamma=0,
-        )
-        check_at_most(self, gamma=1)
         if self.random_steps % self.steps_per_batch:
             raise ValueError(
                 f"random_steps {self.random_steps} must be a multiple of steps_per_batch "

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-from torchrl_tit.settings.checks import check_at_least, check_at_most, check_widths
+from torchrl_tit.settings.numbers import Batch, Episodes, Fraction, Steps, Widths
 
 from .dataset_recipe import DatasetRecipe
 from .recipe import Padding
@@ -15,13 +15,15 @@ from .recipe import Padding
 class TransitionRecipe(DatasetRecipe):
     """Settings of every recipe that learns from transitions of a data set."""
 
+    length: ClassVar[str] = "total_updates"
+
     padding: Padding = "same"
     """What fills a history before the first observation: that observation, or zeros."""
-    total_updates: int = 500_000
+    total_updates: Steps = 500_000
     """Gradient steps to train for."""
-    batch_size: int = 256
+    batch_size: Batch = 256
     """Transitions in one gradient step, sampled with replacement."""
-    slice_length: int = 1
+    slice_length: Batch = 1
     """Consecutive transitions that are drawn together, so that a backbone encodes their frames
     once; must divide batch_size. 1 draws transitions one by one."""
     normalize_observations: bool = False
@@ -32,14 +34,13 @@ class TransitionRecipe(DatasetRecipe):
     function and d3rlpy 1.1.1, which the paper used, drop it."""
     unfinished: Literal["keep", "drop"] = "drop"
     """Whether to keep the last episode if the data stop before it ends."""
-    evaluation_interval: int = 1000
+    evaluation_interval: Steps = 1000
     """Gradient steps between evaluations."""
-    evaluation_episodes: int = 10
+    evaluation_episodes: Episodes = 10
     """Number of episodes in an evaluation, played side by side."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(self, total_updates=1, slice_length=1, evaluation_interval=1)
         if self.batch_size % self.slice_length:
             raise ValueError(
                 f"slice_length {self.slice_length} does not divide batch_size {self.batch_size}: "
@@ -74,22 +75,16 @@ class TransitionRecipe(DatasetRecipe):
 class ActorCriticRecipe(TransitionRecipe):
     """Settings of an actor with two critics, as IQL and TD3+BC have them."""
 
-    total_updates: int = 1_000_000
+    total_updates: Steps = 1_000_000
     """Gradient steps to train for."""
-    gamma: float = 0.99
+    gamma: Fraction = 0.99
     """Discount factor."""
-    tau: float = 0.005
+    tau: Fraction = 0.005
     """Step of the target networks towards the networks at each of their updates, from 0 to 1."""
     critic: Literal["mlp", "backbone"] = "mlp"
     """Whether value networks read the newest observation, or each has a backbone with the actor's
     settings."""
-    critic_hidden: tuple[int, ...] = (256, 256)
+    critic_hidden: Widths = (256, 256)
     """Widths of the hidden layers of value networks."""
-    evaluation_interval: int = 5000
+    evaluation_interval: Steps = 5000
     """Gradient steps between evaluations."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(self, gamma=0, tau=0)
-        check_at_most(self, gamma=1, tau=1)
-        check_widths(self, "critic_hidden")

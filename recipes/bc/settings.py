@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from torchrl_tit.settings.checks import check_at_least
+from torchrl_tit.settings.numbers import Rate, Steps
 
 from ..transition_recipe import TransitionRecipe
 
@@ -14,15 +14,11 @@ from ..transition_recipe import TransitionRecipe
 class BC(TransitionRecipe, algorithm="bc", builds=f"{__package__}.algorithm:BCAlgorithm"):
     """Behaviour cloning: the most likely policy of a data set, whatever its actions are."""
 
-    learning_rate: float = 3e-4
+    learning_rate: Rate = 3e-4
     """Learning rate of Adam."""
     time_limits: Literal["keep", "drop"] = "keep"
     """Whether to keep the last transition of an episode that a time limit truncated."""
     unfinished: Literal["keep", "drop"] = "keep"
     """Whether to keep the last episode if the data stop before it ends."""
-    evaluation_interval: int = 5000
+    evaluation_interval: Steps = 5000
     """Gradient steps between evaluations."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(self, learning_rate=0)

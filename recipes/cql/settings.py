@@ -5,12 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from torchrl_tit.settings.checks import (
-    check_at_least,
-    check_at_most,
-    check_positive,
-    check_widths,
-)
+from torchrl_tit.settings.numbers import Count, Fraction, Positive, Rate, Weight, Widths
 
 from ..recipe import Compile
 from ..transition_recipe import TransitionRecipe
@@ -20,13 +15,13 @@ from ..transition_recipe import TransitionRecipe
 class QRecipe(TransitionRecipe):
     """Settings of both recipes of conservative Q-learning."""
 
-    gamma: float = 0.99
+    gamma: Fraction = 0.99
     """Discount factor."""
-    tau: float = 0.005
+    tau: Fraction = 0.005
     """Step of the target networks towards the networks at each gradient step, from 0 to 1."""
-    conservative_weight: float = 5.0
+    conservative_weight: Weight = 5.0
     """Weight of the conservative term."""
-    adam_eps: float = 1e-8
+    adam_eps: Weight = 1e-8
     """Epsilon of Adam."""
     terminal_observations: Literal["keep", "zero"] = "zero"
     """Whether to keep terminal observations, or zero them as d3rlpy 1.1.1 did. No loss reads
@@ -39,8 +34,6 @@ class QRecipe(TransitionRecipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(self, gamma=0, tau=0, conservative_weight=0, adam_eps=0)
-        check_at_most(self, gamma=1, tau=1)
         if self.compile == "on" and self.slice_length > 1:
             raise ValueError(
                 f"compile is on, but slices of {self.slice_length} are not compiled, because their "
@@ -59,15 +52,15 @@ class CQL(QRecipe, algorithm="cql", builds=f"{__package__}.algorithm:CQLAlgorith
     The defaults are those of d3rlpy 1.1.1, with which arXiv 2212.14538 trained CQL_TIT.
     """
 
-    actor_learning_rate: float = 1e-4
+    actor_learning_rate: Rate = 1e-4
     """Learning rate of Adam for the actor."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: Rate = 3e-4
     """Learning rate of Adam for the critics."""
-    temperature_learning_rate: float = 1e-4
+    temperature_learning_rate: Rate = 1e-4
     """Learning rate of Adam for the temperature."""
-    temperature_init: float = 1.0
+    temperature_init: Positive = 1.0
     """Weight of the entropy at the start."""
-    action_samples: int = 10
+    action_samples: Count = 10
     """Actions sampled in each state from each of: uniform, the policy at s, the policy at s'."""
     over_critics: Literal["mean", "sum"] = "mean"
     """Whether the conservative term is the mean over the two critics, as in d3rlpy 1.1.1, or their
@@ -75,20 +68,8 @@ class CQL(QRecipe, algorithm="cql", builds=f"{__package__}.algorithm:CQLAlgorith
     critic: Literal["mlp", "backbone"] = "mlp"
     """Whether the critics read the newest observation, or each has a backbone with the actor's
     settings."""
-    critic_hidden: tuple[int, ...] = (256, 256, 256)
+    critic_hidden: Widths = (256, 256, 256)
     """Widths of the critics' hidden layers."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(
-            self,
-            actor_learning_rate=0,
-            critic_learning_rate=0,
-            temperature_learning_rate=0,
-            action_samples=1,
-        )
-        check_positive(self, "temperature_init")
-        check_widths(self, "critic_hidden")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,11 +81,7 @@ class DiscreteCQL(
     The squared error is halved, as in TorchRL. The paper ran no discrete task offline.
     """
 
-    conservative_weight: float = 1.0
+    conservative_weight: Weight = 1.0
     """Weight of the conservative term."""
-    learning_rate: float = 3e-4
+    learning_rate: Rate = 3e-4
     """Learning rate of Adam."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(self, learning_rate=0)

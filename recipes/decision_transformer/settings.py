@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from functools import partial
 from typing import ClassVar, Literal
 
 from torchrl_tit.settings import DecisionTransformer, Network
-from torchrl_tit.settings.checks import check_at_least, check_at_most, check_choice, check_positive
+from torchrl_tit.settings.checks import check_at_most
 from torchrl_tit.settings.networks import decision_transformer
+from torchrl_tit.settings.numbers import (
+    Batch,
+    Copies,
+    Episodes,
+    Frames,
+    Positive,
+    Rate,
+    Real,
+    Reals,
+    Steps,
+    StepsOrNone,
+    Weight,
+)
 
 from ..dataset_recipe import DatasetRecipe
 
@@ -28,24 +40,24 @@ class SequenceRecipe(DatasetRecipe):
     action_space: ActionSpace = "continuous"
     """How actions are predicted: "continuous" ones within -1..1 by a tanh; "gaussian" ones by mean
     and standard deviation of a Gaussian that a tanh squashes; "discrete" ones by logits."""
-    target_returns: tuple[float, ...]
+    target_returns: Reals
     """Target returns of the evaluations."""
-    return_scale: float = 1000.0
+    return_scale: Positive = 1000.0
     """Divisor of the returns-to-go."""
-    acting_num_frames: int | None = None
+    acting_num_frames: Frames | None = None
     """Number of steps that the network reads when it acts; at most, and by default, the length of a
     training window."""
-    batch_size: int = 64
+    batch_size: Batch = 64
     """Windows in one gradient step."""
-    learning_rate: float = 1e-4
+    learning_rate: Rate = 1e-4
     """Learning rate after warm-up."""
-    warmup_updates: int = 10_000
+    warmup_updates: StepsOrNone = 10_000
     """Gradient steps over which the learning rate rises linearly."""
-    weight_decay: float = 1e-4
+    weight_decay: Weight = 1e-4
     """Weight decay, on every parameter."""
-    max_grad_norm: float = 0.25
+    max_grad_norm: Weight = 0.25
     """Gradients are scaled down to this norm."""
-    evaluation_episodes: int = 100
+    evaluation_episodes: Episodes = 100
     """Episodes for each target return, in every evaluation."""
 
     def __post_init__(self) -> None:
@@ -55,16 +67,8 @@ class SequenceRecipe(DatasetRecipe):
                 f"backbone.history is {self.backbone.history.name}, but this recipe trains a "
                 "decision-transformer: choose another frame encoder, not another history encoder"
             )
-        check_choice(self, "action_space", ("continuous", "gaussian", "discrete"))
-        check_at_least(self, learning_rate=0, warmup_updates=0, weight_decay=0, max_grad_norm=0)
         if self.acting_num_frames is not None:
-            check_at_least(self, acting_num_frames=1)
             check_at_most(self, acting_num_frames=self.backbone.num_frames)
-        check_positive(self, "return_scale")
-        if not self.target_returns or not all(map(math.isfinite, self.target_returns)):
-            raise ValueError(
-                f"target_returns must be at least one finite number, not {self.target_returns}"
-            )
         if len(set(self.target_columns.values())) < len(self.target_returns):
             raise ValueError(
                 f"target_returns must differ within six digits, unlike {self.target_returns}"
@@ -93,14 +97,15 @@ class DT(SequenceRecipe, algorithm="dt", builds=f"{__package__}.dt:DTAlgorithm")
     The defaults are those of its paper's MuJoCo runs, which arXiv 2212.14538 repeats with DT_TIT.
     """
 
-    iterations: int = 10
+    length: ClassVar[str] = "iterations"
+
+    iterations: Steps = 10
     """Number of iterations; each ends with an evaluation."""
-    updates_per_iteration: int = 10_000
+    updates_per_iteration: Steps = 10_000
     """Gradient steps in an iteration."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(self, iterations=1, updates_per_iteration=1)
         if self.action_space == "gaussian":
             raise ValueError(
                 "action_space is 'gaussian', which this loss cannot train: use 'continuous', or an "
@@ -124,6 +129,8 @@ class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorit
     The defaults are those of its authors' release.
     """
 
+    length: ClassVar[str] = "rounds"
+
     backbone: Network = field(
         default_factory=partial(
             decision_transformer,
@@ -136,55 +143,42 @@ class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorit
     """The network; see dt recipes."""
     action_space: ActionSpace = "gaussian"
     """How actions are predicted; always "gaussian" here."""
-    acting_num_frames: int | None = 5
+    acting_num_frames: Frames | None = 5
     """Number of steps that the network reads when it acts; at most, and if null, the length of a
     training window."""
-    batch_size: int = 256
+    batch_size: Batch = 256
     """Windows in one gradient step."""
-    learning_rate: float = 1e-4
+    learning_rate: Rate = 1e-4
     """Learning rate of LAMB after warm-up."""
-    weight_decay: float = 5e-4
+    weight_decay: Weight = 5e-4
     """Weight decay, on every parameter."""
-    alpha_init: float = 0.1
+    alpha_init: Positive = 0.1
     """Weight of the entropy at the start (the temperature)."""
-    alpha_learning_rate: float = 1e-4
+    alpha_learning_rate: Rate = 1e-4
     """Learning rate of Adam for the temperature."""
-    pretraining_updates: int = 5000
+    pretraining_updates: Steps = 5000
     """Gradient steps on the data set."""
-    rounds: int = 1500
+    rounds: StepsOrNone = 1500
     """Rounds after pre-training, each of new episodes and gradient steps."""
-    episodes_per_round: int = 1
+    episodes_per_round: Copies = 1
     """New episodes at the beginning of a round, played side by side."""
-    updates_per_round: int = 300
+    updates_per_round: Steps = 300
     """Gradient steps in each round."""
-    online_return: float
+    online_return: Real
     """Target return of the episodes that are played for training."""
-    exploration_scale: float = 1.0
+    exploration_scale: Positive = 1.0
     """Factor on the actions' standard deviation in those episodes; below 1 for data of noisy
     policies, because the network learns the noise too."""
-    capacity: int = 1000
+    capacity: Batch = 1000
     """Number of episodes in the store that the network trains on."""
-    evaluation_interval: int = 10
+    evaluation_interval: Steps = 10
     """Rounds between evaluations; there is also one before the first round and one after the
     last."""
-    evaluation_episodes: int = 10
+    evaluation_episodes: Episodes = 10
     """Episodes for each target return, in every evaluation."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_at_least(
-            self,
-            alpha_learning_rate=0,
-            pretraining_updates=1,
-            rounds=0,
-            episodes_per_round=1,
-            updates_per_round=1,
-            capacity=1,
-            evaluation_interval=1,
-        )
-        check_positive(self, "alpha_init", "exploration_scale")
-        if not math.isfinite(self.online_return):
-            raise ValueError(f"online_return must be finite, not {self.online_return}")
         if self.action_space != "gaussian":
             raise ValueError(
                 f"action_space is {self.action_space!r}, but exploration needs a distribution of "

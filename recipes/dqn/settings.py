@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from torchrl_tit.settings.checks import check_at_least, check_at_most
+from torchrl_tit.settings.numbers import Batch, Fraction, Rate, Steps, Weight
 
 from ..replay_recipe import ReplayRecipe
 
@@ -17,20 +17,20 @@ class DQN(ReplayRecipe, algorithm="dqn", builds=f"{__package__}.algorithm:DQNAlg
     The defaults are those of CleanRL for classic control.
     """
 
-    total_steps: int = 500_000
+    total_steps: Steps = 500_000
     """Environment steps to train for, rounded up to whole batches."""
-    random_steps: int = 10_000
+    random_steps: Steps = 10_000
     """Steps at the start with uniformly random actions, during which nothing is learned; must be a
     multiple of steps_per_batch."""
-    steps_per_batch: int = 10
+    steps_per_batch: Batch = 10
     """Environment steps between two rounds of gradient steps; must be a multiple of num_envs."""
-    updates_per_step: float = 0.1
+    updates_per_step: Weight = 0.1
     """Gradient steps for each environment step."""
-    buffer_size: int = 10_000
+    buffer_size: Batch = 10_000
     """Steps in the replay buffer; when it is full, new ones take the place of the oldest."""
-    batch_size: int = 128
+    batch_size: Batch = 128
     """Transitions in one gradient step, sampled with replacement from the buffer."""
-    learning_rate: float = 2.5e-4
+    learning_rate: Rate = 2.5e-4
     """Learning rate of Adam."""
     double: bool = True
     """Whether the trained network chooses the action whose value the target network gives, or the
@@ -38,30 +38,23 @@ class DQN(ReplayRecipe, algorithm="dqn", builds=f"{__package__}.algorithm:DQNAlg
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     """What is minimised of the temporal difference error: its square, or Huber's loss, whose
     gradient is clipped as in the Nature paper."""
-    final_epsilon: float = 0.05
+    final_epsilon: Fraction = 0.05
     """Probability of a random action at the end of exploration; at the start it is 1."""
-    exploration_fraction: float = 0.5
+    exploration_fraction: Fraction = 0.5
     """Part of all steps during which that probability falls, linearly, after the random steps."""
-    target_interval: int = 50
+    target_interval: Steps = 50
     """Gradient steps between updates of the target network."""
-    tau: float = 1.0
+    tau: Fraction = 1.0
     """Step of the target network towards the network at each of its updates; 1 copies it."""
     mask_actions: bool = False
     """Whether actions that the task does not allow are never taken; see docs/environments.md."""
     clip_rewards: bool = False
     """Whether the network learns from the signs of rewards, as is usual for Atari."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(
-            self,
-            learning_rate=0,
-            final_epsilon=0,
-            exploration_fraction=0,
-            target_interval=1,
-            tau=0,
-        )
-        check_at_most(self, final_epsilon=1, exploration_fraction=1, tau=1)
+    @property
+    def schedules(self) -> tuple[str, ...]:
+        """Exploration, which takes a part of the run."""
+        return ("exploration_fraction",) if self.exploration_fraction else ()
 
     @property
     def exploration_steps(self) -> int:

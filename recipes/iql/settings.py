@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_tit.settings.checks import check_at_least, check_positive, check_probability
+from torchrl_tit.settings.numbers import Inside, Rate, Weight
 
 from ..transition_recipe import ActorCriticRecipe
 
@@ -16,20 +16,19 @@ class IQL(ActorCriticRecipe, algorithm="iql", builds=f"{__package__}.algorithm:I
     The defaults are those of the paper for MuJoCo.
     """
 
-    learning_rate: float = 3e-4
+    learning_rate: Rate = 3e-4
     """Learning rate of Adam for all networks."""
     decay_learning_rate: bool = True
     """Whether the actor's learning rate falls to 0 along a cosine."""
-    expectile: float = 0.7
+    expectile: Inside = 0.7
     """Expectile of Q(s, a) over the data's actions that V(s) estimates; 0.5 is the mean."""
-    temperature: float = 3.0
+    temperature: Weight = 3.0
     """Inverse temperature of the weights exp(temperature * advantage) of the actor's loss."""
     normalize_rewards: bool = False
     """Whether rewards are divided by the range of the episodes' returns and multiplied by 1000, as
     in the paper for MuJoCo."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(self, learning_rate=0, temperature=0)
-        check_positive(self, "expectile")
-        check_probability(self, "expectile")
+    @property
+    def schedules(self) -> tuple[str, ...]:
+        """The actor's learning rate, where it falls to 0 at the end."""
+        return ("decay_learning_rate",) if self.decay_learning_rate else ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from torchrl_tit.settings.checks import check_at_least
+from torchrl_tit.settings.numbers import Rate, Steps, Weight
 
 from ..transition_recipe import ActorCriticRecipe
 
@@ -16,27 +16,15 @@ class TD3BC(ActorCriticRecipe, algorithm="td3bc", builds=f"{__package__}.algorit
     normalize_observations: bool = True
     """Whether networks read observations minus their mean in the data, divided by their standard
     deviation there; only for arrays of floats."""
-    actor_learning_rate: float = 3e-4
+    actor_learning_rate: Rate = 3e-4
     """Learning rate of Adam for the actor."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: Rate = 3e-4
     """Learning rate of Adam for the critics."""
-    alpha: float = 2.5
+    alpha: Weight = 2.5
     """Weight of the value in the actor's loss, beside that of the data's actions."""
-    policy_delay: int = 2
+    policy_delay: Steps = 2
     """Gradient steps of the critics between two of the actor and of the targets."""
-    policy_noise: float = 0.2
+    policy_noise: Weight = 0.2
     """Standard deviation of the noise on the target's actions; 1 is half the range of actions."""
-    noise_clip: float = 0.5
+    noise_clip: Weight = 0.5
     """Largest absolute value of that noise; 1 is half the range of actions."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(
-            self,
-            actor_learning_rate=0,
-            critic_learning_rate=0,
-            alpha=0,
-            policy_delay=1,
-            policy_noise=0,
-            noise_clip=0,
-        )

@@ -50,5 +50,5 @@ def test_of_images_whose_sides_share_no_divisor():
 
 @pytest.mark.parametrize("settings", [Inner, StackedInner])
 def test_another_word(settings):
-    with pytest.raises(ValueError, match="unknown patch_size 'all': choose one of"):
+    with pytest.raises(ValueError, match="'patch_size' is 'all', not one of"):
         settings(patch_size="all")

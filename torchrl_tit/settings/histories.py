@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal
 
-from torchrl_tit.settings.checks import check_at_least, check_choice, check_probability
 from torchrl_tit.settings.frames import Activation, PatchTransformerSettings, TransformerSettings
+from torchrl_tit.settings.numbers import Count, Probability, Real, Steps, Width
 from torchrl_tit.settings.parts import Part
 
 TemporalPositions = Literal["none", "learned", "relative", "rotary"]
@@ -35,10 +35,6 @@ class OuterSettings(TransformerSettings, HistorySettings):
     """How the K frames are told apart (the paper's are not): by a learned encoding, a learned bias
     for each distance ("relative"), or rotations (RoPE)."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_choice(self, "temporal_positions", get_args(TemporalPositions))
-
     def check_num_frames(self, num_frames: int) -> None:
         """Raises ValueError if there are temporal positions but only one frame."""
         if self.temporal_positions != "none" and num_frames == 1:
@@ -66,14 +62,10 @@ class Outer(
 ):
     """The outer transformer of Vanilla_TIT: stacked causal blocks over one token a frame."""
 
-    num_blocks: int = 2
+    num_blocks: Count = 2
     """Number of blocks."""
     dense: bool = False
     """Whether to output the concatenated outputs of all blocks, or only that of the last."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(self, num_blocks=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,23 +105,17 @@ class StackedCNN(
     torso: Literal["nature-cnn", "resnet"] = "nature-cnn"
     """The convolutions: those of the deep Q-network, or the residual ones of the baselines."""
 
-    def __post_init__(self) -> None:
-        check_choice(self, "torso", ("nature-cnn", "resnet"))
-
 
 @dataclass(frozen=True, kw_only=True)
 class LayersSettings:
     """Settings of fully connected layers, by default those of Stable-Baselines3 for arrays."""
 
-    hidden_dim: int = 64
+    hidden_dim: Width = 64
     """Width of every layer."""
-    num_layers: int = 2
+    num_layers: Count = 2
     """Number of layers."""
     activation: Activation = "tanh"
     """Activation of every layer."""
-
-    def __post_init__(self) -> None:
-        check_at_least(self, hidden_dim=1, num_layers=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,21 +141,17 @@ class Catformer(
 ):
     """Catformer: a transformer whose layers are concatenated, by default as in arXiv 2212.14538."""
 
-    num_blocks: int = 2
+    num_blocks: Count = 2
     """Number of pairs of an attention layer and an FFN layer."""
-    num_heads: int = 5
+    num_heads: Count = 5
     """Attention heads; must divide ``attention_expansion`` x the width."""
-    attention_expansion: int = 1
+    attention_expansion: Count = 1
     """Width inside attention, as a multiple of the width (2 in its paper's tuning)."""
-    ffn_expansion: int = 4
+    ffn_expansion: Count = 4
     """Hidden width of an FFN as a multiple of the width."""
     temporal_positions: TemporalPositions = "learned"
     """How the K frames are told apart: by a learned encoding, a learned bias for each distance
     ("relative"), rotations (RoPE), or not at all."""
-
-    def __post_init__(self) -> None:
-        check_at_least(self, num_blocks=1, num_heads=1, attention_expansion=1, ffn_expansion=1)
-        check_choice(self, "temporal_positions", get_args(TemporalPositions))
 
     def check_num_frames(self, num_frames: int) -> None:
         """Raises ValueError if there is only one frame."""
@@ -180,17 +162,14 @@ class Catformer(
 class GatedTransformerSettings(HistorySettings):
     """Settings of gated transformer blocks, with GTrXL's widths (arXiv 1910.06764)."""
 
-    num_blocks: int = 2
+    num_blocks: Count = 2
     """Number of gated transformer blocks."""
-    num_heads: int = 8
+    num_heads: Count = 8
     """Attention heads; must divide the width."""
-    ffn_expansion: int = 4
+    ffn_expansion: Count = 4
     """Hidden width of an FFN as a multiple of the width."""
-    gate_bias: float = 0.0
+    gate_bias: Real = 0.0
     """Start value of the bias of all gates; 2 starts them near the identity, as its paper does."""
-
-    def __post_init__(self) -> None:
-        check_at_least(self, num_blocks=1, num_heads=1, ffn_expansion=1)
 
     def check_num_frames(self, num_frames: int) -> None:
         """Raises ValueError if there is only one frame."""
@@ -201,7 +180,7 @@ class GatedTransformerSettings(HistorySettings):
 class GTrXL(GatedTransformerSettings, name="gtrxl", builds="torchrl_tit.histories.gtrxl:GTrXL"):
     """GTrXL: a transformer whose residuals are gated. Its paper has 12 blocks."""
 
-    gate_bias: float = 2.0
+    gate_bias: Real = 2.0
     """Start value of the bias of all gates: 2, as in its paper, starts them near the identity."""
 
 
@@ -209,12 +188,8 @@ class GTrXL(GatedTransformerSettings, name="gtrxl", builds="torchrl_tit.historie
 class CoBERL(GatedTransformerSettings, name="coberl", builds="torchrl_tit.histories.coberl:CoBERL"):
     """CoBERL: a gated transformer, a gate and an LSTM."""
 
-    hidden_dim: int = 512
+    hidden_dim: Width = 512
     """Size of the LSTM's state, which is the encoder's output."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        check_at_least(self, hidden_dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,11 +201,8 @@ class RecurrentSettings(HistorySettings):
 
     is_recurrent = True
 
-    hidden_dim: int = 64
+    hidden_dim: Width = 64
     """Size of the state, which is the encoder's output."""
-
-    def __post_init__(self) -> None:
-        check_at_least(self, hidden_dim=1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,26 +228,20 @@ class DecisionTransformer(
 
     reads_actions = True
 
-    num_blocks: int = 3
+    num_blocks: Count = 3
     """Number of GPT-2 blocks."""
-    num_heads: int = 1
+    num_heads: Count = 1
     """Attention heads of a block; must divide the width."""
-    ffn_dim: int | None = None
+    ffn_dim: Width | None = None
     """Hidden width of a block's FFN; four times the width if not given."""
     activation: Activation = "relu"
     """Activation in a block's FFN."""
-    dropout: float = 0.1
+    dropout: Probability = 0.1
     """Dropout on the tokens, on attention weights, and on the outputs of attention and FFN."""
-    max_ep_len: int = 1000
+    max_ep_len: Steps = 1000
     """Number of time steps in the timestep embedding, counted from 0."""
     timestep_embedding: bool = True
     """Whether tokens get a learned embedding of their time step (Online DT has none)."""
-
-    def __post_init__(self) -> None:
-        check_at_least(self, num_blocks=1, num_heads=1, max_ep_len=1)
-        if self.ffn_dim is not None:
-            check_at_least(self, ffn_dim=1)
-        check_probability(self, "dropout")
 
     def check_num_frames(self, num_frames: int) -> None:
         """Raises ValueError if a window is longer than the longest episode."""

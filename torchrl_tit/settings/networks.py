@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from torchrl_tit.settings.checks import check_at_least, check_choice
+from torchrl_tit.settings.fields import check_fields
 from torchrl_tit.settings.frames import (
     Activation,
     Flat,
@@ -32,6 +32,7 @@ from torchrl_tit.settings.histories import (
     StackedInner,
     TemporalPositions,
 )
+from torchrl_tit.settings.numbers import Frames, Width
 from torchrl_tit.settings.per_key import PerKey
 
 
@@ -39,7 +40,7 @@ from torchrl_tit.settings.per_key import PerKey
 class Head:
     """The layers between the history encoder and the features."""
 
-    features_dim: int | None = 64
+    features_dim: Width | None = 64
     """Size F of the features; if not given, the history encoder's output is the features."""
     activation: Activation = "tanh"
     """Activation after the linear layer."""
@@ -49,8 +50,7 @@ class Head:
     """Whether that second LayerNorm is there."""
 
     def __post_init__(self) -> None:
-        if self.features_dim is not None:
-            check_at_least(self, features_dim=1)
+        check_fields(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +67,7 @@ class Network:
     """What turns the tokens of the last K frames into one vector."""
     head: Head = field(default_factory=Head)
     """What turns that into features."""
-    num_frames: int = 1
+    num_frames: Frames = 1
     """Number K of observations that the network reads."""
     trunks: Literal["shared", "separate"] = "shared"
     """Whether policy and value share the network, or have one each."""
@@ -77,9 +77,7 @@ class Network:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frames", PerKey(self.frames))
-        check_at_least(self, num_frames=1)
-        check_choice(self, "trunks", ("shared", "separate"))
-        check_choice(self, "initialization", ("normal", "default"))
+        check_fields(self)
         self.history.check_num_frames(self.num_frames)
 
     @property

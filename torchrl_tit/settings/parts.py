@@ -6,6 +6,7 @@ import importlib
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
+from torchrl_tit.settings.fields import check_fields
 from torchrl_tit.settings.names import Names
 
 
@@ -43,6 +44,9 @@ class Part:
         if name is not None and builds is not None:
             cls.registered.add(name, cls, f"{cls.__module__}.{cls.__qualname__}")
             cls.name, cls.builds = name, builds
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @classmethod
     def get(cls, name: str) -> type[Self]:
