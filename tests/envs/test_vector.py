@@ -1,5 +1,7 @@
 """GymVectorEnv does what TorchRL's wrapper does, and keeps TorchRL's contract."""
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
@@ -276,7 +278,7 @@ def test_refuses_what_it_cannot_do():
         vector(mode=AutoresetMode.SAME_STEP)
     with pytest.raises(ValueError, match="num_frames must be at least 1, but is 0"):
         make_env("CartPole-v1", num_frames=0)
-    with pytest.raises(ValueError, match="padding must be one of"):
+    with pytest.raises(ValueError, match="field 'padding' is 'zeros', not one of"):
         make_env("CartPole-v1", padding="zeros")  # type: ignore[arg-type]
     env = vector()
     root = env.rand_action(env.reset())
@@ -318,3 +320,24 @@ def test_steps_that_were_taken_can_lack_their_histories(top):
         assert "history" in root
     assert lean.rollout(5, break_when_any_done=False).shape == (3, 5)
     check_env_specs(lean)
+
+
+def test_what_spaces_draw_follows_from_the_seed():
+    """In wrappers too, which draw actions from them, and again after each reset with a seed."""
+    drawn = []
+    for _ in range(2):
+        env = GymVectorEnv(
+            SyncVectorEnv(
+                [lambda: gymnasium.wrappers.StickyAction(gymnasium.make("CartPole-v1"), 0.5)] * 2,
+                autoreset_mode=AutoresetMode.DISABLED,
+            )
+        )
+        env.set_seed(3)
+        copies: Any = env._env
+        first, second = copies.envs
+        drawn.append([first.action_space.sample() for _ in range(20)])
+        drawn.append([second.unwrapped.action_space.sample() for _ in range(20)])
+        env.reset(seed=3)
+        assert [first.action_space.sample() for _ in range(20)] == drawn[-2]
+    assert drawn[:2] == drawn[2:]
+    assert drawn[0] != drawn[1]

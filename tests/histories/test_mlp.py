@@ -64,7 +64,7 @@ def test_wrong_settings_and_inputs(kind: type[Any]) -> None:
         kind((5,), hidden_dim=0)
     with pytest.raises(ValueError, match="num_layers must be at least 1, not 0"):
         kind((5,), num_layers=0)
-    with pytest.raises(ValueError, match="unknown activation 'tan'"):
+    with pytest.raises(ValueError, match="field 'activation' is 'tan', not one of"):
         kind((5,), activation="tan")
     with pytest.raises(ValueError, match=r"\[\.\.\., 1, 5\]"):
         kind((5,))(torch.randn(3, 5))

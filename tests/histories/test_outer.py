@@ -87,7 +87,7 @@ def test_temporal_positions(kind: str, positions: TemporalPositions) -> None:
 
 def test_wrong_positions_say_what_to_do() -> None:
     for kind in KINDS.values():
-        with pytest.raises(ValueError, match="unknown temporal_positions 'rope': choose one of"):
+        with pytest.raises(ValueError, match="'temporal_positions' is 'rope', not one of"):
             kind(temporal_positions="rope")
     with pytest.raises(ValueError, match="'rotary' tells frames apart, but num_frames is 1"):
         settings.Network(

@@ -310,7 +310,10 @@ def test_actions_without_bounds_are_refused(spec):
 
 @pytest.mark.parametrize(
     ("settings", "message"),
-    [({"num_random": 0}, "num_random must be"), ({"over_critics": "max"}, "over_critics must be")],
+    [
+        ({"num_random": 0}, "num_random must be"),
+        ({"over_critics": "max"}, "'over_critics' is 'max'"),
+    ],
 )
 def test_impossible_settings_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):

@@ -18,16 +18,19 @@ from torchrl_tit.envs.torchrl_tasks import make_torchrl_tasks
 from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.envs.wrappers import load_wrappers
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Copies, Seed
 from torchrl_tit.transforms.hide_velocities import HideVelocities
 from torchrl_tit.transforms.history import History
 from torchrl_tit.windows import Padding
 
 
+@checked_arguments
 def make_env(
     name: str,
-    num_envs: int = 1,
+    num_envs: Copies = 1,
     *,
-    seed: int | None = None,
+    seed: Seed | None = None,
     num_frames: int = 1,
     padding: Padding = "same",
     keep_histories: bool = True,

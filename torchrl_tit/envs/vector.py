@@ -135,6 +135,7 @@ class GymVectorEnv(EnvBase):
     ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         options = None if mask is None else {"reset_mask": mask.flatten().numpy(force=True)}
+        self._seed_spaces(seed)
         observations, info = self._env.reset(seed=seed, options=options)
         flag = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return self._tensordict(
@@ -200,7 +201,21 @@ class GymVectorEnv(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         # As in GymWrapper: this reset seeds copy i with seed + i; later resets draw from there.
+        self._seed_spaces(seed)
         self._env.reset(seed=seed)
+
+    def _seed_spaces(self, seed: int | None) -> None:
+        """Seeds what spaces draw, which resets leave to chance; copies in processes keep theirs."""
+        if seed is None:
+            return
+        copies = getattr(self._env.unwrapped, "envs", ())
+        for number, layer in enumerate([self._env, *copies]):
+            while True:
+                for space in (layer.action_space, layer.observation_space):
+                    space.seed(seed + number)
+                if not isinstance(layer, gymnasium.Wrapper | gymnasium.vector.VectorWrapper):
+                    break
+                layer = layer.env
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         tensor = torch.from_numpy(array)

@@ -153,7 +153,11 @@ def check_observation_shape(shape: Sequence[int]) -> tuple[int, ...]:
     Raises:
         ValueError: if it is neither the shape of an array nor that of an image.
     """
-    if not isinstance(shape, Sequence) or len(shape) not in (1, 2, 3) or min(shape) < 1:
+    if (
+        not isinstance(shape, Sequence)
+        or len(shape) not in (1, 2, 3)
+        or not all(isinstance(size, int) and size > 0 for size in shape)
+    ):
         raise ValueError(
             f"observation_shape {shape!r} is not that of an array (D,) or an image (H, W) or "
             "(C, H, W)"

@@ -1,5 +1,7 @@
 """Layers shared by frame and history encoders."""
 
+import warnings
+
 from torchrl_tit.layers.attention import SelfAttention
 from torchrl_tit.layers.block import TransformerBlock
 from torchrl_tit.layers.dropout import Dropout
@@ -13,6 +15,10 @@ from torchrl_tit.layers.initialization import (
 from torchrl_tit.layers.patches import ArrayPatchEmbedding, ImagePatchEmbedding
 from torchrl_tit.layers.positions import RelativeBias, Rotary
 from torchrl_tit.layers.relative_attention import RelativeSelfAttention
+
+# TorchRL's losses call two critics as one by torch.vmap. PyTorch's attention kernel for CPUs then
+# runs once for each of them, as it does without, and so does dropout; PyTorch warns of it.
+warnings.filterwarnings("ignore", "There is a performance drop", module=r"torchrl_tit\.layers\.")
 
 __all__ = [
     "ArrayPatchEmbedding",

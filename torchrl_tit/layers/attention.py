@@ -11,7 +11,9 @@ from torch.nn import functional as F
 
 from torchrl_tit.layers.dropout import Dropout
 from torchrl_tit.layers.positions import RelativeBias, Rotary
+from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.histories import TemporalPositions
+from torchrl_tit.settings.numbers import Count, Frames, Probability, Width
 
 Read = Literal["all", "first", "last"]
 """Positions of a sequence that are read: all, the first (class token), the last (newest step)."""
@@ -52,19 +54,20 @@ class SelfAttention(nn.Module):
         (torch.Size([8, 5, 32]), torch.Size([8, 1, 32]))
     """
 
+    @checked_arguments
     def __init__(
         self,
-        embed_dim: int,
-        num_heads: int,
+        embed_dim: Width,
+        num_heads: Count,
         *,
         causal: bool = False,
-        dropout: float = 0.0,
-        out_dim: int | None = None,
+        dropout: Probability = 0.0,
+        out_dim: Width | None = None,
         positions: TemporalPositions = "none",
-        num_frames: int = 1,
+        num_frames: Frames = 1,
     ) -> None:
         super().__init__()
-        if num_heads < 1 or embed_dim % num_heads:
+        if embed_dim % num_heads:
             raise ValueError(
                 f"the width {embed_dim} cannot be split over {num_heads} attention heads: "
                 "choose a number of heads that divides embed_dim"

@@ -6,8 +6,10 @@ from torch import Tensor, nn
 
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.attention import READ_SLICES, Read, SelfAttention
+from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.frames import Activation, TransformerSettings
 from torchrl_tit.settings.histories import TemporalPositions
+from torchrl_tit.settings.numbers import Count, Probability, Width
 
 
 class TransformerBlock(nn.Module):
@@ -34,15 +36,16 @@ class TransformerBlock(nn.Module):
         torch.Size([8, 1, 32])
     """
 
+    @checked_arguments
     def __init__(
         self,
-        embed_dim: int,
-        num_heads: int,
+        embed_dim: Width,
+        num_heads: Count,
         *,
-        ffn_expansion: int = 4,
+        ffn_expansion: Count = 4,
         activation: Activation = "gelu",
-        attention_dropout: float = 0.0,
-        ffn_dropout: float = 0.0,
+        attention_dropout: Probability = 0.0,
+        ffn_dropout: Probability = 0.0,
         causal: bool = False,
         positions: TemporalPositions = "none",
         num_frames: int = 1,

@@ -10,6 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Size, Width
+
 
 class CategoryIndex(nn.Module):
     """Numbers the values of all entries of a row: entry i's value 0 follows entry i - 1's last one.
@@ -58,7 +61,8 @@ class CategoryPatchEmbedding(nn.Module):
         torch.Size([8, 2, 32])
     """
 
-    def __init__(self, counts: Sequence[int], patch_size: int, embed_dim: int) -> None:
+    @checked_arguments
+    def __init__(self, counts: Sequence[int], patch_size: Size, embed_dim: Width) -> None:
         super().__init__()
         self.patch_size = patch_size
         self.num_patches = math.ceil(len(counts) / patch_size)

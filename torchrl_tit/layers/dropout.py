@@ -7,6 +7,9 @@ import math
 import torch
 from torch import Tensor, nn
 
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Fraction
+
 _INT64 = torch.iinfo(torch.int64)
 _LEVELS = 2**16
 """Number of values of 16 random bits; p is rounded to a multiple of its inverse."""
@@ -30,7 +33,8 @@ class Dropout(nn.Dropout):
         tensor([1., 1.])
     """
 
-    def __init__(self, p: float = 0.5) -> None:
+    @checked_arguments
+    def __init__(self, p: Fraction = 0.5) -> None:
         super().__init__(p)
 
     def forward(self, input: Tensor) -> Tensor:

@@ -7,6 +7,8 @@ from torch import Tensor, nn
 
 from torchrl_tit.layers.attention import READ_SLICES, Read
 from torchrl_tit.layers.relative_attention import RelativeSelfAttention
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Count, Frames, Real, Width
 
 
 class GRUGate(nn.Module):
@@ -29,7 +31,8 @@ class GRUGate(nn.Module):
         True
     """
 
-    def __init__(self, embed_dim: int, bias: float = 0.0) -> None:
+    @checked_arguments
+    def __init__(self, embed_dim: Width, bias: Real = 0.0) -> None:
         super().__init__()
         self.reset_y = nn.Linear(embed_dim, embed_dim, bias=False)
         self.reset_x = nn.Linear(embed_dim, embed_dim, bias=False)
@@ -66,14 +69,15 @@ class GatedTransformerBlock(nn.Module):
         torch.Size([8, 5, 32])
     """
 
+    @checked_arguments
     def __init__(
         self,
-        embed_dim: int,
-        num_heads: int,
-        num_frames: int,
+        embed_dim: Width,
+        num_heads: Count,
+        num_frames: Frames,
         *,
-        ffn_expansion: int = 4,
-        gate_bias: float = 0.0,
+        ffn_expansion: Count = 4,
+        gate_bias: Real = 0.0,
     ) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(embed_dim)

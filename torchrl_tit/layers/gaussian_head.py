@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Size
+
 _LOG_STD_MIN, _LOG_STD_MAX = -5.0, 2.0
 
 
@@ -25,7 +28,8 @@ class GaussianHead(nn.Module):
         (torch.Size([8, 20, 3]), True)
     """
 
-    def __init__(self, in_features: int, action_dim: int) -> None:
+    @checked_arguments
+    def __init__(self, in_features: Size, action_dim: Size) -> None:
         super().__init__()
         self.mean = nn.Linear(in_features, action_dim)
         self.log_std = nn.Linear(in_features, action_dim)
@@ -62,7 +66,8 @@ class ClampedGaussianHead(nn.Module):
         (torch.Size([8, 3]), torch.Size([8, 3]))
     """
 
-    def __init__(self, in_features: int, action_dim: int) -> None:
+    @checked_arguments
+    def __init__(self, in_features: Size, action_dim: Size) -> None:
         super().__init__()
         self.mean = nn.Linear(in_features, action_dim)
         self.log_std = nn.Linear(in_features, action_dim)

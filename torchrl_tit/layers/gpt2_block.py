@@ -8,6 +8,8 @@ from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.attention import SelfAttention
 from torchrl_tit.layers.dropout import Dropout
 from torchrl_tit.settings import Activation
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Count, Probability, Width
 
 
 class GPT2Block(nn.Module):
@@ -31,14 +33,15 @@ class GPT2Block(nn.Module):
         torch.Size([8, 2, 32])
     """
 
+    @checked_arguments
     def __init__(
         self,
-        embed_dim: int,
-        num_heads: int,
-        ffn_dim: int,
+        embed_dim: Width,
+        num_heads: Count,
+        ffn_dim: Width,
         *,
         activation: Activation = "gelu_tanh",
-        dropout: float = 0.0,
+        dropout: Probability = 0.0,
     ) -> None:
         super().__init__()
         self.norm1 = nn.LayerNorm(embed_dim)

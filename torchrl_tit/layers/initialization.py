@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 from torch import nn
 
 from torchrl_tit.layers.block import TransformerBlock
 from torchrl_tit.layers.patches import ImagePatchEmbedding
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Weight
 
 
-def init_normal_(module: nn.Module, std: float = 0.02) -> None:
+@checked_arguments
+def init_normal_(module: nn.Module, std: Weight = 0.02) -> None:
     """Initialises as the authors' networks do: linear and embedding weights normal, biases 0.
 
     LayerNorms become 1 and 0. Convolutions, patch embeddings and the input projections of
@@ -36,7 +37,8 @@ def init_normal_(module: nn.Module, std: float = 0.02) -> None:
             child.reset_parameters()
 
 
-def init_orthogonal_(module: nn.Module, gain: float = math.sqrt(2)) -> None:
+@checked_arguments
+def init_orthogonal_(module: nn.Module, gain: Weight = 2**0.5) -> None:
     """Initialises as Stable-Baselines3 does, which trained the paper's online networks.
 
     Every linear layer (output projections of attention included) and 2-d convolution (image patch
@@ -61,7 +63,8 @@ def init_orthogonal_(module: nn.Module, gain: float = math.sqrt(2)) -> None:
                 nn.init.zeros_(bias)
 
 
-def scale_residual_branches_(module: nn.Module, factor: float) -> None:
+@checked_arguments
+def scale_residual_branches_(module: nn.Module, factor: Weight) -> None:
     """Scales the last weights of attention and FFN in all transformer blocks.
 
     With 0, every block is the identity at the start (arXiv 1901.09321, 2003.04887).

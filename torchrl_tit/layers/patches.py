@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_tit.layers.categories import CategoryPatchEmbedding
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Size, Width
 
 _MOST_CATEGORY_PATCHES = 16
 _IMAGE_PATCHES = 49  # of the paper's Atari games: 84 pixels in patches of 12
@@ -31,21 +33,30 @@ class ArrayPatchEmbedding(nn.Module):
         channels: arrays that are stacked in one observation (frames, say); 1 for a plain one.
         own_weights: whether each patch has weights of its own, and a bias.
 
+    Raises:
+        ValueError: if the patch is larger than the array.
+
     Example:
         >>> ArrayPatchEmbedding(size=11, patch_size=4, embed_dim=32)(torch.randn(8, 1, 11)).shape
         torch.Size([8, 3, 32])
     """
 
+    @checked_arguments
     def __init__(
         self,
-        size: int,
-        patch_size: int,
-        embed_dim: int,
+        size: Size,
+        patch_size: Size,
+        embed_dim: Width,
         *,
-        channels: int = 1,
+        channels: Size = 1,
         own_weights: bool = False,
     ) -> None:
         super().__init__()
+        if patch_size > size:
+            raise ValueError(
+                f"patch_size {patch_size} is larger than the array of {size} entries: choose at "
+                f"most {size}, or None for one patch"
+            )
         self.patch_size = patch_size
         self.num_patches = math.ceil(size / patch_size)
         self.padding = math.ceil((self.num_patches * patch_size - size) / 2)
@@ -99,8 +110,9 @@ class ImagePatchEmbedding(nn.Module):
         torch.Size([8, 49, 64])
     """
 
+    @checked_arguments
     def __init__(
-        self, channels: int, size: tuple[int, int], patch_size: int, embed_dim: int
+        self, channels: Size, size: tuple[int, int], patch_size: Size, embed_dim: Width
     ) -> None:
         super().__init__()
         height, width = size

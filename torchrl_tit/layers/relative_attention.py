@@ -10,6 +10,8 @@ from torch.nn import functional as F
 
 from torchrl_tit.layers.attention import READ_SLICES, Read
 from torchrl_tit.layers.positions import sinusoids
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Count, Frames, Width
 
 
 class RelativeSelfAttention(nn.Module):
@@ -40,7 +42,8 @@ class RelativeSelfAttention(nn.Module):
     distances: Tensor
     index: Tensor
 
-    def __init__(self, embed_dim: int, num_heads: int, num_frames: int) -> None:
+    @checked_arguments
+    def __init__(self, embed_dim: Width, num_heads: Count, num_frames: Frames) -> None:
         super().__init__()
         if num_heads < 1 or embed_dim % num_heads:
             raise ValueError(

@@ -31,7 +31,9 @@ def action_shape(spec: TensorSpec, batch_dims: int | None) -> torch.Size:
         torch.Size([3])
     """
     supported = isinstance(spec, Categorical | OneHot) or (
-        not isinstance(spec, Composite) and spec.dtype.is_floating_point
+        isinstance(spec, TensorSpec)
+        and not isinstance(spec, Composite)
+        and spec.dtype.is_floating_point
     )
     if not supported:
         raise ValueError(
@@ -98,6 +100,8 @@ def describe(spec: TensorSpec) -> str:
         >>> describe(Binary(3))
         'Binary(shape=[3], dtype=int8)'
     """
+    if not isinstance(spec, TensorSpec):
+        return repr(spec)
     if isinstance(spec, Composite):
         return f"Composite({', '.join(map(str, spec.keys()))})"
     dtype = str(spec.dtype).removeprefix("torch.")

@@ -125,6 +125,8 @@ class Backbone(TensorDictModule):
         in_keys, out_keys = (
             [keys] if isinstance(keys, str) else list(keys) for keys in (in_keys, out_keys)
         )
+        if not isinstance(network, nn.Module):
+            raise ValueError(f"network must be one, such as EnhancedTIT((4,)), not {network!r}")
         trunks = trunks_of(network)
         _check_keys(network, trunks, in_keys, out_keys)
         if every_frame:

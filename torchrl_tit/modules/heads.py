@@ -25,17 +25,20 @@ from torchrl_tit.modules.distributions import (
     IndependentCategorical,
     IndependentOneHotCategorical,
 )
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Size, Weight
 
 
+@checked_arguments
 def make_actor(
-    features_dim: int,
+    features_dim: Size,
     action_spec: TensorSpec,
     *,
     in_key: NestedKey = "features",
     action_key: NestedKey = "action",
     mask_key: NestedKey | None = None,
     batch_dims: int | None = None,
-    gain: float = 0.01,
+    gain: Weight = 0.01,
 ) -> ProbabilisticActor:
     """Builds the policy head for an action space.
 
@@ -116,7 +119,8 @@ def make_actor(
     )
 
 
-def make_value(features_dim: int, *, in_key: NestedKey = "features") -> ValueOperator:
+@checked_arguments
+def make_value(features_dim: Size, *, in_key: NestedKey = "features") -> ValueOperator:
     """Builds the state-value head: one linear layer, orthogonal with gain 1.
 
     Args:

@@ -9,10 +9,13 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_tit.layers.gaussian_head import ClampedGaussianHead
 from torchrl_tit.modules.action_specs import describe
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Size
 
 
+@checked_arguments
 def make_squashed_actor(
-    features_dim: int,
+    features_dim: Size,
     action_spec: TensorSpec,
     *,
     in_key: NestedKey = "features",
@@ -34,7 +37,8 @@ def make_squashed_actor(
         A :class:`~torchrl.modules.ProbabilisticActor` that follows TorchRL's exploration type.
 
     Raises:
-        ValueError: if the actions are not continuous and bounded.
+        ValueError: if the actions are not continuous and bounded, or there is nothing between the
+            bounds.
 
     Example:
         >>> import torch
@@ -47,6 +51,11 @@ def make_squashed_actor(
         raise ValueError(
             f"no squashed policy for the action space {describe(action_spec)}: expected a Bounded "
             "spec of one dimension, such as env.action_spec_unbatched"
+        )
+    if not (action_spec.space.low < action_spec.space.high).all():
+        raise ValueError(
+            f"no squashed policy for actions from {action_spec.space.low.tolist()} to "
+            f"{action_spec.space.high.tolist()}: each lower bound must be below the upper one"
         )
     head = ClampedGaussianHead(features_dim, action_spec.shape[0])
     return ProbabilisticActor(

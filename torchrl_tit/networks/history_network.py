@@ -94,6 +94,16 @@ class HistoryNetwork(nn.Module):
                 f"num_frames is the number K of observations and must be at least 1, not "
                 f"{num_frames!r}"
             )
+        chosen = list(frame.values()) if isinstance(frame, Mapping) else [frame]
+        for part, kind in [
+            *((part, settings.FrameSettings) for part in chosen),
+            (history, settings.HistorySettings),
+        ]:
+            if not isinstance(part, kind):
+                raise ValueError(
+                    f"a network is built from settings, such as Inner() and PairedOuter(), but "
+                    f"{part!r} is no {kind.__name__}"
+                )
         self.num_frames = num_frames
         self.observations = read_observations(observation_shape)
         """What the network reads, by name."""

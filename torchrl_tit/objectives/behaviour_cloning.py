@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.objectives import BCLoss
+
+from torchrl_tit.settings.arguments import checked_arguments
 
 
 class LikelihoodBCLoss(BCLoss):
@@ -19,7 +24,10 @@ class LikelihoodBCLoss(BCLoss):
 
     Args:
         actor_network: a policy with ``get_dist``, such as a `ProbabilisticActor`.
-        **settings: ``reduction``.
+        reduction: of the losses of a batch.
+
+    Raises:
+        ValueError: if there is no such ``reduction``, or the policy has no ``get_dist``.
 
     Example:
         >>> import torch
@@ -32,6 +40,17 @@ class LikelihoodBCLoss(BCLoss):
     """
 
     target_actor_network_params: TensorDictParams
+
+    @checked_arguments
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        *,
+        reduction: Literal["none", "mean", "sum"] = "mean",
+    ) -> None:
+        if not hasattr(actor_network, "get_dist"):
+            raise ValueError(f"actor_network must be a policy with get_dist, not {actor_network!r}")
+        super().__init__(actor_network, reduction=reduction)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the loss of a batch [*B], which is left unchanged."""

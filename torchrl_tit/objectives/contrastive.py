@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -35,6 +37,9 @@ def contrastive_prediction_loss(
     Returns:
         The mean over the masked steps, float []; 0 if none is masked.
 
+    Raises:
+        ValueError: if shapes do not fit, or the temperature is not positive.
+
     Example:
         >>> encodings, mask = torch.eye(6).view(2, 3, 6), torch.tensor([[True, False, False]] * 2)
         >>> right = contrastive_prediction_loss(encodings, encodings, mask)
@@ -42,6 +47,15 @@ def contrastive_prediction_loss(
         >>> bool(right < 0.01 < wrong)
         True
     """
+    if not 0 < temperature < math.inf:
+        raise ValueError(f"temperature must be positive and finite, not {temperature}")
+    if not encodings.shape == predictions.shape or mask.shape != encodings.shape[:2]:
+        raise ValueError(
+            f"encodings and predictions must be [N, K, D] and mask [N, K], not "
+            f"{list(encodings.shape)}, {list(predictions.shape)} and {list(mask.shape)}"
+        )
+    if mask.dtype != torch.bool:
+        raise ValueError(f"mask must be bool, not {mask.dtype}")
     x = F.normalize(predictions.flatten(0, 1), dim=-1)  # [N * K, D]
     y = F.normalize(encodings.flatten(0, 1), dim=-1)
     similarity = x @ y.T / temperature  # [N * K, N * K]

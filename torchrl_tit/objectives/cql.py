@@ -17,8 +17,11 @@ from torchrl.objectives import CQLLoss, distance_loss
 from torchrl_tit.modules.many_actions import ManyActions
 from torchrl_tit.objectives.cql_terms import CriticBatch, PolicySamples
 from torchrl_tit.objectives.pairs import encode_pairs, get_dist
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Count, Positive, Real, Weight
 
 OverCritics = Literal["mean", "sum"]
+Distance = Literal["l1", "l2", "smooth_l1"]
 
 
 class ContinuousCQLLoss(CQLLoss):
@@ -99,18 +102,19 @@ class ContinuousCQLLoss(CQLLoss):
 
     out_keys = ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha", "alpha", "entropy")
 
+    @checked_arguments
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
         qvalue_network: TensorDictModuleBase | Sequence[TensorDictModuleBase],
         *,
         action_spec: Bounded,
-        min_q_weight: float = 5.0,
-        num_random: int = 10,
+        min_q_weight: Weight = 5.0,
+        num_random: Count = 10,
         over_critics: OverCritics = "mean",
-        alpha_init: float = 1.0,
-        target_entropy: float | Literal["auto"] = "auto",
-        loss_function: str = "l2",
+        alpha_init: Positive = 1.0,
+        target_entropy: Real | Literal["auto"] = "auto",
+        loss_function: Distance = "l2",
         deactivate_vmap: bool = False,
     ) -> None:
         if not isinstance(action_spec, Bounded) or action_spec.ndim != 1:
@@ -118,10 +122,6 @@ class ContinuousCQLLoss(CQLLoss):
                 f"action_spec must be a Bounded spec of one dimension, not {action_spec}: samples "
                 "are drawn uniformly between the bounds"
             )
-        if num_random < 1:
-            raise ValueError(f"num_random must be at least 1, not {num_random}")
-        if over_critics not in ("mean", "sum"):
-            raise ValueError(f"over_critics must be 'mean' or 'sum', not {over_critics!r}")
         super().__init__(
             actor_network,
             [ManyActions(critic) for critic in qvalue_network]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -10,8 +10,7 @@ from tensordict.nn import TensorDictModule
 from torch.nn import functional as F
 from torchrl.objectives import DTLoss
 
-_LOSSES = ("l2", "l1", "smooth_l1", "cross_entropy")
-"""The last one is for discrete actions, the others for continuous ones."""
+from torchrl_tit.settings.arguments import checked_arguments
 
 
 class MaskedDTLoss(DTLoss):
@@ -27,13 +26,13 @@ class MaskedDTLoss(DTLoss):
         loss_function: "l2", "l1" or "smooth_l1" between continuous actions [..., K, A], or
             "cross_entropy" between logits and discrete ones, integers [..., K] or one-hot.
         mask_key: Key of the mask, bool [..., K], False at padding.
-        **settings: Passed to `DTLoss`: ``reduction``.
+        reduction: Of the losses of the steps.
 
     Returns:
         In ``forward``, a tensordict with "loss", float [].
 
     Raises:
-        ValueError: if there is no such ``loss_function``.
+        ValueError: if there is no such ``loss_function`` or ``reduction``.
         TypeError: in ``forward``, if it does not fit the actions of the batch.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3.
@@ -57,17 +56,16 @@ class MaskedDTLoss(DTLoss):
         torch.Size([])
     """
 
+    @checked_arguments
     def __init__(
         self,
         actor_network: TensorDictModule,
         *,
-        loss_function: str = "l2",
+        loss_function: Literal["l2", "l1", "smooth_l1", "cross_entropy"] = "l2",
         mask_key: NestedKey = "mask",
-        **settings: Any,
+        reduction: Literal["none", "mean", "sum"] = "mean",
     ) -> None:
-        if loss_function not in _LOSSES:
-            raise ValueError(f"unknown loss_function {loss_function!r}: choose one of {_LOSSES}")
-        super().__init__(actor_network, loss_function=loss_function, **settings)
+        super().__init__(actor_network, loss_function=loss_function, reduction=reduction)
         self.loss_mask_key = mask_key
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -75,7 +73,7 @@ class MaskedDTLoss(DTLoss):
         target = tensordict[self.tensor_keys.action_target]
         discrete = self.loss_function == "cross_entropy"
         if discrete == target.is_floating_point():
-            other = "'cross_entropy'" if not discrete else f"one of {_LOSSES[:-1]}"
+            other = "'cross_entropy'" if not discrete else "one of 'l2', 'l1', 'smooth_l1'"
             raise TypeError(
                 f"loss_function {self.loss_function!r} does not fit actions of {target.dtype}: "
                 f"take {other}"

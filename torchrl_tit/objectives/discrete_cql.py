@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import DiscreteCQLLoss
+
+from torchrl_tit.settings.arguments import checked_arguments
 
 
 class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
@@ -30,7 +32,12 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
     Args:
         value_network: writes "action_value", float [..., n], and "chosen_action_value", float
             [..., 1].
-        **settings: passed to `DiscreteCQLLoss`: ``action_space``, ``loss_function``, ``reduction``.
+        loss_function: distance to the target; "l2" is the square.
+        reduction: of the losses of a batch.
+        **settings: passed to `DiscreteCQLLoss`: ``action_space``.
+
+    Raises:
+        ValueError: if a setting is invalid.
 
     Example:
         >>> from tensordict import TensorDict
@@ -56,8 +63,22 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         >>> (losses["loss_qvalue"] + losses["loss_cql"]).backward()
     """
 
-    def __init__(self, value_network: Any, **settings: Any) -> None:
-        super().__init__(value_network, delay_value=True, **settings)
+    @checked_arguments
+    def __init__(
+        self,
+        value_network: Any,
+        *,
+        loss_function: Literal["l1", "l2", "smooth_l1"] = "l2",
+        reduction: Literal["none", "mean", "sum"] = "mean",
+        **settings: Any,
+    ) -> None:
+        super().__init__(
+            value_network,
+            delay_value=True,
+            loss_function=loss_function,
+            reduction=reduction,
+            **settings,
+        )
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Chooses how targets are computed; see TorchRL's `LossModule.make_value_estimator`."""
