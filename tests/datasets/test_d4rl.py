@@ -1,18 +1,23 @@
 """D4RL's files are downloaded once, atomically, and verified by checksum."""
 
+import io
 import threading
 from collections.abc import Iterator
+from email.message import Message
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import ClassVar
+from urllib.response import addinfourl
 
+import h5py
 import numpy as np
 import pytest
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from tests.datasets.rollouts import Transitions, write
 from torchrl_tit.datasets import DatasetError, download_d4rl, load_episodes
+from torchrl_tit.datasets.d4rl import address
 
 NAME = "hopper-medium-replay-v0"
 
@@ -102,6 +107,50 @@ def test_a_changed_file_is_refused(site: str, tmp_path: Path) -> None:
         load_episodes(NAME, cache_dir=tmp_path)
     path.unlink()
     assert download_d4rl(NAME, tmp_path).read_bytes() != content
+
+
+def test_a_second_download_must_be_the_first_again(
+    site: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = download_d4rl(NAME, tmp_path / "cache")
+    content = path.read_bytes()
+    path.unlink()
+    with h5py.File(tmp_path / "site" / "other.hdf5", "w") as file:
+        file["rewards"] = np.zeros(3)
+    monkeypatch.setitem(D4RL_DATASETS, NAME, f"{site}/other.hdf5")
+    with pytest.raises(
+        DatasetError, match=r"other\.hdf5: sends another file than before; delete .*"
+    ):
+        download_d4rl(NAME, tmp_path / "cache")
+    assert not path.exists()
+    path.with_suffix(".json").unlink()  # as the message says
+    assert download_d4rl(NAME, tmp_path / "cache").read_bytes() != content
+
+
+def test_a_damaged_record_is_named(site: str, tmp_path: Path) -> None:
+    record = download_d4rl(NAME, tmp_path).with_suffix(".json")
+    record.write_text("[]")
+    with pytest.raises(DatasetError, match=r"v0\.json: is damaged .*; delete it"):
+        download_d4rl(NAME, tmp_path)
+
+
+def test_all_come_over_https_and_never_leave_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert all(
+        address(name).startswith("https://rail.eecs.berkeley.edu/") for name in D4RL_DATASETS
+    )
+    asked = []
+
+    def redirected(url: str, timeout: float) -> addinfourl:
+        asked.append(url)
+        return addinfourl(io.BytesIO(b""), Message(), url.replace("https", "http"))
+
+    monkeypatch.setattr("urllib.request.urlopen", redirected)
+    with pytest.raises(OSError, match=r"redirected to http://rail.* which is not https"):
+        download_d4rl(NAME, tmp_path)
+    assert asked == [address(NAME)]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_kill_before_the_checksum_does_no_harm(site: str, tmp_path: Path) -> None:

@@ -168,7 +168,7 @@ def test_the_buffer_cannot_be_written(rolled: Transitions) -> None:
         buffer[0] = buffer.sample()
     with pytest.raises(RuntimeError):
         buffer.empty()
-    with pytest.raises(ValueError, match="batch_size must be at least 1, but is 0"):
+    with pytest.raises(ValueError, match="batch_size must be at least 1, not 0"):
         make_replay_buffer(buffer.storage, 0)
 
 

@@ -284,8 +284,8 @@ def test_what_is_refused() -> None:
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"num_frames": 0}, "num_frames must be at least 1"),
         ({"ndim": 3}, "ndim must be 1 .*, but is 3"),
-        ({"padding": "zeros"}, "padding must be one of"),
-        ({"max_size": 0}, "max_size must be at least 1, but is 0"),
+        ({"padding": "zeros"}, "field 'padding' is 'zeros', not one of"),
+        ({"max_size": 0}, "max_size must be at least 1, not 0"),
     ]
     for settings, message in wrong:
         with pytest.raises(ValueError, match=message):

@@ -136,8 +136,8 @@ def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, but is 0"),
-        ({"gaps": "cutt"}, "gaps must be 'error' or 'cut', but is 'cutt'"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, not 0"),
+        ({"gaps": "cutt"}, "field 'gaps' is 'cutt', not one of"),
     ],
 )
 def test_wrong_settings(arrays: Transitions, settings: dict[str, Any], message: str) -> None:

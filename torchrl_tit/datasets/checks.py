@@ -107,11 +107,14 @@ def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | N
 
     Raises:
         DatasetError: If its values are not numbers.
+        ValueError: If ``floats`` is a dtype of other numbers.
 
     Example:
         >>> kept_dtype("a.hdf5", "rewards", np.dtype("float64"), torch.float32)
         torch.float32
     """
+    if not (floats is None or (isinstance(floats, torch.dtype) and floats.is_floating_point)):
+        raise ValueError(f"dtype is that of floats, such as torch.float32, not {floats}")
     if dtype.kind not in "biuf":
         raise DatasetError(source, f"has the dtype {dtype}, but must have a numeric one.", field)
     if field in FLAGS:

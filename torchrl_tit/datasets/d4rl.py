@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import os
 import urllib.request
 from pathlib import Path
 from urllib.error import URLError
+from urllib.parse import urlsplit
 
 import h5py
+import msgspec
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.stored import damage_named
 from torchrl_tit.files import whole_or_not_at_all, write_text_atomic
 
+_HOST = "rail.eecs.berkeley.edu"  # of all of D4RL's files
 _BLOCK = 2**20
 _TIMEOUT = 60  # seconds without an answer
 
@@ -23,9 +26,10 @@ _TIMEOUT = 60  # seconds without an answer
 def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) -> Path:
     """Downloads one of D4RL's data sets, unless it has been downloaded before.
 
-    Files are written atomically. D4RL publishes no checksums, so a download must have the length
-    that the server states and be a whole HDF5 file. Its checksum is stored beside it, and verified
-    whenever the file is used again.
+    Files are written atomically, and come over https. D4RL publishes no checksums, so the first
+    download is what the server says it is: it must have the length that the server states and be a
+    whole HDF5 file. Its size and SHA-256 are stored beside it. They are verified whenever the file
+    is used again, and stay if it is deleted: a second download must be the same file.
 
     Args:
         name: D4RL's name, such as "hopper-medium-replay-v0" or "hopper-medium-v2".
@@ -37,10 +41,10 @@ def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) ->
 
     Raises:
         ValueError: If D4RL has no data set of that name.
-        OSError: If it cannot be downloaded or written.
-        DatasetError: If the file is damaged.
+        OSError: If it cannot be downloaded or written, or the server leaves https.
+        DatasetError: If the file is damaged, or not the one that was downloaded first.
 
-    Source: D4RL (arXiv 2004.07219); the URLs are those of TorchRL.
+    Source: D4RL (arXiv 2004.07219); the URLs are those of TorchRL, which begin with http.
 
     Example:
         >>> download_d4rl("hopper-medium")
@@ -58,17 +62,30 @@ def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) ->
     path = folder / f"{name}.hdf5"
     record = folder / f"{name}.json"
     if not path.exists():
-        record.unlink(missing_ok=True)
         # If another process was faster, its download is used.
         with contextlib.suppress(FileExistsError), whole_or_not_at_all(path) as hidden:
-            _download(D4RL_DATASETS[name], hidden)
-    if not record.exists():  # the process may have been killed between the two
-        write_text_atomic(record, json.dumps(_facts(path)))
-    if json.loads(record.read_text(encoding="utf-8")) != _facts(path):
-        raise DatasetError(
-            str(path), "has changed since it was downloaded; delete it to download it again."
-        )
+            _download(address(name), hidden)
+            other = f"sends another file than before; delete {record} to accept it"
+            _check(record, hidden, address(name), other)
+    changed = "has changed since it was downloaded; delete it to download it again"
+    _check(record, path, str(path), changed)
+    if not record.exists():  # only now: the process may have been killed between the two
+        write_text_atomic(record, msgspec.json.encode(_facts(path)).decode())
     return path
+
+
+def address(name: str) -> str:
+    """Returns where a data set is downloaded from: D4RL's host has https, too.
+
+    Args:
+        name: One of D4RL's names.
+
+    Example:
+        >>> address("hopper-medium-v2")
+        'https://rail.eecs.berkeley.edu/datasets/offline_rl/gym_mujoco_v2/hopper_medium-v2.hdf5'
+    """
+    url = D4RL_DATASETS[name]
+    return url.replace("http://", "https://", 1) if urlsplit(url).hostname == _HOST else url
 
 
 def _cache_folder() -> Path:
@@ -79,6 +96,8 @@ def _cache_folder() -> Path:
 def _download(url: str, path: Path) -> None:
     try:
         with urllib.request.urlopen(url, timeout=_TIMEOUT) as answer, path.open("wb") as file:
+            if urlsplit(url).scheme == "https" != urlsplit(answer.url).scheme:
+                raise OSError(f"it was redirected to {answer.url}, which is not https")
             while block := answer.read(_BLOCK):
                 file.write(block)
             expected = answer.headers.get("Content-Length")
@@ -86,13 +105,34 @@ def _download(url: str, path: Path) -> None:
         raise OSError(f"{url} cannot be downloaded: {error}") from error
     if expected is not None and path.stat().st_size != int(expected):
         raise OSError(f"{url}: received only {path.stat().st_size} of {expected} bytes; try again.")
-    try:
+    with damage_named(url, "is not a whole HDF5 file"):
         h5py.File(path, "r").close()
-    except OSError as error:
-        raise DatasetError(url, f"is not a whole HDF5 file ({error}).") from error
 
 
-def _facts(path: Path) -> dict[str, str | int]:
+class _Facts(msgspec.Struct):
+    """What tells one file from another."""
+
+    bytes: int
+    sha256: str
+
+
+def _facts(path: Path) -> _Facts:
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"bytes": path.stat().st_size, "sha256": digest}
+    return _Facts(path.stat().st_size, digest)
+
+
+def _check(record: Path, path: Path, source: str, problem: str) -> None:
+    """Raises DatasetError if a file is not the one that the record describes, if there is one."""
+    if not record.exists():
+        return
+    try:
+        before = msgspec.json.decode(record.read_bytes(), type=_Facts)
+    except ValueError as error:
+        raise DatasetError(str(record), f"is damaged ({error}); delete it.") from error
+    if before != (now := _facts(path)):
+        raise DatasetError(
+            source,
+            f"{problem} ({now.bytes} bytes with the SHA-256 {now.sha256}, not {before.bytes} with "
+            f"{before.sha256}).",
+        )

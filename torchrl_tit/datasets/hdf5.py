@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,18 @@ import numpy as np
 from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations, rows_per_chunk
-from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.full_disks import new_hdf5
+from torchrl_tit.datasets.stored import check_stored, damage_named, open_hdf5
+from torchrl_tit.datasets.transition_reader import FIELDS
 from torchrl_tit.datasets.transitions import episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
 
 
 def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     """Reads a file with one row per transition, in chunks: it may be larger than the memory.
+
+    Only what the file itself holds is read, and no more than it can hold: see
+    :func:`~torchrl_tit.datasets.stored.check_stored`.
 
     Args:
         path: The file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
@@ -31,7 +37,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        DatasetError: If it is not a whole HDF5 file, or its data cannot be used.
+        DatasetError: If it is not a whole HDF5 file, takes values from other files, declares more
+            than it can hold, or its data cannot be used.
 
     Example:
         >>> import tempfile
@@ -48,14 +55,14 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
         raise FileNotFoundError(
             f"There is no data file {path} in {Path.cwd()}: check the path, or create it first."
         )
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise DatasetError(str(path), f"is not a whole HDF5 file ({error}).") from error
-    with file:
-        return episodes_from_transitions(
-            _datasets(file), source=str(path), attributes=_attributes(file), **settings
-        )
+    source = str(path)
+    with open_hdf5(path) as file:
+        with damage_named(source, "cannot be read"):
+            fields, attributes = _datasets(file), _attributes(file)
+        for name in FIELDS:
+            if name in fields:
+                check_stored(source, name, fields[name])
+        return episodes_from_transitions(fields, source=source, attributes=attributes, **settings)
 
 
 def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
@@ -99,13 +106,15 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
         "timeouts": (episodes.rows["truncated"].squeeze(-1), steps),
         "next_observations": (episodes.rows["observation"], steps + 1),
     }
-    with whole_or_not_at_all(path) as hidden, h5py.File(hidden, "w") as file:
+    with whole_or_not_at_all(path) as hidden, new_hdf5(hidden, path) as (file, check):
         file.attrs.update(episodes.attributes)
         for name, (values, rows) in fields.items():
-            _write(file, name, values, rows)
+            _write(file, name, values, rows, check)
 
 
-def _write(file: h5py.File, name: str, values: Tensor, rows: Tensor) -> None:
+def _write(
+    file: h5py.File, name: str, values: Tensor, rows: Tensor, check: Callable[[], None]
+) -> None:
     """Writes some rows of a field, in chunks."""
     array = values.numpy()
     shape = (len(rows), *array.shape[1:])
@@ -113,6 +122,7 @@ def _write(file: h5py.File, name: str, values: Tensor, rows: Tensor) -> None:
     size = rows_per_chunk(array[0].nbytes)
     for start in range(0, len(rows), size):
         dataset[start : start + size] = array[rows[start : start + size].numpy()]
+        check()
 
 
 def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:

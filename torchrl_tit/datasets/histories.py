@@ -71,6 +71,8 @@ class HistoryStorage(EpisodeStorage):
         unfinished: Unfinished = "drop",
         is_init: bool = False,
     ) -> None:
+        if not isinstance(episodes, Episodes):
+            raise ValueError(f"episodes must be Episodes, as of load_episodes, not {episodes!r}")
         check_windows(num_frames, padding)
         _check_choice("time_limits", time_limits, get_args(TimeLimits))
         zero_or_keep = get_args(TerminalObservations)

@@ -39,13 +39,21 @@ def memory_mapped_rows(
         >>> memory_mapped_rows(5, {"reward": ((1,), torch.float32)})["reward"].shape
         torch.Size([5, 1])
     """
-    with tempfile.TemporaryDirectory(
-        prefix="torchrl-tit-", dir=directory, ignore_cleanup_errors=True
-    ) as folder:
-        tensors = {
-            name: _map(Path(folder, name), (num_rows, *shape), dtype)
-            for name, (shape, dtype) in fields.items()
-        }
+    size = num_rows * sum(prod(shape) * dtype.itemsize for shape, dtype in fields.values())
+    try:
+        with tempfile.TemporaryDirectory(
+            prefix="torchrl-tit-", dir=directory, ignore_cleanup_errors=True
+        ) as folder:
+            tensors = {
+                name: _map(Path(folder, name), (num_rows, *shape), dtype)
+                for name, (shape, dtype) in fields.items()
+            }
+    except OSError as error:
+        raise OSError(
+            f"{num_rows} rows of {size} bytes in all cannot be written into "
+            f"{directory or tempfile.gettempdir()} ({error.strerror or error}): choose a folder "
+            "with room for them as directory"
+        ) from error
     return TensorDict(tensors, [num_rows])
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 from itertools import pairwise
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import minari
 import numpy as np
 import torch
-from gymnasium.spaces import Box, Discrete
 from minari.dataset.minari_dataset import parse_dataset_id
 from minari.storage.datasets_root_dir import get_dataset_path
 from numpy.typing import NDArray
@@ -26,10 +26,21 @@ from torchrl_tit.datasets.checks import (
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
+from torchrl_tit.datasets.minari_folder import check_folder, check_rows, episodes_checked
 from torchrl_tit.datasets.tasks import TaskSpaces, check_shape, check_task_name
 
 # What Minari raises if a data set is damaged or cannot be downloaded.
-_FAILURES = (AssertionError, ImportError, KeyError, OSError, TypeError, ValueError)
+_FAILURES = (
+    AssertionError,
+    AttributeError,
+    ImportError,
+    IndexError,
+    KeyError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 ATTRIBUTES = "attributes"  # the entry of this library in Minari's metadata
 # Minari's own metadata fields, by the names of our attributes.
 METADATA_FIELDS = {
@@ -73,8 +84,9 @@ def read_minari(
 
     Raises:
         FileNotFoundError: If Minari has no such data set, or cannot download it.
-        DatasetError: If it is damaged or of another task, or a field is missing, has the wrong
-            length, shape or dtype, or contains NaN, infinity, or actions out of bounds.
+        DatasetError: If it is damaged, claims more than its files can hold, takes data from other
+            files or is of another task, or a field is missing, has the wrong length, shape or
+            dtype, or contains NaN, infinity, or actions out of bounds.
 
     Example:
         >>> import tempfile
@@ -87,15 +99,8 @@ def read_minari(
         tensor([2, 2])
     """
     source = str(name)
-    dataset = _open(name)
-    for kind, space in (
-        ("observation", dataset.observation_space),
-        ("action", dataset.action_space),
-    ):
-        if not isinstance(space, Box | Discrete):
-            raise DatasetError(
-                source, f"its {kind}s are a {type(space).__name__} space, but must be one array."
-            )
+    folder = _folder(name)
+    dataset = _open(source, folder)
     attributes = _attributes(dataset)
     if task is not None:
         check_task_name(source, attributes.get("env_id"), task)
@@ -105,8 +110,8 @@ def read_minari(
         left_out.add("env_spec")  # except for the name
     bounds = [0, *(lengths + 1).cumsum(0).tolist()]
     rows = TensorDict({}, [0])
-    for number, (start, stop) in enumerate(pairwise(bounds)):
-        place = f"{source}: episode {number}"
+    places = episodes_checked(source, folder, len(lengths))
+    for number, (place, (start, stop)) in enumerate(zip(places, pairwise(bounds), strict=True)):
         episode = _episode(dataset, number, place)
         left_out |= {"infos"} if episode.infos else set()
         fields = _checked(place, episode, stop - start - 1, task)
@@ -115,6 +120,7 @@ def read_minari(
                 field: (array.shape[1:], kept_dtype(place, FIELDS[field][0], array.dtype, dtype))
                 for field, array in fields.items()
             }
+            check_rows(source, folder, bounds[-1], _row_bytes(kept))
             rows = memory_mapped_rows(bounds[-1], kept, directory)
         for field, array in fields.items():
             target = rows[field][start : start + len(array)]
@@ -147,25 +153,30 @@ def is_minari_name(name: str) -> bool:
     return True
 
 
-def _open(name: str | os.PathLike[str]) -> minari.MinariDataset:
+def _folder(name: str | os.PathLike[str]) -> Path:
+    """The folder of a data set's files, which is downloaded if need be."""
     folder = Path(name).absolute()  # Minari cannot handle relative paths
     if folder.is_dir():
-        data = folder / "data" if (folder / "data").is_dir() else folder
-    else:
-        data = get_dataset_path(str(name)) / "data"
-        if not data.is_dir():
-            try:
-                minari.download_dataset(str(name))
-            except Exception as error:  # anything that the network or its client raises
-                raise FileNotFoundError(
-                    f"There is no Minari data set {str(name)!r} in {data.parent}, and it cannot be "
-                    f"downloaded: {error}"
-                ) from error
+        return folder / "data" if (folder / "data").is_dir() else folder
+    data = get_dataset_path(str(name)) / "data"
+    if not data.is_dir():
+        try:
+            minari.download_dataset(str(name))
+        except Exception as error:  # anything that the network or its client raises
+            raise FileNotFoundError(
+                f"There is no Minari data set {str(name)!r} in {data.parent}, and it cannot be "
+                f"downloaded: {error}"
+            ) from error
+    return data
+
+
+def _open(source: str, folder: Path) -> minari.MinariDataset:
+    check_folder(source, folder)
     try:
-        return minari.MinariDataset(data)
+        return minari.MinariDataset(folder)
     except _FAILURES as error:
         raise DatasetError(
-            str(name), f"is not a whole Minari data set ({error}): see {data}."
+            source, f"is not a whole Minari data set ({error}): see {folder}."
         ) from error
 
 
@@ -187,7 +198,7 @@ def _lengths(dataset: minari.MinariDataset, source: str) -> tuple[torch.Tensor, 
         for episode in dataset.storage.get_episode_metadata(dataset.episode_indices):
             steps.append(int(episode["total_steps"]))
             noted |= {name for name in ("seed", "options") if episode.get(name) is not None}
-        lengths = torch.tensor(steps)
+        lengths = torch.tensor(steps)  # fails if a number is too large
     except _FAILURES as error:
         raise DatasetError(source, f"its episodes cannot be listed ({error}).") from error
     if not len(lengths):
@@ -195,6 +206,11 @@ def _lengths(dataset: minari.MinariDataset, source: str) -> tuple[torch.Tensor, 
     if lengths.min() < 1:
         raise DatasetError(source, f"episode {int(lengths.argmin())} has no steps.")
     return lengths, noted
+
+
+def _row_bytes(fields: dict[str, tuple[tuple[int, ...], torch.dtype]]) -> int:
+    """Bytes of one row of all fields."""
+    return sum(prod(shape) * dtype.itemsize for shape, dtype in fields.values())
 
 
 def _episode(dataset: minari.MinariDataset, number: int, place: str) -> minari.EpisodeData:

@@ -13,11 +13,12 @@ import numpy as np
 import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Discrete
-from minari.data_collector import EpisodeBuffer
 from minari.dataset.minari_storage import MinariStorage
 from minari.storage.datasets_root_dir import get_dataset_path
+from numpy.typing import NDArray
 
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
+from torchrl_tit.datasets.full_disks import errors_named, new_hdf5
 from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, METADATA_FIELDS, is_minari_name
 from torchrl_tit.datasets.tasks import task_spaces
 from torchrl_tit.envs import is_atari
@@ -29,9 +30,9 @@ def write_minari(
 ) -> None:
     """Writes episodes as a Minari data set, one at a time.
 
-    Fields keep their dtypes. The data set is written from Minari's episode buffers, because its
-    collector requires packages that a conversion does not need. The attributes "algorithm",
-    "description", "author", "author_email" and "code_permalink" also go into Minari's own metadata.
+    Fields keep their dtypes. Minari writes its metadata, and this function the episodes in its
+    layout, since it survives a full disk. The attributes "algorithm", "description", "author",
+    "author_email" and "code_permalink" also go into Minari's own metadata.
 
     Args:
         episodes: The data.
@@ -60,7 +61,7 @@ def write_minari(
     folder, dataset_id = _target(name)
     action_space = _action_space(episodes) if env_name is None else task_spaces(env_name).action
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with whole_or_not_at_all(folder) as hidden:
+    with whole_or_not_at_all(folder) as hidden, errors_named(folder):
         hidden.mkdir()
         storage = MinariStorage.new(
             hidden / "data",
@@ -69,15 +70,26 @@ def write_minari(
             env_spec=_env_spec(env_name),
             jpeg_encoding=False,  # images are stored exactly
         )
+        data = hidden / "data" / "main_data.hdf5"
+        with new_hdf5(data, folder) as (file, check):
+            for number, steps in enumerate(_steps(episodes)):
+                group = file.create_group(f"episode_{number}")
+                group.attrs.update({"id": number, "total_steps": len(steps["rewards"])})
+                for field, values in steps.items():
+                    shape = (None, *values.shape[1:])  # as Minari's own, which can grow
+                    group.create_dataset(field, data=values, chunks=True, maxshape=shape)
+                check()
         storage.update_metadata(
             {
                 "dataset_id": dataset_id,
                 "minari_version": minari.__version__,
+                "total_episodes": len(episodes.lengths),
+                "total_steps": episodes.num_transitions,
+                "dataset_size": storage.get_size(),
                 ATTRIBUTES: dict(episodes.attributes),
                 **_listed(episodes),
             }
         )
-        storage.update_episodes(_buffers(episodes))
 
 
 def _target(name: str | os.PathLike[str]) -> tuple[Path, str]:
@@ -124,7 +136,8 @@ def _box(values: torch.Tensor) -> Box:
     return Box(low, high, array.shape[1:], array.dtype.type)
 
 
-def _buffers(episodes: Episodes) -> Iterator[EpisodeBuffer]:
+def _steps(episodes: Episodes) -> Iterator[dict[str, NDArray]]:
+    """The fields of each episode by Minari's names."""
     for first, last in zip(episodes.first_rows.tolist(), episodes.last_rows.tolist(), strict=True):
         steps = {
             name: episodes.rows[field][first : last + 1 + more].numpy()
@@ -132,4 +145,4 @@ def _buffers(episodes: Episodes) -> Iterator[EpisodeBuffer]:
         }
         for name in ("rewards", "terminations", "truncations"):
             steps[name] = steps[name].squeeze(-1)
-        yield EpisodeBuffer(**steps)
+        yield steps

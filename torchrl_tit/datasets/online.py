@@ -13,6 +13,8 @@ from torch import Tensor
 from torchrl_tit.datasets.end_frames import EndFrames
 from torchrl_tit.datasets.gathering import Entries, GatheringStorage, take
 from torchrl_tit.datasets.histories import check_windows, episode_entries, frame_entries
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Batch
 from torchrl_tit.windows import Padding, Windows, find_windows
 
 _HERE = ("observation", "action", "action_mask", "is_init")
@@ -60,9 +62,10 @@ class OnlineHistoryStorage(GatheringStorage):
         torch.Size([32, 8, 4])
     """
 
+    @checked_arguments
     def __init__(
         self,
-        max_size: int,
+        max_size: Batch,
         num_frames: int = 1,
         *,
         ndim: int = 1,
@@ -71,8 +74,6 @@ class OnlineHistoryStorage(GatheringStorage):
         device: torch.device | str = "cpu",
     ) -> None:
         check_windows(num_frames, padding)
-        if max_size < 1:
-            raise ValueError(f"max_size must be at least 1, but is {max_size}.")
         if ndim not in (1, 2):
             raise ValueError(f"ndim must be 1 (steps) or 2 (environments, steps), but is {ndim}.")
         super().__init__(max_size, device=device, ndim=ndim)

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from msgspec import Meta
 from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
 from torchrl.data.replay_buffers.samplers import RandomSampler
 
 from torchrl_tit.datasets.consecutive import ConsecutiveSampler
 from torchrl_tit.datasets.storage import EpisodeStorage
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Batch
+
+AnySeed = Annotated[int, Meta(ge=0, le=2**62)]
 
 
+@checked_arguments
 def make_replay_buffer(
     storage: EpisodeStorage,
-    batch_size: int,
+    batch_size: Batch,
     *,
-    seed: int = 0,
-    slice_length: int = 1,
+    seed: AnySeed = 0,
+    slice_length: Batch = 1,
     **settings: Any,
 ) -> ReplayBuffer:
     """Makes a replay buffer that draws items uniformly, with replacement.
@@ -40,7 +46,8 @@ def make_replay_buffer(
         The buffer; ``buffer.sample()`` gives a tensordict [batch_size].
 
     Raises:
-        ValueError: If ``batch_size`` or ``slice_length`` is less than 1.
+        ValueError: If ``batch_size`` or ``slice_length`` is less than 1, or the second does not
+            divide the first.
 
     Example:
         >>> import numpy as np
@@ -51,8 +58,11 @@ def make_replay_buffer(
         >>> buffer.sample()["next", "history"].shape
         torch.Size([8, 3, 2])
     """
-    if batch_size < 1:
-        raise ValueError(f"batch_size must be at least 1, but is {batch_size}.")
+    if batch_size % slice_length:
+        raise ValueError(
+            f"A batch of {batch_size} steps cannot be divided into slices of {slice_length}; "
+            f"choose a slice_length that divides it."
+        )
     return ReplayBuffer(
         storage=storage,
         writer=ImmutableDatasetWriter(),

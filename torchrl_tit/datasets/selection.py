@@ -21,6 +21,9 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
     Returns:
         The selected episodes.
 
+    Raises:
+        ValueError: If there is no such episode.
+
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
         >>> states, ends = torch.arange(5.0).view(5, 1), [False, True, False, False, True]
@@ -28,6 +31,10 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
         >>> select_episodes(episodes, torch.tensor([1])).rows["observation"].flatten()
         tensor([2., 3., 4., 0.])
     """
+    index = torch.as_tensor(index)
+    count = len(episodes.lengths)
+    if index.is_floating_point() or ((index < 0) | (index >= count)).any():
+        raise ValueError(f"index must be integers from 0 to {count - 1}, not {index.tolist()}")
     lengths = episodes.lengths[index] + 1  # including the final observation
     shifts = episodes.first_rows[index] - (lengths.cumsum(0) - lengths)
     steps = torch.arange(int(lengths.sum()), device=lengths.device)
@@ -50,6 +57,9 @@ def join_episodes(parts: Sequence[Episodes]) -> Episodes:
     Returns:
         The episodes of all of them.
 
+    Raises:
+        ValueError: If there are none, or their fields have other shapes or dtypes.
+
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
         >>> states, ends = torch.zeros(3, 1), [False, False, True]
@@ -57,6 +67,17 @@ def join_episodes(parts: Sequence[Episodes]) -> Episodes:
         >>> join_episodes([episodes, episodes]).lengths
         tensor([3, 3])
     """
+    if not parts:
+        raise ValueError("there are no data sets to join")
+    for part in parts:
+        for name, field in parts[0].rows.items():
+            other = part.rows[name]
+            if (other.shape[1:], other.dtype) != (field.shape[1:], field.dtype):
+                raise ValueError(
+                    f"{part.source}: field {name!r} has the shape {list(other.shape[1:])} and "
+                    f"{other.dtype}, but in {parts[0].source} {list(field.shape[1:])} and "
+                    f"{field.dtype}: data sets of one task and dtype can be joined"
+                )
     return replace(
         parts[0],
         rows=torch.cat([part.rows for part in parts]),

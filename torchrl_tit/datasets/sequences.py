@@ -9,6 +9,8 @@ from torch import Tensor
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.gathering import Entries
 from torchrl_tit.datasets.storage import EpisodeStorage
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Frames, Positive, Real
 
 
 class SequenceStorage(EpisodeStorage):
@@ -29,8 +31,8 @@ class SequenceStorage(EpisodeStorage):
         action_padding: Value of the actions at padding, where all else is 0.
 
     Raises:
-        ValueError: If ``num_frames`` is less than 1, ``return_scale`` is not positive, or one of
-            ``mean`` and ``std`` is missing.
+        ValueError: If ``num_frames`` is less than 1, ``return_scale`` is not positive, or ``mean``
+            and ``std`` are not finite, do not fit the observations, or one of them is missing.
         DatasetError: If no episode is finished.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3 and its authors' code.
@@ -44,22 +46,25 @@ class SequenceStorage(EpisodeStorage):
         (tensor([False,  True,  True]), tensor([0., 5., 3.]))
     """
 
+    @checked_arguments
     def __init__(
         self,
         episodes: Episodes,
-        num_frames: int = 20,
+        num_frames: Frames = 20,
         *,
         mean: Tensor | None = None,
         std: Tensor | None = None,
-        return_scale: float = 1000.0,
-        action_padding: float = -10.0,
+        return_scale: Positive = 1000.0,
+        action_padding: Real = -10.0,
     ) -> None:
-        if num_frames < 1:
-            raise ValueError(f"num_frames must be at least 1, not {num_frames}")
-        if not return_scale > 0:
-            raise ValueError(f"return_scale must be positive, not {return_scale}")
         if (mean is None) != (std is None):
             raise ValueError("mean and std go together: give both, or neither")
+        shape = episodes.rows["observation"].shape[1:]
+        for name, values in {"mean": mean, "std": std}.items():
+            if values is not None and not (values.shape == shape and values.isfinite().all()):
+                raise ValueError(f"{name} must be finite numbers {list(shape)}, not {values}")
+        if std is not None and not (std > 0).all():
+            raise ValueError(f"std must be positive, not {std}")
         super().__init__(episodes, episodes.lengths * episodes.finished)
         self._last_rows = episodes.last_rows
         self._returns_to_go = _returns_to_go(episodes).div_(return_scale).float()  # [R]

@@ -63,6 +63,10 @@ def load_episodes(
         ...
         ValueError: 'hopper' is not a data set: give an HDF5 file, a Minari folder, D4RL's name ...
     """
+    if not isinstance(source, str | os.PathLike) or not os.fspath(source):
+        raise ValueError(f"source must name a file, a folder or a data set, not {source!r}")
+    if not isinstance(task, str | TaskSpaces | None):
+        raise ValueError(f"task must be a name, or what task_spaces returns, not {task!r}")
     spaces = task_spaces(task) if isinstance(task, str) else task
     name = os.fspath(source)
     path = Path(source)

@@ -10,12 +10,14 @@ from gymnasium.envs.registration import parse_env_id
 
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.envs import is_atari, make_games
+from torchrl_tit.envs.gymnasium_tasks import make_unchecked
+from torchrl_tit.settings.arguments import checked_arguments
 
 
 class TaskSpaces(NamedTuple):
     """The spaces of a task.
 
-    Args:
+    Attributes:
         observation: Gymnasium's space of one observation.
         action: Gymnasium's space of one action.
         name: The task's name, for messages.
@@ -26,6 +28,7 @@ class TaskSpaces(NamedTuple):
     name: str = "the task"
 
 
+@checked_arguments
 def task_spaces(env_name: str) -> TaskSpaces:
     """Returns the spaces of a Gymnasium task.
 
@@ -49,7 +52,7 @@ def task_spaces(env_name: str) -> TaskSpaces:
         games.close()
         return TaskSpaces(games.single_observation_space, games.single_action_space, env_name)
     try:
-        env = gymnasium.make(env_name, disable_env_checker=True)
+        env = make_unchecked(env_name)
     except (gymnasium.error.Error, ImportError) as error:
         raise ValueError(f"Task {env_name!r} cannot be made: {error}") from error
     try:

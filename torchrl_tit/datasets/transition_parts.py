@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.full_disks import new_hdf5
 from torchrl_tit.datasets.joined_field import JoinedField
+from torchrl_tit.datasets.stored import check_group, damage_named, open_hdf5
 from torchrl_tit.datasets.transition_reader import FIELDS
 from torchrl_tit.datasets.transitions import episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
@@ -45,6 +47,7 @@ class TransitionParts:
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder).absolute()
         self.folder.mkdir(parents=True, exist_ok=True)
+        self._checked: set[int] = set()
 
     def numbers(self, last: int | None = None) -> list[int]:
         """Lists the parts.
@@ -55,7 +58,8 @@ class TransitionParts:
         Returns:
             The numbers of the parts in ascending order.
         """
-        found = sorted(int(path.stem) for path in self.folder.glob("[0-9]*.hdf5"))
+        names = [path.stem for path in self.folder.glob("*.hdf5")]
+        found = sorted(int(name) for name in names if name.isdecimal())
         return [number for number in found if last is None or number <= last]
 
     def write(self, number: int, fields: Mapping[str, NDArray]) -> None:
@@ -69,10 +73,12 @@ class TransitionParts:
             FileExistsError: If a part of that number exists already.
             OSError: If it cannot be written.
         """
-        with whole_or_not_at_all(self._path(number)) as hidden, h5py.File(hidden, "w") as file:
+        path = self._path(number)
+        with whole_or_not_at_all(path) as hidden, new_hdf5(hidden, path) as (file, check):
             for name in FIELDS:
                 array = np.ascontiguousarray(fields[name])
                 file.create_dataset(name, data=array, chunks=True, compression="lzf")
+                check()
 
     def read(self, number: int) -> dict[str, NDArray]:
         """Reads a part.
@@ -86,7 +92,7 @@ class TransitionParts:
         Raises:
             DatasetError: If it is damaged.
         """
-        with self._open(number) as file:
+        with self._open(number) as file, damage_named(str(self._path(number)), "cannot be read"):
             return {name: file[name][:] for name in FIELDS}
 
     def drop_after(self, number: int) -> None:
@@ -167,10 +173,16 @@ class TransitionParts:
 
     def _open(self, number: int) -> h5py.File:
         path = self._path(number)
-        try:
-            return h5py.File(path, "r")
-        except OSError as error:
-            raise DatasetError(str(path), f"is not a whole HDF5 file ({error}).") from error
+        file = open_hdf5(path)
+        if number not in self._checked:
+            check_group(str(path), file)
+            for name in FIELDS:
+                shape = getattr(file.get(name), "shape", ())
+                if len(shape) < 2 or shape[:2] != file["observations"].shape[:2]:
+                    problem = f"has the shape {list(shape)}, which must begin as all others do."
+                    raise DatasetError(str(path), problem, name)
+            self._checked.add(number)
+        return file
 
     def _path(self, number: int) -> Path:
         return self.folder / f"{number:012d}.hdf5"

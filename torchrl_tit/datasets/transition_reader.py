@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -19,6 +20,7 @@ from torchrl_tit.datasets.checks import (
 )
 from torchrl_tit.datasets.episodes import rows_per_chunk
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.stored import damage_named
 from torchrl_tit.datasets.tasks import TaskSpaces, check_shape
 
 FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
@@ -53,7 +55,7 @@ class TransitionReader:
         self.fields, self.source, self.task, self.dtype = fields, source, task, dtype
         for name in _REQUIRED:
             if name not in fields:
-                found = ", ".join(sorted(fields)) or "nothing"
+                found = ", ".join(sorted(map(str, fields))) or "nothing"
                 raise DatasetError(source, f"is missing; there is {found}.", name)
         self.shapes = {name: self._shape(name) for name in FIELDS if name in fields}
         self.num_rows = len(fields["observations"])
@@ -120,23 +122,32 @@ class TransitionReader:
 
     def flags(self, name: str) -> NDArray:
         """All values of a field of flags; bool [N]."""
-        values = self._slice(name, 0, self.num_rows).reshape(self.num_rows)
-        wrong = (values != 0) & (values != 1)
-        if wrong.any():
-            row = int(wrong.argmax())
-            raise DatasetError(self.source, f"is {values[row]}, but must be 0 or 1.", name, row)
-        return values.astype(bool)
+        flags = np.empty(self.num_rows, dtype=bool)
+        for part in self._parts(name):
+            values = self._slice(name, part).reshape(-1)
+            wrong = (values != 0) & (values != 1)
+            if wrong.any():
+                row = int(wrong.argmax())
+                raise DatasetError(
+                    self.source, f"is {values[row]}, but must be 0 or 1.", name, part.start + row
+                )
+            flags[part] = values
+        return flags
 
     def chunks(self, name: str) -> Iterator[tuple[int, Tensor]]:
         """The chunks of a field, each with the index of its first row."""
-        dtype = self.fields[name].dtype
-        size = rows_per_chunk(dtype.itemsize * int(np.prod(self.shapes[name])))
+        for part in self._parts(name):
+            yield part.start, self.read(name, part.start, part.stop)
+
+    def _parts(self, name: str) -> Iterator[slice]:
+        """The rows of a field in pieces of bounded size."""
+        size = rows_per_chunk(self.fields[name].dtype.itemsize * math.prod(self.shapes[name]))
         for start in range(0, self.num_rows, size):
-            yield start, self.read(name, start, start + size)
+            yield slice(start, min(start + size, self.num_rows))
 
     def read(self, name: str, start: int, stop: int) -> Tensor:
         """Reads, checks and converts some rows; [n, *row]."""
-        values = self._slice(name, start, stop)
+        values = self._slice(name, slice(start, stop))
         dtype = self.torch_dtype("observations" if name == "next_observations" else name)
         check_finite(self.source, name, values, start, dtype)
         if name == "actions" and self.task is not None:
@@ -144,10 +155,6 @@ class TransitionReader:
         shape = (1,) if name == "rewards" else self.shapes[name]
         return plain_tensor(values).reshape(len(values), *shape).to(dtype)
 
-    def _slice(self, name: str, start: int, stop: int) -> NDArray:
-        try:
-            return np.asarray(self.fields[name][start:stop])
-        except OSError as error:  # a file that is damaged here
-            raise DatasetError(
-                self.source, f"rows from here on cannot be read ({error}).", name, start
-            ) from error
+    def _slice(self, name: str, rows: slice) -> NDArray:
+        with damage_named(self.source, "rows from here on cannot be read", name, rows.start):
+            return np.asarray(self.fields[name][rows])

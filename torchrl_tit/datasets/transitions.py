@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
 from torchrl_tit.datasets.tasks import TaskSpaces, check_task_name
 from torchrl_tit.datasets.transition_reader import FIELDS, TransitionReader
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Steps
 
 Gaps = Literal["error", "cut"]
 
@@ -56,19 +58,27 @@ def episodes_from_arrays(
     """
     given = (observations, actions, rewards, terminals, timeouts, next_observations)
     fields = {
-        name: np.asarray(array)
+        name: _as_array(name, array)
         for name, array in zip(FIELDS, given, strict=True)
         if array is not None
     }
     return episodes_from_transitions(fields, **settings)
 
 
+def _as_array(name: str, array: ArrayLike) -> NDArray:
+    try:
+        return np.asarray(array)
+    except ValueError as error:  # rows of several lengths
+        raise DatasetError("the data", f"is not one array ({error}).", name) from error
+
+
+@checked_arguments
 def episodes_from_transitions(
     fields: Mapping[str, Any],
     *,
     source: str = "the data",
     task: TaskSpaces | None = None,
-    max_episode_steps: int | None = None,
+    max_episode_steps: Steps | None = None,
     gaps: Gaps = "error",
     dtype: torch.dtype | None = torch.float32,
     directory: str | os.PathLike[str] | None = None,
@@ -100,7 +110,8 @@ def episodes_from_transitions(
         The episodes. The last one may be unfinished.
 
     Raises:
-        ValueError: If ``max_episode_steps`` is less than 1, or ``gaps`` is not one of the above.
+        ValueError: If ``max_episode_steps`` is less than 1, ``gaps`` is not one of the above, or
+            ``dtype`` is not that of floats.
         DatasetError: If a field is missing or empty, has the wrong length, shape or dtype, or
             contains NaN, infinity, or actions out of bounds; if no episode ends; or if
             ``next_observations`` is not the observation of the next row within an episode.
@@ -112,10 +123,8 @@ def episodes_from_transitions(
         ...
         torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'actions': is missing; there...
     """
-    if max_episode_steps is not None and max_episode_steps < 1:
-        raise ValueError(f"max_episode_steps must be at least 1, but is {max_episode_steps}.")
-    if gaps not in get_args(Gaps):
-        raise ValueError(f"gaps must be 'error' or 'cut', but is {gaps!r}.")
+    if not isinstance(task, TaskSpaces | None):
+        raise ValueError(f"task must be what task_spaces returns, not {task!r}")
     if task is not None:
         check_task_name(source, (attributes or {}).get("env_id"), task)
     reader = TransitionReader(fields, source, task, dtype)
