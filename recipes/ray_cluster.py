@@ -1,4 +1,8 @@
-"""Connections to a Ray cluster, whose machines share a file system."""
+"""Connections to a Ray cluster, whose machines share a file system.
+
+Whoever reaches a cluster can run anything on its machines, so Ray's authentication by token is on
+unless the user says otherwise.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,14 @@ import logging
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from torchrl_tit.settings.imports import allowed_modules
 
+_MODE, _LOOPBACK = "RAY_AUTH_MODE", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+os.environ.setdefault(_MODE, "token")  # here, since Ray reads it when TorchRL imports it
 _PATIENCE = 30.0  # seconds that a cluster has to answer; it needs two or three
 _ASK = """
 import json, sys, ray
@@ -30,7 +36,8 @@ def ask_for_machines(address: str) -> list[dict[str, float]]:
     Raises:
         ValueError: if Ray is missing, or no cluster answers there.
     """
-    _import_ray()
+    if find_spec("ray") is None:
+        raise ValueError("Ray is not installed: pip install 'torchrl-tit[ray]'")
     # Ray itself waits for ten minutes or more if no cluster answers.
     try:
         answer = subprocess.run(
@@ -44,9 +51,16 @@ def ask_for_machines(address: str) -> list[dict[str, float]]:
     except subprocess.TimeoutExpired as error:
         raise ValueError(
             f"no Ray cluster answered at {address!r} in {_PATIENCE:.0f} seconds: is it the address "
-            "that `ray start --head` printed, or ray://HOST:10001 from outside the cluster?"
+            "that `ray start --head` printed, or ray://HOST:10001 from outside the cluster? If it "
+            f"listens on 127.0.0.1 only, {_LOOPBACK}=0 must be set here, too"
         ) from error
     except subprocess.CalledProcessError as error:
+        if "uthentication" in error.stderr:
+            raise ValueError(
+                f"the Ray cluster at {address!r} and this process have no authentication token in "
+                "common: `ray get-auth-token --generate` on one machine, copy ~/.ray/auth_token to "
+                f"the others, and start Ray with {_MODE}=token; {_MODE}=disabled goes without"
+            ) from error
         reason = error.stderr.strip().splitlines()[-1:]
         raise ValueError(f"no connection to Ray at {address!r}: {' '.join(reason)}") from error
     return json.loads(answer.stdout.splitlines()[-1])
@@ -61,19 +75,13 @@ def connect(address: str) -> None:
     Raises:
         ValueError: if Ray is missing, or no cluster answers there.
     """
-    ray = _import_ray()
-    if ray.is_initialized():
+    loaded = sys.modules.get("ray")
+    if loaded is not None and loaded.is_initialized():
         return
     ask_for_machines(address)
+    import ray
+
     ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
-
-
-def _import_ray() -> ModuleType:
-    try:
-        import ray
-    except ImportError as error:
-        raise ValueError("Ray is not installed: pip install 'torchrl-tit[ray]'") from error
-    return ray
 
 
 def import_variables() -> dict[str, str]:

@@ -16,6 +16,7 @@ def cluster() -> Iterator[str]:
     folder = tempfile.mkdtemp(prefix="ray-")  # pytest's is too long a name for sockets
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_TMPDIR", folder)
+        patch.setenv("RAY_AUTH_TOKEN", "f" * 64)
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_worker_niceness", "0")  # not 15: other tests run beside these
         machines = Cluster(

@@ -202,6 +202,10 @@ def test_settings_that_do_not_fit(recipe, fields, words):
         replace(recipe, **fields)
 
 
+def test_a_token_is_asked_for_unless_the_user_says_otherwise():
+    assert os.environ["RAY_AUTH_MODE"] == "token"  # set by the import, before Ray's
+
+
 def test_a_name_that_others_cannot_reach_is_refused(monkeypatch):
     monkeypatch.setattr("socket.gethostbyname", lambda name: "127.0.1.1")
     _check_own_name({"10.0.0.1"})  # a single machine

@@ -99,6 +99,16 @@ def test_a_sweep_goes_on_after_its_driver_was_killed_and_stops_at_ctrl_c(
 
 
 @pytest.mark.slow
+def test_a_cluster_takes_no_one_without_its_token(
+    cluster: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert len(ask_for_machines(cluster)) == 2
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "0" * 64)
+    with pytest.raises(ValueError, match="have no authentication token in common: `ray get-auth"):
+        ask_for_machines(cluster)
+
+
+@pytest.mark.slow
 def test_runs_that_fail_or_whose_worker_dies_are_named(cluster: str, tmp_path: Path) -> None:
     killed = begin(tmp_path / "seed-0", LONG)
     damaged = begin(tmp_path / "seed-1", TINY)
