@@ -30,13 +30,14 @@ class Page:
 
     Args:
         step: a step of the episode, which says what there is to draw.
-        title: title of the page.
+        title: title of the page; without one, nothing is written above it.
+        dpi: dots per inch; the page is 9.6 x 5.4 inches.
     """
 
-    def __init__(self, step: ExplainedStep, title: str) -> None:
-        self._figure = Figure(figsize=_SIZE, dpi=_DPI, layout="constrained")
+    def __init__(self, step: ExplainedStep, title: str, dpi: int = _DPI) -> None:
+        self._figure = Figure(figsize=_SIZE, dpi=dpi, layout="constrained")
         self._canvas = FigureCanvasAgg(self._figure)
-        self._title = self._figure.suptitle(title, fontsize=9)
+        self._title = self._figure.suptitle(title, fontsize=9) if title else None
         self._text = title
         over_time = step.attention is not None and step.attention.shape[-1] > 1
         lower = ["timeline"] * over_time + ["value"] * (step.value is not None)
@@ -81,9 +82,10 @@ class Page:
             number: number of the step, counted from 0.
 
         Returns:
-            uint8 [432, 768, 3].
+            uint8 [432, 768, 3] at 80 dots per inch.
         """
-        self._title.set_text(f"{self._text}, step {number}")
+        if self._title is not None:
+            self._title.set_text(f"{self._text}, step {number}")
         self._picture.show(pictures[-1])
         strip: list[np.ndarray] = []
         for name, seen in step.seen.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -10,7 +11,6 @@ from typing import Any
 
 import imageio.v2 as imageio
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from torchrl_tit.evaluation import evaluate
@@ -56,11 +56,12 @@ def check_film(video: Path) -> None:
 
 def film_policy(
     make_env: Callable[..., EnvBase],
-    policy: TensorDictModuleBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
     name: str | Path,
     video: Path,
     episodes: int = 1,
     seed: int = 0,
+    max_pictures: int | None = None,
 ) -> list[float]:
     """Films a policy while it plays with its most likely actions.
 
@@ -71,6 +72,8 @@ def film_policy(
         video: As that of :func:`film`.
         episodes: Number of episodes, one after the other in one film.
         seed: Seed of the first episode; episode i begins from ``seed + i``.
+        max_pictures: Length of the film, after which the policy plays on unseen; by default all is
+            shown.
 
     Returns:
         The return of each episode.
@@ -90,9 +93,13 @@ def film_policy(
         ):
             reel = Path(folder, video.name)
             with open_film(reel, base.render_fps) as pictures:
+                left = math.inf if max_pictures is None else max_pictures
 
                 def filmed(tensordict: TensorDictBase) -> TensorDictBase:
-                    pictures.append_data(take_picture(base, name))
+                    nonlocal left
+                    if left > 0:
+                        pictures.append_data(take_picture(base, name))
+                        left -= 1
                     return policy(tensordict)
 
                 returns = evaluate(env, filmed, episodes, seed=seed)

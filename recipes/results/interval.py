@@ -45,5 +45,29 @@ def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
     return Interval(float(_iqm(x)), low, high)
 
 
+def intervals_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Summarises curves: as :func:`interval_of`, at every point.
+
+    Args:
+        values: float [runs, points].
+
+    Returns:
+        Interquartile means and both ends of their 95% intervals, float [points] each. Of a single
+        run, the ends are NaN.
+
+    Example:
+        >>> intervals_of(np.array([[1.0, 5.0], [3.0, 5.0]]))[0].tolist()
+        [2.0, 5.0]
+    """
+    means = _iqm(values, axis=0)
+    if len(values) == 1:
+        unknown = np.full(len(means), np.nan)
+        return means, unknown, unknown
+    found = bootstrap(
+        (values,), _iqm, axis=0, n_resamples=2_000, batch=200, method="percentile", rng=0
+    )
+    return means, *found.confidence_interval
+
+
 def _iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
     return trim_mean(x, 0.25, axis=axis)

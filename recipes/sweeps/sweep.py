@@ -39,6 +39,8 @@ class Job:
     folder: Path
     source: str = ""
     """The file that holds the recipe, as the command line takes it; empty for a named recipe."""
+    wandb: str = ""
+    """The project of Weights & Biases that metrics are sent to, if any."""
 
     @property
     def log(self) -> Path:
@@ -50,8 +52,9 @@ class Job:
 
         It imports the modules that the user named for this process.
         """
+        options = [*(["--wandb", self.wandb] if self.wandb else []), *import_options()]
         if self._exists():
-            return ["train", "--resume", str(self.folder), *import_options()]
+            return ["train", "--resume", str(self.folder), *options]
         return [
             "train",
             self.source or self.recipe.name,
@@ -59,7 +62,7 @@ class Job:
             str(self.recipe.seed),
             "--out",
             str(self.folder),
-            *import_options(),
+            *options,
         ]
 
     def is_complete(self) -> bool:

@@ -7,6 +7,8 @@ import math
 import signal
 import subprocess
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState
 from tqdm import tqdm
 
-from torchrl_tit.files import write_text_atomic
+from torchrl_tit.files import remove_leftovers, write_text_atomic
 
 from ..algorithm import make_algorithm
 from ..interrupt import raise_on_signals
@@ -27,6 +29,7 @@ from ..recipe import Recipe
 from ..recipe_json import recipe_to_json
 from .search_space import SearchSpace, with_values
 from .sweep import Job, start
+from .trials import write_trials
 
 _WINDOW = 5  # batches over which a trial's return is averaged when trials are compared
 
@@ -57,6 +60,8 @@ class Search:
         study.log       Optuna's journal of all trials
         trial-N.json    the recipe of a trial, and trial-N/ its run folders
         best.json       the recipe of the best trial, which ``train`` takes
+        trials.csv      every trial: its state, value and fields
+        importance.csv  how much each field mattered, from four complete trials on
 
     Trials are drawn by Optuna's tree-structured Parzen estimator and stopped early by its median
     pruner, on returns of training episodes. A trial's value is the mean of its evaluations. Its
@@ -77,19 +82,20 @@ class Search:
         _write_or_compare(folder / "space.json", msgspec.json.encode(settings.space).decode())
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         seed = settings.recipe.seed
-        self.study = optuna.create_study(
-            study_name=settings.recipe.name or settings.recipe.algorithm,
-            storage=JournalStorage(JournalFileBackend(str(folder / "study.log"))),
-            direction="maximize",
-            load_if_exists=True,
-            sampler=optuna.samplers.TPESampler(
-                n_startup_trials=settings.startup_trials, seed=seed, constant_liar=True
-            ),
-            pruner=optuna.pruners.MedianPruner(
-                n_startup_trials=settings.startup_trials,
-                n_warmup_steps=int(settings.warmup * settings.recipe.final_step),
-            ),
-        )
+        with _journal(folder / "study.log") as storage:
+            self.study = optuna.create_study(
+                study_name=settings.recipe.name or settings.recipe.algorithm,
+                storage=storage,
+                direction="maximize",
+                load_if_exists=True,
+                sampler=optuna.samplers.TPESampler(
+                    n_startup_trials=settings.startup_trials, seed=seed, constant_liar=True
+                ),
+                pruner=optuna.pruners.MedianPruner(
+                    n_startup_trials=settings.startup_trials,
+                    n_warmup_steps=int(settings.warmup * settings.recipe.final_step),
+                ),
+            )
 
     def run(self, trials: int, workers: int) -> list[int]:
         """Runs trials, some at a time, until the given number has ended.
@@ -107,7 +113,11 @@ class Search:
         """
         try:
             with filelock.FileLock(self.folder / ".lock", timeout=0):
-                return self._run(trials, workers)
+                remove_leftovers(self.folder)
+                try:
+                    return self._run(trials, workers)
+                finally:
+                    self._write_trials()
         except filelock.Timeout as error:
             raise RuntimeError(
                 f"{self.folder} is in use by another process: wait for it, or stop it"
@@ -122,6 +132,7 @@ class Search:
             if trial.state == TrialState.RUNNING
         ]
         failed = [t.number for t in ended if t.state == TrialState.FAIL]
+        shown = ""
         done = len(ended)  # not progress.n: a disabled progress bar does not count
         progress = tqdm(total=trials, initial=done, unit=" trials")
         with raise_on_signals(), progress:
@@ -137,16 +148,22 @@ class Search:
                             running.remove(trial)
                             done += 1
                             progress.update()
+                            self._write_trials()
                             if state == TrialState.FAIL:
                                 failed.append(trial.number)
                     best = self.best()
-                    if best is not None:
-                        progress.set_postfix_str(f"best {best.value:.1f}, trial {best.number}")
+                    text = f"best {best.value:.1f}, trial {best.number}" if best else ""
+                    if text != shown:
+                        progress.set_postfix_str(text)
+                        shown = text
             except KeyboardInterrupt:
                 for trial in running:
                     trial.stop()
                 raise
         return failed
+
+    def _write_trials(self) -> None:
+        write_trials(self.study, list(self.settings.space), self.folder)
 
     def best(self) -> FrozenTrial | None:
         """The best trial so far, whose recipe is in ``best.json``; None before the first."""
@@ -239,6 +256,18 @@ class _Trial:
         return state
 
 
+@contextmanager
+def _journal(path: Path) -> Iterator[JournalStorage]:
+    """Optuna's storage; raises ValueError if it cannot read what is in the file."""
+    try:
+        yield JournalStorage(JournalFileBackend(str(path)))
+    except (AssertionError, KeyError, TypeError, ValueError) as error:  # what a line makes it raise
+        raise ValueError(
+            f"{path} is no whole journal of Optuna's ({type(error).__name__}: {error}): name "
+            "another folder with --out, or take the damaged line out"
+        ) from error
+
+
 def _to_json(settings: Settings) -> str:
     fields = {
         "recipe": json.loads(recipe_to_json(settings.recipe)),
@@ -253,7 +282,14 @@ def _write_or_compare(path: Path, text: str) -> None:
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text_atomic(path, text)
-    elif json.loads(path.read_text(encoding="utf-8")) != json.loads(text):
+        return
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(
+            f"{path} cannot be read ({error}): name another folder with --out"
+        ) from error
+    if before != json.loads(text):
         raise ValueError(
             f"{path.parent} holds a search with other settings: name another folder with --out, "
             "or move it away"

@@ -8,6 +8,7 @@ from recipes.ppo import PPO
 from recipes.recipe import Recipe
 from recipes.run import Run
 from recipes.sweeps.sweep import Job
+from tests.recipes.commands import Command
 from torchrl_tit.settings.networks import mlp
 
 TINY = PPO(
@@ -27,3 +28,9 @@ def begin(folder: Path, recipe: Recipe) -> Job:
     """Begins a run as a worker would, so that workers resume it with these small settings."""
     Run.create(folder, recipe)
     return Job(recipe, folder)
+
+
+def fork_worker(job: Job) -> Command:
+    """Starts a run in its own process, without the seconds that importing PyTorch takes."""
+    job.log.parent.mkdir(parents=True, exist_ok=True)
+    return Command(job.arguments(), job.log)

@@ -1,11 +1,13 @@
 """Sweeps: complete runs stay, killed ones go on, other settings are refused."""
 
+import os
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,7 +19,21 @@ from recipes.results.plot import plot_run
 from recipes.run import Run
 from recipes.sweeps import sweep
 from tests.recipes.commands import Command
-from tests.recipes.sweeps.sweep_runs import TINY, begin
+from tests.recipes.sweeps.sweep_runs import TINY, begin, fork_worker
+
+
+def long_run(folder):
+    """A recipe in a file, and its run in a sweep, which is only over when it is stopped."""
+    path = folder / "recipe.json"
+    long = replace(TINY, total_steps=10**6, checkpoint_interval=10**6, compile="off")
+    path.write_text(recipe_to_json(long))
+    [job] = sweep.make_jobs([str(path)], [0], folder / "sweep")
+    return path, job
+
+
+def is_training(job):
+    metrics = job.folder / "metrics.csv"
+    return metrics.exists() and len(metrics.read_text().splitlines()) > 1
 
 
 def test_patterns_and_seeds_make_the_runs(tmp_path):
@@ -61,7 +77,7 @@ def test_a_run_whose_frame_encoders_were_chosen_by_kind_is_the_sweeps(tmp_path, 
     recipe = replace(TINY, name="ppo/grid/mlp", env="MiniGrid-Empty-5x5-v0")
     file.write_text(recipe_to_json(recipe))
     [job] = sweep.make_jobs([str(file)], [0], tmp_path)
-    monkeypatch.setattr(training, "_finish", lambda run: None)
+    monkeypatch.setattr(training, "_finish", lambda *_: None)
     main(job.arguments())
     assert Run.open(job.folder).recipe.backbone.frames
     assert sweep.make_jobs([str(file)], [0], tmp_path) == [job]
@@ -81,7 +97,7 @@ def test_sweep_resumes_runs_and_leaves_complete_ones(tmp_path, capsys):
         plot_run(run)
     before = (jobs[0].folder / "evaluation.json").stat().st_mtime_ns
     assert [job.is_complete() for job in jobs] == [True, False, False]
-    assert sweep.run_jobs(jobs, workers=2) == []
+    assert sweep.run_jobs(jobs, workers=2, start=fork_worker) == []
     assert all(job.is_complete() for job in jobs)
     assert (jobs[0].folder / "evaluation.json").stat().st_mtime_ns == before
     assert not jobs[0].log.exists()
@@ -160,20 +176,31 @@ def test_unknown_names_are_refused(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ctrl_c_stops_every_worker(tmp_path, number):
-    out, path = tmp_path / "sweep", tmp_path / "recipe.json"
-    long = replace(TINY, total_steps=10**6, checkpoint_interval=10**6, compile="off")
-    path.write_text(recipe_to_json(long))
-    job = sweep.make_jobs([str(path)], [0], out)[0]
-    process = Command(["sweep", path, "--out", out], tmp_path / "errors")
-    metrics = job.folder / "metrics.csv"
-    while not (metrics.exists() and len(metrics.read_text().splitlines()) > 1):
+def test_ctrl_c_stops_every_worker(tmp_path):
+    path, job = long_run(tmp_path)
+    process = Command(["sweep", path, "--out", tmp_path / "sweep"], tmp_path / "errors")
+    while not is_training(job):
         assert process.poll() is None
         time.sleep(0.05)
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     assert process.wait() == 130
     assert "the same command resumes it" in process.errors.read_text()
+    assert list((job.folder / "checkpoints").iterdir())
+    with Run.open(job.folder):  # nobody is at work there any more
+        pass
+
+
+def test_sigterm_stops_every_worker(tmp_path, monkeypatch):
+    _, job = long_run(tmp_path)
+
+    def nap(seconds):
+        time.sleep(0.05)
+        if is_training(job):
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(sweep, "time", SimpleNamespace(sleep=nap))
+    with pytest.raises(KeyboardInterrupt):
+        sweep.run_jobs([job], workers=1, start=fork_worker)
     assert list((job.folder / "checkpoints").iterdir())
     with Run.open(job.folder):  # nobody is at work there any more
         pass

@@ -18,6 +18,7 @@ from recipes.run import Run
 from recipes.sweeps.search_space import load_space, with_values
 from recipes.sweeps.tune import Search, Settings
 from tests.recipes.commands import Command
+from tests.recipes.sweeps.sweep_runs import fork_worker
 from torchrl_tit.settings.networks import mlp
 
 optuna = pytest.importorskip("optuna")
@@ -53,7 +54,7 @@ def words(files, trials):
 
 
 @pytest.mark.slow
-def test_a_search_that_was_killed_goes_on(files, capsys):
+def test_a_search_that_was_killed_goes_on(files, capsys, monkeypatch):
     out = files / "out"
     process = Command(words(files, 2), files / "errors")
     deadline = time.monotonic() + 120
@@ -68,6 +69,7 @@ def test_a_search_that_was_killed_goes_on(files, capsys):
         time.sleep(0.1)
     drawn = (out / "trial-0.json").read_text()
 
+    monkeypatch.setattr("recipes.sweeps.tune.start", fork_worker)
     main(words(files, 2))
     assert (out / "trial-0.json").read_text() == drawn
     assert sorted(path.name for path in out.glob("trial-*/")) == ["trial-0", "trial-1"]
@@ -134,6 +136,12 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, monkeypatch):
     last = search.study.trials[-1]
     assert last.state == optuna.trial.TrialState.PRUNED
     assert last.intermediate_values == {128: (10 + 12) / 2}
+    rows = (tmp_path / "trials.csv").read_text().splitlines()
+    assert [row.split(",")[:3] for row in rows[1:]] == [
+        ["0", "complete", "100.0"],
+        ["1", "complete", "100.0"],
+        ["2", "pruned", "11.0"],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -231,6 +239,17 @@ def test_without_a_progress_view(tmp_path, monkeypatch):
     monkeypatch.setattr("recipes.sweeps.tune.start", lambda job: FailingWorker())
     monkeypatch.setattr(time, "sleep", lambda _: next(naps))
     assert Search(tmp_path / "out", Settings(RECIPE, space)).run(2, workers=1) == [0, 1]
+
+
+@pytest.mark.parametrize("line", ['{"op_code": 99, "worker_id": "w"}', "{}", "[]", "trial 7"])
+def test_a_journal_that_optuna_did_not_write_is_named(tmp_path, line):
+    settings = Settings(RECIPE, load_space(None, RECIPE))
+    Search(tmp_path, settings)
+    with (tmp_path / "study.log").open("a") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(ValueError, match=r"study\.log is no whole journal of Optuna's") as error:
+        Search(tmp_path, settings)
+    assert "\n" not in str(error.value)
 
 
 def test_one_process_at_a_time(tmp_path):

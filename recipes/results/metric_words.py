@@ -1,0 +1,109 @@
+"""What each metric says, in words: the one source of the reports and of docs/recipes.md."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+
+from ..recipe import Recipe
+
+_TARGET = re.compile(r"return_-?[\d.]+(e[+-]?\d+)?")
+_TIMES = " * "
+
+
+@dataclass(frozen=True)
+class MetricWords:
+    """What a column of ``metrics.csv`` is, and how to read it. Code stands between backticks."""
+
+    column: str
+    what: str
+    healthy: str = ""
+    otherwise: str = ""
+    low: str = ""
+    """What it should not fall below: a number, as a formula of :func:`limit`."""
+    high: str = ""
+    """What it should not rise above."""
+    needs: str = ""
+    """A column without whose change it means nothing."""
+
+
+def words_of(algorithm: str, column: str) -> MetricWords:
+    """Looks up what a column of an algorithm's metrics says.
+
+    Args:
+        algorithm: the name of the algorithm.
+        column: the column; one that is not known is described by nothing but its name.
+
+    Example:
+        >>> words_of("ppo", "clip_fraction").what
+        'share of the samples whose probability ratio was clipped'
+        >>> words_of("dt", "return_3600").what
+        'mean return of the evaluation that aims for 3600'
+    """
+    found = _read()
+    known = found.get((algorithm, column)) or found.get(("", column))
+    if known is None and _TARGET.fullmatch(column):
+        target = column.removeprefix("return_")
+        return MetricWords(column, f"mean return of the evaluation that aims for {target}")
+    return known or MetricWords(column, "")
+
+
+def known_columns(algorithm: str) -> list[str]:
+    """Lists the columns of an algorithm that are described, those that say most first."""
+    return [column for of, column in _read() if of in ("", algorithm)]
+
+
+def to_markdown(algorithm: str) -> str:
+    """Writes the table of an algorithm's metrics for the documents."""
+    lines = ["| column | what it is | healthy | otherwise |", "|---|---|---|---|"]
+    for column in known_columns(algorithm):
+        words = words_of(algorithm, column)
+        lines.append(f"| `{column}` | {words.what} | {words.healthy} | {words.otherwise} |")
+    return "\n".join(lines) + "\n"
+
+
+def limit(formula: str, recipe: Recipe, values: Mapping[str, float]) -> float | None:
+    """Reads a limit: a number, or a number times a field of the recipe or another metric.
+
+    Args:
+        formula: such as "0.02", "10 * max_grad_norm" or "10 * policy_gradient".
+        recipe: the settings of the run.
+        values: other metrics of the same row, by column.
+
+    Returns:
+        The limit; None if there is none here.
+
+    Example:
+        >>> from recipes.registry import get_recipe
+        >>> limit("10 * max_grad_norm", get_recipe("ppo/cartpole/mlp"), {})
+        5.0
+    """
+    if not formula:
+        return None
+    factor, _, name = formula.partition(_TIMES)
+    if not name:
+        return float(factor)
+    value = values.get(name, getattr(recipe, name, None))
+    return None if value is None else float(factor) * float(value)
+
+
+@cache
+def _read() -> dict[tuple[str, str], MetricWords]:
+    """All words, by algorithm (empty for all of them) and column."""
+    text = resources.files(__package__).joinpath("metrics.csv").read_text(encoding="utf-8")
+    return {
+        (algorithm, words.column): words
+        for algorithms, words in _rows(csv.DictReader(io.StringIO(text)))
+        for algorithm in algorithms
+    }
+
+
+def _rows(rows: Iterable[dict[str, str]]) -> Iterable[tuple[list[str], MetricWords]]:
+    for row in rows:
+        algorithms = row.pop("algorithms").split() or [""]
+        yield algorithms, MetricWords(**row)

@@ -1,0 +1,197 @@
+"""What a report reads from run folders."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...metrics import read_metrics
+from ...recipe import Recipe
+from ...run import Run
+from ..experiments import Experiment, group_runs
+
+_LONGEST = 40  # letters of a name in a legend
+
+
+@dataclass(frozen=True)
+class RunData:
+    """A run: its metrics, its evaluation and the versions that it began with."""
+
+    run: Run
+    metrics: dict[str, np.ndarray]
+    """The columns of ``metrics.csv``, float [rows]."""
+    evaluation: dict[str, Any] | None
+    """None if it is not evaluated yet."""
+    versions: dict[str, Any]
+
+    @property
+    def label(self) -> str:
+        """Its seed."""
+        return f"seed {self.run.recipe.seed}"
+
+    @property
+    def steps(self) -> int:
+        """The steps in its metrics."""
+        return int(self.metrics["step"][-1])
+
+    @property
+    def seconds(self) -> float:
+        """How long it took to train, without interruptions: the steps over their speeds."""
+        steps, speed = self.metrics["step"], self.metrics["steps_per_second"]
+        done = np.diff(steps, prepend=0)
+        return float((done[speed > 0] / speed[speed > 0]).sum())
+
+
+@dataclass(frozen=True)
+class Group:
+    """The runs of an experiment, and what it is called in the report."""
+
+    experiment: Experiment
+    label: str
+    """Its name without what the names of all experiments begin with."""
+    runs: tuple[RunData, ...]
+
+    @property
+    def recipe(self) -> Recipe:
+        """The settings of its runs, but for seed and machine."""
+        return self.experiment.settings
+
+    @property
+    def columns(self) -> list[str]:
+        """The metrics of its runs that are known at some step, without step and time."""
+        return [
+            name
+            for name in self.runs[0].metrics
+            if name not in ("step", "time")
+            and any(np.isfinite(run.metrics[name]).any() for run in self.runs)
+        ]
+
+
+def read_groups(folders: Iterable[Path]) -> list[Group]:
+    """Reads runs and puts those of the same settings together.
+
+    Args:
+        folders: run folders, or folders with run folders somewhere below.
+
+    Raises:
+        ValueError: if a folder holds no run, a run is damaged or has no metrics, two runs are the
+            same, or they are of different tasks or of different kinds of steps.
+    """
+    experiments = group_runs(_find_runs(folders))
+    _check_together([experiment.settings for experiment in experiments], experiments)
+    labels = _labels(experiments)
+    return [
+        Group(experiment, label, tuple(_read(run) for run in _by_seed(experiment.runs)))
+        for experiment, label in zip(experiments, labels, strict=True)
+    ]
+
+
+def _find_runs(folders: Iterable[Path]) -> list[Run]:
+    found: dict[Path, Run] = {}
+    for folder in folders:
+        paths = sorted(folder.rglob("recipe.json"))
+        if not paths:
+            raise ValueError(f"{folder} holds no run: there is no recipe.json in it or below")
+        found |= {path.parent.resolve(): Run.open(path.parent) for path in paths}
+    return list(found.values())
+
+
+def _by_seed(runs: Iterable[Run]) -> list[Run]:
+    return sorted(runs, key=lambda run: run.recipe.seed)
+
+
+def _read(run: Run) -> RunData:
+    rows = read_metrics(run.folder / "metrics.csv")
+    if not rows:
+        raise ValueError(
+            f"{run.folder} has no metrics yet: train it first, or leave it out of the report"
+        )
+    metrics = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    missing = [name for name in ("step", "return_mean") if name not in metrics]
+    if missing:
+        raise ValueError(f"{run.folder / 'metrics.csv'} is damaged: it has no column {missing[0]}")
+    if "steps_per_second" not in metrics:  # a run of an earlier version
+        metrics["steps_per_second"] = np.diff(metrics["step"], prepend=np.nan) / np.diff(
+            metrics.get("time", metrics["step"]), prepend=np.nan
+        )
+    return RunData(run, metrics, _evaluation(run.folder / "evaluation.json"), _versions(run.folder))
+
+
+def _evaluation(path: Path) -> dict[str, Any] | None:
+    if not path.exists():
+        return None
+    try:
+        found = json.loads(path.read_bytes())
+        returns = [float(value) for value in found["returns"]]
+        numbers = [float(found[name]) for name in ("mean", "std", "steps")]
+        if not returns or not np.isfinite([*returns, *numbers]).all():
+            raise ValueError("its numbers are not finite")
+    except (ValueError, LookupError, TypeError) as error:
+        raise ValueError(
+            f"{path} is damaged: `evaluate {path.parent}` writes it again ({error})"
+        ) from error
+    return {"episodes": len(returns), **found, "returns": returns}
+
+
+def _versions(folder: Path) -> dict[str, Any]:
+    try:
+        found = json.loads((folder / "versions.json").read_bytes())
+    except (OSError, ValueError):  # lost or damaged: the report says that they are unknown
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _check_together(recipes: Sequence[Recipe], experiments: Sequence[Experiment]) -> None:
+    """Raises ValueError if returns or steps of some experiments do not share an axis."""
+    first = experiments[0]
+    for recipe, other in zip(recipes, experiments, strict=True):
+        names = f"{first.runs[0].folder} and {other.runs[0].folder} do not go together"
+        if recipe.env != first.settings.env:
+            raise ValueError(
+                f"{names}: their tasks are {first.settings.env} and {recipe.env}; write a report "
+                "for each"
+            )
+        if recipe.offline != first.settings.offline:
+            raise ValueError(
+                f"{names}: environment steps and gradient steps do not share an axis; write a "
+                "report for each"
+            )
+
+
+def _labels(experiments: Sequence[Experiment]) -> list[str]:
+    """Short names: what differs in the recipes' names, or else in the names of the folders."""
+    if len(experiments) == 1:
+        return [_last_part(experiments[0].name)]
+    names = _without_common_part([experiment.label.split("/") for experiment in experiments])
+    if max(map(len, names)) > _LONGEST:
+        folders = [_folder(experiment) for experiment in experiments]
+        names = _without_common_part([list(folder.parts) for folder in folders])
+    if len({*names, ""}) <= len(names):  # one is empty, or two are the same
+        return [f"{number + 1}: {experiment.name}" for number, experiment in enumerate(experiments)]
+    return names
+
+
+def _folder(experiment: Experiment) -> Path:
+    """The folder of all runs of an experiment; their names are seeds."""
+    folders = [run.folder.resolve() for run in experiment.runs]
+    if len(folders) == 1:
+        return folders[0].parent if re.fullmatch(r"seed-\d+", folders[0].name) else folders[0]
+    return Path(os.path.commonpath(folders))
+
+
+def _without_common_part(names: Sequence[list[str]]) -> list[str]:
+    shared = 0
+    while all(len(name) > shared + 1 and name[shared] == names[0][shared] for name in names):
+        shared += 1
+    return ["/".join(name[shared:]) for name in names]
+
+
+def _last_part(name: str) -> str:
+    return name.rpartition("/")[2]

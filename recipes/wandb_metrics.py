@@ -1,0 +1,128 @@
+"""Metrics of a run on Weights & Biases, beside CSV and TensorBoard."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import secrets
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from torchrl.record.loggers.wandb import WandbLogger
+
+from torchrl_tit.files import write_text_atomic
+
+from .callback import Callback
+from .metrics import read_metrics
+from .outcomes import Outcome
+from .recipe_json import recipe_to_json
+from .run import Run
+
+_FILE = "wandb.json"
+_NOT_DRAWN = ("step", "time")
+
+
+class WandbMetrics(Callback):
+    """Sends each row of ``metrics.csv`` to Weights & Biases, with TorchRL's logger.
+
+    A resumed run goes on in the run of W&B whose name is in ``wandb.json``. Rows that it has had
+    already are the same again, and are not sent twice. A run that is resumed with W&B for the first
+    time sends its earlier rows too. Everything else is as W&B's own variables say:
+    ``WANDB_MODE=offline`` keeps all in the run folder's ``wandb/``, which ``wandb sync`` uploads.
+
+    Args:
+        run: the open run folder.
+        project: the project on W&B.
+
+    Raises:
+        ValueError: if wandb is not installed, or the run is in another project.
+        RuntimeError: if W&B cannot start: nobody is logged in, say.
+    """
+
+    def __init__(self, run: Run, project: str) -> None:
+        check_wandb(project)
+        import wandb  # an extra
+
+        name, known = _name_of(run, project)
+        earlier = read_metrics(run.folder / "metrics.csv")
+        settings = json.loads(recipe_to_json(run.recipe))
+        try:
+            self._logger = WandbLogger(
+                exp_name=f"{run.recipe.name or run.folder.name}, seed {run.recipe.seed}",
+                project=project,
+                id=name,
+                save_dir=run.folder,
+                log_env_packages=False,  # versions.json has what results depend on
+                config=settings,
+                group=run.recipe.name or None,
+            )
+        except wandb.Error as error:
+            raise RuntimeError(
+                f"Weights & Biases cannot start: {' '.join(str(error).split())}; log in with "
+                "`wandb login`, or set WANDB_MODE=offline to keep everything in the run folder"
+            ) from error
+        self._sent = -1.0
+        if known and earlier:
+            self._sent = earlier[-1]["step"]
+        else:
+            for row in earlier:
+                self.logged(int(row["step"]), row)
+
+    def logged(self, step: int, row: Mapping[str, float]) -> None:
+        """Sends a row, if it is new."""
+        if step <= self._sent:
+            return
+        known = {
+            name: value
+            for name, value in row.items()
+            if name not in _NOT_DRAWN and not math.isnan(value)
+        }
+        if known:
+            self._logger.log_metrics(known, step=step)
+        self._sent = step
+
+    def evaluated(self, step: int, outcomes: Sequence[Outcome]) -> None:
+        """Writes the mean return of the newest evaluation into the summary."""
+        best = max(outcome.mean for outcome in outcomes)
+        self._logger.experiment.summary.update({"evaluation": best, "evaluation_step": step})
+
+    def close(self) -> None:
+        """Ends the run on W&B once all is sent."""
+        self._logger.experiment.finish()
+
+
+def check_wandb(project: str) -> None:
+    """Raises ValueError if metrics cannot be sent to a project, before anything is begun."""
+    if importlib.util.find_spec("wandb") is None:
+        raise ValueError("--wandb needs wandb: pip install 'torchrl-tit[wandb]'")
+    if not project or any(letter in project for letter in "/\\#?%:"):
+        raise ValueError(
+            f"--wandb needs the name of a project, without / \\ # ? % and :, not {project!r}"
+        )
+
+
+def _name_of(run: Run, project: str) -> tuple[str, bool]:
+    """The name of the run on W&B, a new one if it has none, and whether it had one."""
+    path = run.folder / _FILE
+    if path.exists():
+        found = _read(path)
+        if found["project"] != project:
+            raise ValueError(
+                f"{run.folder} is in the project {found['project']!r} already: go on there, or "
+                f"delete {path} to begin a run in {project!r}"
+            )
+        return found["id"], True
+    name = secrets.token_hex(4)
+    write_text_atomic(path, json.dumps({"project": project, "id": name}) + "\n")
+    return name, False
+
+
+def _read(path: Path) -> dict[str, str]:
+    try:
+        found = json.loads(path.read_bytes())
+        return {"project": str(found["project"]), "id": str(found["id"])}
+    except (ValueError, LookupError, TypeError) as error:
+        raise ValueError(
+            f"{path} is damaged: delete it to begin a new run on Weights & Biases"
+        ) from error

@@ -1,0 +1,51 @@
+"""What metrics say in words: the same in the reports and in the documents."""
+
+from pathlib import Path
+
+import pytest
+
+from recipes import registry
+from recipes.algorithm import make_algorithm
+from recipes.recipe import Recipe
+from recipes.registry import get_recipe
+from recipes.results.metric_words import known_columns, limit, to_markdown, words_of
+from torchrl_tit.settings import resolve
+
+ROOT = Path(__file__).parents[3]
+assert registry.RECIPES  # every algorithm is registered
+ALGORITHMS = sorted(
+    name for name, kind in Recipe.registered.items() if kind.__module__.startswith("recipes.")
+)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_column_is_described(algorithm):
+    kind = Recipe.registered[algorithm]
+    columns = getattr(resolve(kind.builds), "columns", None)
+    if columns is None:  # PPO's depend on the recipe
+        columns = [*make_algorithm(get_recipe("ppo/cartpole/mlp")).columns, "loss_contrastive"]
+    for column in ("steps_per_second", "return_mean", *columns):
+        assert words_of(algorithm, column).what, f"{column} of {algorithm} in metrics.csv"
+        assert column in known_columns(algorithm)
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_documents_have_the_same_words(algorithm):
+    page = ROOT / "docs" / ("recipes.md" if algorithm == "ppo" else "metrics.md")
+    table = to_markdown(algorithm)
+    assert table in page.read_text(), f"{page.name} lacks this table:\n{table}"
+
+
+def test_limits():
+    recipe = get_recipe("ppo/cartpole/mlp")
+    high = words_of("ppo", "value_gradient").high
+    assert limit(high, recipe, {"policy_gradient": 0.2}) == pytest.approx(2)
+    assert limit(high, recipe, {}) is None
+    assert limit(words_of("ppo", "kl_approx").high, recipe, {}) == 0.02
+    assert limit(words_of("ppo", "entropy").high, recipe, {}) is None
+
+
+def test_columns_that_are_not_known():
+    assert words_of("ppo", "mine").what == ""
+    assert words_of("dt", "return_-20").what == "mean return of the evaluation that aims for -20"
+    assert words_of("dt", "return_scale").what == ""
