@@ -174,6 +174,37 @@ def torch_device(device: str) -> torch.device:
     return torch.device(device)
 
 
+def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
+    """Loads weights exactly: of the same names, shapes and dtypes, and finite.
+
+    Loading by itself converts dtypes, and takes what is not a number.
+
+    Args:
+        networks: the networks.
+        weights: their state, by name.
+
+    Raises:
+        ValueError: if a weight has another dtype, or is not finite where the networks' own is.
+        RuntimeError: if names or shapes differ.
+
+    Example:
+        >>> load_weights(nn.Linear(1, 1), {"weight": torch.tensor([[torch.nan]])})
+        Traceback (most recent call last):
+            ...
+        ValueError: weight has entries that are not finite
+    """
+    own = networks.state_dict()
+    for name, weight in weights.items():
+        expected = own.get(name)
+        if not (isinstance(weight, Tensor) and isinstance(expected, Tensor)):
+            continue
+        if weight.dtype != expected.dtype:
+            raise ValueError(f"{name} is {weight.dtype}, not {expected.dtype}")
+        if not weight.isfinite().all() and expected.isfinite().all():
+            raise ValueError(f"{name} has entries that are not finite")
+    networks.load_state_dict(dict(weights))
+
+
 def check_finite(names: Sequence[str], values: Tensor) -> None:
     """Checks that values are finite.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
@@ -23,6 +23,9 @@ class Callback:
         ...         print("step", step)
         ...         return step >= 1000  # ends training
     """
+
+    last_step: int | None = None
+    """The step at which it will end training at the latest; None if it does not know."""
 
     def collected(self, step: int, batch: Any) -> None:
         """Called with each batch, before the update.
@@ -51,6 +54,14 @@ class Callback:
         Args:
             step: number of steps that the policy was trained for.
             outcomes: the returns of the episodes, for each target return if there are any.
+        """
+
+    def logged(self, step: int, row: Mapping[str, float]) -> None:
+        """Called with each row of ``metrics.csv`` once it is written.
+
+        Args:
+            step: number of steps so far.
+            row: the numbers by column; NaN stands for one that does not exist at this step.
         """
 
     def saving(self, step: int) -> None:

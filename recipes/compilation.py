@@ -48,14 +48,26 @@ def should_compile(setting: Compile, gradient_steps: int) -> bool:
         >>> should_compile("auto", gradient_steps=100)
         False
     """
+    check_compiler(setting)
+    if setting == "auto":
+        return gradient_steps >= _PAYS_FROM and _has_compiler() and _works()
+    return setting == "on"
+
+
+def check_compiler(setting: Compile) -> None:
+    """Checks that what must be compiled can be, without compiling anything yet.
+
+    Raises:
+        ValueError: if the setting is "on" and there is no C++ compiler.
+
+    Example:
+        >>> check_compiler("auto")
+    """
     if setting == "on" and not _has_compiler():
         raise ValueError(
             f"compile is on, but there is no C++ compiler (looked for {', '.join(_COMPILERS)}): "
             "install one, or set compile to off"
         )
-    if setting == "auto":
-        return gradient_steps >= _PAYS_FROM and _has_compiler() and _works()
-    return setting == "on"
 
 
 def compile_and_time(function: Callable[P, T], name: str) -> Callable[P, T]:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
@@ -34,11 +35,12 @@ def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Ten
 
     Raises:
         FileNotFoundError: if the folder holds no run, or no checkpoint.
-        ValueError: if no weights fit.
+        ValueError: if no weights fit, or one that does is not finite.
     """
     run = Run.open(folder)
     step, checkpoint = run.load_trained()
-    theirs = _tensors(checkpoint["networks"])
+    with run.restoring(step):
+        theirs = _tensors(checkpoint["networks"])
     own = _tensors(algorithm.networks().state_dict())
     names = {name: name for name in own.keys() - _hyperparameters(algorithm.networks())}
     if run.recipe.algorithm == algorithm.recipe.algorithm:
@@ -55,10 +57,10 @@ def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Ten
     taken = {
         name: theirs[other]
         for name, other in names.items()
-        if other in theirs and theirs[other].shape == own[name].shape
+        if other in theirs and _kind(theirs[other]) == _kind(own[name])
     }
     reshaped = [
-        f"{name} {list(theirs[other].shape)} instead of {list(own[name].shape)}"
+        f"{name} {_kind(theirs[other])} instead of {_kind(own[name])}"
         for name, other in names.items()
         if other in theirs and name not in taken
     ]
@@ -75,11 +77,20 @@ def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Ten
     )
     if not taken:
         raise ValueError(f"no weights of {source} fit these networks{rest}")
+    for name, weight in taken.items():
+        if not weight.isfinite().all():
+            raise ValueError(f"{name} of {source} has entries that are not finite: it cannot start")
     return taken, f"initial weights: {len(taken)} of {len(names)} tensors from {source}{rest}"
 
 
 def _tensors(state: Mapping[str, Any]) -> dict[str, Tensor]:
     return {name: value for name, value in state.items() if isinstance(value, Tensor)}
+
+
+def _kind(tensor: Tensor) -> str:
+    """A tensor's shape, and its dtype where that is not the usual one."""
+    dtype = "" if tensor.dtype == torch.get_default_dtype() else f" {tensor.dtype}"
+    return f"{list(tensor.shape)}{dtype}"
 
 
 def _hyperparameters(networks: Stateful) -> set[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 import shutil
 import time
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
-from torchrl_tit.files import write_text_atomic
+from torchrl_tit.files import naming, write_text_atomic
 
 
 class Metrics:
@@ -37,21 +38,32 @@ class Metrics:
         # Written at once: a process that is killed here loses no row.
         lines = [self._line(self._columns), *(self._line(self._cells(row)) for row in kept)]
         write_text_atomic(self.path, "".join(lines))
-        shutil.rmtree(folder / "tensorboard", ignore_errors=True)
+        events = folder / "tensorboard"
+        if events.is_symlink():  # what it leads to is not ours
+            events.unlink()
+        shutil.rmtree(events, ignore_errors=True)
         self._tensorboard = TensorboardLogger(exp_name="tensorboard", log_dir=str(folder))
         for row in kept:
             self._draw(row)
         self._file = self.path.open("a", encoding="utf-8", newline="")
 
-    def log(self, step: int, **values: float) -> None:
-        """Adds a row; NaN stands for a number that does not exist at this step."""
+    def log(self, step: int, **values: float) -> dict[str, float]:
+        """Adds a row and returns it; NaN stands for a number that does not exist at this step."""
         before, then = self._last
         self._last = (step, time.monotonic())
         speed = (step - before) / max(self._last[1] - then, 1e-9)
         row = {"step": step, "time": time.time(), "steps_per_second": speed, **values}
-        self._file.write(self._line(self._cells(row)))
-        self._file.flush()
+        line = self._line(self._cells(row))
+        with naming(self.path):
+            self._file.write(line)
+            self._file.flush()
         self._draw(row)
+        return row
+
+    def sync(self) -> None:
+        """Flushes the rows to the disk."""
+        with naming(self.path):
+            os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Closes the files."""
@@ -94,12 +106,16 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
     """
     if not path.exists():
         return []
-    # A row without its line end was left by a killed process; it does not count.
-    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    rows = []
-    for row in csv.DictReader(line for line in lines if line.endswith("\n")):
-        try:
-            rows.append({name: float(value) for name, value in row.items()})
-        except (TypeError, ValueError) as error:  # too few or too many cells, or no numbers
-            raise ValueError(f"{path} has a damaged row for step {row.get('step')}") from error
+    rows: list[dict[str, float]] = []
+    try:
+        # A row without its line end was left by a killed process; it does not count.
+        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        for cells in csv.DictReader(line for line in lines if line.endswith("\n")):
+            row = {name: float(value) for name, value in cells.items()}
+            if not row["step"].is_integer():
+                raise ValueError("its step is not a whole number")
+            rows.append(row)
+    except (csv.Error, LookupError, TypeError, ValueError) as error:
+        last = f"step {rows[-1]['step']:.0f}" if rows else "its beginning"
+        raise ValueError(f"{path} has a damaged row after {last}") from error
     return rows

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import torch
 
 from torchrl_tit.datasets import has_reference, normalized_score, normalized_spread
@@ -19,7 +20,7 @@ class Outcome:
     """Returns of the episodes that were played at one step of training, for one target return."""
 
     step: int
-    returns: list[float]
+    returns: Annotated[list[float], msgspec.Meta(min_length=1)]
     target_return: float | None = None
     """The target return; None if the network has none."""
 

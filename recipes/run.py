@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import os
 import platform
 import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +18,11 @@ import filelock
 from torchrl_tit.checkpoint import (
     CheckpointError,
     checkpoint_steps,
+    latest_step,
     load_checkpoint,
     save_checkpoint,
 )
-from torchrl_tit.files import write_text_atomic
+from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.settings.imports import allowed_modules
 
 from .metrics import Metrics
@@ -30,6 +33,10 @@ from .registry import find_recipe
 _IMPORTS = "imports.json"
 _WEIGHTS = "initial_weights"
 _WRITTEN_BEFORE = ("versions.json", _IMPORTS, _WEIGHTS)
+_WRITTEN_WHOLE = (
+    *("recipe.json", "versions.json", _IMPORTS, "metrics.csv", "learning_curve.png"),
+    *("evaluation.json", "evaluation_best.json"),
+)
 _PACKAGES = ["torchrl-tit", "torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy"]
 
 
@@ -54,14 +61,17 @@ class Run:
         recipe: the settings.
     """
 
-    def __init__(self, folder: Path, recipe: Recipe) -> None:
-        self.folder = folder
+    def __init__(self, folder: str | os.PathLike[str], recipe: Recipe) -> None:
+        self.folder = Path(folder)
         self.recipe = recipe
-        self._lock = filelock.FileLock(folder / ".lock", timeout=0)
+        self._lock = filelock.FileLock(self.folder / ".lock", timeout=0)
 
     @classmethod
     def create(
-        cls, folder: Path, recipe: Recipe, initial_weights: dict[str, Any] | None = None
+        cls,
+        folder: str | os.PathLike[str],
+        recipe: Recipe,
+        initial_weights: dict[str, Any] | None = None,
     ) -> Run:
         """Makes a new run folder.
 
@@ -73,20 +83,27 @@ class Run:
 
         Raises:
             FileExistsError: if the folder exists already and is not empty.
+            RuntimeError: if another process is making it.
         """
         cls.check_new(folder)
+        run = cls(folder, recipe)
+        folder = run.folder
         folder.mkdir(parents=True, exist_ok=True)
-        write_text_atomic(folder / "versions.json", json.dumps(package_versions(), indent=2) + "\n")
-        if modules := allowed_modules():
-            write_text_atomic(folder / _IMPORTS, json.dumps(modules) + "\n")
-        if initial_weights is not None:
-            save_checkpoint(folder / _WEIGHTS, 0, initial_weights)
-        write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
-        return cls(folder, recipe)
+        with run:
+            cls.check_new(folder)  # another process can have made it since
+            versions = json.dumps(package_versions(), indent=2) + "\n"
+            write_text_atomic(folder / "versions.json", versions)
+            if modules := allowed_modules():
+                write_text_atomic(folder / _IMPORTS, json.dumps(modules) + "\n")
+            if initial_weights is not None:
+                save_checkpoint(folder / _WEIGHTS, 0, initial_weights)
+            write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
+        return run
 
     @staticmethod
-    def check_new(folder: Path) -> None:
+    def check_new(folder: str | os.PathLike[str]) -> None:
         """Raises FileExistsError if :meth:`create` would."""
+        folder = Path(folder)
         # recipe.json is written last: without it, what a killed process left here is not a run.
         if folder.exists() and (
             not folder.is_dir()
@@ -101,13 +118,14 @@ class Run:
             )
 
     @classmethod
-    def open(cls, folder: Path) -> Run:
+    def open(cls, folder: str | os.PathLike[str]) -> Run:
         """Opens an existing run folder.
 
         Raises:
             FileNotFoundError: if the folder is not a run folder.
             ValueError: if its recipe cannot be read.
         """
+        folder = Path(folder)
         path = folder / "recipe.json"
         if not path.is_file():
             raise FileNotFoundError(f"{folder} is not a run folder: there is no {path}")
@@ -116,6 +134,27 @@ class Run:
         except ValueError as error:
             raise ValueError(f"{error}{_import_hint(folder)}") from error
 
+    def lengthen(self, length: int) -> None:
+        """Makes the run shorter or longer, which is open; training then goes on to its new end.
+
+        Args:
+            length: the new value of the recipe's ``length``, such as its ``total_steps``.
+
+        Raises:
+            ValueError: if the run is past that end already, or the recipe refuses it.
+        """
+        field = self.recipe.length
+        changes: dict[str, Any] = {field: length}
+        recipe = replace(self.recipe, **changes)
+        done = latest_step(self.checkpoints) or 0
+        if recipe.final_step < done:
+            raise ValueError(
+                f"{field} {length} ends at step {recipe.final_step}, but {self.folder} is trained "
+                f"for {done} steps already: name a larger number"
+            )
+        write_text_atomic(self.folder / "recipe.json", recipe_to_json(recipe))
+        self.recipe = recipe
+
     def __enter__(self) -> Run:
         try:
             self._lock.acquire()
@@ -123,6 +162,7 @@ class Run:
             raise RuntimeError(
                 f"{self.folder} is in use by another process: wait for it, or stop it"
             ) from error
+        remove_leftovers(self.folder, _WRITTEN_WHOLE)
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -146,7 +186,7 @@ class Run:
         if not checkpoint_steps(self.checkpoints):
             return None
         step, state = load_checkpoint(self.checkpoints)
-        if "networks" not in state:
+        if not isinstance(state, dict) or "networks" not in state:
             raise CheckpointError(
                 f"the checkpoint of step {step} in {self.checkpoints} is from an older version of "
                 "torchrl-tit, whose networks had other parts: train the run again"
@@ -176,13 +216,19 @@ class Run:
 
     @contextmanager
     def restoring(self, step: int) -> Iterator[None]:
-        """Raises ValueError if a checkpoint's state does not fit what the recipe builds."""
+        """Raises ValueError if a checkpoint's state does not fit what the recipe builds.
+
+        Its sums only say that it is as it was written. What is wrong inside can fail in any way.
+        """
         try:
             yield
-        except (LookupError, RuntimeError, TypeError, ValueError) as error:
+        except CheckpointError:  # of a part that has a folder of its own
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(
                 f"the checkpoint of step {step} in {self.checkpoints} does not fit "
-                f"{self.folder / 'recipe.json'}; was that file changed since? ({error})"
+                f"{self.folder / 'recipe.json'}; was that file changed since? ({reason})"
             ) from error
 
     def metrics(self, columns: list[str], last_step: int) -> Metrics:
@@ -214,7 +260,8 @@ class Run:
         path = self.folder / "versions.json"
         try:
             before = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # lost or damaged: nothing to compare with
+            before.items()
+        except (AttributeError, OSError, ValueError):  # lost or damaged: nothing to compare with
             return []
         now = package_versions()
         return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]

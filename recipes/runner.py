@@ -6,17 +6,26 @@ import math
 import random
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm import tqdm
 
 from torchrl_tit.checkpoint import checkpoint_steps, global_rng_state, set_global_rng_state
+from torchrl_tit.evaluation import watching_episodes
 
-from .algorithm import Algorithm, NotFiniteError, Stateful, check_finite, make_algorithm
+from .algorithm import (
+    Algorithm,
+    NotFiniteError,
+    Stateful,
+    check_finite,
+    load_weights,
+    make_algorithm,
+)
 from .best import EPISODES, Best
 from .callback import Callback
 from .interrupt import Interrupt
@@ -49,7 +58,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     if step == 0 and (weights := run.load_initial_weights()):
         with run.restoring(step):
             networks = algorithm.networks()
-            networks.load_state_dict({**networks.state_dict(), **weights})
+            load_weights(networks, {**networks.state_dict(), **weights})
     algorithm.prepare(step, run.folder)
     with ExitStack() as stack:
         stack.enter_context(closing(algorithm))
@@ -63,9 +72,14 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
         }
         _load(run, parts)
         metrics = stack.enter_context(closing(run.metrics(record.columns, last_step=step)))
-        unit = " updates" if recipe.offline else " steps"
         progress = stack.enter_context(
-            tqdm(total=recipe.final_step, initial=step, unit=unit, desc=recipe.name, smoothing=0.05)
+            tqdm(
+                total=min([recipe.final_step, *(c.last_step for c in callbacks if c.last_step)]),
+                initial=step,
+                unit=f" {recipe.unit}",
+                desc=recipe.name,
+                smoothing=0.05,
+            )
         )
         interrupt = stack.enter_context(Interrupt())
         batches = iter(algorithm.batches())
@@ -97,7 +111,9 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
                     callback.evaluated(step, outcomes)
             if log_due or evaluation_due:
                 row = record.take_row(step)
-                metrics.log(step, **row)
+                written = metrics.log(step, **row)
+                for callback in callbacks:
+                    callback.logged(step, written)
                 if not math.isnan(row["return_mean"]):
                     progress.set_postfix_str(f"return {row['return_mean']:.1f}")
 
@@ -106,6 +122,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             if due or evaluation_due or enough or interrupt.requested:
                 with _naming(step, saved_step):
                     record.check()
+                metrics.sync()  # the checkpoint's rows are on the disk before it is
                 for callback in callbacks:
                     callback.saving(step)
                 _save(run, step, parts)
@@ -193,11 +210,24 @@ class Record:
 
     def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
         """Restores a state."""
-        self.outcomes = [Outcome(**outcome) for outcome in state_dict["outcomes"]]
-        sums = state_dict["sums"]
-        self._sums = torch.tensor(sums, dtype=torch.float64) if sums else None
-        self._count = state_dict["count"]
-        self._returns = list(state_dict["returns"])
+        state = msgspec.convert(state_dict, _RecordState)
+        if len(state.sums) != (len(self._names) if state.count else 0):
+            raise ValueError(f"the record has {len(state.sums)} sums of {state.count} updates")
+        self.outcomes = state.outcomes
+        self._sums = torch.tensor(state.sums, dtype=torch.float64) if state.sums else None
+        self._count = state.count
+        self._returns = state.returns
+
+
+@dataclass(frozen=True)
+class _RecordState:
+    """What a checkpoint holds of a :class:`Record`."""
+
+    outcomes: list[Outcome]
+    evaluation_seed: int
+    sums: list[float]
+    count: Annotated[int, msgspec.Meta(ge=0)]
+    returns: list[float]
 
 
 def load_trained(
@@ -232,7 +262,7 @@ def load_trained(
             "or none was evaluated; evaluate the last ones (without --best)"
         )
     with run.restoring(step):
-        algorithm.networks().load_state_dict(weights)
+        load_weights(algorithm.networks(), weights)
     algorithm.policy.eval()  # without dropout
     return step, algorithm, state
 
@@ -265,9 +295,9 @@ def evaluate(
     recipe = recipe or run.recipe
     step, algorithm, state = load_trained(run, recipe, best=best)
     with run.restoring(step):
-        record = state["record"]
-        outcomes = [Outcome(**outcome) for outcome in record["outcomes"]]
-        same_seed = record["evaluation_seed"] == recipe.evaluation_seed
+        record = msgspec.convert(state["record"], _RecordState)
+    outcomes = record.outcomes
+    same_seed = record.evaluation_seed == recipe.evaluation_seed
     targets: list[float | None] = [*recipe.target_columns] or [None]
     now = [
         outcome
@@ -278,7 +308,12 @@ def evaluate(
         and outcome.target_return in targets
     ]
     if len(now) < len(targets):
-        now = algorithm.play(step)
+        episodes = len(targets) * recipe.evaluation_episodes
+        with (
+            tqdm(total=episodes, unit=" episodes", desc="evaluation", delay=1) as progress,
+            watching_episodes(progress.update),
+        ):
+            now = algorithm.play(step)
     for callback in callbacks:
         callback.evaluated(step, now)
     return {
@@ -312,8 +347,7 @@ def _load(run: Run, parts: Mapping[str, Stateful]) -> None:
     with run.restoring(step):
         for name, part in parts.items():
             _load_part(part, state[name])
-        rng = state["rng"]
-    set_global_rng_state(rng)
+        set_global_rng_state(state["rng"])
 
 
 def _load_part(part: Stateful, state: dict[str, Any]) -> None:
@@ -322,4 +356,21 @@ def _load_part(part: Stateful, state: dict[str, Any]) -> None:
         groups = zip(state["param_groups"], part.state_dict()["param_groups"], strict=True)
         kept = [{**own, **{k: saved[k] for k in saved if k == "step"}} for saved, own in groups]
         state = {**state, "param_groups": kept}
-    part.load_state_dict(state)
+        _check_moments(part, state["state"])
+    if isinstance(part, nn.Module):
+        load_weights(part, state)
+    else:
+        part.load_state_dict(state)
+
+
+def _check_moments(optimizer: torch.optim.Optimizer, state: Mapping[int, Any]) -> None:
+    """Raises ValueError if what an optimizer keeps for a weight is not like the weight."""
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+    for index, kept in state.items():
+        for name, value in kept.items():
+            like = weights[index]
+            if value.ndim and (value.shape, value.dtype) != (like.shape, like.dtype):
+                raise ValueError(
+                    f"{name} of weight {index} is {value.dtype} {list(value.shape)}, not "
+                    f"{like.dtype} {list(like.shape)}"
+                )

@@ -46,6 +46,10 @@ class CollectorState:
         """Restores a state."""
         state = state_dict["collector"]
         if isinstance(self.collector, Collector) and state is not None:
+            if state["frames"] != self.step:
+                raise ValueError(
+                    f"the collector has {state['frames']!r} steps, but the checkpoint {self.step}"
+                )
             set_collector_state(self.collector, state)
         reset_unsavable_env(self.collector, self.seed, self.step)
 

@@ -6,6 +6,7 @@ Every network here is a frame encoder followed by a history encoder; everything 
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 from typing import Any
 
 _HOMES = {
@@ -22,6 +23,16 @@ _HOMES = {
 """Where the public names live: PyTorch is loaded with the first of them that needs it."""
 
 __all__ = [*_HOMES]
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("torchrl-tit")
+    except importlib.metadata.PackageNotFoundError:  # a clone that is not installed
+        return "not installed"
+
+
+__version__ = _version()
 
 
 def __getattr__(name: str) -> Any:

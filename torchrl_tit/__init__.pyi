@@ -7,3 +7,5 @@ from torchrl_tit.settings import Inner as Inner
 from torchrl_tit.settings import Outer as Outer
 from torchrl_tit.settings import PairedOuter as PairedOuter
 from torchrl_tit.transforms import History as History
+
+__version__: str

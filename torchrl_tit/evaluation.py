@@ -3,6 +3,8 @@
 import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +14,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_tit.modules import acting
+
+_WATCHER: ContextVar[Callable[[int], Any] | None] = ContextVar("watcher", default=None)
 
 
 def evaluate(
@@ -78,6 +82,31 @@ def evaluate(
             made.close()
 
 
+@contextmanager
+def watching_episodes(ended: Callable[[int], Any]) -> Iterator[None]:
+    """Calls a function with the number of episodes that have just ended, to show progress.
+
+    Args:
+        ended: The function.
+
+    Example:
+        >>> from torchrl.data import Categorical
+        >>> from torchrl.modules import RandomPolicy
+        >>> from torchrl_tit.envs import make_env
+        >>> counts = []
+        >>> policy = RandomPolicy(Categorical(2, shape=(5,)))
+        >>> with watching_episodes(counts.append):
+        ...     _ = evaluate(lambda n: make_env("CartPole-v1", n), policy, episodes=5)
+        >>> sum(counts)
+        5
+    """
+    token = _WATCHER.set(ended)
+    try:
+        yield
+    finally:
+        _WATCHER.reset(token)
+
+
 def _play_all(
     env: EnvBase,
     policy: Callable[[TensorDictBase], TensorDictBase],
@@ -103,7 +132,8 @@ def _play(
     tensordict = env.reset(seed=seed)
     returns = torch.zeros(env.batch_size.numel(), dtype=torch.float64, device=env.device)
     playing = torch.ones_like(returns, dtype=torch.bool)
-    while playing.any():
+    left = len(playing)
+    while left:
         acted = _act(policy, tensordict, playing) if shrink else policy(tensordict)
         step, tensordict = env.step_and_maybe_reset(acted)
         outcome = step["next"]
@@ -115,6 +145,9 @@ def _play(
         else:
             returns = outcome["game_return"].flatten().double().where(playing, returns)
             playing &= ~game_over.flatten()
+        before, left = left, int(playing.sum())
+        if left < before and (watcher := _WATCHER.get()) is not None:
+            watcher(before - left)
     return returns
 
 

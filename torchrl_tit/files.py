@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
+
+_HIDDEN = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp")
+"""Names of what is being written, or was when its process was killed."""
 
 
 def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
@@ -36,17 +40,46 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
     path = Path(path)
     _check_folder(path)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    with naming(path):
+        try:
+            with temporary.open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        except BaseException:  # Ctrl-C as well must leave nothing behind
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+        fsync_directory(path.parent)
+
+
+@contextlib.contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Let an error of the system name the file that was to be written.
+
+    A full disk shows when an open file is flushed, which by itself does not say which one.
+
+    Args:
+        path: The file.
+
+    Raises:
+        OSError: As raised within, with the file's name.
+
+    Example:
+        >>> import errno
+        >>> try:
+        ...     with naming("notes.txt"):
+        ...         raise OSError(errno.EIO, "Input/output error")
+        ... except OSError as error:
+        ...     print(error.filename)
+        notes.txt
+    """
     try:
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except BaseException:  # Ctrl-C as well must leave nothing behind
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
         raise
-    fsync_directory(path.parent)
 
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
@@ -69,6 +102,33 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
         'all of it'
     """
     write_bytes_atomic(path, text.encode("utf-8"))
+
+
+def remove_leftovers(folder: str | os.PathLike[str], names: Collection[str] | None = None) -> None:
+    """Remove the hidden files and folders that killed writes have left in a folder.
+
+    Args:
+        folder: A folder into which no other process writes.
+        names: The files that were written; any if None.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> for name in ("a.json", ".a.json.0a1b2c3d.tmp", ".mine"):
+        ...     folder.joinpath(name).touch()
+        >>> remove_leftovers(folder)
+        >>> sorted(path.name for path in folder.iterdir())
+        ['.mine', 'a.json']
+    """
+    for path in list(Path(folder).iterdir()):
+        match = _HIDDEN.fullmatch(path.name)
+        if match is None or (names is not None and match[1] not in names):
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 @contextlib.contextmanager

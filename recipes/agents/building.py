@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from torchrl_tit.agents import AgentError, TrainedAgent
 from torchrl_tit.agents.folder import EVALUATION, RECIPE, AgentFiles, check_evaluation
 from torchrl_tit.checkpoint import latest_step
 
-from ..algorithm import Algorithm, make_algorithm
+from ..algorithm import Algorithm, load_weights, make_algorithm
 from ..decision_transformer.settings import SequenceRecipe
 from ..recipe import Recipe
 from ..recipe_json import recipe_from_json, recipe_to_json
@@ -50,8 +49,7 @@ def agent_from_files(files: AgentFiles, name: str, device: Device) -> TrainedAge
         ) from error
     networks = algorithm.acting_networks()
     try:
-        _check_weights(files.weights, networks.state_dict())
-        networks.load_state_dict(files.weights)
+        load_weights(networks, files.weights)
     except (RuntimeError, ValueError) as error:
         raise AgentError(
             f"the agent {files.folder} cannot be used: its weights do not fit {RECIPE} in this "
@@ -99,18 +97,6 @@ def read_json(file: Path) -> dict[str, Any]:
         if isinstance(found, dict):
             return found
     return {}
-
-
-def _check_weights(weights: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-    """Raises ValueError if weights are of another type than those of the networks, or not finite.
-
-    Loading itself compares names and shapes, but converts types.
-    """
-    for name, weight in weights.items():
-        if name in expected and weight.dtype != expected[name].dtype:
-            raise ValueError(f"{name} is {weight.dtype}, not {expected[name].dtype}")
-        if not weight.isfinite().all():
-            raise ValueError(f"{name} has entries that are not finite")
 
 
 def _acting(recipe: Recipe, evaluation: Mapping[str, Any], device: Device) -> Recipe:

@@ -120,6 +120,6 @@ def _check(target: str, found: Any) -> None:
         safe = home not in TRUSTED
     if not safe:
         raise AgentError(
-            f"{target!r} may start programs, write files or download, which no agent's recipe may "
-            f"ask for: to allow it, add `--import {module}`"
+            f"{target!r} may start programs, write files or download, which the recipe of a run or "
+            f"an agent may not ask for: to allow it, add `--import {module}`"
         )

@@ -11,7 +11,9 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..recipe import MAX_SEED, Recipe
+from torchrl_tit.settings.numbers import MAX_SEED
+
+from ..recipe import Recipe
 from .imports import HELP, OPTION
 
 
@@ -38,6 +40,16 @@ def check_seed(seed: int | None) -> None:
     """Ends the program if a seed is none that environments take; None is."""
     if seed is not None and not 0 <= seed <= MAX_SEED:
         fail(f"--seed must be from 0 to {MAX_SEED}, not {seed}")
+
+
+def option(field: str) -> str:
+    """Returns a field as it is typed.
+
+    Example:
+        >>> option("total_steps")
+        '--total-steps'
+    """
+    return f"--{field.replace('_', '-')}"
 
 
 def override(recipe: Recipe, **fields: Any) -> Recipe:

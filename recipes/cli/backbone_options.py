@@ -17,9 +17,10 @@ import tyro
 
 from torchrl_tit.settings import NETWORKS, FrameSettings, HistorySettings, Part, PerKey
 from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.fields import field_types
 from torchrl_tit.settings.plugins import load_plugins
 
-from ..recipe import Recipe, field_types
+from ..recipe import Recipe
 
 RecipeT = TypeVar("RecipeT", bound=Recipe)
 T = TypeVar("T")

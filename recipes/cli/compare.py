@@ -24,7 +24,11 @@ def compare(arguments: list[str]) -> None:
     if options.out.suffix != ".png":
         fail(f"--out {options.out} must end in .png: the figure is a PNG")
     seeds: dict[Recipe, list[Path]] = {}  # runs of the same settings
-    for folder in dict.fromkeys(options.runs):
+    # Beside the runs of a sweep lie its logs, which `sweep/*/seed-*` names too.
+    folders = [path for path in dict.fromkeys(options.runs) if path.suffix != ".log"]
+    if not folders:
+        fail(f"{options.runs[0]} is not a run folder, but a log: name the folder beside it")
+    for folder in folders:
         seeds.setdefault(experiment_of(Run.open(folder).recipe), []).append(folder)
     offline = {recipe.offline for recipe in seeds}
     if len(offline) > 1:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,15 @@ def evaluate(arguments: list[str]) -> None:
     parser.add_argument(
         "--out",
         type=Path,
-        help="file to write; default: RUN/evaluation.json, or RUN/evaluation_best.json",
+        help="file to write; default: RUN/evaluation.json, with _best and other --episodes or "
+        "--seed in its name, so that it never replaces the run's own evaluation",
     )
     add_machine_options(parser)
     options = parser.parse_args(arguments)
     from .. import runner  # not at the top: help needs no PyTorch
-    from ..run import Run
+    from .opening import open_run
 
-    run = Run.open(options.run)
+    run = open_run(options.run)
     recipe = override(
         run.recipe,
         evaluation_episodes=options.episodes,
@@ -40,17 +42,30 @@ def evaluate(arguments: list[str]) -> None:
     )
     if options.out is not None and not options.out.absolute().parent.is_dir():
         fail(f"--out {options.out} cannot be written: there is no folder {options.out.parent}")
-    evaluation = runner.evaluate(run, recipe, best=options.best)
-    out = options.out or (run.folder / "evaluation_best.json" if options.best else None)
-    path = run.save_evaluation(evaluation, out)
-    print(f"{one_line(recipe, evaluation)}\nwritten to {path}")
+    # What is written into the run folder is written by one process at a time.
+    lock: AbstractContextManager[Any] = run if options.out is None else nullcontext()
+    with lock:
+        evaluation = runner.evaluate(run, recipe, best=options.best)
+        out = options.out or run.folder / _file_name(run.recipe, recipe, options.best)
+        run.save_evaluation(evaluation, out)
+    print(f"{one_line(recipe, evaluation)}\nwritten to {out}")
+
+
+def _file_name(own: Recipe, recipe: Recipe, best: bool) -> str:
+    """Names an evaluation by what distinguishes it from the run's own."""
+    parts = ["evaluation", *(["best"] if best else [])]
+    for field in ("episodes", "seed"):
+        value = getattr(recipe, f"evaluation_{field}")
+        if value != getattr(own, f"evaluation_{field}"):
+            parts.append(f"{field}-{value}")
+    return f"{'_'.join(parts)}.json"
 
 
 def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
     """Returns an evaluation in one line."""
     return (
         f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
-        f"{evaluation['episodes']} episodes after {evaluation['steps']} steps "
+        f"{evaluation['episodes']} episodes after {evaluation['steps']} {recipe.unit} "
         f"({evaluation['weights']} weights)"
     )
 
@@ -66,9 +81,9 @@ def render(arguments: list[str]) -> None:
     )
     options = parser.parse_args(arguments)
     from ..results.film import film  # not at the top: help needs no PyTorch
-    from ..run import Run
+    from .opening import open_run
 
-    run = Run.open(options.run)
+    run = open_run(options.run)
     recipe = override(run.recipe, evaluation_seed=options.seed)
     returns = film(recipe, run, options.out, options.episodes)
     print(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")

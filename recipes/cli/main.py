@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
+import torchrl_tit
 from torchrl_tit.settings import resolve
 
 from .arguments import fail, program
@@ -23,6 +25,7 @@ COMMANDS = {
     "export": "export:export",
     "compare": "compare:compare",
     "table": "compare:table",
+    "report": "report:report",
     "data": "data:data",
 }
 """The commands by name, each a "module:function" of this package."""
@@ -35,7 +38,8 @@ usage: {program} COMMAND ...
   train NAME [--FIELD VALUE]  train a named recipe, or one in a JSON or Python file (FILE.py:NAME;
                               the file is run); `train NAME --help` explains every field
   train NAME --init-from RUN  start from the weights of another run
-  train --resume RUN          resume a run that was stopped or killed
+  train --resume RUN          resume a run that was stopped or killed; with --total-steps N (or
+                              --total-updates, --iterations, --rounds) train a finished one further
   evaluate RUN                evaluate a run's newest checkpoint
   render RUN --out FILE       film a run's agent: a GIF or MP4
   explain AGENT --out FILE    film what a trained agent looks at, or draw one step of it as PNG
@@ -48,12 +52,14 @@ usage: {program} COMMAND ...
   tune NAME --out FOLDER      search for the best values of a recipe's fields, with Optuna
   compare RUN [RUN ...]       plot learning curves of several runs, a recipe's seeds as one band
   table FOLDER [FOLDER ...]   print the paper's tables with all runs in the folders
+  report RUN... --out FILE    write everything about runs into one HTML file, to send to a colleague
   data info SOURCE            describe a data set: an HDF5 file, D4RL's or Minari's name
   data convert SOURCE TARGET  convert between HDF5 in D4RL's layout and Minari
   data collect TASK           make medium, mixed, expert and random data sets, as D4RL does
 
 Common options: --seed, --out, --device, --threads where they apply; see COMMAND --help.
 Every command takes --import MODULE, for recipes, encoders, algorithms and tasks of your own.
+--version prints the version.
 """
 
 
@@ -64,18 +70,26 @@ def main(arguments: list[str] | None = None) -> None:
         arguments: the arguments after the program's name; those of this process if None.
     """
     try:
-        _run(import_what_is_typed(sys.argv[1:] if arguments is None else arguments))
+        try:
+            _run(import_what_is_typed(sys.argv[1:] if arguments is None else arguments))
+        finally:
+            sys.stdout.flush()  # here, where a reader who is gone can be met
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # `list | head`: the reader is gone
-        sys.stdout = None
+    except BrokenPipeError:  # `list | head`: what is left goes nowhere
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except MemoryError as error:
+        fail(f"there is not enough memory: {error}")
     except (ValueError, OSError, RuntimeError, FloatingPointError, ImportError) as error:
-        fail(str(error))
+        fail(str(error) or type(error).__name__)
 
 
 def _run(arguments: list[str]) -> None:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE.format(program=program()))
+        return
+    if arguments[0] == "--version":
+        print(f"torchrl-tit {torchrl_tit.__version__}")
         return
     name, *rest = arguments
     if name not in COMMANDS:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from ..algorithm import make_algorithm
 from ..registry import find_recipe
 from ..sweeps.sweep import make_jobs, run_jobs
+from ..wandb_metrics import check_wandb
 from .arguments import Parser, fail, program
 
 
@@ -29,11 +31,19 @@ def sweep(arguments: list[str]) -> None:
     parser.add_argument(
         "--ray", metavar="ADDRESS", help="run on a Ray cluster: auto, HOST:PORT or ray://HOST:PORT"
     )
+    parser.add_argument(
+        "--wandb", metavar="PROJECT", help="project of Weights & Biases that metrics are sent to"
+    )
     parser.add_argument("--out", type=Path, default=Path("runs/sweep"), help="folder of the runs")
     options = parser.parse_args(arguments)
     if options.workers is not None and options.workers < 1:
         fail(f"--workers must be at least 1, not {options.workers}")
-    jobs = make_jobs(options.names, options.seeds, options.out)
+    if options.wandb is not None:
+        check_wandb(options.wandb)
+    jobs = [
+        replace(job, wandb=options.wandb or "")
+        for job in make_jobs(options.names, options.seeds, options.out)
+    ]
     try:
         if options.ray is None:
             failed = run_jobs(jobs, options.workers or 1)
@@ -75,6 +85,7 @@ def tune(arguments: list[str]) -> None:
     try:
         # Not at the top: Optuna is an extra.
         from ..sweeps.search_space import load_space
+        from ..sweeps.trials import importances
         from ..sweeps.tune import Search, Settings
     except ModuleNotFoundError as error:
         raise ValueError("tune needs Optuna: pip install 'torchrl-tit[tune]'") from error
@@ -100,3 +111,7 @@ def tune(arguments: list[str]) -> None:
     values = ", ".join(f"{field} {value}" for field, value in best.params.items())
     print(f"best of {len(search.study.trials)} trials: {best.value:.1f} with {values}")
     print(f"its recipe: {options.out / 'best.json'}")
+    if shares := importances(search.study):
+        named = ", ".join(f"{field} {share:.0%}" for field, share in shares.items())
+        print(f"what mattered: {named}")
+    print(f"all trials: {options.out / 'trials.csv'}")

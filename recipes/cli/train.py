@@ -12,12 +12,15 @@ from typing import Annotated, Any
 import tyro
 
 from torchrl_tit.settings import resolve
+from torchrl_tit.settings.fields import field_types
 from torchrl_tit.settings.plugins import load_plugins
 
 from ..recipe import Recipe
 from ..registry import find_recipe
-from .arguments import Parser, add_machine_options, fail, parse_fields, program
+from .arguments import Parser, add_machine_options, fail, option, parse_fields, program
 from .backbone_options import check_recipe, choose_network, option_fields
+
+WANDB_HELP = "Project of Weights & Biases that metrics are sent to, beside CSV and TensorBoard."
 
 
 def train(arguments: list[str]) -> None:
@@ -25,11 +28,15 @@ def train(arguments: list[str]) -> None:
     if not arguments:
         fail("train needs the name of a recipe first, or --resume RUN")
     if arguments[0].startswith("-"):
-        options = _parse_resume(arguments)
-        resolve(f"{__package__}.training:resume")(options.resume, options.device, options.threads)
+        options = vars(_parse_resume(arguments))
+        run, device, threads = (options.pop(name) for name in ("resume", "device", "threads"))
+        lengths = {name: value for name in _lengths() if (value := options[name]) is not None}
+        resolve(f"{__package__}.training:resume")(run, device, threads, lengths, options["wandb"])
     else:
         recipe, options = _parse_recipe(find_recipe(arguments[0]), arguments[1:])
-        resolve(f"{__package__}.training:start")(recipe, options.out, options.init_from)
+        resolve(f"{__package__}.training:start")(
+            recipe, options.out, options.init_from, options.wandb
+        )
 
 
 def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
@@ -39,8 +46,10 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
         help="Run folder whose newest checkpoint gives the first weights, as far as they fit.",
         metavar="RUN",
     )
+    wandb = tyro.conf.arg(help=WANDB_HELP, metavar="PROJECT")
     if not {"-h", "--help"}.isdisjoint(arguments):
         load_plugins()  # whose parts are choices, too
+    _check_length(recipe, arguments)
     recipe = choose_network(recipe, arguments)
     parsed = parse_fields(
         [
@@ -48,6 +57,7 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
             *option_fields(recipe),
             ("out", Annotated[Path | None, out], None),
             ("init_from", Annotated[Path | None, init_from], None),
+            ("wandb", Annotated[str | None, wandb], None),
         ],
         arguments,
         f"train {recipe.name}",
@@ -56,14 +66,42 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
     return check_recipe(parsed.recipe), parsed
 
 
+def _check_length(recipe: Recipe, arguments: list[str]) -> None:
+    """Ends the program with a hint if the length is that of another algorithm's runs."""
+    typed = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
+    for length in _lengths().keys() - {recipe.length}:
+        if option(length) in typed and length not in field_types(type(recipe)):
+            fail(
+                f"{recipe.algorithm} has no {option(length)}: the length of its runs is "
+                f"{option(recipe.length)} (see `{program()} train {recipe.name} --help`)"
+            )
+
+
 def _parse_resume(arguments: list[str]) -> argparse.Namespace:
     parser = Parser(
         f"{program()} train",
         usage="%(prog)s NAME [--FIELD VALUE ...] [--init-from RUN]\n       %(prog)s --resume RUN "
-        "[--device DEVICE] [--threads THREADS]",
+        "[--total-steps N] [--device DEVICE] [--threads THREADS]",
         description="Train a named recipe, or one in a JSON or Python file; `train NAME --help` "
-        "explains every field. Or resume a run that was stopped or killed.",
+        "explains every field. Or resume a run that was stopped or killed, or train a finished one "
+        "further.",
     )
     parser.add_argument("--resume", type=Path, metavar="RUN", required=True, help="run folder")
+    for length, algorithms in _lengths().items():
+        parser.add_argument(
+            option(length),
+            type=int,
+            metavar="N",
+            help=f"new length of the whole run ({', '.join(algorithms)})",
+        )
+    parser.add_argument("--wandb", metavar="PROJECT", help=WANDB_HELP)
     add_machine_options(parser)
     return parser.parse_args(arguments)
+
+
+def _lengths() -> dict[str, list[str]]:
+    """The fields that say how long runs are, each with its algorithms."""
+    lengths: dict[str, list[str]] = {}
+    for algorithm, kind in Recipe.registered.items():
+        lengths.setdefault(kind.length, []).append(algorithm)
+    return lengths

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shlex
 import sys
 import time
+from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 from torchrl_tit.settings.imports import import_options
@@ -16,18 +18,25 @@ from ..initial_weights import weights_from
 from ..recipe import Recipe
 from ..results.plot import plot_run
 from ..run import Run
-from .arguments import override, program
+from ..wandb_metrics import WandbMetrics, check_wandb
+from .arguments import option, override, program
 from .evaluate import one_line
+from .opening import open_run
 
 
-def start(recipe: Recipe, folder: Path | None, init_from: Path | None = None) -> None:
+def start(
+    recipe: Recipe, folder: Path | None, init_from: Path | None = None, wandb: str | None = None
+) -> None:
     """Starts a run; writes nothing if its recipe cannot be run.
 
     Args:
         recipe: the recipe.
         folder: the run folder to make; runs/NAME/seed-SEED-DATE if None.
         init_from: the run whose weights to start from, if any.
+        wandb: the project of Weights & Biases that metrics are sent to, if any.
     """
+    if wandb is not None:
+        check_wandb(wandb)
     algorithm = make_algorithm(recipe)
     algorithm.check()
     weights = None
@@ -37,40 +46,79 @@ def start(recipe: Recipe, folder: Path | None, init_from: Path | None = None) ->
     recipe, chosen = with_chosen_frames(recipe, algorithm)
     if chosen:
         print(f"frames chosen by kind of observation: {chosen}")
-    _finish(Run.create(folder or _make_folder(recipe), recipe, weights))
+    with Run.create(folder or _make_folder(recipe), recipe, weights) as run:
+        _finish(run, wandb)
 
 
-def resume(folder: Path, device: str | None = None, threads: int | None = None) -> None:
-    """Resumes a run.
+def resume(
+    folder: Path,
+    device: str | None = None,
+    threads: int | None = None,
+    lengths: Mapping[str, int] | None = None,
+    wandb: str | None = None,
+) -> None:
+    """Resumes a run, or trains a finished one further.
 
     Args:
         folder: the run folder.
         device: the device to use; the recipe's if None.
         threads: the number of PyTorch's threads; the recipe's if None.
+        lengths: the run's new length by the name of its field, such as ``total_steps``; the
+            recipe's if None.
+        wandb: as that of :func:`start`.
     """
-    run = Run.open(folder)
-    run.recipe = override(run.recipe, device=device, threads=threads)
-    if changes := run.version_changes():
-        print(f"note: versions changed since the start: {'; '.join(changes)}", file=sys.stderr)
-    _finish(run)
+    if wandb is not None:
+        check_wandb(wandb)
+    with open_run(folder) as run:
+        if lengths:
+            _lengthen(run, lengths)
+        run.recipe = override(run.recipe, device=device, threads=threads)
+        if changes := run.version_changes():
+            print(f"note: versions changed since the start: {'; '.join(changes)}", file=sys.stderr)
+        _finish(run, wandb)
 
 
-def _finish(run: Run) -> None:
-    """Finishes a run: trains, evaluates and plots what is left."""
+def _lengthen(run: Run, lengths: Mapping[str, int]) -> None:
+    """Gives a run another length, and says what that changes besides."""
+    field = run.recipe.length
+    if wrong := [name for name in lengths if name != field]:
+        raise ValueError(
+            f"{run.folder} is a run of {run.recipe.algorithm}, whose length is {option(field)}, "
+            f"not {option(wrong[0])}"
+        )
+    before = getattr(run.recipe, field)
+    run.lengthen(lengths[field])
+    if run.recipe.schedules and lengths[field] != before:
+        print(
+            f"note: {', '.join(run.recipe.schedules)} depends on {field}: from here on it is that "
+            f"of a run with {field} {lengths[field]}, and before it was that of {before}",
+            file=sys.stderr,
+        )
+
+
+def _finish(run: Run, wandb: str | None) -> None:
+    """Finishes a run, which is open: trains, evaluates and plots what is left."""
     recipe, folder = run.recipe, run.folder
-    with run:
-        if run.is_complete():
-            print(f"{folder} is complete: trained for {recipe.final_step} steps and evaluated")
-            return
-        try:
-            runner.train(recipe, run)
-            evaluation = runner.evaluate(run)
-        except KeyboardInterrupt:
-            words = [*program().split(), "train", "--resume", str(folder), *import_options()]
-            print(f"stopped; to resume: {shlex.join(words)}", file=sys.stderr)
-            raise
-        run.save_evaluation(evaluation)
-        plot_run(run)
+    if run.is_complete():
+        print(
+            f"{folder} is complete: trained for {recipe.final_step} {recipe.unit} and evaluated; "
+            f"{option(recipe.length)} trains it further"
+        )
+        return
+    try:
+        with ExitStack() as stack:
+            callbacks = []
+            if wandb is not None:
+                callbacks.append(stack.enter_context(closing(WandbMetrics(run, wandb))))
+            runner.train(recipe, run, callbacks)
+            evaluation = runner.evaluate(run, callbacks=callbacks)
+    except KeyboardInterrupt:
+        words = [*program().split(), "train", "--resume", str(folder), *import_options()]
+        words += [] if wandb is None else ["--wandb", wandb]
+        print(f"stopped; to resume: {shlex.join(words)}", file=sys.stderr)
+        raise
+    run.save_evaluation(evaluation)
+    plot_run(run)
     print(one_line(recipe, evaluation))
     print(f"run folder: {folder}\nlearning curve: {run.curve}")
 

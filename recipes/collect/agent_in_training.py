@@ -55,6 +55,7 @@ class AgentInTraining(Agent, Callback):
         super().__init__(algorithm, settings)
         self.final_step = min(self.recipe.final_step, settings.total_steps)
         """Environment steps after which training ends."""
+        self.last_step = self.final_step
         self._folder = folder
         self._action_space = action_space
         marks = (settings.medium_return, settings.expert_return)

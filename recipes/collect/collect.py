@@ -11,6 +11,7 @@ from gymnasium.spaces import Box, Discrete
 from torchrl_tit.datasets import TaskSpaces, task_spaces
 from torchrl_tit.envs.actions import ActionWriter
 from torchrl_tit.envs.spaces import ObservationReader
+from torchrl_tit.files import remove_leftovers
 
 from .find_agent import find_agent
 from .output_folder import claim_folder
@@ -63,6 +64,7 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with filelock.FileLock(folder / ".lock", timeout=0):
+            remove_leftovers(folder)
             recipe = None if agent is None else agent.recipe
             provenance = claim_folder(folder, settings, recipe, command)
             maker = SetMaker(settings, folder, task, agent, provenance)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, TypeVar
 
-from ..compilation import should_compile
+from ..compilation import check_compiler, should_compile
 from ..transition_algorithm import TransitionAlgorithm
 from .settings import QRecipe
 
@@ -30,6 +30,6 @@ class QAlgorithm(TransitionAlgorithm[RecipeT]):
         return pays and should_compile(setting, self.recipe.total_updates)
 
     def check(self) -> None:
-        """As :meth:`DatasetAlgorithm.check`; also checks that compiling works if requested."""
-        self.should_compile()
+        """As :meth:`DatasetAlgorithm.check`; also checks that there is a compiler if requested."""
+        check_compiler(self.recipe.compile)
         super().check()

@@ -41,6 +41,9 @@ class Cell:
     changes: str = ""
     """Fields in which the runs differ from the recipe of that name, with the runs' values."""
 
+    measure: str = "return"
+    """What the values are: "return" or "normalized score"."""
+
     @property
     def label(self) -> str:
         """The recipe's name, and the changed fields."""

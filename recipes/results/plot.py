@@ -53,8 +53,11 @@ def plot_learning_curve(
     figure = _figure(title, offline)
     (axes,) = figure.axes
     batch, batches = ("an evaluation", "evaluations") if offline else ("a batch", "batches")
-    axes.plot(steps, returns, color="C0", alpha=0.35, linewidth=1, label=f"mean of {batch}")
-    axes.plot(steps, smooth, color="C0", linewidth=2, label=f"mean of {window} {batches}")
+    if not len(steps):
+        axes.text(0.5, 0.5, "no episode has ended", ha="center", transform=axes.transAxes)
+    marker = "o" if len(steps) == 1 else ""  # a line through one point cannot be seen
+    axes.plot(steps, returns, marker, ls="-", c="C0", alpha=0.35, lw=1, label=f"mean of {batch}")
+    axes.plot(steps, smooth, marker, ls="-", c="C0", lw=2, label=f"mean of {window} {batches}")
     _write(figure, picture)
 
 
@@ -94,7 +97,8 @@ def plot_comparison(
         returns = np.stack([np.interp(grid, *run) for run in known])
         mean, deviation = returns.mean(0), returns.std(0)
         label = f"{name.removeprefix(common)} ({len(known)} runs)"
-        (line,) = axes.plot(grid, mean, linewidth=2, label=label)
+        marker = "o" if grid[0] == grid[-1] else ""
+        (line,) = axes.plot(grid, mean, marker, ls="-", linewidth=2, label=label)
         axes.fill_between(
             grid, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.2, linewidth=0
         )
@@ -105,26 +109,26 @@ def plot_comparison(
 
 
 def plot_table(cells: Sequence[Cell], picture: Path) -> None:
-    """Draws cells beside the paper's values, one panel per task.
+    """Draws cells beside the paper's values, one panel for each task and measure.
 
     Args:
         cells: what :func:`~recipes.results.table.make_table` returns.
         picture: the PNG file to write.
     """
-    tasks: dict[str, list[Cell]] = {}
+    tasks: dict[tuple[str, str], list[Cell]] = {}  # of one measure: scores are no returns
     for cell in cells:
-        tasks.setdefault(cell.recipe.rpartition("/")[0], []).append(cell)
+        tasks.setdefault((cell.recipe.rpartition("/")[0], cell.measure), []).append(cell)
     columns = min(3, len(tasks))
     rows = -(-len(tasks) // columns)
     labels = {
-        task: [_break(cell.label.removeprefix(f"{task}/")) for cell in group]
-        for task, group in tasks.items()
+        (task, measure): [_break(cell.label.removeprefix(f"{task}/")) for cell in group]
+        for (task, measure), group in tasks.items()
     }
     breaks = max(label.count("\n") for group in labels.values() for label in group)
     height = 0.6 + (0.32 + 0.16 * breaks) * max(map(len, tasks.values()))
     figure = _blank((4.2 * columns, height * rows + 0.6))
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
-    for axes, (task, group) in zip(panels, tasks.items(), strict=False):
+    for axes, ((task, measure), group) in zip(panels, tasks.items(), strict=False):
         places = np.arange(len(group))
         # A single run has no interval.
         below = [cell.iqm - cell.low if cell.runs > 1 else 0 for cell in group]
@@ -147,8 +151,8 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
             markersize=4,
             label="paper",
         )
-        axes.set_yticks(places, labels[task])
-        axes.set(title=task, ylim=(len(group) - 0.4, -0.6))
+        axes.set_yticks(places, labels[task, measure])
+        axes.set(title=task, xlabel=measure, ylim=(len(group) - 0.4, -0.6))
         axes.grid(alpha=0.3)
     for axes in panels[len(tasks) :]:
         axes.set_visible(False)

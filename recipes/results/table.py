@@ -10,17 +10,27 @@ from dataclasses import asdict, dataclass, fields
 from functools import cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from torchrl_tit.datasets import has_reference
+
 from ..dataset_recipe import DatasetRecipe
 from ..recipe import Recipe
+from ..registry import RECIPES
 from ..run import Run
 from .cell import Cell
 from .experiments import Experiment, group_runs
 from .interval import interval_of
 
 OTHER = "not in the paper"
+
+_TASK = (
+    *("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions"),
+    "backbone",
+)
+"""The fields that say which task is learned, and by which network."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +153,10 @@ def _value(evaluation: dict) -> float:
     return float(evaluation["score"]["best"] if "score" in evaluation else evaluation["mean"])
 
 
+def _measure(recipe: Recipe, evaluation: dict) -> str:
+    return "normalized score" if "score" in evaluation and has_reference(recipe.env) else "return"
+
+
 def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
     values = np.array([_value(evaluation) for evaluation in evaluations])
     spreads = [evaluation.get("score_std", evaluation["std"]) for evaluation in evaluations]
@@ -162,15 +176,24 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
         paper_mean=paper.mean if paper else float("nan"),
         paper_std=paper.std if paper else float("nan"),
         changes=experiment.changes,
+        measure=_measure(experiment.settings, evaluations[0]),
     )
 
 
 def _paper_result(recipe: Recipe) -> Result | None:
-    """What the paper reports of a recipe, unless it was trained on other data than there."""
+    """What the paper reports of a recipe, if task, network and data are those of its name."""
     plain = _plain(recipe.name)
+    named = RECIPES.get(recipe.name) or RECIPES.get(plain)
+    if named is None or any(_part(recipe, field) != _part(named, field) for field in _TASK):
+        return None
     if isinstance(recipe, DatasetRecipe) and _stem(recipe.dataset) not in plain.split("/"):
         return None
     return paper_results().get(plain)
+
+
+def _part(recipe: Recipe, field: str) -> Any:
+    """A field that only some recipes have; None in the others."""
+    return getattr(recipe, field, None)
 
 
 def _stem(dataset: str) -> str:

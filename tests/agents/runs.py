@@ -23,13 +23,13 @@ def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
         env_settings=("max_episode_steps=20",),
     )
     torch.manual_seed(3)
-    networks = make_algorithm(recipe).networks()
+    algorithm = make_algorithm(recipe)
     state = {
         name: torch.rand_like(value) - 0.5 if name.endswith(("bias", "mean")) else value
-        for name, value in networks.state_dict().items()
+        for name, value in algorithm.networks().state_dict().items()
     }
     run = Run.create(folder, recipe)
-    record = {"outcomes": [], "evaluation_seed": recipe.evaluation_seed}
+    record = runner.Record(recipe, algorithm).state_dict()
     run.save(7, {"networks": state, "record": record})
     run.save_evaluation(runner.evaluate(run))
     return folder

@@ -1,11 +1,14 @@
+import itertools
 import json
+import multiprocessing
 import os
 import pickle
 import resource
 import shutil
+import signal
 import subprocess
-import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +35,14 @@ def assert_state(state: dict[str, Any], step: int) -> None:
     assert state["step"] == step
     assert state["weights"]["a"].equal(torch.full((50,), float(step)))
     assert state["weights"]["b"].equal(torch.tensor(step))
+
+
+def run(function: Callable[..., None], *args: object) -> int | None:
+    """Runs a function in a process of its own, and returns its exit code."""
+    process = multiprocessing.Process(target=function, args=args)
+    process.start()
+    process.join()
+    return process.exitcode
 
 
 def snapshot(folder: Path) -> dict[str, bytes]:
@@ -134,35 +145,29 @@ def test_failing_while_saving(tmp_path: Path, monkeypatch, target, error) -> Non
     assert checkpoint_steps(tmp_path) == [2]
 
 
-FULL_DISK = """
-import sys, torch
-from torchrl_tit.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-try:
-    save_checkpoint(sys.argv[1], 2, {"weight": torch.ones(1_000_000)})
-except CheckpointError as error:
-    print(error)
-print(load_checkpoint(sys.argv[1])[0])
-"""
+def save_on_a_full_disk(folder: Path, limit: int, output: Path) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    message = ""
+    try:
+        save_checkpoint(folder, 2, {"weight": torch.ones(1_000_000)})
+    except CheckpointError as error:
+        message = str(error)
+    output.write_text(f"{message}\n{load_checkpoint(folder)[0]}")
 
 
 def check_full_disk(folder: Path, limit: int) -> None:
     save_checkpoint(folder, 1, make_state(1))
     before = snapshot(folder)
-    result = subprocess.run(
-        [sys.executable, "-c", FULL_DISK, str(folder)],
-        capture_output=True,
-        text=True,
-        check=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
-    )
-    message, loaded = result.stdout.splitlines()
+    output = folder.with_name("output")
+    assert run(save_on_a_full_disk, folder, limit, output) == 0
+    message, loaded = output.read_text().splitlines()
     assert f"step 2 could not be saved in {folder}" in message
     assert loaded == "1"
     assert snapshot(folder) == before
 
 
 def test_a_limit_of_the_operating_system(tmp_path: Path) -> None:
-    check_full_disk(tmp_path, 100_000)
+    check_full_disk(tmp_path / "folder", 100_000)
 
 
 def test_a_really_full_disk(tmp_path: Path) -> None:
@@ -289,94 +294,73 @@ def test_pickle_in_place_of_a_file(folder: Path, tmp_path: Path, name: str, pack
     assert not (tmp_path / "sprung").exists()
 
 
-# Dies at the n-th call that changes the disk, for every n there is, in a child each time; after
-# each death the parent loads, like a resumed run.
-DIE_EVERYWHERE = """
-import os, pathlib, shutil, signal, sys, torch
-torch.set_num_threads(1)
-from torchrl_tit.checkpoint import (
-    checkpoint_steps, contents, load_checkpoint, save_checkpoint
-)
-folder, first, second = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
-
-def make(value):
+def make_whole(value: int) -> dict[str, Any]:
     return {"value": value, "weight": torch.full((50,), float(value))}
 
-def save_and_die(after):
+
+def save_and_die(folder: Path, step: int, after: int) -> None:
+    """Dies at the first call that changes the disk after so many of them."""
     left = after
-    def fragile(call):
-        def wrapper(*args, **kwargs):
+
+    def fragile(call: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapper(*args: Any, **kwargs: Any) -> Any:
             nonlocal left
             if left == 0:
                 os.kill(os.getpid(), signal.SIGKILL)
             left -= 1
             return call(*args, **kwargs)
+
         return wrapper
+
     for name in ("fsync", "rename", "mkdir", "unlink", "rmdir", "open"):
         setattr(os, name, fragile(getattr(os, name)))
     contents.save_file = fragile(contents.save_file)
-    save_checkpoint(folder, second, make(2), keep=1)
+    save_checkpoint(folder, step, make_whole(2), keep=1)
     os._exit(0)
-
-for after in range(1000):
-    shutil.rmtree(folder, ignore_errors=True)
-    save_checkpoint(folder, first, make(1), keep=1)
-    child = os.fork()
-    if child == 0:
-        save_and_die(after)
-    _, status = os.waitpid(child, 0)
-    assert checkpoint_steps(folder)
-    for found in checkpoint_steps(folder):  # whatever has a number is whole
-        step, state = load_checkpoint(folder, found)
-        value = state["value"]
-        assert state["weight"].equal(torch.full((50,), float(value)))
-        assert step == (first if value == 1 else second), (after, step, value)
-    save_checkpoint(folder, second, make(3), keep=1)
-    assert load_checkpoint(folder)[1]["value"] == 3
-    assert os.listdir(folder) == [f"{second:012d}"], os.listdir(folder)
-    if status == 0:
-        print("deaths", after)
-        break
-    assert os.WTERMSIG(status) == signal.SIGKILL
-"""
 
 
 @pytest.mark.parametrize("second", [2, 1], ids=["next step", "same step"])
 def test_killed_at_every_single_point(tmp_path: Path, second: int) -> None:
-    arguments = [str(tmp_path / "checkpoints"), "1", str(second)]
-    result = subprocess.run(
-        [sys.executable, "-c", DIE_EVERYWHERE, *arguments], capture_output=True, text=True
-    )
-    assert result.returncode == 0, result.stderr
-    assert int(result.stdout.split()[1]) >= 10
+    """After each death, this process loads, like a resumed run."""
+    folder, first = tmp_path / "checkpoints", 1
+    for after in range(1000):
+        shutil.rmtree(folder, ignore_errors=True)
+        save_checkpoint(folder, first, make_whole(1), keep=1)
+        status = run(save_and_die, folder, second, after)
+        assert checkpoint_steps(folder)
+        for found in checkpoint_steps(folder):  # whatever has a number is whole
+            step, state = load_checkpoint(folder, found)
+            value = state["value"]
+            assert state["weight"].equal(torch.full((50,), float(value)))
+            assert step == (first if value == 1 else second), after
+        save_checkpoint(folder, second, make_whole(3), keep=1)
+        assert load_checkpoint(folder)[1]["value"] == 3
+        assert os.listdir(folder) == [f"{second:012d}"]
+        if status == 0:
+            break
+        assert status == -signal.SIGKILL
+    assert 10 <= after < 999
 
 
-SAVE_FOR_EVER = """
-import itertools, sys, torch
-torch.set_num_threads(1)
-from torchrl_tit.checkpoint import latest_step, save_checkpoint
-print("ready", flush=True)
-start = latest_step(sys.argv[1]) or 0
-for step in itertools.count(start):  # the first one again, like a resumed run
-    state = {"step": step, "weight": torch.full((100_000,), float(step))}
-    save_checkpoint(sys.argv[1], step, state, keep=2)
-"""
+def save_for_ever(folder: Path) -> None:
+    for step in itertools.count(
+        latest_step(folder) or 0
+    ):  # the first one again, like a resumed run
+        weight = torch.full((100_000,), float(step))
+        save_checkpoint(folder, step, {"step": step, "weight": weight}, keep=2)
 
 
 def test_killed_at_any_moment(tmp_path: Path) -> None:
     reached = -1
     for delay in (0.05, 0.31, 0.173):
-        with subprocess.Popen(
-            [sys.executable, "-c", SAVE_FOR_EVER, str(tmp_path)], stdout=subprocess.PIPE
-        ) as process:
-            assert process.stdout is not None
-            process.stdout.readline()
-            while (latest_step(tmp_path) or -1) <= reached:
-                assert process.poll() is None
-            try:
-                process.wait(delay)
-            except subprocess.TimeoutExpired:
-                process.kill()
+        process = multiprocessing.Process(target=save_for_ever, args=(tmp_path,))
+        process.start()
+        while (latest_step(tmp_path) or -1) <= reached:
+            assert process.is_alive()
+        process.join(delay)
+        assert process.is_alive()
+        process.kill()
+        process.join()
         step, state = load_checkpoint(tmp_path)
         assert step > reached
         reached = step

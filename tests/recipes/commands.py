@@ -1,19 +1,13 @@
-"""The command line in a process of its own, without the seconds that importing PyTorch takes.
-
-Each process is forked from one that has imported everything already.
-"""
+"""The command line in a process of its own, without the seconds that importing PyTorch takes."""
 
 import multiprocessing
 import os
-import signal
+import resource
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from recipes.cli import main
-
-_CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["recipes.cli.main", "recipes.runner", "recipes.ppo.algorithm"])
 
 
 class Command:
@@ -22,12 +16,16 @@ class Command:
     Args:
         words: the command and its arguments.
         errors: file for what it writes to standard error.
+        file_size: bytes that no file may exceed, as if the disk were full.
     """
 
-    def __init__(self, words: Sequence[object], errors: Path) -> None:
+    def __init__(
+        self, words: Sequence[object], errors: Path, *, file_size: int | None = None
+    ) -> None:
         self.errors = errors
-        # Not a daemon: it may have processes of its own.
-        self._process = _CONTEXT.Process(target=_run, args=([str(word) for word in words], errors))
+        # It begins at once: see tests/processes.py. Not a daemon: it may have processes of its own.
+        arguments = [str(word) for word in words], errors, file_size
+        self._process = multiprocessing.Process(target=_run, args=arguments)
         self._process.start()
 
     def poll(self) -> int | None:
@@ -35,7 +33,12 @@ class Command:
         self._process.join(0)
         return self._process.exitcode
 
-    def send_signal(self, number: signal.Signals) -> None:
+    @property
+    def returncode(self) -> int | None:
+        """As that of ``subprocess.Popen``."""
+        return self.poll()
+
+    def send_signal(self, number: int) -> None:
         """Sends the process a signal."""
         assert self._process.pid is not None
         os.kill(self._process.pid, number)
@@ -49,8 +52,10 @@ class Command:
         return self._process.exitcode
 
 
-def _run(words: list[str], errors: Path) -> None:
+def _run(words: list[str], errors: Path, file_size: int | None) -> None:
     os.setsid()
+    if file_size is not None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
     with errors.open("w") as file, open(os.devnull, "w") as null:
         os.dup2(null.fileno(), 1)
         os.dup2(file.fileno(), 2)

@@ -43,7 +43,7 @@ def test_a_run_starts_from_the_weights_and_resumes_without_the_other_run(
     tmp_path, capsys, monkeypatch
 ):
     weights = begin(tmp_path / "other", PPO)
-    monkeypatch.setattr(training, "_finish", lambda run: None)
+    monkeypatch.setattr(training, "_finish", lambda *_: None)
     words = ["train", str(tmp_path / "other" / "recipe.json"), "--learning-rate", "1e-30"]
     main([*words, "--out", str(tmp_path / "new"), "--init-from", str(tmp_path / "other")])
     names = [f"backbone.module.{name}" for name in LAYERS]

@@ -67,8 +67,29 @@ def test_a_damaged_row_is_named(row, tmp_path):
     write(tmp_path, [(64, 1.0, 2.0)])
     path = tmp_path / "metrics.csv"
     path.write_text(path.read_text() + row + "\n")
-    with pytest.raises(ValueError, match=r"metrics\.csv has a damaged row for step 128"):
+    with pytest.raises(ValueError, match=r"metrics\.csv has a damaged row after step 64"):
         read_metrics(path)
+
+
+@pytest.mark.parametrize(
+    "text", ["time,loss\n1,2\n", "step,loss\ninf,2\n", f"step,loss\n1,{'2' * 200_000}\n", "\xff"]
+)
+def test_a_file_that_is_no_metrics_is_named(text, tmp_path):
+    path = tmp_path / "metrics.csv"
+    path.write_text(text, encoding="latin-1")
+    with pytest.raises(ValueError, match=r"metrics\.csv has a damaged row after its beginning"):
+        read_metrics(path)
+
+
+def test_a_linked_folder_of_tensorboard_is_not_touched(tmp_path):
+    other = tmp_path / "elsewhere"
+    other.mkdir()
+    (other / "thesis.tex").write_text("years of work")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "tensorboard").symlink_to(other)
+    write(tmp_path / "run", [(64, 1.0, 2.0)])
+    assert [path.name for path in other.iterdir()] == ["thesis.tex"]
+    assert scalars(tmp_path / "run", "loss") == [(64, 1.0)]
 
 
 def test_metrics_of_another_run_are_refused_and_stay(tmp_path):

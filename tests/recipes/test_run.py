@@ -22,6 +22,9 @@ from recipes.ppo import PPO
 from recipes.recipe_json import settings_to_dict
 from recipes.results.plot import plot_run
 from recipes.run import Run
+from tests.recipes.commands import Command
+from tests.recipes.states import unchecked
+from tests.recipes.untrained import untrained
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit
 
@@ -71,6 +74,20 @@ def test_what_a_kill_leaves_before_the_recipe_is_no_run(tmp_path):
     assert Run.create(folder, SMALL).recipe == Run.open(folder).recipe == SMALL
 
 
+def test_what_killed_writes_left_is_removed(tmp_path):
+    run = untrained(tmp_path / "run", SMALL)
+    for name in (".metrics.csv.0a1b2c3d.tmp", ".recipe.json.0a1b2c3d.tmp", ".mine.0a1b2c3d.tmp"):
+        (run.folder / name).touch()
+    with run:
+        hidden = {path.name for path in run.folder.iterdir() if path.name.startswith(".")}
+    assert hidden == {".lock", ".mine.0a1b2c3d.tmp"}
+
+
+def test_a_folder_may_be_named_by_text(tmp_path):
+    Run.create(str(tmp_path / "run"), SMALL)
+    assert Run.open(str(tmp_path / "run")).checkpoints == tmp_path / "run" / "checkpoints"
+
+
 def edit(path: Path, **fields: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
@@ -114,7 +131,7 @@ def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch,
     monkeypatch.setattr(runner, "train", lambda *_: None)
     monkeypatch.setattr("recipes.cli.training.plot_run", lambda run: None)
     evaluation = {"mean": 0, "std": 0, "episodes": 1, "steps": 0, "weights": "last"}
-    monkeypatch.setattr(runner, "evaluate", lambda *_: evaluation)
+    monkeypatch.setattr(runner, "evaluate", lambda *_, **__: evaluation)
     for _ in range(3):
         main(["train", "ppo/cartpole/enhanced-tit"])
     folders = sorted(path.name for path in Path("runs/ppo/cartpole/enhanced-tit").iterdir())
@@ -140,7 +157,7 @@ def test_is_complete_only_when_trained_evaluated_and_drawn(tmp_path):
 
 
 def test_a_run_that_was_stopped_in_its_evaluation_is_evaluated_then(tmp_path, monkeypatch, capsys):
-    def ctrl_c(*_):
+    def ctrl_c(*_, **__):
         raise KeyboardInterrupt
 
     arguments = ["train", "ppo/cartpole/enhanced-tit", "--out", str(tmp_path / "run")]
@@ -208,8 +225,9 @@ def test_version_changes(tmp_path):
     assert run.version_changes() == []
     edit(run.folder / "versions.json", torch="1.0")
     assert run.version_changes() == [f"torch 1.0 -> {torch.__version__}"]
-    (run.folder / "versions.json").write_text("{")
-    assert run.version_changes() == []
+    for text in ("{", "[]"):
+        (run.folder / "versions.json").write_text(text)
+        assert run.version_changes() == []
 
 
 def test_an_edited_recipe_takes_effect(tmp_path):
@@ -317,7 +335,7 @@ def test_weights_that_explode_are_never_saved(minibatch_size, tmp_path):
     run = trained(tmp_path / "run", replace(recipe, total_steps=64))
     message = r"weights became (inf|nan) in the update at step 128; the checkpoint of step 64 is"
     with run, pytest.raises(FloatingPointError, match=message):
-        runner.train(replace(recipe, learning_rate=1e30), run)
+        runner.train(unchecked(recipe, learning_rate=1e30), run)
     assert run.load()[0] == 64  # type: ignore[index]
     assert len(read_metrics(run.folder / "metrics.csv")) == 1
 
@@ -334,26 +352,15 @@ def test_unicode_and_relative_paths(tmp_path, monkeypatch, capsys):
 
 def test_a_disk_that_is_full_stops_the_process_with_one_line(tmp_path):
     """The limit on a file's size stands for the disk; the metrics still fit, a checkpoint not."""
-    program = """
-import resource, sys
-from recipes import runner
-from recipes.cli import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-main(sys.argv[1:])
-"""
     run = trained(tmp_path / "run")
     edit(run.folder / "recipe.json", total_steps=256)
     before = contents(run.checkpoints)
-    result = subprocess.run(
-        [sys.executable, "-c", program, "train", "--resume", str(run.folder)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert result.returncode == 2
-    line = result.stderr.splitlines()[-1]
+    process = Command(["train", "--resume", run.folder], tmp_path / "errors", file_size=20_000)
+    assert process.wait() == 2
+    errors = process.errors.read_text()
+    line = errors.splitlines()[-1]
     assert line.startswith("error: the checkpoint of step 192 could not be saved")
-    assert "Traceback" not in result.stderr
+    assert "Traceback" not in errors
     assert contents(run.checkpoints) == before
 
 

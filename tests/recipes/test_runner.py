@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import random
@@ -19,7 +20,7 @@ from torch import nn
 
 from recipes.algorithm import Algorithm, NotFiniteError, check_finite
 from recipes.callback import Callback
-from recipes.metrics import read_metrics
+from recipes.metrics import Metrics, read_metrics
 from recipes.outcomes import Outcome
 from recipes.recipe import Recipe
 from recipes.run import Run
@@ -39,7 +40,7 @@ class Toy(Recipe):
     batch: int = 1
     learning_rate: float = 0.1
     bad_step: int = 0
-    bad_value: float = math.nan
+    bad_value: str = "nan"
     evaluation_interval: int = 10
 
     @property
@@ -74,9 +75,10 @@ class ToyAlgorithm(Algorithm[Toy]):
     def prepare(self, step: int, folder: Path) -> None:
         self.optimizer = torch.optim.Adam(self.weight.parameters(), lr=self.recipe.learning_rate)
         self.log.append(("prepare", step, folder))
+        self.first = step // self.recipe.batch
 
     def batches(self) -> Any:
-        return count()
+        return count(self.first)
 
     def size(self, batch: int) -> int:
         return self.recipe.batch
@@ -92,9 +94,9 @@ class ToyAlgorithm(Algorithm[Toy]):
         self.optimizer.step()
         value = self.weight.weight.detach().squeeze()
         if step == self.recipe.bad_step and step:
-            if self.recipe.bad_value == math.inf:  # found at once
+            if self.recipe.bad_value == "inf":  # found at once
                 check_finite(["weight"], torch.tensor([math.inf]))
-            value = torch.tensor(self.recipe.bad_value)  # left to the loop
+            value = torch.tensor(float(self.recipe.bad_value))  # left to the loop
         return {"rare": math.nan, "weight": value}
 
     def state(self) -> dict[str, Any]:
@@ -256,20 +258,86 @@ def test_a_resumed_optimizer_has_the_recipes_settings_and_its_own_counters(tmp_p
     assert state["state"][0]["step"].item() == 25
 
 
+def test_a_disk_that_is_full_at_any_write_loses_nothing(tmp_path, monkeypatch):
+    """Each write of a run fails once; the error names the file, and the run then goes on."""
+    recipe = replace(SMALL, total_steps=10)
+    fsync, written, limit = os.fsync, 0, 10**6
+
+    def until_full(descriptor):
+        nonlocal written
+        if written >= limit:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written += 1
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", until_full)
+    whole = start(recipe, tmp_path / "whole")
+    writes = written
+    assert writes > 20
+    for number in range(writes):
+        folder, written, limit = tmp_path / str(number), 0, number
+        with pytest.raises(OSError, match=rf"No space left on device.*{folder}|{folder}.*No space"):
+            start(recipe, folder)
+        limit = 10**6
+        if not (folder / "recipe.json").exists():
+            Run.create(folder, recipe)
+        assert_same_run(start(recipe, folder), whole)
+        assert not [path for path in folder.rglob("*") if ".tmp" in path.name]
+        shutil.rmtree(folder)
+
+
+def test_the_rows_of_a_checkpoint_are_on_the_disk_before_it_is(tmp_path, monkeypatch):
+    written: list[str] = []
+    sync, save = Metrics.sync, Run.save
+
+    def sync_rows(metrics):
+        sync(metrics)
+        written.append("rows")
+
+    def save_state(*own):
+        written.append("checkpoint")
+        save(*own)
+
+    monkeypatch.setattr(Metrics, "sync", sync_rows)
+    monkeypatch.setattr(Run, "save", save_state)
+    start(replace(SMALL, total_steps=8), tmp_path / "run")
+    assert written == ["rows", "checkpoint"] * 2
+
+
+def test_a_callback_that_ends_training_earlier_says_so_in_the_bar(tmp_path, capsys):
+    callback = Steps(7, lambda: True)
+    callback.last_step = 8
+    start(SMALL, tmp_path / "run", callback)
+    assert "/8 " in capsys.readouterr().err
+
+
 def test_a_callback_ends_the_training_at_a_checkpoint(tmp_path):
     run = start(SMALL, tmp_path / "run", Steps(7, lambda: True), Steps())
     assert checkpoint_steps(run.checkpoints)[-1] == 7
     assert ToyAlgorithm.log[-1] == ("close",)
 
 
-@pytest.mark.parametrize("value", [math.inf, math.nan])
+def test_a_finished_run_is_trained_further_as_if_it_had_been_that_long(tmp_path):
+    long = start(replace(SMALL, total_steps=40), tmp_path / "long")
+    run = start(SMALL, tmp_path / "run")
+    with run, pytest.raises(ValueError, match=r"total_steps 23 ends at .* trained for 24 steps"):
+        run.lengthen(23)
+    assert run.recipe == SMALL
+    with run:
+        run.lengthen(40)
+        train(run.recipe, run)
+    assert (run.folder / "recipe.json").read_text() == (long.folder / "recipe.json").read_text()
+    assert_same_run(run, long)
+
+
+@pytest.mark.parametrize("value", ["inf", "nan"])
 @pytest.mark.parametrize(
     ("bad_step", "found", "saved"), [(1, 4, 0), (6, 8, 4), (9, 10, 8), (13, 15, 12), (23, 24, 20)]
 )
 def test_what_is_not_finite_is_neither_logged_nor_saved(tmp_path, value, bad_step, found, saved):
     """Found by the update itself, or by the loop before the next row and the next checkpoint."""
     recipe = replace(SMALL, bad_step=bad_step, bad_value=value)
-    at = bad_step + 1 if value == math.inf else found
+    at = bad_step + 1 if value == "inf" else found
     good = f"the checkpoint of step {saved} is good" if saved else "none was saved"
     message = rf"^weight became {value} in the update at step {at}; {good}$"
     with pytest.raises(NotFiniteError, match=message):
@@ -295,6 +363,9 @@ class Hooks(Callback):
     def evaluated(self, step, outcomes):
         self.calls.append((self.name, "evaluated", step, outcomes[0].returns))
 
+    def logged(self, step, row):
+        self.calls.append((self.name, "logged", step, row["step"]))
+
     def saving(self, step):
         self.calls.append((self.name, "saving", step))
 
@@ -308,7 +379,7 @@ def test_hooks_are_called_in_their_order_and_from_the_checkpoint_on(tmp_path):
     recipe = replace(SMALL, total_steps=3, evaluation_interval=3)
     start(recipe, tmp_path / "run", *hooks)
     steps = [(hook, n) for n in (1, 2, 3) for hook in ("collected", "updated")]
-    end = [("evaluated", 3, [3, 4]), ("saving", 3), ("saved", 3, 3)]
+    end = [("evaluated", 3, [3, 4]), ("logged", 3, 3), ("saving", 3), ("saved", 3, 3)]
     assert calls == [(n, *call) for call in [*steps, *end] for n in "ab"]
     calls.clear()
     run = start(replace(recipe, total_steps=4), tmp_path / "run", *hooks)

@@ -55,8 +55,8 @@ def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
         state: What :func:`collector_state` returned.
 
     Raises:
-        ValueError: The state is from another kind of environment, or only one of the two collectors
-            tracks trajectories.
+        ValueError: The state is from another kind of environment, only one of the two collectors
+            tracks trajectories, or a count is none.
 
     Example:
         >>> from torchrl.collectors import Collector
@@ -74,6 +74,9 @@ def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
             "only one of the saved collector and this one tracks trajectories; use the settings of "
             "the saved collector"
         )
+    for name in ("frames", "iteration"):
+        if type(state[name]) is not int or state[name] < 0:
+            raise ValueError(f"the collector's {name} is {state[name]!r}, not a whole number")
     if state["env"] is not None:
         set_env_state(collector.env, state["env"])
         collector._carrier = _placed_like(state["carried"], collector._carrier)

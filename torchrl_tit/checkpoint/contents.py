@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ def write_contents(path: Path, step: int, tensors: dict[str, Tensor], tree: Any)
     }
     document["sha256"] = _sha256_of_document(document)
     (path / _STATE).write_text(json.dumps(document, allow_nan=False), encoding="utf-8")
+    shutil.copymode(path / _STATE, path / _TENSORS)  # safetensors lets only the owner read
     for name in (_TENSORS, _STATE):
         fsync_file(path / name)
     fsync_directory(path)

@@ -85,6 +85,9 @@ def set_layer_state(layer: _Layer, state: dict[str, Any]) -> None:
         layer: A layer of the same class.
         state: What :func:`layer_state` returned.
 
+    Raises:
+        ValueError: The state has other attributes than those that change in such a layer.
+
     Example:
         >>> import gymnasium as gym
         >>> env, other = gym.make("CartPole-v1"), gym.make("CartPole-v1")
@@ -94,6 +97,12 @@ def set_layer_state(layer: _Layer, state: dict[str, Any]) -> None:
         >>> bool((other.unwrapped.state == env.unwrapped.state).all())
         True
     """
+    known = ATTRIBUTES[class_name(layer)]
+    if sorted(state["attributes"]) != sorted(known):
+        raise ValueError(
+            f"the state of {class_name(layer)} has the attributes {sorted(state['attributes'])}, "
+            f"but those that change are {sorted(known)}"
+        )
     for key, value in state["attributes"].items():
         present = getattr(layer, key, None)
         if isinstance(present, deque):

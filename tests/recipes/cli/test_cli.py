@@ -1,10 +1,15 @@
 """The command line, and recipes as JSON."""
 
+import importlib.metadata
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
 
+import torchrl_tit
 from recipes.cli import main
 from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import RECIPES, get_recipe
@@ -72,6 +77,14 @@ def test_train_evaluate_and_resume(capsys, tmp_path):
     assert "exists already" in line
     assert "--resume" in line
 
+    assert "length is --total-steps, not" in fails(
+        capsys, "train", "--resume", str(run), "--total-updates", "128"
+    )
+    main(["train", "--resume", str(run), "--total-steps", "128"])  # further than it was to go
+    assert "decay_learning_rate depends on total_steps" in capsys.readouterr().err
+    assert json.loads((run / "recipe.json").read_text()) == {**recipe, "total_steps": 128}
+    assert json.loads((run / "evaluation.json").read_text())["steps"] == 128
+
 
 def test_help_explains_every_field(capsys):
     with pytest.raises(SystemExit) as exit_:
@@ -100,6 +113,10 @@ def test_help_explains_every_field(capsys):
         (["show", "nothing.json"], "nothing.json"),
         (["list", "atlantis"], "no recipe's name contains 'atlantis'"),
         (["fly"], "unknown command 'fly'"),
+        (["train", "cql/hopper-medium-v0/mlp", "--total-steps", "9"], "runs is --total-updates"),
+        (["train", "dt/hopper-medium-v2/dt", "--total_updates=9"], "its runs is --iterations"),
+        (["train", "NAME", "--threads", "5000"], "threads must be at most 1024, not 5000"),
+        (["train", "NAME", "--entropy-coeff", "nan"], "entropy_coeff must be at least"),
     ],
 )
 def test_bad_words_are_one_line_and_leave_nothing(words, message, capsys, tmp_path, monkeypatch):
@@ -107,6 +124,51 @@ def test_bad_words_are_one_line_and_leave_nothing(words, message, capsys, tmp_pa
     words = ["ppo/cartpole/enhanced-tit" if word == "NAME" else word for word in words]
     assert message in fails(capsys, *words)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_version(capsys):
+    main(["--version"])
+    assert capsys.readouterr().out == f"torchrl-tit {torchrl_tit.__version__}\n"
+    assert torchrl_tit.__version__ == importlib.metadata.version("torchrl-tit")
+
+
+def test_a_reader_who_is_gone_is_no_error():
+    reading, writing = os.pipe()
+    os.close(reading)
+    words = [sys.executable, "-m", "recipes", "--help"]
+    done = subprocess.run(words, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_an_evaluation_of_ones_own_does_not_replace_the_runs(capsys, tmp_path):
+    run = tmp_path / "run"
+    main(["train", "ppo/cartpole/mlp", "--out", str(run), *SHORT])
+    own = (run / "evaluation.json").read_bytes()
+    names = {
+        "evaluation_episodes-3.json": ["--episodes", "3"],
+        "evaluation_seed-7.json": ["--seed", "7"],
+        "evaluation.json": ["--seed", "1000000", "--episodes", "2"],
+    }
+    for name, options in names.items():
+        main(["evaluate", str(run), *options])
+        assert capsys.readouterr().out.endswith(f"written to {run / name}\n")
+    assert (run / "evaluation.json").read_bytes() == own
+    assert json.loads((run / "evaluation_seed-7.json").read_text())["seed"] == 7
+
+
+def test_a_strangers_run_may_only_name_what_computes(capsys, tmp_path):
+    recipe = replace(
+        get_recipe("ppo/cartpole/mlp"),
+        wrappers=("gymnasium.wrappers:RecordVideo(video_folder='films')",),
+    )
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "recipe.json").write_text(recipe_to_json(recipe))
+    for words in (["evaluate"], ["render", "--out", "film.gif"], ["train", "--resume"]):
+        line = fails(capsys, words[0], *words[1:], str(tmp_path / "run"))
+        assert "RecordVideo" in line
+        assert "add `--import gymnasium.wrappers`" in line
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["recipe.json"]
 
 
 def test_list_takes_names_as_gymnasium_writes_them(capsys):
@@ -153,6 +215,8 @@ def test_recipes_come_back_from_json(name):
             r"backbone\.network.*older version",
         ),
         ({"backbone": 3}, r"field 'backbone': expected an object"),
+        ({"backbone": {"network": ["mlp"]}}, r"backbone\.network.*older version"),
+        ({"epochs": 1e30}, r"epochs must be at most 1000000000000, not 1e\+30"),
         ({"device": "tpu"}, r"field 'device' is 'tpu', not one of \('cpu', 'cuda', 'auto'\)"),
     ],
 )
@@ -162,7 +226,7 @@ def test_json_with_wrong_fields_is_refused(change, message):
         recipe_from_json(json.dumps(fields), "recipe.json")
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"algorithm": 1}'])
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"algorithm": 1}', '{"algorithm": ["ppo"]}'])
 def test_text_that_is_no_recipe_is_refused(text):
     with pytest.raises(ValueError, match=r"here\.json cannot be read as a recipe"):
         recipe_from_json(text, "here.json")

@@ -1,6 +1,7 @@
 """Which runs `compare` draws as one curve."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -43,6 +44,15 @@ def drawn(monkeypatch):
 def test_seeds_of_a_recipe_are_one_curve(begun, drawn):
     begun("a"), begun("b", seed=1), begun("c", "ppo/cartpole/d2rl")
     assert drawn("a", "b", "c", "./a") == {NAME: ["a", "b"], "ppo/cartpole/d2rl": ["c"]}
+
+
+def test_the_logs_of_a_sweep_are_passed_over(begun, drawn, capsys):
+    begun("seed-0")
+    Path("seed-0.log").touch()
+    assert drawn("seed-0", "seed-0.log") == {NAME: ["seed-0"]}
+    with pytest.raises(SystemExit):
+        main(["compare", "seed-0.log"])
+    assert "seed-0.log is not a run folder, but a log" in capsys.readouterr().err
 
 
 def test_other_settings_under_one_name_are_another_curve(begun, drawn):

@@ -24,6 +24,7 @@ from recipes.runner import train as train_in
 from tests.datasets.rollouts import roll, write
 from tests.recipes.cql.cql_runs import make_algorithm, make_cql, make_discrete_cql, roll_pong, tit
 from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, assert_same_run, train
+from tests.recipes.states import unchecked
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import normalized_score, normalized_spread
 from torchrl_tit.networks import HistoryNetwork
@@ -97,6 +98,7 @@ def test_images_of_a_game(tmp_path):
         tmp_path,
         dataset=str(write(tmp_path / "pong.hdf5", roll_pong())),
         env="ALE/Pong-v5",
+        env_settings=("max_num_frames_per_episode=400",),
         backbone=tit(4, patch_size=42),
         padding="constant",
         total_updates=4,
@@ -269,7 +271,7 @@ def test_command_line(tmp_path, capsys):
         f"train {path} --backbone.num-frames 2 --backbone.frame.embed-dim 16 --critic-hidden 8 8 "
         f"--over-critics sum --out {out}".split()
     )
-    assert "over 3 episodes after 18 steps" in capsys.readouterr().out
+    assert "over 3 episodes after 18 updates" in capsys.readouterr().out
     recipe = Run.open(out).recipe
     assert isinstance(recipe, CQL)
     assert isinstance(recipe.backbone.frame, Inner)
@@ -287,7 +289,7 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
     recipe = make_cql(tmp_path)
     with Run.create(tmp_path / "run", recipe) as run:
         train_in(replace(recipe, total_updates=9), run)
-        poisoned = replace(recipe, conservative_weight=float("inf"))
+        poisoned = unchecked(recipe, critic_learning_rate=float("inf"))
         with pytest.raises(
             FloatingPointError, match=r"in the update at step \d+.*of step 9 is good"
         ):

@@ -176,7 +176,7 @@ def test_command_line(tmp_path, capsys):
             *("--backbone.history.dropout", "0", "--out", str(out)),
         ]
     )
-    assert "over 3 episodes after 18 steps" in capsys.readouterr().out
+    assert "over 3 episodes after 18 updates" in capsys.readouterr().out
     assert json.loads((out / "evaluation.json").read_text())["targets"].keys() == {"30"}
     recipe = Run.open(out).recipe
     assert isinstance(recipe, DT)

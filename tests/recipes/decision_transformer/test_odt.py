@@ -245,7 +245,7 @@ def test_lamb_is_that_of_the_release():
     ("settings", "message"),
     [
         ({"alpha_init": 0.0}, "alpha_init must be positive, not 0"),
-        ({"online_return": math.inf}, "online_return must be finite, not inf"),
+        ({"online_return": math.inf}, "online_return must be at most 1000000000.0, not inf"),
         ({"capacity": 0}, "capacity must be at least 1"),
         ({"episodes_per_round": 0}, "episodes_per_round must be at least 1"),
         ({"exploration_scale": 0.0}, "exploration_scale must be positive, not 0"),

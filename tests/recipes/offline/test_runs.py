@@ -123,7 +123,7 @@ def test_slices_have_the_loss_of_their_transitions(tmp_path, kind):
         (IQL, {"env": "Blackjack-v1"}, "data sets hold one observation, but .* has several"),
         (BC, {"env": "FrozenLake-v1", "normalize_observations": True}, "int64, not floats: swit"),
         (BC, {"backbone": lstm()}, "bc draws single transitions, so its network cannot carry"),
-        (IQL, {"expectile": 1.0}, r"expectile is a probability in \[0, 1\), not 1.0"),
+        (IQL, {"expectile": 1.0}, r"expectile must be a probability in \(0, 1\), not 1.0"),
         (IQL, {"temperature": -1.0}, "temperature must be at least 0"),
         (IQL, {"critic_hidden": ()}, "critic_hidden must be at least one width"),
         (TD3BC, {"policy_delay": 0}, "policy_delay must be at least 1, not 0"),

@@ -26,7 +26,7 @@ def test_the_name_of_a_task_is_enough(name, env):
 
 def test_what_was_chosen_is_printed_and_recorded(monkeypatch, tmp_path, capsys):
     runs: list[Run] = []
-    monkeypatch.setattr(training, "_finish", runs.append)
+    monkeypatch.setattr(training, "_finish", lambda run, *_: runs.append(run))
     words = ["--env", TASK, "--backbone.frames.state/0", "linear", "--out", str(tmp_path / "run")]
     main(["train", "ppo/mlp", *words, "--backbone.frames.state/0.embed-dim", "8"])
     assert capsys.readouterr().out == (

@@ -8,11 +8,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch._dynamo.utils import counters
 from torch.utils._pytree import tree_leaves
 from torchrl.modules import RandomPolicy
 from torchrl.objectives.value import GAE
 
-from recipes.compilation import STATIC_SHAPES
+from recipes.compilation import compile_and_time
 from recipes.ppo import PPO
 from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
 from recipes.ppo.rollout import FrameCollector, Rollout
@@ -259,19 +260,22 @@ def test_each_frame_of_a_sequence_is_encoded_once(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("c++"), reason="torch.compile needs a C++ compiler")
-def test_the_objective_compiles_as_one_graph(tmp_path):
+def test_the_compiled_objective_is_one_graph_and_the_eager_one(tmp_path):
     recipe = replace(RECIPE, backbone=enhanced_tit(4, num_blocks=1, **SMALL), padding="constant")
     algorithm, batch, rollout, _ = collected(recipe, tmp_path)
     agent, weights = algorithm.agent, list(algorithm.agent.parameters())
     with torch.no_grad():
         add_advantages(batch, rollout, agent, algorithm.gae, True)
-    fast = torch.compile(algorithm._objective, fullgraph=True, **STATIC_SHAPES)
+    counters.clear()
+    fast = compile_and_time(algorithm._objective, "the loss")
     for minibatch in minibatches(batch, rollout, agent, recipe):
         results = []
         for objective in (algorithm._objective, fast):
             total, terms = objective(minibatch.copy())
             results.append([total, terms, *torch.autograd.grad(total, weights)])
         assert_near(*results)
+    assert counters["stats"]["unique_graphs"]
+    assert not counters["graph_break"]
 
 
 @pytest.mark.parametrize("frames", [4, 24])  # some windows begin two batches ago

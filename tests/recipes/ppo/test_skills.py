@@ -72,7 +72,9 @@ def minibatch():
 
 def prepared(tmp_path, **fields):
     torch.manual_seed(0)
-    recipe = replace(ATARI_RECIPES["ppo/pong/coberl"], backbone=COBERL, compile="off", **fields)
+    recipe = replace(
+        ATARI_RECIPES["ppo/pong/coberl"], backbone=COBERL, num_envs=1, compile="off", **fields
+    )
     algorithm = PPOAlgorithm(recipe)
     algorithm.prepare(0, tmp_path)
     algorithm.close()

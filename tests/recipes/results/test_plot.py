@@ -7,7 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from recipes.results.cell import Cell
-from recipes.results.plot import plot_comparison, plot_table
+from recipes.results.plot import plot_comparison, plot_learning_curve, plot_table
 
 
 def height(folder: Path, groups: int) -> int:
@@ -72,3 +72,19 @@ def test_what_was_changed_has_room_beside_its_panel(tmp_path, monkeypatch):
         ]
         boxes += [axes.bbox, *(label.get_window_extent() for label in labels)]
     assert not any(box.overlaps(other) for box, other in combinations(boxes, 2))
+
+
+@pytest.mark.parametrize("rows", ["1,0,2.0\n", "", "1,0,nan\n"])
+def test_a_run_of_one_batch_is_seen(rows, tmp_path, monkeypatch):
+    metrics = tmp_path / "metrics.csv"
+    metrics.write_text(f"step,time,return_mean\n{rows}")
+    figures = []
+    monkeypatch.setattr("recipes.results.plot._save", lambda figure, _: figures.append(figure))
+    plot_learning_curve(metrics, tmp_path / "curve.png", title="")
+    (axes,) = figures[0].axes
+    point = "2.0" in rows
+    assert {line.get_marker() for line in axes.lines} == {"o" if point else "None"}
+    assert [text.get_text() for text in axes.texts] == ([] if point else ["no episode has ended"])
+    if point:
+        plot_comparison({"run": [metrics]}, tmp_path / "curve.png", title="")
+        assert figures[1].axes[0].lines[0].get_marker() == "o"

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from recipes.cli import main
 from recipes.recipe_json import recipe_to_json
 from recipes.registry import RECIPES, get_recipe
+from recipes.results import plot
 from recipes.results.table import make_table, paper_results, to_csv, to_markdown
 from torchrl_tit.settings import Linear
 from torchrl_tit.settings.networks import enhanced_tit, mlp
@@ -110,6 +112,44 @@ def test_other_data_do_not_stand_beside_the_papers_numbers(tmp_path):
     assert [cell.table for cell in cells] == ["offline", "not in the paper"]
 
 
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, True),
+        ({"learning_rate": 1e-3, "total_steps": 1000}, True),
+        ({"env": "CartPole-v1"}, False),
+        ({"env_settings": ("max_episode_steps=9",)}, False),
+        ({"wrappers": ("gymnasium.wrappers:TimeLimit(max_episode_steps=9)",)}, False),
+        ({"hide_velocities": True}, False),
+        ({"backbone": mlp(hidden_dim=256)}, False),
+        ({"name": "ppo/acrobot/mine"}, False),
+    ],
+)
+def test_another_task_or_network_does_not_stand_beside_the_papers(changes, expected, tmp_path):
+    write_run(tmp_path / "run", "ppo/acrobot/mlp", 0, [-80.0], **changes)
+    ((cell,), _) = make_table([tmp_path])
+    assert (cell.table == "online, arrays") == expected
+    assert (cell.paper_mean == cell.paper_mean) == expected
+
+
+def test_scores_and_returns_are_not_of_one_measure(tmp_path):
+    name = "cql/hopper-medium-v0/mlp"
+    for number, env in enumerate(["Hopper-v4", "Reacher-v5"]):
+        folder = write_run(tmp_path / str(number), name, 0, [10.0], env=env)
+        evaluation = json.loads((folder / "evaluation.json").read_text())
+        evaluation |= {"score": {"best": 10.0, "last": 10.0}, "score_std": 0.0}
+        (folder / "evaluation.json").write_text(json.dumps(evaluation))
+    cells, _ = make_table([tmp_path])
+    assert [cell.measure for cell in cells] == ["normalized score", "return"]
+    picture = tmp_path / "table.png"
+    figures: list[Figure] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plot, "_save", lambda figure, _: figures.append(figure))
+        plot.plot_table(cells, picture)
+    panels = [axes for axes in figures[0].axes if axes.get_visible()]
+    assert [axes.get_xlabel() for axes in panels] == ["normalized score", "return"]
+
+
 def test_every_value_of_the_paper_belongs_to_a_recipe():
     assert set(paper_results()) <= set(RECIPES)
     online = {name for name, result in paper_results().items() if name.startswith("ppo/")}
@@ -156,8 +196,8 @@ def test_what_was_changed_is_named(tmp_path):
     write_run(tmp_path / "1", "ppo/cartpole/d2rl", 0, [500.0])
     cells, _ = make_table([tmp_path])
     assert [cell.changes for cell in cells] == [
-        "backbone.history.hidden_dim 256, total_steps 1000",
         "",
+        "backbone.history.hidden_dim 256, total_steps 1000",
     ]
     text = to_markdown(cells)
     assert (

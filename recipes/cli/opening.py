@@ -1,0 +1,22 @@
+"""Run folders that commands are given, which may be a stranger's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..agents.named_parts import check_named_parts
+from ..run import Run
+
+
+def open_run(folder: Path) -> Run:
+    """Opens a run that is to act: as of an agent, what its recipe names may only compute.
+
+    Raises:
+        AgentError: if its recipe names a task or a wrapper that may do more, which the user did not
+            name.
+        FileNotFoundError: if the folder is not a run folder.
+        ValueError: if its recipe cannot be read, or what it names is not there.
+    """
+    run = Run.open(folder)
+    check_named_parts(run.recipe)
+    return run
