@@ -6,18 +6,28 @@
 PYTHON ?= python3
 VENV ?= .venv
 WORKERS ?= 2
+VERSIONS ?= 3.11-lowest 3.12-pinned 3.13-newest
 OUT ?= runs/demo-$(shell date +%Y%m%d-%H%M%S)
 ARGS ?=
 
 BIN := $(VENV)/bin
 # One thread a process: the workers of the tests would otherwise fight over the cores.
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1
+# The tests force thousands of files to the disk; a folder in memory saves that wait, if it has room.
+IN_MEMORY := $(shell df -Pk /dev/shm 2>/dev/null | \
+  awk 'NR == 2 && $$4 > 4000000 {print "PYTEST_DEBUG_TEMPROOT=/dev/shm"}')
+TESTED := $(BIN)
+PYTEST = $(ONE_THREAD) $(IN_MEMORY) $(TESTED)/python -m pytest -n $(WORKERS) --dist worksteal
+
+# Every process of the tests would compile every module anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
+.PRECIOUS: $(VENV)/installed-%
 # The tests come last, also under `make -j`: their closing line ends the log.
 .NOTPARALLEL:
-.PHONY: help demo test lint types numerics unit bench format hooks clean
+.PHONY: help demo test lint types numerics unit versions kill fuzz soak browser bench docs format hooks clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -37,15 +47,53 @@ types: $(VENV)/installed-test  ## Check types
 
 # Processors differ in the order in which they add numbers up; this is the order of the plainest.
 numerics: $(VENV)/installed-test  ## Compare numbers once more as a processor of another kind makes them
-	ATEN_CPU_CAPABILITY=default $(ONE_THREAD) $(BIN)/python -m pytest tests -n $(WORKERS) \
-	  --dist worksteal -m "numerics and not slow" -k "not compile and not export"
+	ATEN_CPU_CAPABILITY=default $(PYTEST) -m "numerics and not slow" \
+	  -k "not compile and not export" \
+	  $$(grep -rlF --include='test_*.py' pytest.mark.numerics tests)
 
 unit: $(VENV)/installed-test  ## Run the tests and the examples in docstrings (ARGS="-k history" for some)
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
+	$(PYTEST) --durations 20 $(ARGS)
+
+# Of the direct dependencies: the oldest that pyproject.toml allows, those of constraints.txt, and
+# the newest. UV_PYTHON_DOWNLOADS=never uses the interpreters of this machine alone.
+versions: $(addprefix versions/,$(VERSIONS))  ## Run the tests on the versions and Pythons allowed (30 GB; ARGS as above)
+
+RESOLUTION_lowest := --resolution lowest-direct
+RESOLUTION_pinned := -c constraints.txt
+
+versions/%: TESTED = $(VENV)-$*/bin
+versions/%: $(VENV)/installed-versions
+	$(BIN)/uv venv --clear --python $(word 1,$(subst -, ,$*)) $(VENV)-$*
+	$(BIN)/uv pip install --compile-bytecode --python $(TESTED)/python \
+	  $(RESOLUTION_$(word 2,$(subst -, ,$*))) -e '.[test]'
+	$(PYTEST) $(ARGS)
+
+# The runs are left in RUNS; the same folder goes on where `make kill` was stopped.
+RUNS ?= runs/reliability
+MINUTES ?= 120
+
+kill: $(VENV)/installed-test  ## Kill runs at random moments and resume them, bit for bit (an hour or more)
+	$(ONE_THREAD) $(BIN)/python -m tests.reliability.kill --runs $(RUNS)/kill $(ARGS)
+
+fuzz: $(VENV)/installed-test  ## Give 1,000 wrong inputs to recipes, networks, data sets and commands
+	$(ONE_THREAD) $(BIN)/python -m tests.reliability.fuzz $(ARGS)
+
+soak: $(VENV)/installed-test  ## Watch memory, files and speed of three runs for MINUTES=120
+	$(ONE_THREAD) $(BIN)/python -m tests.reliability.soak --runs $(RUNS)/soak --minutes $(MINUTES) $(ARGS)
+
+# Debian: apt-get install chromium chromium-driver
+browser: $(VENV)/installed-browser  ## Look at reports in headless Chromium, which has to be there
+	BROWSER_TESTS=1 $(PYTEST) tests/recipes/results -n 0 -m browser $(ARGS)
 
 bench: $(VENV)/installed-bench  ## Measure speed against other libraries
 	$(BIN)/python -m pip install --no-deps -r benchmarks/d3rlpy.txt
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(ARGS)
+
+# The commands and fields are read from the code; the site is built beside it, with packages of its own.
+docs: $(VENV)/installed-run $(VENV)-docs/installed  ## Build the documentation site: build/site/index.html
+	rm -rf build/docs
+	$(ONE_THREAD) $(BIN)/python -m docs.tools.reference build/docs/reference
+	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict --quiet
 
 format: $(VENV)/installed-test  ## Rewrite the code in the project's style
 	$(BIN)/ruff check --fix .
@@ -55,7 +103,7 @@ hooks: $(VENV)/installed-test  ## Check every commit and push as `make test` doe
 	$(BIN)/pre-commit install
 
 clean:  ## Remove the environment, builds and caches; runs stay
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-* build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/created:
@@ -63,6 +111,11 @@ $(VENV)/created:
 	  echo "torchrl-tit needs Python 3.11 or newer, and '$(PYTHON)' is not:" \
 	    "make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
 	$(PYTHON) -m venv --clear $(VENV)
+	@touch $@
+
+$(VENV)-docs/installed: docs/requirements.txt $(VENV)/created
+	$(BIN)/python -m venv --clear $(VENV)-docs
+	$(VENV)-docs/bin/python -m pip install -r docs/requirements.txt
 	@touch $@
 
 # The extra to install is the end of the stamp's name; 'run' stands for none.

@@ -1,35 +1,73 @@
-"""Settings of the whole suite."""
+"""Settings of the whole suite.
+
+PyTorch is imported where it is used: the process that deals the tests out to others needs it not.
+"""
 
 import os
+import platform
+import random
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from copy import deepcopy
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
-import torch
 
 from recipes.recipe import Recipe
 from recipes.registry import RECIPES
+from tests import processes
 from torchrl_tit.settings import FrameSettings, HistorySettings, plugins
 from torchrl_tit.settings.names import Names
 
 # Small networks gain nothing from threads, and parallel test workers would fight over the cores.
-if "OMP_NUM_THREADS" not in os.environ:
-    torch.set_num_threads(1)
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+processes.use_server()
 
 # A shell that starts the suite in the background ignores Ctrl-C, which tests of it do not expect.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+SEED = int(os.environ.get("TEST_SEED", "0"))
+
+
 @pytest.fixture(autouse=True)
 def _seed() -> None:
     """A test draws the same numbers whichever tests ran before it."""
-    torch.manual_seed(0)
+    import torch
+
+    random.seed(SEED)
+    np.random.seed(SEED)
+    torch.manual_seed(SEED)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """A failing test says what it ran with, so that it can be run so again."""
+    report = yield
+    if report.failed:
+        report.sections.append(("what it ran with", "\n".join(_describe(item))))
+    return report
+
+
+def _describe(item: pytest.Item) -> Iterator[str]:
+    import torch
+
+    for name, value in item.callspec.params.items() if hasattr(item, "callspec") else ():
+        yield f"{name} = {value!r}"
+    yield f"TEST_SEED={SEED} ATEN_CPU_CAPABILITY={torch.backends.cpu.get_cpu_capability()}"
+    yield f"{torch.get_num_threads()} threads, {torch.get_default_dtype()}"
+    packages = [
+        f"{name} {version(name)}" for name in ("torch", "torchrl", "tensordict", "gymnasium")
+    ]
+    yield ", ".join([f"Python {platform.python_version()}", *packages])
 
 
 @pytest.fixture(autouse=True)
@@ -41,6 +79,8 @@ def _imports(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def float64() -> Iterator[None]:
     """Networks and inputs are made in float64, where rounding hides no mistake."""
+    import torch
+
     before = torch.get_default_dtype()
     torch.set_default_dtype(torch.float64)
     yield

@@ -60,7 +60,8 @@ def test_wheel_holds_every_module_once_and_nothing_beside_the_library(wheel: Pat
     recipes = {
         p.relative_to(ROOT).as_posix()
         for p in (ROOT / "recipes").rglob("*")
-        if p.suffix in (".py", ".csv", ".json")  # with the paper's results and search spaces
+        # With the paper's results, search spaces, and the page of reports.
+        if p.suffix in (".py", ".csv", ".json", ".css", ".html", ".js")
     }
 
     assert "torchrl_tit/agents/cartpole/model.safetensors" in agents

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
-from transformers import GPT2Config, GPT2Model
 
 from tests.interop.test_official_decision_transformer import make_inputs
 from tests.networks.reference import randomize
@@ -48,6 +47,9 @@ class TransformersDT(ReferenceDT):
             "activation_function": activation,
             "attn_implementation": "eager",
         }
+        # Not at the top: it takes seconds to import, in every process that collects tests.
+        from transformers import GPT2Config, GPT2Model
+
         config = GPT2Config(**settings)
         self.gpt2 = GPT2Model(config)
         self.transformer = nn.ModuleDict()

@@ -105,7 +105,7 @@ def test_what_does_not_fit_is_named(kind: str) -> None:
             from_official({"kind": kind, entry: 24}, params)
     with pytest.raises(ValueError, match=r"missing network\.history_encoder\.blocks\.1\."):
         from_official({"kind": kind, "n_layer": 2}, params)
-    with pytest.raises(ValueError, match="unknown activation 'softplus'"):
+    with pytest.raises(ValueError, match="field 'activation' is 'softplus', not one of"):
         from_official({"kind": kind, "activation": "softplus"}, params)
     with pytest.raises(ValueError, match="num_frames 60 is more than max_ep_len 50"):
         from_official({"kind": kind, "context": 60}, params)

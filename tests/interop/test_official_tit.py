@@ -33,7 +33,7 @@ BASE: dict[str, Any] = {
 CASES: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
     "array": ((5,), {}),
     "array, padded patches": ((11,), {"patch_size": 4, "activation_head": "relu"}),
-    "array, patch larger than it": ((3,), {"patch_size": 4}),
+    "array, one patch": ((3,), {"patch_size": 3}),
     "array, whole observation, no positions": (
         (17,),
         {
@@ -218,7 +218,7 @@ def test_missing_entry(entry: str) -> None:
     [
         ("variant", "plain", "variant is 'plain': expected one of .*enhanced.*vanilla"),
         ("observation", "text", "observation is 'text': expected one of .*array.*image"),
-        ("activation_head", "swish", "unknown activation 'swish'"),
+        ("activation_head", "swish", "field 'activation' is 'swish', not one of"),
         ("num_heads_inner", 3, "width 16 cannot be split over 3 attention heads"),
     ],
 )

@@ -32,6 +32,8 @@ CASES: dict[str, tuple[type[Any], tuple[int, ...], int, dict[str, Any]]] = {
 IMAGES = [NatureCNN, ResNet, Catformer, CoBERL]
 ARRAYS = [MLP, OFENet, D2RL]
 every_network = pytest.mark.parametrize("name", CASES)
+# Bytes, and two trunks; test_pairs.py traces every encoder.
+traced_networks = pytest.mark.parametrize("name", ["resnet", "d2rl"])
 
 
 def make(name: str, seed: int = 0) -> nn.Module:
@@ -61,7 +63,7 @@ def _fresh_compiler() -> Iterator[None]:
     torch.compiler.reset()
 
 
-@every_network
+@traced_networks
 def test_compile_in_one_graph_equals_eager(name: str) -> None:
     network, history = make(name), make_history(name, 4)
     compiled = torch.compile(network, fullgraph=True, backend="aot_eager")
@@ -75,7 +77,7 @@ def test_compile_in_one_graph_equals_eager(name: str) -> None:
     assert_near(results[1], results[0])
 
 
-@every_network
+@traced_networks
 def test_export(name: str) -> None:
     network, history = make(name).eval(), make_history(name, 4)
     exported = torch.export.export(network, (history,)).module()

@@ -201,9 +201,7 @@ def test_state_dict_round_trip(case: str) -> None:
     assert torch.equal(fresh(*inputs), network(*inputs))
 
 
-@pytest.mark.parametrize(
-    "case", ["flat+mlp, categories", "inner+paired-outer, categories", "resnet+mlp, several"]
-)
+@pytest.mark.parametrize("case", ["inner+paired-outer, categories", "resnet+mlp, several"])
 @torch.no_grad()  # the backward passes are those of other networks
 def test_export_and_compile(case: str) -> None:
     network, inputs = network_of(case), frames_of(case, 2, NUM_FRAMES)

@@ -46,8 +46,8 @@ every_network = pytest.mark.parametrize("network", NETWORKS)
 every_observation = pytest.mark.parametrize("observation", OBSERVATIONS)
 
 
-# Compiling takes seconds: every network and every observation once.
-compiled_cases = pytest.mark.parametrize(
+# Tracing takes seconds: every network and every observation once.
+traced_cases = pytest.mark.parametrize(
     ("network", "observation"),
     [
         ("vanilla", "array, K=3"),
@@ -92,9 +92,12 @@ def _fresh_compiler() -> Iterator[None]:
     torch.compiler.reset()
 
 
-@compiled_cases
+@pytest.mark.parametrize(
+    ("network", "observation"),
+    [("enhanced, temporal, shared", "array, K=3"), ("without outer", "image")],
+)
 def test_compile_in_one_graph_equals_eager(network: str, observation: str) -> None:
-    """With dropout; tests/networks/test_pairs.py compiles the pairs without."""
+    """With dropout; tests/networks/test_pairs.py compiles every pair without."""
     module = make(network, observation, **DROPOUT).train()
     history = make_history(observation, 4)
     compiled = torch.compile(module, fullgraph=True, backend="aot_eager")
@@ -120,7 +123,7 @@ def test_compile_with_any_batch_size_is_done_once() -> None:
     assert len(graphs) == 1
 
 
-@compiled_cases
+@traced_cases
 def test_export_with_a_dynamic_batch(network: str, observation: str) -> None:
     module = make(network, observation).eval()
     exported = torch.export.export(

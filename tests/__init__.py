@@ -1,0 +1,1 @@
+"""A package by name, since some libraries install a package `tests`, too."""
