@@ -1,0 +1,176 @@
+"""Long runs of several kinds side by side: what memory, open files and speed do over time.
+
+``make soak`` runs PPO, CQL and a memory task for two hours and samples each every 30 seconds:
+
+- ``soak.csv``: a row a sample, written as it is taken, so that a shorter run says something too;
+- ``soak.md``: slopes over time with 95 % intervals. What leaks has a slope above zero.
+
+Speed is steps per second of processor time, which other work on the machine changes little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from torchrl_tit.files import write_text_atomic
+
+COLUMNS = ["run", "seconds", "memory_mb", "descriptors", "processor_seconds", "steps"]
+MEASURES = {
+    "memory_mb": "resident memory, MB",
+    "descriptors": "open files",
+    "speed": "steps per processor second",
+}
+_BLOCKS = 12
+"""Blocks of time whose means are fitted: neighbouring samples are not independent."""
+_FOREVER = "1000000000"
+
+_TASKS = {
+    "PPO": ["ppo/cartpole/enhanced-tit", "--num-envs", "8", "--total-steps", _FOREVER],
+    "CQL": ["cql/hopper-medium-v0/mlp", "--env", "Reacher-v5", "--dataset", "{data}/random.hdf5"],
+    "memory task": ["ppo/cartpole-no-velocity/lstm", "--num-envs", "8", "--total-steps", _FOREVER],
+}
+_DATA = ["data", "collect", "Reacher-v5", "--sets", "random", "--transitions", "2000"]
+_PROGRAM = [sys.executable, "-m", "recipes"]
+
+
+@dataclass
+class Worker:
+    """A run in a process of its own."""
+
+    name: str
+    folder: Path
+    process: subprocess.Popen[bytes]
+
+    def sample(self, begin: float) -> list[object]:
+        """Reads what the run takes from the machine, and how far it is."""
+        root = Path("/proc", str(self.process.pid))
+        pages = int((root / "statm").read_text().split()[1])
+        times = (root / "stat").read_text().rpartition(")")[2].split()[11:15]
+        return [
+            self.name,
+            round(time.monotonic() - begin, 1),
+            round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 3),
+            len(list((root / "fd").iterdir())),
+            sum(map(int, times)) / os.sysconf("SC_CLK_TCK"),
+            last_step(self.folder / "metrics.csv"),
+        ]
+
+
+def last_step(path: Path) -> int:
+    """The step in the last whole row of a ``metrics.csv``; 0 before the first."""
+    if not path.exists():
+        return 0
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 4096))
+        lines = file.read().split(b"\n")[:-1]
+    step = lines[-1].partition(b",")[0]
+    return int(step) if step.isdigit() else 0
+
+
+def soak(folder: Path, out: Path, minutes: float, interval: float) -> None:
+    """Runs all tasks until the time is over, and samples them."""
+    subprocess.run([*_PROGRAM, *_DATA, "--out", str(folder / "data")], check=True)
+    workers = []
+    for name, words in _TASKS.items():
+        run = folder / name.replace(" ", "-")
+        words = [word.format(data=folder / "data") for word in words]
+        more = ["--total-updates", _FOREVER] if name == "CQL" else []
+        command = [*_PROGRAM, "train", *words, *more, "--compile", "off", "--out", str(run)]
+        with (folder / f"{run.name}.log").open("wb") as log:
+            process = subprocess.Popen(command, stdout=log, stderr=log)
+        workers.append(Worker(name, run, process))
+    begin = time.monotonic()
+    try:
+        with (out / "soak.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            while time.monotonic() - begin < 60 * minutes:
+                time.sleep(interval)
+                for worker in workers:
+                    if worker.process.poll() is not None:
+                        raise RuntimeError(f"{worker.name} has ended: see {folder}")
+                    writer.writerow(worker.sample(begin))
+                file.flush()
+    finally:
+        for worker in workers:
+            worker.process.send_signal(signal.SIGINT)
+        for worker in workers:
+            worker.process.wait()
+
+
+def summarize(path: Path) -> str:
+    """Returns the table of slopes as Markdown.
+
+    Args:
+        path: ``soak.csv``, of a run that may still go on.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    lines = [
+        "| run | minutes | steps | what | mean | slope per hour | 95 % interval | zero within it |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name in dict.fromkeys(row["run"] for row in rows):
+        samples = {
+            c: np.array([float(r[c]) for r in rows if r["run"] == name]) for c in COLUMNS[1:]
+        }
+        hours = samples["seconds"] / 3600
+        # Before the first steps it imports and builds; then caches and allocators fill.
+        begun = int((samples["steps"] > 0).argmax())
+        begun = int((hours >= hours[begun] + (hours[-1] - hours[begun]) / 10).argmax())
+        edges = np.linspace(begun, len(hours) - 1, _BLOCKS + 1).astype(int)
+        if edges[1] - edges[0] < 2:
+            lines.append(f"| {name} | {60 * hours[-1]:.0f} | too few samples yet | | | | | |")
+            continue
+        for measure, what in MEASURES.items():
+            blocks = [slice(*pair) for pair in pairwise(edges)]
+            if measure == "speed":
+                took = np.diff(samples["processor_seconds"][edges])
+                values = np.diff(samples["steps"][edges]) / np.maximum(took, 1e-9)
+            else:
+                values = np.array([samples[measure][block].mean() for block in blocks])
+            times = np.array([hours[block].mean() for block in blocks])
+            fit = stats.linregress(times, values)
+            spread = np.nan_to_num(fit.stderr) * stats.t.ppf(0.975, _BLOCKS - 2)
+            zero = "yes" if abs(fit.slope) <= spread else "no"
+            lines.append(
+                f"| {name} | {60 * (hours[-1] - hours[begun]):.0f} | {samples['steps'][-1]:.0f} "
+                f"| {what} | {values.mean():.1f} | {fit.slope:+.2f} | ± {spread:.2f} | {zero} |"
+            )
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Reads the arguments, measures, and writes the table."""
+    parser = argparse.ArgumentParser("python -m tests.reliability.soak")
+    parser.add_argument("--minutes", type=float, default=120)
+    parser.add_argument("--interval", type=float, default=30, help="seconds between samples")
+    parser.add_argument("--runs", type=Path, default=Path("runs/soak"), help="new folder for runs")
+    parser.add_argument("--out", type=Path, default=Path("docs/results/reliability"))
+    parser.add_argument("--table", action="store_true", help="only write the table of --out")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    if not options.table:
+        if options.runs.exists():
+            parser.error(f"--runs {options.runs} exists already: name a new folder")
+        options.runs.mkdir(parents=True)
+        soak(options.runs, options.out, options.minutes, options.interval)
+    table = summarize(options.out / "soak.csv")
+    write_text_atomic(options.out / "soak.md", table)
+    print(table, end="")
+
+
+if __name__ == "__main__":
+    main()
