@@ -67,7 +67,9 @@ def test_commands_of_the_page(installed, own_modules, capsys):
 
     runs = own_modules / "runs"
     assert [row["step"] for row in read_metrics(runs / "line" / "metrics.csv")] == [512, 1024]
-    assert json.loads((runs / "line" / "evaluation.json").read_text())["episodes"] == 5
+    evaluations = {"evaluation.json": 20, "evaluation_episodes-5.json": 5}
+    for name, episodes in evaluations.items():
+        assert json.loads((runs / "line" / name).read_text())["episodes"] == episodes
     assert (runs / "line.gif").read_bytes().startswith(b"GIF")
     [data] = [command for command in commands if command.startswith("data")]
     assert printed[data].startswith("medium: 1")  # 100 transitions and the rest of an episode
