@@ -1,7 +1,7 @@
 """Tasks by name, with histories of their observations."""
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import Any
 
 import gymnasium
 import torch
@@ -120,12 +120,6 @@ def make_env(
         ...
         ValueError: Unknown task 'CartPole-v2'; did you mean 'CartPole-v1' or 'CartPole-v0'...
     """
-    if num_envs < 1:
-        raise ValueError(f"num_envs must be at least 1, but is {num_envs}.")
-    if vectorization_mode not in get_args(VectorizationMode):
-        raise ValueError(
-            f"vectorization_mode must be 'sync' or 'async', but is {vectorization_mode!r}."
-        )
     wraps, transforms = load_wrappers(wrappers)
     reading: dict[str, Any] = {
         "clip_actions": clip_actions,
