@@ -85,15 +85,31 @@ def changed_fields(before: Recipe, after: Recipe) -> str:
         >>> changed_fields(recipe, replace(recipe, num_envs=4, seed=7))
         'num_envs 4'
     """
-    old, new = (_fields(json.loads(recipe_to_json(experiment_of(r)))) for r in (before, after))
-    changed = [field for field in new if field not in old or old[field] != new[field]]
+    old, new = (fields_of(experiment_of(recipe)) for recipe in (before, after))
+    changed = [
+        field
+        for field, value in new.items()
+        if value != {} and (field not in old or old[field] != value)
+    ]
     return ", ".join(f"{field} {new[field]}" for field in changed)
 
 
-def _fields(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flattens settings and nested settings into one dictionary, by the full names of fields."""
+def fields_of(recipe: Recipe) -> dict[str, Any]:
+    """Returns all settings as in JSON, nested ones by their full names.
+
+    Example:
+        >>> from recipes.registry import get_recipe
+        >>> fields_of(get_recipe("ppo/cartpole/mlp"))["backbone.num_frames"]
+        1
+    """
+    return _flat(json.loads(recipe_to_json(recipe)))
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     fields: dict[str, Any] = {}
     for name, value in settings.items():
-        nested = isinstance(value, dict)
-        fields |= _fields(value, f"{prefix}{name}.") if nested else {prefix + name: value}
+        if isinstance(value, dict) and value:
+            fields |= _flat(value, f"{prefix}{name}.")
+        else:
+            fields[prefix + name] = value
     return fields

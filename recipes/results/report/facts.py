@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ...recipe import Recipe, experiment_of
-from ...recipe_json import recipe_to_json
 from ...registry import RECIPES
 from ..cell import Cell
+from ..experiments import fields_of
 from ..metric_words import MetricWords, limit, words_of
 from .charts import last_value
 from .run_data import Group, RunData
@@ -40,7 +39,7 @@ class Finding:
 
 def settings_of(recipe: Recipe) -> dict[str, str]:
     """Returns all settings, nested ones by their full names, such as "backbone.num_frames"."""
-    return _flat(json.loads(recipe_to_json(recipe)))
+    return {name: _text(value) for name, value in fields_of(recipe).items()}
 
 
 def differences(recipes: Sequence[Recipe]) -> list[Difference]:
@@ -174,16 +173,6 @@ def _bound(formula: str, recipe: Recipe) -> str:
         return number(value)
     factor, _, name = formula.partition(" * ")
     return f"{factor} times `{name}`"
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, str]:
-    fields: dict[str, str] = {}
-    for name, value in settings.items():
-        if isinstance(value, dict) and value:
-            fields |= _flat(value, f"{prefix}{name}.")
-        else:
-            fields[prefix + name] = _text(value)
-    return fields
 
 
 def _text(value: Any) -> str:
