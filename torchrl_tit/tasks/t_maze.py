@@ -73,10 +73,10 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
         right, up = _MOVES[action]
         self._steps += 1
         at_junction = self._x == self.corridor_length
-        if right and self._y == 0:
+        if right:
             self._x = min(max(self._x + int(right), 0), self.corridor_length)
         elif up and at_junction:
-            self._y = min(max(self._y + int(up), -1), 1)
+            self._y = int(up)  # at the last step: the way to the junction takes all others
         over = self._steps > self.corridor_length
         if over:
             reward = float(self._y == self._goal)
