@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .experiments import label
+from .reported import Published
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,9 @@ class Cell:
 
     measure: str = "return"
     """What the values are: "return" or "normalized score"."""
+
+    published: tuple[Published, ...] = ()
+    """What others report of the same task and kind of network."""
 
     @property
     def label(self) -> str:

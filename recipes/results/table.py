@@ -6,40 +6,21 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
-from functools import cache
-from importlib import resources
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from torchrl_tit.datasets import has_reference
 
-from ..dataset_recipe import DatasetRecipe
 from ..recipe import Recipe
-from ..registry import RECIPES
 from ..run import Run
 from .cell import Cell
 from .experiments import Experiment, group_runs
 from .interval import interval_of
+from .reported import Published, paper_results, plain_name, reported_of
 
 OTHER = "not in the paper"
-
-_TASK = (
-    *("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions"),
-    "backbone",
-)
-"""The fields that say which task is learned, and by which network."""
-
-
-@dataclass(frozen=True)
-class Result:
-    """The result of an experiment in the paper's tables."""
-
-    table: str
-    mean: float
-    std: float
 
 
 def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
@@ -87,55 +68,46 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
     order = {name: index for index, name in enumerate(paper_results())}
 
     def rank(cell: Cell) -> tuple[bool, int, str]:
-        place = order.get(_plain(cell.recipe), len(order))
+        place = order.get(plain_name(cell.recipe), len(order))
         return cell.table == OTHER, place, cell.label
 
     cells.sort(key=rank)
     return cells, notes
 
 
-@cache
-def paper_results() -> dict[str, Result]:
-    """What the paper reports, by the recipe's name.
-
-    arXiv 2212.14538, tables of section 4 and the ablation; the standard deviations of Decision
-    Transformer are taken from the curves that its authors published, since the paper applied the
-    score's offset to them.
-
-    Example:
-        >>> paper_results()["ppo/mountaincar/enhanced-tit"].mean
-        -97.0
-    """
-    text = resources.files(__package__).joinpath("paper_results.csv").read_text(encoding="utf-8")
-    return {
-        row["recipe"]: Result(row["table"], float(row["mean"]), float(row["std"]))
-        for row in csv.DictReader(io.StringIO(text))
-    }
-
-
 def to_markdown(cells: Sequence[Cell]) -> str:
-    """Writes cells as Markdown, one table for each of the paper's."""
+    """Writes cells as Markdown, one table for each of the paper's.
+
+    A table in which others have published results of the same task and network has a column for
+    them.
+    """
     parts = []
     for table in dict.fromkeys(cell.table for cell in cells):
-        lines = [
-            f"### {table[0].upper()}{table[1:]}\n",
-            "| recipe | runs | mean ± over runs | ± over episodes | interquartile mean [95%] "
-            "| paper |",
-            "|---|---|---|---|---|---|",
-        ]
-        lines += [_row(cell) for cell in cells if cell.table == table]
+        rows = [cell for cell in cells if cell.table == table]
+        columns = ["recipe", "runs", "mean ± over runs", "± over episodes"]
+        columns += ["interquartile mean [95%]", "paper"]
+        published = any(cell.published for cell in rows)
+        columns += ["published"] if published else []
+        lines = [f"### {table[0].upper()}{table[1:]}\n", _line(columns)]
+        lines += ["|---" * len(columns) + "|"]
+        lines += [_line(_row(cell)[: len(columns)]) for cell in rows]
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)
 
 
 def to_csv(cells: Sequence[Cell]) -> str:
-    """Writes cells as CSV, one row each; unknown values are empty."""
+    """Writes cells as CSV, one row each; unknown values are empty, published ones are one text."""
     buffer = io.StringIO()
     names = [field.name for field in fields(Cell)]
     writer = csv.DictWriter(buffer, names, lineterminator="\n")
     writer.writeheader()
     for cell in cells:
-        writer.writerow({k: "" if v != v else v for k, v in asdict(cell).items()})
+        values = {name: getattr(cell, name) for name in names}
+        values["published"] = "; ".join(
+            f"{result.source} {result.mean} ± {result.std} ({result.note}; {result.url})"
+            for result in cell.published
+        )
+        writer.writerow({k: "" if v != v else v for k, v in values.items()})
     return buffer.getvalue()
 
 
@@ -161,7 +133,7 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
     values = np.array([_value(evaluation) for evaluation in evaluations])
     spreads = [evaluation.get("score_std", evaluation["std"]) for evaluation in evaluations]
     interval = interval_of(values)
-    paper = _paper_result(experiment.settings)
+    paper, published = reported_of(experiment.settings)
     return Cell(
         table=paper.table if paper else OTHER,
         recipe=experiment.name,
@@ -177,45 +149,31 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
         paper_std=paper.std if paper else float("nan"),
         changes=experiment.changes,
         measure=_measure(experiment.settings, evaluations[0]),
+        published=published,
     )
 
 
-def _paper_result(recipe: Recipe) -> Result | None:
-    """What the paper reports of a recipe, if task, network and data are those of its name."""
-    plain = _plain(recipe.name)
-    named = RECIPES.get(recipe.name) or RECIPES.get(plain)
-    if named is None or any(_part(recipe, field) != _part(named, field) for field in _TASK):
-        return None
-    if isinstance(recipe, DatasetRecipe) and _stem(recipe.dataset) not in plain.split("/"):
-        return None
-    return paper_results().get(plain)
-
-
-def _part(recipe: Recipe, field: str) -> Any:
-    """A field that only some recipes have; None in the others."""
-    return getattr(recipe, field, None)
-
-
-def _stem(dataset: str) -> str:
-    """A data set's name, also if given as D4RL's file: "hopper_medium-v2.hdf5"."""
-    return Path(dataset).name.removesuffix(".hdf5").replace("_", "-")
-
-
-def _plain(name: str) -> str:
-    """The paper's name of a recipe that has other settings."""
-    if name in paper_results():
-        return name
-    return name.removesuffix("-tuned").removesuffix("-protocol")
-
-
-def _row(cell: Cell) -> str:
+def _row(cell: Cell) -> list[str]:
     interval = f" [{_number(cell.low)}, {_number(cell.high)}]" if cell.runs > 1 else ""
     known = cell.paper_mean == cell.paper_mean
-    paper = f"{_number(cell.paper_mean)} ± {_number(cell.paper_std)}" if known else ""
-    return (
-        f"| {cell.label} | {cell.runs} | {_number(cell.mean)} ± {_number(cell.std)} "
-        f"| {_number(cell.std_episodes)} | {_number(cell.iqm)}{interval} | {paper} |"
-    )
+    return [
+        cell.label,
+        str(cell.runs),
+        f"{_number(cell.mean)} ± {_number(cell.std)}",
+        _number(cell.std_episodes),
+        f"{_number(cell.iqm)}{interval}",
+        f"{_number(cell.paper_mean)} ± {_number(cell.paper_std)}" if known else "",
+        ", ".join(map(_published, cell.published)),
+    ]
+
+
+def _published(result: Published) -> str:
+    numbers = f"{_number(result.mean)} ± {_number(result.std)}"
+    return f"[{result.source}]({result.url}) {numbers} ({result.note})"
+
+
+def _line(columns: Sequence[str]) -> str:
+    return f"| {' | '.join(columns)} |"
 
 
 def _number(value: float) -> str:

@@ -82,6 +82,7 @@ def _context(
             if cell is not None
         ],
         "has_paper": has_paper,
+        "has_published": any(cell.published for cell in known),
         "measure": f"{measure[0].upper()}{measure[1:]}",
         "returns": curves,
         "episodes": episodes,
@@ -192,6 +193,9 @@ def _row(group: Group, cell: Cell) -> dict[str, Any]:
         "mean": number(cell.mean) + (f" ± {spread(cell.std)}" if several else ""),
         "episodes": spread(cell.std_episodes),
         "paper": f"{number(cell.paper_mean)} ± {spread(cell.paper_std)}" if known else "-",
+        "published": [
+            (result, f"{number(result.mean)} ± {spread(result.std)}") for result in cell.published
+        ],
     }
 
 

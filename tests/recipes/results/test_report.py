@@ -172,7 +172,8 @@ def test_what_a_comparison_says(comparison):
     assert "Interquartile mean and its 95% interval over 3 runs" in text
     at = interval_of([485.0, 482.0, 479.0])
     assert f"3 {at.iqm:.0f} [{at.low:.0f}, {at.high:.0f}] 482 ± 2.4 11.18 500 ± 0" in text
-    assert "mlp (epochs 5) 2 305 [305, 305] 305 ± 0 5 500 ± 0" in text
+    published = "CleanRL 490 ± 6.1 (training return after 500k steps, 3 seeds) ; RL Zoo 500 ± 0"
+    assert f"mlp (epochs 5) 2 305 [305, 305] 305 ± 0 5 500 ± 0 {published}" in text
     assert "What differs from the recipe ppo/cartpole/mlp:" in text
     assert "epochs 10 5" in text
     assert "What differs between the experiments" in text

@@ -13,7 +13,8 @@ from recipes.cli import main
 from recipes.recipe_json import recipe_to_json
 from recipes.registry import RECIPES, get_recipe
 from recipes.results import plot
-from recipes.results.table import make_table, paper_results, to_csv, to_markdown
+from recipes.results.reported import paper_results, published_results
+from recipes.results.table import make_table, to_csv, to_markdown
 from torchrl_tit.settings import Linear
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
@@ -155,6 +156,34 @@ def test_every_value_of_the_paper_belongs_to_a_recipe():
     online = {name for name, result in paper_results().items() if name.startswith("ppo/")}
     assert len(online) == 30 + 29 + 12  # arrays, images, ablation
     assert len(paper_results()) - len(online) == 12 + 12  # CQL, Decision Transformer
+
+
+def test_published_results_stand_beside_the_same_task_and_network(tmp_path):
+    """CleanRL's and the RL Zoo's numbers for an MLP on Acrobot, and for nothing else."""
+    assert set(published_results()) <= set(RECIPES)
+    for of, fields in (
+        ("ppo/acrobot/mlp", {}),
+        ("ppo/acrobot/mlp", {"env": "CartPole-v1"}),
+        ("ppo/acrobot/enhanced-tit", {}),
+    ):
+        name = f"{of}-{len(fields)}"
+        write_run(tmp_path / name, of, 0, [-90.0, -80.0], **fields)
+    cells, _ = make_table([tmp_path])
+    sources = {cell.label: [result.source for result in cell.published] for cell in cells}
+    assert sources == {
+        "ppo/acrobot/mlp": ["CleanRL", "RL Zoo"],
+        "ppo/acrobot/mlp (env CartPole-v1)": [],
+        "ppo/acrobot/enhanced-tit": [],
+    }
+    cleanrl = published_results()["ppo/acrobot/mlp"][0]
+    assert (cleanrl.mean, cleanrl.std) == (-86.36, 1.32)
+    text = to_markdown(cells)
+    assert f"[CleanRL]({cleanrl.url}) -86.4 ± 1.3 (training return after 500k steps" in text
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert "| published |" in lines[0], "the paper's table has the column"
+    assert "CleanRL -86.36 ± 1.32" in to_csv(cells)
+    alone, _ = make_table([tmp_path / "ppo/acrobot/enhanced-tit-0"])
+    assert "published" not in to_markdown(alone)
 
 
 def test_command(runs, tmp_path, capsys):
