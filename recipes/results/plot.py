@@ -55,9 +55,13 @@ def plot_learning_curve(
     batch, batches = ("an evaluation", "evaluations") if offline else ("a batch", "batches")
     if not len(steps):
         axes.text(0.5, 0.5, "no episode has ended", ha="center", transform=axes.transAxes)
-    marker = "o" if len(steps) == 1 else ""  # a line through one point cannot be seen
-    axes.plot(steps, returns, marker, ls="-", c="C0", alpha=0.35, lw=1, label=f"mean of {batch}")
-    axes.plot(steps, smooth, marker, ls="-", c="C0", lw=2, label=f"mean of {window} {batches}")
+    marker = "o" if len(steps) == 1 else "None"  # a line through one point cannot be seen
+    axes.plot(
+        steps, returns, marker=marker, ls="-", c="C0", alpha=0.35, lw=1, label=f"mean of {batch}"
+    )
+    axes.plot(
+        steps, smooth, marker=marker, ls="-", c="C0", lw=2, label=f"mean of {window} {batches}"
+    )
     _write(figure, picture)
 
 
@@ -97,8 +101,8 @@ def plot_comparison(
         returns = np.stack([np.interp(grid, *run) for run in known])
         mean, deviation = returns.mean(0), returns.std(0)
         label = f"{name.removeprefix(common)} ({len(known)} runs)"
-        marker = "o" if grid[0] == grid[-1] else ""
-        (line,) = axes.plot(grid, mean, marker, ls="-", linewidth=2, label=label)
+        marker = "o" if grid[0] == grid[-1] else "None"
+        (line,) = axes.plot(grid, mean, marker=marker, ls="-", linewidth=2, label=label)
         axes.fill_between(
             grid, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.2, linewidth=0
         )

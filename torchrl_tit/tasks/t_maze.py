@@ -23,13 +23,11 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
     2307.03864, section 5.1, after Bakker, "Reinforcement Learning with Long Short-Term Memory",
     NeurIPS 2001.
 
-    ===========  ===============  ==================================================================
-    observation  float32 [2]      1 from the junction on, else 0; at the first step the goal's side,
-                                  1 (up) or -1 (down), in the corridor 0, after the turn the agent's
-    action       Discrete(4)      right, up, left, down; against a wall the agent stays
-    reward       float            at the last step 1 at the goal, else 0; before it 0, or the cost
-    terminated   bool             after ``corridor_length + 1`` steps
-    ===========  ===============  ==================================================================
+    - **Observation**, float32 [2]: 1 from the junction on, else 0; and at the first step the goal's
+      side, 1 (up) or -1 (down), in the corridor 0, after the turn the agent's side.
+    - **Action**, Discrete(4): right, up, left, down. Against a wall the agent stays.
+    - **Reward**: at the last step 1 at the goal, else 0; before it 0, or the cost.
+    - **Terminated** after ``corridor_length + 1`` steps; never truncated.
 
     Args:
         corridor_length: steps from the start to the junction, at least 1.
