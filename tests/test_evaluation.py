@@ -180,5 +180,5 @@ def test_closes_what_it_made_and_nothing_else():
 
 
 def test_no_episodes():
-    with pytest.raises(ValueError, match="episodes must be at least 1, but is 0"):
+    with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
         evaluate(make_env("CartPole-v1"), lean, episodes=0)

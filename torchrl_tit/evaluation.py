@@ -71,7 +71,7 @@ def evaluate(
         torch.Size([20])
     """
     if episodes < 1:
-        raise ValueError(f"episodes must be at least 1, but is {episodes}.")
+        raise ValueError(f"episodes must be at least 1, not {episodes}")
     with _acting(policy, seed, deterministic):
         if isinstance(env, EnvBase):
             return _play_all(env, policy, episodes, seed, reward_key, shrink)

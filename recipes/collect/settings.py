@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated, Literal, get_args
 
 import tyro
 
-from torchrl_tit.settings.checks import check_at_least, check_at_most
+from torchrl_tit.settings.fields import check_fields
+from torchrl_tit.settings.numbers import Batch, Copies, Episodes, Real, Seed, Steps, Threads
 
 Kind = Literal["random", "mixed", "medium", "expert"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -33,56 +33,42 @@ class Collection:
     set."""
     sets: tuple[Kind, ...] = ("random", "mixed", "medium", "expert")
     """Which sets to make. More sets can be added to the same folder later."""
-    transitions: int = 100_000
+    transitions: Batch = 100_000
     """Minimum number of transitions in a set; the last episode is always complete. The mixed set
     has as many as the training took."""
-    medium_return: float | None = None
+    medium_return: Real | None = None
     """Mean return in an evaluation at which the mixed set ends and the agent is medium; by default
     at the end of training."""
-    expert_return: float | None = None
+    expert_return: Real | None = None
     """Mean return in an evaluation at which the agent is the expert; by default at the end of
     training."""
-    total_steps: int = 1_000_000
+    total_steps: Steps = 1_000_000
     """Maximum number of environment steps to train the agent for; the recipe's own maximum also
     holds. Can be raised later if a mark was not reached."""
-    evaluation_interval: int = 5_000
+    evaluation_interval: Steps = 5_000
     """Environment steps between the evaluations that are compared with the marks."""
-    evaluation_episodes: int = 10
+    evaluation_episodes: Episodes = 10
     """Number of episodes in an evaluation."""
     deterministic: bool = False
     """Whether medium and expert agents take their most likely actions instead of sampled ones, in
     the data and in the evaluations."""
-    num_envs: int = 8
+    num_envs: Copies = 8
     """Number of environments for medium, expert and random sets."""
-    checkpoint_interval: int = 10_000
+    checkpoint_interval: Steps = 10_000
     """Environment steps between checkpoints of the training. It should be large for games and other
     tasks that cannot be saved, which begin new episodes at each checkpoint."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of agent, environments and sets."""
-    threads: int = 1
+    threads: Threads = 1
     """PyTorch's CPU threads."""
 
     def __post_init__(self) -> None:
-        check_at_least(
-            self,
-            transitions=1,
-            total_steps=1,
-            evaluation_interval=1,
-            evaluation_episodes=1,
-            num_envs=1,
-            checkpoint_interval=1,
-            seed=0,
-            threads=1,
-        )
-        check_at_most(self, seed=2**31)
         unknown = [kind for kind in self.sets if kind not in KINDS]
         if unknown or not self.sets or len(set(self.sets)) < len(self.sets):
             raise ValueError(
                 f"sets must be some of {', '.join(KINDS)}, each once, not {list(self.sets)}"
             )
-        for name in ("medium_return", "expert_return"):
-            if (mark := getattr(self, name)) is not None and not math.isfinite(mark):
-                raise ValueError(f"{name} must be finite, not {mark}")
+        check_fields(self)
         if self.medium_return is None and {"medium", "expert"} <= set(self.sets):
             raise ValueError(
                 "medium and expert would be the same agent: give medium_return, the mean return at "

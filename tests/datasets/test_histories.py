@@ -177,7 +177,7 @@ def test_the_buffer_cannot_be_written(rolled: Transitions) -> None:
     [
         ({"num_frames": 0}, "num_frames must be at least 1"),
         ({"padding": "zeros"}, "padding must be one of"),
-        ({"time_limits": "lose"}, "time_limits must be one of 'keep', 'drop', but is 'lose'"),
+        ({"time_limits": "lose"}, "time_limits must be one of 'keep', 'drop', not 'lose'"),
         ({"terminal_observations": "drop"}, "terminal_observations must be one of 'keep', 'zero'"),
         ({"unfinished": True}, "unfinished must be one of"),
     ],

@@ -283,7 +283,7 @@ def test_what_is_refused() -> None:
         storage.add_part(storage.part(15))
     wrong: list[tuple[dict[str, Any], str]] = [
         ({"num_frames": 0}, "num_frames must be at least 1"),
-        ({"ndim": 3}, "ndim must be 1 .*, but is 3"),
+        ({"ndim": 3}, "ndim must be 1 .*, not 3"),
         ({"padding": "zeros"}, "field 'padding' is 'zeros', not one of"),
         ({"max_size": 0}, "max_size must be at least 1, not 0"),
     ]

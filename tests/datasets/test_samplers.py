@@ -287,7 +287,7 @@ def test_consecutive_steps_are_those_of_an_environment(make: Make) -> None:
 
 def test_slices_that_cannot_be_drawn(make: Make) -> None:
     storage = make().storage
-    with pytest.raises(ValueError, match="slice_length must be at least 1, but is 0"):
+    with pytest.raises(ValueError, match="slice_length must be at least 1, not 0"):
         ConsecutiveSampler(0)
     with pytest.raises(ValueError, match="12 steps cannot be divided into slices of 5"):
         ConsecutiveSampler(5).sample(storage, 12)

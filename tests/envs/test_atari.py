@@ -273,10 +273,10 @@ def test_bad_input():
         make_env("ALE/Pog-v5")
     with pytest.raises(ValueError, match="Unknown game 'ping'"):
         AtariGames("ping")
-    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', but is 'human'"):
+    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array', not 'human'"):
         AtariGames("pong", render_mode="human")
     for name, value in {"num_envs": 0, "noop_max": -1, "max_num_frames_per_episode": 0}.items():
-        with pytest.raises(ValueError, match=f"{name} must be at least .*, but is {value}"):
+        with pytest.raises(ValueError, match=f"{name} must be at least .*, not {value}"):
             AtariGames("pong", **{name: value})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="runs in threads, side by side"):
         make_env("ALE/Pong-v5", vectorization_mode="async")

@@ -276,7 +276,7 @@ def test_state_dict_holds_the_histories():
 def test_refuses_what_it_cannot_do():
     with pytest.raises(ValueError, match=r"autoreset_mode=AutoresetMode.DISABLED, not .*SAME_STEP"):
         vector(mode=AutoresetMode.SAME_STEP)
-    with pytest.raises(ValueError, match="num_frames must be at least 1, but is 0"):
+    with pytest.raises(ValueError, match="num_frames must be at least 1, not 0"):
         make_env("CartPole-v1", num_frames=0)
     with pytest.raises(ValueError, match="field 'padding' is 'zeros', not one of"):
         make_env("CartPole-v1", padding="zeros")  # type: ignore[arg-type]

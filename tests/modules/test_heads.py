@@ -214,7 +214,7 @@ def test_a_row_without_any_action_is_refused():
     mask[2, 2:] = False
     with pytest.raises(ValueError, match=r"\('agent', 'mask'\) allows no action at \[2, 1\]"):
         actor(features(4).set(("agent", "mask"), mask))
-    with pytest.raises(ValueError, match=r"bool mask of the shape \[4, 5\], but is torch.int8"):
+    with pytest.raises(ValueError, match=r"bool mask of the shape \[4, 5\], not torch.int8"):
         actor(features(4).set(("agent", "mask"), mask.to(torch.int8)))
     with pytest.raises(ValueError, match="no action mask for the action space Binary"):
         make_actor(16, Binary(2), mask_key="action_mask")

@@ -246,10 +246,10 @@ def test_takes_one_key_as_a_name():
 @pytest.mark.parametrize(
     ("arguments", "error", "words"),
     [
-        ({"num_frames": 0}, ValueError, "num_frames must be at least 1, but is 0"),
-        ({"num_frames": 2.0}, TypeError, "num_frames must be an integer, but is 2.0"),
+        ({"num_frames": 0}, ValueError, "num_frames must be at least 1, not 0"),
+        ({"num_frames": 2.0}, TypeError, "num_frames must be an integer, not 2.0"),
         ({"num_frames": 2, "observation_ndim": -1}, ValueError, "observation_ndim .* -1"),
-        ({"num_frames": 2, "padding": "zeros"}, ValueError, "'same', 'constant', but is 'zeros'"),
+        ({"num_frames": 2, "padding": "zeros"}, ValueError, "'same', 'constant', not 'zeros'"),
         ({"num_frames": 2, "in_keys": ["a", "b"]}, ValueError, r"in_keys=\['a', 'b'\]"),
         ({"num_frames": 2, "in_keys": [], "out_keys": []}, ValueError, "at least one"),
         ({"num_frames": 2, "out_keys": ["observation"]}, ValueError, "needs a key of its own"),

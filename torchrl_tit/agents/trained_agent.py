@@ -95,6 +95,6 @@ class TrainedAgent:
         if episodes is None:
             episodes = int(self.evaluation.get("episodes", _EPISODES))
         if episodes < 1:
-            raise ValueError(f"episodes must be at least 1, but is {episodes}.")
+            raise ValueError(f"episodes must be at least 1, not {episodes}")
         returns = self.plays(episodes, self.first_seed if seed is None else seed)
         return torch.tensor(returns, dtype=torch.float64)

@@ -38,7 +38,7 @@ class ConsecutiveSampler(RandomSampler):
     def __init__(self, slice_length: int) -> None:
         super().__init__()
         if slice_length < 1:
-            raise ValueError(f"slice_length must be at least 1, but is {slice_length}.")
+            raise ValueError(f"slice_length must be at least 1, not {slice_length}")
         self.slice_length = slice_length
 
     def sample(

@@ -181,13 +181,13 @@ def check_windows(num_frames: int, padding: str) -> None:
         ValueError: If it is less than 1, or the padding is unknown.
     """
     if isinstance(num_frames, bool) or not isinstance(num_frames, int):
-        raise TypeError(f"num_frames must be an integer, but is {num_frames!r}.")
+        raise TypeError(f"num_frames must be an integer, not {num_frames!r}")
     if num_frames < 1:
-        raise ValueError(f"num_frames must be at least 1, but is {num_frames}.")
+        raise ValueError(f"num_frames must be at least 1, not {num_frames}")
     _check_choice("padding", padding, get_args(Padding))
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         known = ", ".join(map(repr, choices))
-        raise ValueError(f"{name} must be one of {known}, but is {value!r}.")
+        raise ValueError(f"{name} must be one of {known}, not {value!r}")

@@ -75,7 +75,7 @@ class OnlineHistoryStorage(GatheringStorage):
     ) -> None:
         check_windows(num_frames, padding)
         if ndim not in (1, 2):
-            raise ValueError(f"ndim must be 1 (steps) or 2 (environments, steps), but is {ndim}.")
+            raise ValueError(f"ndim must be 1 (steps) or 2 (environments, steps), not {ndim}")
         super().__init__(max_size, device=device, ndim=ndim)
         self.max_size: int
         self._num_frames = num_frames

@@ -80,14 +80,14 @@ class AtariGames(VectorEnv):
         if game not in roms.get_all_rom_ids():
             raise ValueError(f"Unknown game {game!r}: ale-py has {roms.get_all_rom_ids()}.")
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', but is {render_mode!r}.")
+            raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
         for name, given, least in (
             ("num_envs", num_envs, 1),
             ("noop_max", noop_max, 0),
             ("max_num_frames_per_episode", max_num_frames_per_episode, 1),
         ):
             if given < least:
-                raise ValueError(f"{name} must be at least {least}, but is {given}.")
+                raise ValueError(f"{name} must be at least {least}, not {given}")
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._noop_max = noop_max

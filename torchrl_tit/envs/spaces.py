@@ -259,7 +259,7 @@ def check_layout(layout: str) -> None:
     """Raises ValueError if an image layout is unknown."""
     if layout not in get_args(ImageLayout):
         known = ", ".join(map(repr, get_args(ImageLayout)))
-        raise ValueError(f"image_layout must be one of {known}, but is {layout!r}.")
+        raise ValueError(f"image_layout must be one of {known}, not {layout!r}")
 
 
 def _leaf_spaces(

@@ -55,7 +55,7 @@ def action_shape(spec: TensorSpec, batch_dims: int | None) -> torch.Size:
     if not 0 <= batch_dims <= spec.ndim:
         raise ValueError(
             f"batch_dims must be at least 0 and at most {spec.ndim}, the dimensions of the action "
-            f"space {describe(spec)}, but is {batch_dims}"
+            f"space {describe(spec)}, not {batch_dims}"
         )
     return spec.shape[batch_dims:]
 

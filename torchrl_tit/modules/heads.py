@@ -247,7 +247,7 @@ class _ChoicesHead(nn.Module):
             return logits
         if mask.shape != flat.shape or mask.dtype != torch.bool:
             raise ValueError(
-                f"{self.mask_key!r} must be a bool mask of the shape {list(flat.shape)}, but is "
+                f"{self.mask_key!r} must be a bool mask of the shape {list(flat.shape)}, not "
                 f"{mask.dtype} of the shape {list(mask.shape)}"
             )
         allowed = pad(mask, (0, 1), value=False)[..., self.columns]

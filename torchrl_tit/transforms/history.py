@@ -70,7 +70,7 @@ class History(CatFrames):
         _check_integer("observation_ndim", observation_ndim, minimum=0)
         if padding not in get_args(Padding):
             known = ", ".join(map(repr, get_args(Padding)))
-            raise ValueError(f"padding must be one of {known}, but is {padding!r}.")
+            raise ValueError(f"padding must be one of {known}, not {padding!r}")
         observations, histories = _key_list(in_keys), _key_list(out_keys)
         _check_keys(observations, histories)
         super().__init__(
@@ -269,7 +269,7 @@ class History(CatFrames):
         if len(shape) != self._observation_ndim:
             raise ValueError(
                 f"One observation {key!r} has the shape {list(shape)}, so observation_ndim "
-                f"must be {len(shape)}, but is {self._observation_ndim}."
+                f"must be {len(shape)}, not {self._observation_ndim}"
             )
 
 
@@ -280,9 +280,9 @@ def _buffer_name(key: NestedKey) -> str:
 
 def _check_integer(name: str, value: int, minimum: int) -> None:
     if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError(f"{name} must be an integer, but is {value!r}.")
+        raise TypeError(f"{name} must be an integer, not {value!r}")
     if value < minimum:
-        raise ValueError(f"{name} must be at least {minimum}, but is {value}.")
+        raise ValueError(f"{name} must be at least {minimum}, not {value}")
 
 
 def _key_list(keys: Sequence[NestedKey] | str) -> list[NestedKey]:

@@ -147,7 +147,7 @@ def test_what_an_agent_knows(agent, run):
     with acting(loaded.policy):
         steps = env.rollout(5, loaded.policy, break_when_any_done=False)
     assert steps["history"].shape == (4, 5, 2, 4)
-    with pytest.raises(ValueError, match="episodes must be at least 1, but is 0"):
+    with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
         loaded.evaluate(0)
 
 
