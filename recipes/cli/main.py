@@ -10,6 +10,7 @@ from torchrl_tit.settings import resolve
 
 from .arguments import fail, program
 from .imports import import_what_is_typed
+from .warned import one_line_warnings
 
 COMMANDS = {
     "list": "named_recipes:list_recipes",
@@ -71,7 +72,8 @@ def main(arguments: list[str] | None = None) -> None:
     """
     try:
         try:
-            _run(import_what_is_typed(sys.argv[1:] if arguments is None else arguments))
+            with one_line_warnings():
+                _run(import_what_is_typed(sys.argv[1:] if arguments is None else arguments))
         finally:
             sys.stdout.flush()  # here, where a reader who is gone can be met
     except KeyboardInterrupt:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import warnings
 from collections.abc import Sequence
 from functools import partial
@@ -16,6 +17,10 @@ from torchrl_tit.envs.wrappers import Wrap
 from torchrl_tit.settings.plugins import load_plugins
 
 VectorizationMode = Literal["sync", "async"]
+
+_HAS_SCREEN = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")) or (
+    sys.platform != "linux"
+)
 
 
 def make_gymnasium_tasks(
@@ -51,8 +56,11 @@ def make_unchecked(name: str, **kwargs: Any) -> gymnasium.Env:
     """Makes one task as Gymnasium does, but without its checker and its advice to name a newer one.
 
     The checker costs time in each step, and the tests check the specs instead. Who names an older
-    version means it: D4RL's data are of such.
+    version means it: D4RL's data are of such. Without a screen, SDL draws pictures into memory and
+    is not asked to look for one, which it reports as an error.
     """
+    if kwargs.get("render_mode") == "rgb_array" and not _HAS_SCREEN:
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".* is out of date", DeprecationWarning)
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
