@@ -27,13 +27,18 @@ unexport PYTHONDONTWRITEBYTECODE
 .PRECIOUS: $(VENV)/installed-%
 # The tests come last, also under `make -j`: their closing line ends the log.
 .NOTPARALLEL:
-.PHONY: help demo test lint types numerics unit versions kill fuzz soak browser bench docs format hooks clean
+.PHONY: help demo demo-memory test lint types numerics unit versions kill fuzz soak browser bench docs format hooks clean
 
 help:  ## List the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "make %-10s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 demo: $(VENV)/installed-run  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 5 minutes) into runs/
 	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit --out $(OUT) $(ARGS)
+
+demo-memory: $(VENV)/installed-run  ## Train four frames and TIT on a maze that only memory solves (about 10 minutes)
+	$(BIN)/python -m recipes sweep ppo/tmaze-10/frames-4 ppo/tmaze-10/enhanced-tit \
+	  --workers 2 --out $(OUT) $(ARGS)
+	$(BIN)/python -m recipes compare $(OUT)/ppo/tmaze-10/*/seed-* --out $(OUT)/memory.png
 
 test: lint types numerics unit  ## Check style, types and behaviour: all that must pass
 

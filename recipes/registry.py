@@ -14,6 +14,7 @@ from .presets.offline import OFFLINE_RECIPES
 from .presets.ppo_any_task import ANY_TASK_RECIPES
 from .presets.ppo_arrays import ARRAY_RECIPES
 from .presets.ppo_atari import ATARI_RECIPES
+from .presets.ppo_memory import MEMORY_RECIPES
 from .presets.ppo_no_velocity import NO_VELOCITY_RECIPES
 from .presets.sac import SAC_RECIPES
 from .recipe import Recipe
@@ -52,6 +53,7 @@ for _named in (
     ANY_TASK_RECIPES,
     ARRAY_RECIPES,
     NO_VELOCITY_RECIPES,
+    MEMORY_RECIPES,
     ATARI_RECIPES,
     SAC_RECIPES,
     DQN_RECIPES,

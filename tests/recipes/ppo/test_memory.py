@@ -1,0 +1,39 @@
+"""Recipes of tasks that only memory solves: they differ in the memory alone."""
+
+from dataclasses import replace
+
+import pytest
+
+from recipes.algorithm import make_algorithm
+from recipes.presets.ppo_memory import MEMORY_RECIPES
+from recipes.registry import RECIPES
+
+TASKS = {name.rpartition("/")[0] for name in MEMORY_RECIPES}
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_only_the_memory_differs(task):
+    recipes = {name: recipe for name, recipe in MEMORY_RECIPES.items() if name.startswith(task)}
+    frames = {replace(recipe.backbone.frame, every_block=False) for recipe in recipes.values()}
+    assert len(frames) == 1, "one frame encoder"
+    tit = recipes[f"{task}/enhanced-tit"]
+    for name, recipe in recipes.items():
+        assert RECIPES[name] == recipe
+        assert replace(recipe, name=tit.name, backbone=tit.backbone) == tit
+    sizes = []
+    for recipe in recipes.values():
+        algorithm = make_algorithm(recipe)
+        algorithm.check()
+        history = algorithm.make_env(1, seed=0).reset()["history"]
+        assert history.shape == (1, recipe.backbone.num_frames, 2)
+        sizes.append(sum(weights.numel() for weights in algorithm.policy.parameters()))
+    assert max(sizes) < 1.1 * min(sizes), "about the same number of weights"
+
+
+@pytest.mark.parametrize("task", sorted(TASKS))
+def test_the_cue_is_within_reach_of_those_that_should_solve_it(task):
+    length = int(task.rpartition("-")[2])
+    for name, recipe in MEMORY_RECIPES.items():
+        if name.startswith(f"{task}/"):
+            reaches = recipe.backbone.num_frames > length or recipe.backbone.carries_state
+            assert reaches == ("frames" not in name)
