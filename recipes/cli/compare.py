@@ -7,7 +7,7 @@ from pathlib import Path
 
 from torchrl_tit.files import write_text_atomic
 
-from ..recipe import Recipe, experiment_of
+from ..results.experiments import check_together, group_runs
 from ..results.plot import plot_comparison, plot_table
 from ..results.table import make_table, to_csv, to_markdown
 from ..run import Run
@@ -23,27 +23,18 @@ def compare(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.out.suffix != ".png":
         fail(f"--out {options.out} must end in .png: the figure is a PNG")
-    seeds: dict[Recipe, list[Path]] = {}  # runs of the same settings
     # Beside the runs of a sweep lie its logs, which `sweep/*/seed-*` names too.
-    folders = [path for path in dict.fromkeys(options.runs) if path.suffix != ".log"]
+    folders = {path.resolve(): path for path in options.runs if path.suffix != ".log"}
     if not folders:
         fail(f"{options.runs[0]} is not a run folder, but a log: name the folder beside it")
-    for folder in folders:
-        seeds.setdefault(experiment_of(Run.open(folder).recipe), []).append(folder)
-    offline = {recipe.offline for recipe in seeds}
-    if len(offline) > 1:
-        fail(
-            "environment steps and gradient steps do not share an axis: compare such runs "
-            "separately"
-        )
-    names = [recipe.name for recipe in seeds]
-    curves = {}
-    for recipe, folders in seeds.items():
-        name = recipe.name
-        if not name or names.count(name) > 1:
-            name = f"{name} {folders[0]}".lstrip()
-        curves[name] = [folder / "metrics.csv" for folder in folders]
-    plot_comparison(curves, options.out, title=options.title, offline=offline.pop())
+    experiments = group_runs(Run.open(folder) for folder in folders.values())
+    check_together(experiments)
+    curves = {
+        experiment.label: [run.folder / "metrics.csv" for run in experiment.runs]
+        for experiment in experiments
+    }
+    offline = experiments[0].settings.offline
+    plot_comparison(curves, options.out, title=options.title, offline=offline)
     print(f"written to {options.out}")
 
 

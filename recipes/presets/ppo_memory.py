@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from torchrl_tit.settings import LSTM, MLP, GTrXL, Network
+from torchrl_tit.settings import LSTM, MLP, GTrXL, Inner, Network
 
 from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
@@ -21,7 +21,8 @@ _T_MAZES = {10: (16, 50_000), 50: (64, 200_000)}
 def _networks(num_frames: int) -> dict[str, Network]:
     """The four memories with K observations; 4 frames and the LSTM have none to choose."""
     tit = reliable_tit("enhanced-tit", num_frames)
-    last = replace(tit.frame, every_block=False)  # the class token of the last inner block alone
+    # TIT's inner transformer, of which the others read the class token of the last block alone.
+    last = Inner(patch_size="auto", patch_weights="own", every_block=False)
     return {
         "frames-4": replace(tit, frame=last, history=MLP(hidden_dim=96), num_frames=4),
         "lstm": replace(tit, frame=last, history=LSTM(hidden_dim=64), num_frames=1),

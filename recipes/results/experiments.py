@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,6 +63,27 @@ def group_runs(runs: Iterable[Run]) -> list[Experiment]:
             changes = changed_fields(named.setdefault(name, settings), settings)
         experiments.append(Experiment(settings, name, changes, tuple(seeds.values())))
     return experiments
+
+
+def check_together(experiments: Sequence[Experiment]) -> None:
+    """Checks that experiments can be compared: that they have the same task and unit of steps.
+
+    Raises:
+        ValueError: if returns or steps of some do not share an axis.
+    """
+    first = experiments[0]
+    for other in experiments:
+        names = f"{first.runs[0].folder} and {other.runs[0].folder} do not go together"
+        if other.settings.env != first.settings.env:
+            raise ValueError(
+                f"{names}: their tasks are {first.settings.env} and {other.settings.env}; compare "
+                "the runs of each task"
+            )
+        if other.settings.offline != first.settings.offline:
+            raise ValueError(
+                f"{names}: environment steps and gradient steps do not share an axis; compare the "
+                "runs of each kind"
+            )
 
 
 def label(name: str, changes: str) -> str:

@@ -100,7 +100,7 @@ def plot_comparison(
         )
         returns = np.stack([np.interp(grid, *run) for run in known])
         mean, deviation = returns.mean(0), returns.std(0)
-        label = f"{name.removeprefix(common)} ({len(known)} runs)"
+        label = name.removeprefix(common) + (f" ({len(known)} runs)" if len(known) > 1 else "")
         marker = "o" if grid[0] == grid[-1] else "None"
         (line,) = axes.plot(grid, mean, marker=marker, ls="-", linewidth=2, label=label)
         axes.fill_between(

@@ -15,7 +15,7 @@ import numpy as np
 from ...metrics import read_metrics
 from ...recipe import Recipe
 from ...run import Run
-from ..experiments import Experiment, group_runs
+from ..experiments import Experiment, check_together, group_runs
 
 _LONGEST = 40  # letters of a name in a legend
 
@@ -85,7 +85,7 @@ def read_groups(folders: Iterable[Path]) -> list[Group]:
             same, or they are of different tasks or of different kinds of steps.
     """
     experiments = group_runs(_find_runs(folders))
-    _check_together([experiment.settings for experiment in experiments], experiments)
+    check_together(experiments)
     labels = _labels(experiments)
     return [
         Group(experiment, label, tuple(_read(run) for run in _by_seed(experiment.runs)))
@@ -146,23 +146,6 @@ def _versions(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError):  # lost or damaged: the report says that they are unknown
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def _check_together(recipes: Sequence[Recipe], experiments: Sequence[Experiment]) -> None:
-    """Raises ValueError if returns or steps of some experiments do not share an axis."""
-    first = experiments[0]
-    for recipe, other in zip(recipes, experiments, strict=True):
-        names = f"{first.runs[0].folder} and {other.runs[0].folder} do not go together"
-        if recipe.env != first.settings.env:
-            raise ValueError(
-                f"{names}: their tasks are {first.settings.env} and {recipe.env}; write a report "
-                "for each"
-            )
-        if recipe.offline != first.settings.offline:
-            raise ValueError(
-                f"{names}: environment steps and gradient steps do not share an axis; write a "
-                "report for each"
-            )
 
 
 def _labels(experiments: Sequence[Experiment]) -> list[str]:

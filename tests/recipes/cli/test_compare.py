@@ -57,7 +57,7 @@ def test_the_logs_of_a_sweep_are_passed_over(begun, drawn, capsys):
 
 def test_other_settings_under_one_name_are_another_curve(begun, drawn):
     begun("a"), begun("b", learning_rate=1e-3), begun("c", seed=2)
-    assert drawn("a", "b", "c") == {f"{NAME} a": ["a", "c"], f"{NAME} b": ["b"]}
+    assert drawn("a", "b", "c") == {NAME: ["a", "c"], f"{NAME} (learning_rate 0.001)": ["b"]}
 
 
 def test_runs_without_a_name_are_called_as_their_folder(begun, drawn):
@@ -66,8 +66,16 @@ def test_runs_without_a_name_are_called_as_their_folder(begun, drawn):
     assert drawn("a", "b") == {"a": ["a"], "b": ["b"]}
 
 
+def test_tasks_are_not_compared(begun, capsys):
+    begun("a"), begun("b", "ppo/acrobot/mlp")
+    with pytest.raises(SystemExit):
+        main(["compare", "a", "b"])
+    error = capsys.readouterr().err
+    assert "a and b do not go together: their tasks are CartPole-v1 and Acrobot-v1" in error
+
+
 def test_gradient_steps_and_environment_steps_are_not_compared(begun, capsys):
-    begun("a"), begun("b", "cql/hopper-medium-v0/mlp")
+    begun("a"), begun("b", "discrete-cql/cartpole-mixed/mlp")
     with pytest.raises(SystemExit):
         main(["compare", "a", "b"])
     assert "environment steps and gradient steps do not share an axis" in capsys.readouterr().err

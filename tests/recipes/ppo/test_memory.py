@@ -7,6 +7,7 @@ import pytest
 from recipes.algorithm import make_algorithm
 from recipes.presets.ppo_memory import MEMORY_RECIPES
 from recipes.registry import RECIPES
+from torchrl_tit.settings import Inner
 
 TASKS = {name.rpartition("/")[0] for name in MEMORY_RECIPES}
 
@@ -14,7 +15,10 @@ TASKS = {name.rpartition("/")[0] for name in MEMORY_RECIPES}
 @pytest.mark.parametrize("task", sorted(TASKS))
 def test_only_the_memory_differs(task):
     recipes = {name: recipe for name, recipe in MEMORY_RECIPES.items() if name.startswith(task)}
-    frames = {replace(recipe.backbone.frame, every_block=False) for recipe in recipes.values()}
+    frames = set()
+    for recipe in recipes.values():
+        assert isinstance(recipe.backbone.frame, Inner)
+        frames.add(replace(recipe.backbone.frame, every_block=False))
     assert len(frames) == 1, "one frame encoder"
     tit = recipes[f"{task}/enhanced-tit"]
     for name, recipe in recipes.items():

@@ -46,8 +46,8 @@ def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, monkeypat
         (axes.get_title(), axes.get_legend_handles_labels()[1])
         for (axes,) in (figure.axes for figure in figures)
     ]
-    labels = ["mlp (1 runs)", "mlp-stack-8 (1 runs)", "lstm (1 runs)"]
-    assert drawn == [("ppo/cartpole", labels), ("mine", labels), ("", [f"{names[0]} (1 runs)"])]
+    labels = ["mlp", "mlp-stack-8", "lstm"]
+    assert drawn == [("ppo/cartpole", labels), ("mine", labels), ("", [f"{names[0]}"])]
 
 
 def test_what_was_changed_has_room_beside_its_panel(tmp_path, monkeypatch):
