@@ -9,6 +9,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -51,6 +52,24 @@ def test_page_runs(page, own_modules, monkeypatch):
                 words = shlex.split(command)
                 assert words[:3] == ["python", "-m", "recipes"], command
                 main(words[3:])
+
+
+def test_k_of_the_script_stands_in_one_place():
+    namespace: dict[str, Any] = {}
+    script = "".join(
+        code for _, _, code in blocks(ROOT / "docs" / "tutorials" / "torchrl-script.md")
+    )
+    assert script.count("K = 4\n") == 1
+    exec(compile(script.replace("K = 4\n", "K = 16\n"), "torchrl-script.md", "exec"), namespace)
+    assert namespace["tit"].num_frames == 16
+
+
+def test_no_two_pages_write_one_run():
+    """Readers follow them one after the other, in one folder."""
+    runs = re.compile(r"(?:train|sweep) [^\n]*--out (runs/\S+)")
+    written = [run for page in PAGES for run in {*runs.findall(page.read_text())}]
+    assert len(written) > 10
+    assert len(written) == len({*written})
 
 
 def test_what_is_shown_and_not_run_is_a_command():
