@@ -70,7 +70,8 @@ def test_train_evaluate_and_resume(capsys, tmp_path):
     assert first == second
 
     picture = tmp_path / "comparison.png"
-    main(["compare", str(run), str(again), "--out", str(picture)])
+    assert "are the same run" in fails(capsys, "compare", str(run), str(again))
+    main(["compare", str(run), "--out", str(picture)])
     assert picture.read_bytes().startswith(b"\x89PNG")
 
     line = fails(capsys, *words)

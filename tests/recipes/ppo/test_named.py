@@ -81,10 +81,11 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings():
         for name, recipe in RECIPES.items()
         if isinstance(recipe, PPO) and not name.endswith("-protocol") and "ALE" not in recipe.env
     ]
-    assert len({recipe.env for recipe in recipes}) == 7
+    assert len({recipe.env for recipe in recipes}) == 8  # the paper's and the T-Maze
     one = PPO(env="one", backbone=mlp(), **PPO_SETTINGS)
     same: dict[str, Any] = {
         "env": "one",
+        "env_settings": (),
         "backbone": mlp(),
         "total_steps": one.total_steps,
         "name": "",
