@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from ..recipe import Recipe, experiment_of
@@ -28,6 +29,26 @@ class Experiment:
     def label(self) -> str:
         """The name, and the changed fields."""
         return label(self.name, self.changes)
+
+
+def find_runs(folders: Iterable[Path]) -> list[Run]:
+    """Opens all runs in folders, each once.
+
+    Args:
+        folders: run folders, or folders with run folders somewhere below.
+
+    Raises:
+        ValueError: if a folder holds none, or the recipe of one cannot be read.
+    """
+    found: dict[Path, Run] = {}
+    for folder in folders:
+        paths = sorted(folder.rglob("recipe.json"))
+        if not paths:
+            raise ValueError(
+                f"{folder} holds no run folder: there is no recipe.json in it or below"
+            )
+        found |= {path.parent.resolve(): Run.open(path.parent) for path in paths}
+    return list(found.values())
 
 
 def group_runs(runs: Iterable[Run]) -> list[Experiment]:

@@ -14,9 +14,8 @@ import numpy as np
 from torchrl_tit.datasets import has_reference
 
 from ..recipe import Recipe
-from ..run import Run
 from .cell import Cell
-from .experiments import Experiment, group_runs
+from .experiments import Experiment, find_runs, group_runs
 from .interval import interval_of
 from .reported import Published, paper_results, plain_name, reported_of
 
@@ -38,7 +37,7 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
     """
     evaluations: dict[Path, dict] = {}
     runs, notes = [], []
-    for run in _runs(folders):
+    for run in find_runs(folders):
         try:
             text = (run.folder / "evaluation.json").read_text(encoding="utf-8")
             evaluation = json.loads(text)
@@ -109,16 +108,6 @@ def to_csv(cells: Sequence[Cell]) -> str:
         )
         writer.writerow({k: "" if v != v else v for k, v in values.items()})
     return buffer.getvalue()
-
-
-def _runs(folders: Iterable[Path]) -> list[Run]:
-    found: dict[Path, Run] = {}
-    for folder in folders:
-        paths = sorted(folder.rglob("recipe.json"))
-        if not paths:
-            raise ValueError(f"{folder} holds no run folder: there is no recipe.json in it")
-        found |= {path.parent.resolve(): Run.open(path.parent) for path in paths}
-    return list(found.values())
 
 
 def _value(evaluation: dict) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from ...metrics import read_metrics
 from ...recipe import Recipe
 from ...run import Run
-from ..experiments import Experiment, check_together, group_runs
+from ..experiments import Experiment, check_together, find_runs, group_runs
 
 _LONGEST = 40  # letters of a name in a legend
 
@@ -84,23 +84,13 @@ def read_groups(folders: Iterable[Path]) -> list[Group]:
         ValueError: if a folder holds no run, a run is damaged or has no metrics, two runs are the
             same, or they are of different tasks or of different kinds of steps.
     """
-    experiments = group_runs(_find_runs(folders))
+    experiments = group_runs(find_runs(folders))
     check_together(experiments)
     labels = _labels(experiments)
     return [
         Group(experiment, label, tuple(_read(run) for run in _by_seed(experiment.runs)))
         for experiment, label in zip(experiments, labels, strict=True)
     ]
-
-
-def _find_runs(folders: Iterable[Path]) -> list[Run]:
-    found: dict[Path, Run] = {}
-    for folder in folders:
-        paths = sorted(folder.rglob("recipe.json"))
-        if not paths:
-            raise ValueError(f"{folder} holds no run: there is no recipe.json in it or below")
-        found |= {path.parent.resolve(): Run.open(path.parent) for path in paths}
-    return list(found.values())
 
 
 def _by_seed(runs: Iterable[Run]) -> list[Run]:
