@@ -27,7 +27,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PRECIOUS: $(VENV)/installed-%
 # The tests come last, also under `make -j`: their closing line ends the log.
 .NOTPARALLEL:
-.PHONY: help demo demo-memory test lint types numerics unit versions kill fuzz soak browser bench docs format hooks clean
+.PHONY: help demo demo-memory test lint types unit slow numerics versions kill fuzz soak browser bench docs format hooks clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -40,7 +40,7 @@ demo-memory: $(VENV)/installed-run  ## Train four frames and TIT on a maze that 
 	  --workers 2 --out $(OUT) $(ARGS)
 	$(BIN)/python -m recipes compare $(OUT)/ppo/tmaze-10/*/seed-* --out $(OUT)/memory.png
 
-test: lint types numerics unit  ## Check style, types and behaviour: all that must pass
+test: lint types unit  ## Check style, types and behaviour: all that must pass
 
 lint: $(VENV)/installed-test  ## Check style, formatting and which modules import which
 	$(BIN)/ruff check .
@@ -50,14 +50,17 @@ lint: $(VENV)/installed-test  ## Check style, formatting and which modules impor
 types: $(VENV)/installed-test  ## Check types
 	$(BIN)/mypy
 
+unit: $(VENV)/installed-test  ## Run the tests and the examples in docstrings (ARGS="-k history" for some)
+	$(PYTEST) --durations 20 -m "not slow" $(ARGS)
+
+slow: $(VENV)/installed-test numerics  ## Run the tests that take long, and those of numbers on a plain processor
+	$(PYTEST) --durations 20 -m slow $(ARGS)
+
 # Processors differ in the order in which they add numbers up; this is the order of the plainest.
 numerics: $(VENV)/installed-test  ## Compare numbers once more as a processor of another kind makes them
 	ATEN_CPU_CAPABILITY=default $(PYTEST) -m "numerics and not slow" \
 	  -k "not compile and not export" \
 	  $$(grep -rlF --include='test_*.py' pytest.mark.numerics tests)
-
-unit: $(VENV)/installed-test  ## Run the tests and the examples in docstrings (ARGS="-k history" for some)
-	$(PYTEST) --durations 20 $(ARGS)
 
 # Of the direct dependencies: the oldest that pyproject.toml allows, those of constraints.txt, and
 # the newest. UV_PYTHON_DOWNLOADS=never uses the interpreters of this machine alone.

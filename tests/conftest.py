@@ -3,6 +3,7 @@
 PyTorch is imported where it is used: the process that deals the tests out to others needs it not.
 """
 
+import gc
 import os
 import platform
 import random
@@ -31,6 +32,13 @@ processes.use_server()
 
 # A shell that starts the suite in the background ignores Ctrl-C, which tests of it do not expect.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays: the garbage collector need not look through it in each test."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
 
 
 SEED = int(os.environ.get("TEST_SEED", "0"))

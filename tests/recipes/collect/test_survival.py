@@ -28,6 +28,7 @@ class Kill(BaseException):
     """Not caught by any part of the project."""
 
 
+@pytest.mark.slow
 def test_a_killed_collection_resumes_to_the_same_data(
     cartpole: Path, cartpole_settings: Collection, tmp_path: Path, monkeypatch: Any
 ) -> None:
@@ -164,6 +165,7 @@ def test_a_mark_that_is_never_reached_and_a_longer_training(
         collect(settings, tmp_path / "c")
 
 
+@pytest.mark.slow
 def test_sets_that_are_made_later_are_the_same(
     cartpole: Path, cartpole_settings: Collection, tmp_path: Path
 ) -> None:
