@@ -31,6 +31,9 @@ COMMANDS = {
 }
 """The commands by name, each a "module:function" of this package."""
 
+_OF_USERS = (ValueError, OSError, RuntimeError, FloatingPointError, ImportError, MemoryError)
+"""What a mistake of the user's, or a limit of the machine, raises."""
+
 USAGE = """\
 usage: {program} COMMAND ...
 
@@ -80,10 +83,19 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
     except BrokenPipeError:  # `list | head`: what is left goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except MemoryError as error:
-        fail(f"there is not enough memory: {error}")
-    except (ValueError, OSError, RuntimeError, FloatingPointError, ImportError) as error:
-        fail(str(error) or type(error).__name__)
+    except _OF_USERS as error:
+        fail(_describe(error))
+
+
+def _describe(error: Exception) -> str:
+    text = str(error) or type(error).__name__
+    # PyTorch's, of a processor and of a GPU, are RuntimeErrors.
+    if isinstance(error, MemoryError) or "allocate memory" in text or "out of memory" in text:
+        return (
+            "there is not enough memory: a smaller network, num_frames, num_envs, minibatch_size "
+            f"or batch_size needs less ({text})"
+        )
+    return text
 
 
 def _run(arguments: list[str]) -> None:

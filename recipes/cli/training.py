@@ -13,6 +13,7 @@ from torchrl_tit.settings.imports import import_options
 
 from .. import runner
 from ..algorithm import make_algorithm
+from ..callback import Callback
 from ..chosen_frames import with_chosen_frames
 from ..initial_weights import weights_from
 from ..recipe import Recipe
@@ -22,6 +23,7 @@ from ..wandb_metrics import WandbMetrics, check_wandb
 from .arguments import option, override, program
 from .evaluate import one_line
 from .opening import open_run
+from .unused_frames import UnusedFrames
 
 
 def start(
@@ -107,7 +109,7 @@ def _finish(run: Run, wandb: str | None) -> None:
         return
     try:
         with ExitStack() as stack:
-            callbacks = []
+            callbacks: list[Callback] = [] if recipe.offline else [UnusedFrames(recipe)]
             if wandb is not None:
                 callbacks.append(stack.enter_context(closing(WandbMetrics(run, wandb))))
             runner.train(recipe, run, callbacks)

@@ -17,14 +17,20 @@ class Command:
         words: the command and its arguments.
         errors: file for what it writes to standard error.
         file_size: bytes that no file may exceed, as if the disk were full.
+        memory: bytes that it may take besides those it begins with, as if there were no more.
     """
 
     def __init__(
-        self, words: Sequence[object], errors: Path, *, file_size: int | None = None
+        self,
+        words: Sequence[object],
+        errors: Path,
+        *,
+        file_size: int | None = None,
+        memory: int | None = None,
     ) -> None:
         self.errors = errors
         # It begins at once: see tests/processes.py. Not a daemon: it may have processes of its own.
-        arguments = [str(word) for word in words], errors, file_size
+        arguments = [str(word) for word in words], errors, file_size, memory
         self._process = multiprocessing.Process(target=_run, args=arguments)
         self._process.start()
 
@@ -52,8 +58,12 @@ class Command:
         return self._process.exitcode
 
 
-def _run(words: list[str], errors: Path, file_size: int | None) -> None:
+def _run(words: list[str], errors: Path, file_size: int | None, memory: int | None) -> None:
     os.setsid()
+    if memory is not None:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        limit = pages * resource.getpagesize() + memory
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     if file_size is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
     with errors.open("w") as file, open(os.devnull, "w") as null:

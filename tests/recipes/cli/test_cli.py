@@ -13,6 +13,7 @@ import torchrl_tit
 from recipes.cli import main
 from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import RECIPES, get_recipe
+from tests.recipes.commands import Command
 
 SHORT = [
     "--total-steps", "64", "--steps-per-batch", "64", "--minibatch-size", "32", "--epochs", "1",
@@ -231,3 +232,12 @@ def test_json_with_wrong_fields_is_refused(change, message):
 def test_text_that_is_no_recipe_is_refused(text):
     with pytest.raises(ValueError, match=r"here\.json cannot be read as a recipe"):
         recipe_from_json(text, "here.json")
+
+
+def test_more_than_the_memory_holds_is_one_line(tmp_path):
+    words = ["train", "ppo/cartpole/mlp", "--backbone.history.hidden-dim", 65536, "--out"]
+    process = Command([*words, tmp_path / "run"], tmp_path / "errors", memory=2 * 10**9)
+    assert process.wait() == 2
+    [line] = process.errors.read_text().splitlines()
+    assert line.startswith("error: there is not enough memory: a smaller network, num_frames")
+    assert not (tmp_path / "run").exists()
