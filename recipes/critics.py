@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
-from torchrl.modules import MLP, ValueOperator
+from torchrl.modules import MLP
 
 from torchrl_tit.frames.observation import Observations, read_observations
+from torchrl_tit.modules.tensor_module import TensorValue
 from torchrl_tit.settings import Network
 
 from .policies import make_backbone
@@ -58,7 +59,7 @@ def make_critic(
         activation_kwargs={"inplace": True},
     )
     in_keys = [key, "action"] if action_dim else [key]
-    return TensorDictSequential(*modules, ValueOperator(mlp, in_keys=in_keys, out_keys=[out_key]))
+    return TensorDictSequential(*modules, TensorValue(mlp, in_keys=in_keys, out_keys=[out_key]))
 
 
 def _array_size(observation: Observations) -> int:

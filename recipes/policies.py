@@ -7,7 +7,6 @@ import math
 from tensordict.nn import (
     AddStateIndependentNormalScale,
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
     TensorDictSequential,
 )
 from torch import nn
@@ -17,6 +16,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, QValueModule,
 from torchrl_tit.frames.observation import Observations
 from torchrl_tit.modules import Backbone, history_keys, make_actor
 from torchrl_tit.modules.sequences import default_observation_keys
+from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import build_network
 from torchrl_tit.settings import Network
 
@@ -68,7 +68,7 @@ def make_cloning_policy(
     mean = _bounded(backbone, action_spec, "loc")
     scale = AddStateIndependentNormalScale(action_spec.shape[0], scale_lb=math.exp(_MIN_LOG_STD))
     return ProbabilisticActor(
-        TensorDictSequential(*mean, TensorDictModule(scale, ["loc"], ["loc", "scale"])),
+        TensorDictSequential(*mean, TensorModule(scale, ["loc"], ["loc", "scale"])),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         distribution_kwargs={"validate_args": False},
@@ -96,7 +96,7 @@ def make_value_policy(
         mask_key: key of the actions that are allowed, if it reads them.
     """
     values = nn.Linear(backbone.features_dim, action_spec.space.n)
-    head = TensorDictModule(values, ["features"], ["action_value"])
+    head = TensorModule(values, ["features"], ["action_value"])
     choice = QValueModule(spec=action_spec, action_mask_key=mask_key)
     return TensorDictSequential(backbone, head, choice)
 
@@ -123,6 +123,6 @@ def _bounded(backbone: Backbone, action_spec: Bounded, key: str) -> list[nn.Modu
     space = action_spec.space
     return [
         backbone,
-        TensorDictModule(linear, ["features"], [key]),
+        TensorModule(linear, ["features"], [key]),
         TanhModule(in_keys=[key], low=space.low, high=space.high),
     ]

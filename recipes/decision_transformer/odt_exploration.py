@@ -6,12 +6,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
     TensorDictModuleBase,
 )
 from torchrl.envs import EnvBase
 
 from torchrl_tit.datasets import Episodes, episodes_from_arrays, join_episodes
+from torchrl_tit.modules.tensor_module import TensorModule
 
 _STEP: list[NestedKey] = [
     "observation",
@@ -32,7 +32,7 @@ def scale_noise(actor: TensorDictModuleBase, factor: float) -> TensorDictModuleB
         return actor
     assert isinstance(actor, ProbabilisticTensorDictSequential)
     *network, draw = actor.module
-    scale = TensorDictModule(lambda std: factor * std, ["scale"], ["scale"])
+    scale = TensorModule(lambda std: factor * std, ["scale"], ["scale"])
     return ProbabilisticTensorDictSequential(*network, scale, draw)
 
 

@@ -8,7 +8,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import (
     NormalParamExtractor,
-    TensorDictModule,
     TensorDictSequential,
     set_skip_existing,
 )
@@ -18,6 +17,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_tit.modules import Backbone
+from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.objectives import encode_pairs
 
 from ..critics import make_critic
@@ -97,7 +97,7 @@ def _make_actor(backbone: Backbone, action_spec: Bounded) -> ProbabilisticActor:
     )
     return ProbabilisticActor(
         TensorDictSequential(
-            backbone, TensorDictModule(head, backbone.features_keys, ["loc", "scale"])
+            backbone, TensorModule(head, backbone.features_keys, ["loc", "scale"])
         ),
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,

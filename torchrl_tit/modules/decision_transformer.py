@@ -8,7 +8,6 @@ from tensordict import NestedKey
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
     ProbabilisticTensorDictSequential,
-    TensorDictModule,
     TensorDictSequential,
 )
 from tensordict.utils import unravel_key
@@ -17,6 +16,7 @@ from torchrl.modules import OneHotCategorical, TanhNormal
 
 from torchrl_tit.layers.gaussian_head import GaussianHead
 from torchrl_tit.modules.backbone import Backbone
+from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import HistoryNetwork
 
 ActionSpace = Literal["continuous", "gaussian", "discrete"]
@@ -136,9 +136,7 @@ def make_dt_predictor(network: HistoryNetwork, head: DTHead) -> TensorDictSequen
             "OnlineDTLoss, or set action_space='continuous'"
         )
     backbone = make_dt_backbone(network, every_frame=True)
-    return TensorDictSequential(
-        backbone, TensorDictModule(head, ["features", "action"], ["action"])
-    )
+    return TensorDictSequential(backbone, TensorModule(head, ["features", "action"], ["action"]))
 
 
 def make_dt_actor(
@@ -191,7 +189,7 @@ def make_dt_actor(
     backbone = make_dt_backbone(network, group=group, every_frame=every_frame)
     head_keys = ["features", backbone.in_keys[1]]  # the latter to check the kind of actions
     if head.action_space == "continuous":
-        return TensorDictSequential(backbone, TensorDictModule(head, head_keys, [action_key]))
+        return TensorDictSequential(backbone, TensorModule(head, head_keys, [action_key]))
     distribution: type[distributions.Distribution]
     if head.action_space == "gaussian":
         parameters, distribution = ["loc", "scale"], TanhNormal
@@ -200,7 +198,7 @@ def make_dt_actor(
         distribution = OneHotCategorical if one_hot else distributions.Categorical
     return ProbabilisticTensorDictSequential(
         backbone,
-        TensorDictModule(head, head_keys, parameters),
+        TensorModule(head, head_keys, parameters),
         ProbabilisticTensorDictModule(
             in_keys=parameters, out_keys=[action_key], distribution_class=distribution
         ),

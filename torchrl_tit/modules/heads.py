@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from tensordict.nn import AddStateIndependentNormalScale
 from torch import Tensor, distributions, nn
 from torch.nn.functional import pad
 from torchrl.data import Binary, Categorical, OneHot, TensorSpec
@@ -25,6 +25,7 @@ from torchrl_tit.modules.distributions import (
     IndependentCategorical,
     IndependentOneHotCategorical,
 )
+from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Size, Weight
 
@@ -109,7 +110,7 @@ def make_actor(
     init_orthogonal_(parts.network, gain=gain)
     in_keys = [in_key] if mask_key is None else [in_key, mask_key]
     return ProbabilisticActor(
-        TensorDictModule(parts.network, in_keys=in_keys, out_keys=list(parts.parameters.values())),
+        TensorModule(parts.network, in_keys=in_keys, out_keys=list(parts.parameters.values())),
         in_keys=parts.parameters,
         out_keys=[action_key],
         distribution_class=parts.distribution,
@@ -138,7 +139,7 @@ def make_value(features_dim: Size, *, in_key: NestedKey = "features") -> ValueOp
     """
     layer = nn.Linear(features_dim, 1)
     init_orthogonal_(layer, gain=1.0)
-    return ValueOperator(layer, in_keys=[in_key])
+    return TensorValue(layer, in_keys=[in_key])
 
 
 class _Parts(NamedTuple):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from tensordict import NestedKey
-from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_tit.layers.gaussian_head import ClampedGaussianHead
 from torchrl_tit.modules.action_specs import describe
+from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Size
 
@@ -59,7 +59,7 @@ def make_squashed_actor(
         )
     head = ClampedGaussianHead(features_dim, action_spec.shape[0])
     return ProbabilisticActor(
-        TensorDictModule(head, in_keys=[in_key], out_keys=["loc", "scale"]),
+        TensorModule(head, in_keys=[in_key], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=[action_key],
         distribution_class=TanhNormal,
