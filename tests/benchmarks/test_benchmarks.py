@@ -77,6 +77,7 @@ def test_segments_hold_the_windows_that_the_peers_read():
     assert_near(features.flatten(0, 1), network(windows))
 
 
+@pytest.mark.slow
 def test_segments_against_full_windows_of_the_earlier_commit():
     row = segments.Row(Case("Enhanced", "arrays", 4, 32), length=16, straightforward=True)
     try:

@@ -202,6 +202,7 @@ def test_run_folder_holds_what_it_says(tmp_path):
     assert Run.open(run.folder).recipe == recipe
 
 
+@pytest.mark.slow
 def test_every_named_recipe_builds_its_agent():
     """Each algorithm with each of its networks, and with each of its tasks."""
     networks, tasks = set(), set()
