@@ -270,7 +270,7 @@ def summarize(rows: list[list[str]]) -> str:
         own = [row for row in rows if row[0] == kind.name]
         killed = [row for row in own if row[2] == "killed"]
         saving = sum(row[-1] == "True" for row in killed)
-        ended = len(own) - len(killed)
+        ended = len({row[1] for row in killed})  # a run that was not compared ends the program
         lines.append(f"| {kind.name} | {len(killed)} of {kind.kills} | {saving} | {ended} |")
     return "\n".join(lines) + "\n"
 
