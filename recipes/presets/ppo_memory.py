@@ -14,8 +14,8 @@ from torchrl_tit.settings import LSTM, MLP, GTrXL, Inner, Network
 from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
 
-_T_MAZES = {10: (16, 50_000), 50: (64, 200_000)}
-"""By the corridor's length: K, which is above it, and the number of steps."""
+_T_MAZES = {10: 50_000, 50: 200_000}
+"""The number of steps by the corridor's length. At the junction, K just reaches the cue."""
 
 
 def _networks(num_frames: int) -> dict[str, Network]:
@@ -40,7 +40,7 @@ MEMORY_RECIPES: dict[str, PPO] = {
         backbone=backbone,
         **PPO_SETTINGS,
     )
-    for length, (num_frames, total_steps) in _T_MAZES.items()
-    for network, backbone in _networks(num_frames).items()
+    for length, total_steps in _T_MAZES.items()
+    for network, backbone in _networks(num_frames=length + 1).items()
 }
 """The recipes by name."""
