@@ -53,7 +53,7 @@ types: $(VENV)/installed-test  ## Check types
 unit: $(VENV)/installed-test  ## Run the tests and the examples in docstrings (ARGS="-k history" for some)
 	$(PYTEST) --durations 20 -m "not slow" $(ARGS)
 
-slow: $(VENV)/installed-test numerics  ## Run the tests that take long, and those of numbers on a plain processor
+slow: numerics  ## Run the tests that take long, and those of numbers on a plain processor
 	$(PYTEST) --durations 20 -m slow $(ARGS)
 
 # Processors differ in the order in which they add numbers up; this is the order of the plainest.

@@ -204,8 +204,7 @@ def test_run_folder_holds_what_it_says(tmp_path):
 
 @pytest.mark.slow
 def test_every_named_recipe_builds_its_agent():
-    """Each algorithm with each of its networks, and with each of its tasks."""
-    networks, tasks = set(), set()
+    built = set()
     for name, recipe in RECIPES.items():
         # Recipes of Atari games differ in the game alone (tests/recipes/ppo/test_atari.py); those
         # without velocities are built in tests/recipes/ppo/test_no_velocity.py.
@@ -213,13 +212,11 @@ def test_every_named_recipe_builds_its_agent():
             continue
         if "-no-velocity/" in name:
             continue
-        data = recipe.dataset if isinstance(recipe, DatasetRecipe) else ""
-        task = (recipe.algorithm, recipe.env, "remote" if is_remote(data) else data)
-        network = (recipe.algorithm, recipe.backbone)
-        if task in tasks and network in networks:
-            continue
-        tasks.add(task)
-        networks.add(network)
+        if isinstance(recipe, DatasetRecipe) and is_remote(recipe.dataset):  # not read here
+            alike = replace(recipe, name="", dataset="hopper-medium-v2")
+            if alike in built:
+                continue
+            built.add(alike)
         if name.startswith("discrete-cql/"):  # on data that its user collects
             with pytest.raises(FileNotFoundError, match=r"no data file data/.*create it first"):
                 make_algorithm(recipe).check()

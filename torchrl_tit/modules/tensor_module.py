@@ -11,12 +11,19 @@ from torch import Tensor
 from torchrl.modules import ValueOperator
 
 
-class WritesTensors(TensorDictModule):
-    """Writes outputs that are tensors as they are, as a mixin.
+class TensorModule(TensorDictModule):
+    """A :class:`~tensordict.nn.TensorDictModule` that writes tensors as they are.
 
     TensorDict 0.14 asks of each output whether it is a data frame, and for that whether pandas is
     installed: a search of all folders of packages, 0.1 ms, at every call of a module that is not
     compiled (docs/upstream/tensordict.md).
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> double = TensorModule(lambda x: 2 * x, in_keys=["x"], out_keys=["y"])
+        >>> double(TensorDict(x=torch.ones(2), batch_size=[2]))["y"]
+        tensor([2., 2.])
     """
 
     def _write_to_tensordict(
@@ -37,17 +44,5 @@ class WritesTensors(TensorDictModule):
         return out
 
 
-class TensorModule(WritesTensors):
-    """A :class:`~tensordict.nn.TensorDictModule` whose outputs are tensors.
-
-    Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> double = TensorModule(lambda x: 2 * x, in_keys=["x"], out_keys=["y"])
-        >>> double(TensorDict(x=torch.ones(2), batch_size=[2]))["y"]
-        tensor([2., 2.])
-    """
-
-
-class TensorValue(WritesTensors, ValueOperator):
+class TensorValue(TensorModule, ValueOperator):
     """A :class:`~torchrl.modules.ValueOperator`, likewise."""
