@@ -1,0 +1,42 @@
+"""What agents read of a cue when they decide: ``python -m benchmarks.cue_attention RUN ...``.
+
+Runs are trained ones on tasks whose first observation is the cue: ppo/tmaze-10/enhanced-tit.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks.report import publish
+from recipes.results.cue_attention import measure_decisions, to_markdown
+from recipes.run import Run
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measures runs, prints Markdown, and writes it and the numbers as JSON."""
+    parser = argparse.ArgumentParser("python -m benchmarks.cue_attention")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of trained runs")
+    parser.add_argument("--episodes", type=int, default=100, help="episodes of each run")
+    parser.add_argument("--seed", type=int, help="of the first episode; default: the evaluation's")
+    parser.add_argument("--out", type=Path, help="folder for cue_attention.md and .json")
+    options = parser.parse_args(arguments)
+    if options.out is not None and options.out.exists() and not options.out.is_dir():
+        parser.error(f"--out {options.out} is a file: name a folder")
+    try:
+        groups = {
+            f"{run.recipe.name}, seed {run.recipe.seed}": measure_decisions(
+                run, episodes=options.episodes, seed=options.seed
+            )
+            for run in map(Run.open, options.runs)
+        }
+    except (ValueError, OSError, RuntimeError) as error:
+        parser.error(" ".join(str(error).split()))
+    numbers = {name: [asdict(decision) for decision in found] for name, found in groups.items()}
+    command = f"python -m benchmarks.cue_attention RUN ... --episodes {options.episodes}"
+    publish("cue_attention", to_markdown(groups), {"runs": numbers}, options.out, command)
+
+
+if __name__ == "__main__":
+    main()
