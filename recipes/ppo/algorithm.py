@@ -44,7 +44,7 @@ from .collectors import make_collector, with_state
 from .flat_parameters import FlatParameters
 from .learning_rate import KLAdaptiveRate
 from .rollout import Rollout
-from .scaling import ReturnScale, ValueHead, normalize_advantages
+from .scaling import AdvantageScale, ReturnScale, ValueHead, normalize_advantages
 from .settings import PPO
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
@@ -159,6 +159,7 @@ class PPOAlgorithm(Algorithm[PPO]):
             *self.terms,
         ]
         self.return_scale = ReturnScale(recipe.gamma)
+        self.advantage_scale = AdvantageScale()
         self.rate = KLAdaptiveRate(recipe.target_kl or math.inf)
 
     @property
@@ -184,7 +185,7 @@ class PPOAlgorithm(Algorithm[PPO]):
             entropy_coeff=recipe.entropy_coeff,
             critic_coeff=recipe.critic_coeff,
             loss_critic_type="l2",
-            normalize_advantage=not recipe.advantage_floor,
+            normalize_advantage=not (recipe.advantage_floor or recipe.running_advantage_floor),
             log_explained_variance=False,
             functional=False,
         )
@@ -212,6 +213,7 @@ class PPOAlgorithm(Algorithm[PPO]):
             "optimizer": self.optimizer,
             "collector": self.collector_state,
             "return_scale": self.return_scale,
+            "advantage_scale": self.advantage_scale,
             "rate": self.rate,
         }
 
@@ -250,14 +252,15 @@ class PPOAlgorithm(Algorithm[PPO]):
         if recipe.normalize_values:
             agent.critic.module.update(target)
             self.loss.critic_coeff.fill_(recipe.critic_coeff / agent.critic.module.std**2)
+        running = self.advantage_scale.update(batch["advantage"])
+        floor = max(recipe.advantage_floor, recipe.running_advantage_floor * running)
         agent.train()
         steps: list[Tensor] = []
         kl = TERMS.index("kl_approx")
         per_epoch = math.ceil(batch.numel() / recipe.minibatch_size)
         for minibatch in minibatches(batch, rollout, agent, recipe):
-            if recipe.advantage_floor:
-                advantage = normalize_advantages(minibatch["advantage"], recipe.advantage_floor)
-                minibatch["advantage"] = advantage
+            if not self.loss.normalize_advantage:
+                minibatch["advantage"] = normalize_advantages(minibatch["advantage"], floor)
             try:
                 steps.append(self._step(minibatch))
             except RuntimeError:  # TorchRL draws samples where an entropy is not finite

@@ -101,6 +101,9 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     that are all but noise, as of a task that is solved, move the policy as far as any others. With
     normalize_rewards, 1 is the deviation of the discounted return (DreamerV3 divides by at least 1
     in the same way, arXiv 2301.04104)."""
+    running_advantage_floor: Weight = 0.0
+    """The same, as a share of the running deviation of the advantages of all batches so far, for
+    tasks whose advantages differ in size. The larger of both floors counts."""
     normalize_values: bool = False
     """Whether the critic learns values with the running mean 0 and standard deviation 1 (PopArt,
     arXiv 1602.07714; arXiv 2006.05990, "value function normalization")."""

@@ -150,6 +150,46 @@ def test_advantages_are_divided_by_a_floor_at_least(tmp_path, monkeypatch):
     assert objective[2] < 1e-3 * objective[0]
 
 
+def test_advantages_are_divided_by_a_share_of_their_running_deviation(tmp_path, monkeypatch):
+    """Advantages that are a thousandth of earlier ones move the policy far less."""
+    seen = []
+    original = algorithm.normalize_advantages
+
+    def recording(advantage, floor):
+        seen.append((advantage, floor, original(advantage, floor)))
+        return seen[-1][-1]
+
+    add = algorithm.add_advantages
+    sizes = iter([1.0, 1e-3, 1.0])
+
+    def shrinking(batch, *args):
+        add(batch, *args)
+        batch["advantage"] *= next(sizes)
+
+    monkeypatch.setattr(algorithm, "normalize_advantages", recording)
+    monkeypatch.setattr(algorithm, "add_advantages", shrinking)
+    recipe = replace(RECIPE, running_advantage_floor=0.5, total_steps=192)
+    run = run_of(recipe, tmp_path / "run")
+    batches = [seen[start : start + 4] for start in (0, 4, 8)]  # 2 minibatches, 2 epochs
+    variances = [torch.cat([raw for raw, *_ in batch[:2]]).var().item() for batch in batches]
+    for count, batch in enumerate(batches, start=1):
+        expected = 0.5 * (sum(variances[:count]) / count) ** 0.5
+        for raw, floor, normal in batch:
+            assert floor == pytest.approx(expected, rel=1e-5)
+            scale = max(expected, raw.std().item())
+            torch.testing.assert_close(normal, (raw - raw.mean()) / scale, rtol=1e-4, atol=1e-5)
+    assert max(normal.abs().max() for *_, normal in batches[1]) < 0.04
+    _, state = load_checkpoint(run.checkpoints)
+    assert state["advantage_scale"] == {
+        "batches": 3,
+        "variances": pytest.approx(sum(variances), rel=1e-5),
+    }
+
+
+def test_one_number_has_no_deviation():
+    assert algorithm.normalize_advantages(torch.tensor([2.0]), 0.5).tolist() == [2.0]
+
+
 @pytest.mark.parametrize("backbone", [RECIPE.backbone, mlp()])
 def test_observations_are_normalized_in_training_and_evaluation(tmp_path, monkeypatch, backbone):
     frames = []
@@ -201,6 +241,7 @@ def test_a_run_with_all_of_them_resumes_bit_for_bit(tmp_path):
     recipe = replace(
         RECIPE,
         normalize_rewards=True,
+        running_advantage_floor=0.5,
         normalize_values=True,
         value_gradient=0.5,
         normalize_observations=True,
@@ -214,6 +255,7 @@ def test_a_run_with_all_of_them_resumes_bit_for_bit(tmp_path):
     states = [load_checkpoint(run.checkpoints)[1] for run in (whole, run)]
     assert_same(states[0]["networks"], states[1]["networks"])
     assert_same(states[0]["return_scale"], states[1]["return_scale"])
+    assert_same(states[0]["advantage_scale"], states[1]["advantage_scale"])
     assert_same(states[0]["rate"], states[1]["rate"])
 
 
