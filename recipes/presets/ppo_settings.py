@@ -19,7 +19,9 @@ PPO_SETTINGS: dict[str, Any] = {
     "normalize_observations": True,
     "normalize_rewards": True,
     # Once a task is solved, advantages are mostly noise, which must not count as much as a signal.
-    "advantage_floor": 0.3,
+    "running_advantage_floor": 0.5,
+    # An update that has moved the policy so far ends early.
+    "target_kl": 0.02,
 }
 """Fields of the recipe; the others have their defaults, which are Stable-Baselines3's."""
 
