@@ -38,14 +38,14 @@ CASES = [
 ]
 _TASKS = {"arrays": "CartPole-v1", "images": "ALE/Pong-v5"}
 
-Act = Callable[[Tensor, bool], object]
+Act = Callable[[Tensor, bool], Tensor]
 """Acts on the frames so far [N, T, *obs], given whether they are the first of an episode."""
 
 
 def live(policy: TensorDictSequential, num_frames: int) -> Act:
     """The TensorDict policy."""
 
-    def act(frames: Tensor, first: bool) -> object:
+    def act(frames: Tensor, first: bool) -> Tensor:
         window = frames[:, -num_frames:]
         return policy(TensorDict({"history": window}, [len(frames)]))["action"]
 
@@ -57,9 +57,9 @@ def exported(file: Path, facts: dict[str, Any], num_frames: int) -> Act:
     run = FORMATS[file.suffix.removeprefix(".")].read(file)
     kept: dict[str, Tensor] = {}
 
-    def act(frames: Tensor, first: bool) -> object:
+    def act(frames: Tensor, first: bool) -> Tensor:
         if "history" in facts["inputs"]:
-            return run({"history": frames[:, -num_frames:].contiguous()})
+            return run({"history": frames[:, -num_frames:].contiguous()})["action"]
         inputs = {"observation": frames[:, -1].contiguous()}
         if facts["state"]:
             shape = facts["inputs"]["tokens"]["shape"]

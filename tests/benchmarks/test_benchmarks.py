@@ -7,7 +7,7 @@ import pytest
 import torch
 from torchrl.modules import set_recurrent_mode
 
-from benchmarks import acting, memory, segments, training_step
+from benchmarks import acting, export, memory, segments, training_step
 from benchmarks.__main__ import BENCHMARKS, gather
 from benchmarks.cases import Case, same_number_of_weights
 from benchmarks.earlier import earlier_tree
@@ -88,6 +88,29 @@ def test_segments_against_full_windows_of_the_earlier_commit():
     assert set(result["ms"]) == {"segments", "full windows", "straightforward"}
     assert all(len(times) == 2 for times in result["ms"].values())
     assert len(segments.cells(result, rate=1e9)) == 10
+
+
+@pytest.mark.slow
+def test_exported_policies_act_as_the_live_one(monkeypatch):
+    pytest.importorskip("onnxruntime")
+    taken = {}
+    seconds = export.seconds
+
+    def recording(act, frames, num_frames):
+        steps = range(num_frames, frames.shape[1] + 1)
+        actions = [act(frames[:, :step], step == num_frames) for step in steps]
+        taken.setdefault(len(frames), []).append(torch.stack(actions))
+        return seconds(act, frames, num_frames)
+
+    monkeypatch.setattr(export, "seconds", recording)
+    found = export.measure(Case("Enhanced", "arrays", 3, max(export.SIZES)), steps=4, repeats=1)
+    assert list(found) == ["live", "pt2", "pt2, step by step", "onnx", "onnx, step by step"]
+    for row in found.values():
+        assert all(rate > 0 for rates in row["rates"].values() for rate in rates)
+    for actions in taken.values():
+        assert len(actions) == len(found)
+        for others in actions[1:]:  # step by step, the window begins with one frame
+            assert torch.equal(others[2:].to(actions[0].dtype), actions[0][2:])
 
 
 def test_operations_of_matrix_products_are_counted():
