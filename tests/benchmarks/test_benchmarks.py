@@ -93,7 +93,7 @@ def test_segments_against_full_windows_of_the_earlier_commit():
 @pytest.mark.slow
 def test_exported_policies_act_as_the_live_one(monkeypatch):
     pytest.importorskip("onnxruntime")
-    taken = {}
+    taken: dict[int, list[torch.Tensor]] = {}
     seconds = export.seconds
 
     def recording(act, frames, num_frames):
