@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.report import publish
-from recipes.results.cue_attention import measure_decisions, to_markdown
+from recipes.results.cue_attention import Decision, measure_decisions, to_markdown
 from recipes.run import Run
 
 
@@ -25,12 +25,11 @@ def main(arguments: list[str] | None = None) -> None:
     if options.out is not None and options.out.exists() and not options.out.is_dir():
         parser.error(f"--out {options.out} is a file: name a folder")
     try:
-        groups = {
-            f"{run.recipe.name}, seed {run.recipe.seed}": measure_decisions(
-                run, episodes=options.episodes, seed=options.seed
-            )
-            for run in map(Run.open, options.runs)
-        }
+        groups: dict[str, list[Decision]] = {}
+        for run in map(Run.open, options.runs):
+            name = f"{run.recipe.name}, seed {run.recipe.seed}"
+            name += f" ({run.folder})" if name in groups else ""
+            groups[name] = measure_decisions(run, episodes=options.episodes, seed=options.seed)
     except (ValueError, OSError, RuntimeError) as error:
         parser.error(" ".join(str(error).split()))
     numbers = {name: [asdict(decision) for decision in found] for name, found in groups.items()}

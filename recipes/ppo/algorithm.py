@@ -252,8 +252,10 @@ class PPOAlgorithm(Algorithm[PPO]):
         if recipe.normalize_values:
             agent.critic.module.update(target)
             self.loss.critic_coeff.fill_(recipe.critic_coeff / agent.critic.module.std**2)
-        running = self.advantage_scale.update(batch["advantage"])
-        floor = max(recipe.advantage_floor, recipe.running_advantage_floor * running)
+        floor = recipe.advantage_floor
+        if recipe.running_advantage_floor:
+            running = self.advantage_scale.update(batch["advantage"])
+            floor = max(floor, recipe.running_advantage_floor * running)
         agent.train()
         steps: list[Tensor] = []
         kl = TERMS.index("kl_approx")

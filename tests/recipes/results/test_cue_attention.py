@@ -54,6 +54,14 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
         assert all(0 < share < 1 for share in decision["shares"])
 
 
+def test_two_runs_of_one_recipe_and_seed_have_a_row_each(tmp_path, capsys):
+    runs = [untrained(tmp_path / name, RECIPE) for name in ("a", "b")]
+    main([*(str(run.folder) for run in runs), "--episodes", "1"])
+    printed = capsys.readouterr().out
+    assert "| maze, seed 0 | wrong | 1 | " in printed
+    assert f"| maze, seed 0 ({runs[1].folder}) | wrong | 1 | " in printed
+
+
 def test_right_and_wrong_decisions_have_a_row_each():
     right = [Decision(True, [0.1, 0.7], 0.25), Decision(True, [0.9, 0.1], 0.25)]
     text = to_markdown({"maze": [*right, Decision(False, [0.2, 0.2], 0.25)]})
