@@ -39,6 +39,17 @@ def test_gymnasium_wrappers_in_order():
         make_env(MINIGRID, wrappers=inner_first[::-1])
 
 
+def test_observations_that_do_not_fit_their_space_are_named():
+    # ViewSizeWrapper narrows MiniGrid's symbols, not its pictures.
+    names = [
+        "minigrid.wrappers:ViewSizeWrapper(agent_view_size=3)",
+        "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)",
+        "minigrid.wrappers:ImgObsWrapper",
+    ]
+    with pytest.raises(ValueError, match=r"shape \(56, 56, 3\), but its space says \(24, 24, 3\)"):
+        make_env(MINIGRID, 2, wrappers=names).reset()
+
+
 def test_transforms_before_histories():
     scaled = "torchrl.envs:ObservationNorm(loc=0.0, scale=2.0, in_keys=['observation'])"
     env, plain = (

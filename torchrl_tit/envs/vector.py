@@ -136,7 +136,11 @@ class GymVectorEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         options = None if mask is None else {"reset_mask": mask.flatten().numpy(force=True)}
         self._seed_spaces(seed)
-        observations, info = self._env.reset(seed=seed, options=options)
+        try:
+            observations, info = self._env.reset(seed=seed, options=options)
+        except ValueError:
+            self._check_shapes()
+            raise
         flag = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return self._tensordict(
             **self._observed(observations, info),
@@ -160,6 +164,17 @@ class GymVectorEnv(EnvBase):
                 self._masks.from_observations(observed) if observed else self._masks.from_info(info)
             )
         return entries
+
+    def _check_shapes(self) -> None:
+        """Raises ValueError if a task returns other shapes than its observation space has."""
+        for env in getattr(self._env, "envs", ()):  # which tasks in other processes lack
+            observation, _ = env.reset()
+            shape, declared = np.shape(observation), env.observation_space.shape
+            if declared is not None and shape != declared:
+                raise ValueError(
+                    f"The task {env} returns observations of shape {shape}, but its space says "
+                    f"{declared}: correct the task, or the order of its wrappers."
+                )
 
     def _check_masks(self) -> None:
         """Raises ValueError if the task has no masks of its actions."""
