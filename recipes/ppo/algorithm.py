@@ -380,12 +380,12 @@ class PPOAlgorithm(Algorithm[PPO]):
 
 
 def normalize_frames(network: nn.Module) -> None:
-    """Puts a :class:`NormalizedFrames` in front of each frame encoder that reads floats."""
+    """Puts a :class:`NormalizedFrames` in front of each frame encoder but those of categories."""
     for trunk in trunks_of(network).values():
         names = list(trunk.frame_encoders)
         seen = zip(names, trunk.frames, trunk.observations.values(), strict=True)
         for key, encoder, observation in seen:
-            if observation.is_float:
+            if observation.categories is None:
                 trunk.frame_encoders[key] = NormalizedFrames(encoder)
 
 

@@ -112,8 +112,8 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     share; 0 trains the backbone on the policy's loss alone (arXiv 2009.04416 compares)."""
     normalize_observations: bool = False
     """Whether the network reads observations with the running mean 0 and standard deviation 1 (as
-    in VecNormalize; arXiv 2006.05990, "observation normalization"). Images are only scaled to
-    0..1."""
+    in VecNormalize; arXiv 2006.05990, "observation normalization"): those of each entry of an
+    array, and of each channel of an image."""
     target_kl: Positive | None = None
     """KL divergence that an update should have; see at_target_kl."""
     at_target_kl: Literal["stop", "adapt"] = "stop"

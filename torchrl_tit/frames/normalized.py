@@ -7,16 +7,23 @@ from torch import Tensor
 
 from torchrl_tit.frames.encoder import FrameEncoder
 
+_IMAGES = 256
+"""Images that become floats at a time, which take four times the memory of bytes."""
+
 
 class NormalizedFrames(FrameEncoder):
     """A frame encoder that reads observations divided by their running standard deviation.
 
-    Each entry has a mean and a standard deviation of its own, as in `VecNormalize` of
-    Stable-Baselines3; results beyond +-``limit`` are clipped. The statistics are buffers of the
-    network, so checkpoints, evaluation, copies and exports have them, and a frame's tokens stay the
-    same while a batch is collected. TorchRL's `VecNormV2` is a transform of the environment: its
-    statistics change with each step, so that a history would hold frames of several scales, and a
-    network without that environment would read observations of a scale that it does not know.
+    Each entry of an array has a mean and a standard deviation of its own, as in `VecNormalize` of
+    Stable-Baselines3, and so has each channel of an image, whose bytes become 0..1 before: of
+    pixels that are all positive, a network sees first what all images have in common. Results
+    beyond +-``limit`` are clipped.
+
+    The statistics are buffers of the network, so checkpoints, evaluation, copies and exports have
+    them, and a frame's tokens stay the same while a batch is collected. TorchRL's `VecNormV2` is a
+    transform of the environment: its statistics change with each step, so that a history would hold
+    frames of several scales, and a network without that environment would read observations of a
+    scale that it does not know.
 
     Args:
         encoder: the frame encoder.
@@ -40,25 +47,39 @@ class NormalizedFrames(FrameEncoder):
         )
         self.encoder = encoder
         self.limit = limit
+        shape = encoder.observation_shape
+        self.is_image = len(shape) > 1
+        shape = (*shape[:-2], 1, 1) if self.is_image else shape
         self.register_buffer("count", torch.zeros(()))
-        self.register_buffer("mean", torch.zeros(encoder.observation_shape))
-        self.register_buffer("variance", torch.ones(encoder.observation_shape))
+        self.register_buffer("mean", torch.zeros(shape))
+        self.register_buffer("variance", torch.ones(shape))
 
     @torch.no_grad()
     def update(self, observations: Tensor) -> None:
-        """Adds observations to the statistics, [N, *observation_shape]."""
+        """Adds observations to the statistics, float or uint8 [N, *observation_shape]."""
+        for part in observations.split(_IMAGES) if self.is_image else [observations]:
+            self._add(self._as_floats(part))
+
+    def _add(self, observations: Tensor) -> None:
+        over = (0, -2, -1) if self.is_image else (0,)
         size = observations.shape[0]
         total = self.count + size
-        shift = observations.mean(0) - self.mean
-        squares = self.variance * self.count + observations.var(0, unbiased=False) * size
+        shift = observations.mean(over, keepdim=True)[0] - self.mean
+        variance = observations.var(over, unbiased=False, keepdim=True)[0]
+        squares = self.variance * self.count + variance * size
         self.variance.copy_((squares + shift.square() * self.count * size / total) / total)
         self.mean.add_(shift * size / total)
         self.count.copy_(total)
 
     def normalize(self, observation: Tensor) -> Tensor:
-        """Normalises observations, float [..., *observation_shape]."""
-        normal = (observation - self.mean) * (self.variance + 1e-8).rsqrt()
+        """Normalises observations, float or uint8 [..., *observation_shape] -> float."""
+        normal = (self._as_floats(observation) - self.mean) * (self.variance + 1e-8).rsqrt()
         return normal.clamp(-self.limit, self.limit)
+
+    def _as_floats(self, observation: Tensor) -> Tensor:
+        if observation.dtype == torch.uint8:
+            return observation.to(self.mean.dtype) / 255
+        return observation
 
     def forward(self, observation: Tensor) -> Tensor:
         """See :meth:`FrameEncoder.forward`."""

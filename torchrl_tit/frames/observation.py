@@ -57,13 +57,6 @@ class Observation:
         return "array" if len(self.shape) == 1 else "image"
 
     @property
-    def is_float(self) -> bool:
-        """Whether its entries are floats, as far as is known: not bytes, not categories."""
-        if self.dtype is None:
-            return self.kind == "array"
-        return self.categories is None and self.dtype.is_floating_point
-
-    @property
     def entries(self) -> int:
         """Number of entries; of categories, of all their one-hot vectors."""
         return math.prod(self.shape) if self.categories is None else sum(self.categories)

@@ -212,15 +212,25 @@ def test_observations_are_normalized_in_training_and_evaluation(tmp_path, monkey
     assert len(encoders) == (2 if backbone == mlp() else 1)
 
 
-def test_images_are_not_normalized():
-    pytest.importorskip("ale_py")
-    recipe = replace(
+def test_images_are_normalized_by_channel_and_categories_are_not(tmp_path):
+    pytest.importorskip("minigrid")
+    images = replace(
         RECIPE,
-        env="ALE/Pong-v5",
+        env="MiniGrid-Empty-5x5-v0",
+        wrappers=(
+            "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=2)",
+            "minigrid.wrappers:ImgObsWrapper",
+        ),
         normalize_observations=True,
-        backbone=enhanced_tit(2, patch_size=42, embed_dim=8, features_dim=8),
+        backbone=enhanced_tit(2, patch_size=2, embed_dim=8, features_dim=8),
     )
-    assert not normalized_frames(make_algorithm(recipe).networks())
+    _, trained, _ = load_trained(run_of(images, tmp_path / "run"))
+    (frames,) = normalized_frames(trained.networks())
+    assert frames.mean.shape == (3, 1, 1)
+    assert (frames.mean > 0.05).all()
+    assert (frames.variance < 0.2).all()
+    categories = replace(images, env="Taxi-v4", wrappers=(), backbone=mlp())
+    assert not normalized_frames(make_algorithm(categories).networks())
 
 
 def test_an_update_ends_at_the_target_divergence(tmp_path):
