@@ -8,6 +8,7 @@ a recurrent state, a gated transformer over the last K observations, and TIT's o
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 from torchrl_tit.settings import LSTM, MLP, GTrXL, Inner, Network
 
@@ -17,12 +18,27 @@ from .ppo_settings import PPO_SETTINGS, reliable_tit
 _T_MAZES = {10: 50_000, 50: 200_000}
 """The number of steps by the corridor's length. At the junction, K just reaches the cue."""
 
+_MINIGRIDS = {7: 1_000_000, 9: 2_000_000, 11: 4_000_000}
+"""The number of steps by the size of the maze."""
 
-def _networks(num_frames: int) -> dict[str, Network]:
-    """The four memories with K observations; 4 frames and the LSTM have none to choose."""
-    tit = reliable_tit("enhanced-tit", num_frames)
+_VIEW = (
+    "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)",
+    "minigrid.wrappers:ImgObsWrapper",
+    "torchrl_tit.tasks:FirstActions(count=3)",  # left, right, forward
+)
+
+
+def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[str, Network]:
+    """Returns the four memories by name.
+
+    Args:
+        num_frames: number K of observations; 4 frames and the LSTM have none to choose.
+        patch_size: pixels along a side of an image's patch; an array is one patch.
+    """
+    patch: dict[str, Any] = {"patch_size": patch_size or "auto", "patch_weights": "own"}
+    tit = reliable_tit("enhanced-tit", num_frames, **patch)
     # TIT's inner transformer, of which the others read the class token of the last block alone.
-    last = Inner(patch_size="auto", patch_weights="own", every_block=False)
+    last = Inner(every_block=False, **patch)
     return {
         "frames-4": replace(tit, frame=last, history=MLP(hidden_dim=96), num_frames=4),
         "lstm": replace(tit, frame=last, history=LSTM(hidden_dim=64), num_frames=1),
@@ -41,6 +57,19 @@ MEMORY_RECIPES: dict[str, PPO] = {
         **PPO_SETTINGS,
     )
     for length, total_steps in _T_MAZES.items()
-    for network, backbone in _networks(num_frames=length + 1).items()
+    for network, backbone in memory_networks(length + 1).items()
+} | {
+    # As in arXiv 2505.15040: a view of 3 x 3 tiles, 96 steps. A patch is a tile.
+    f"ppo/memory-s{size}/{network}": PPO(
+        name=f"ppo/memory-s{size}/{network}",
+        env=f"MiniGrid-MemoryS{size}-v0",
+        env_settings=("agent_view_size=3", "max_steps=96"),
+        wrappers=_VIEW,
+        total_steps=total_steps,
+        backbone=backbone,
+        **PPO_SETTINGS,
+    )
+    for size, total_steps in _MINIGRIDS.items()
+    for network, backbone in memory_networks(32, patch_size=8).items()
 }
 """The recipes by name."""

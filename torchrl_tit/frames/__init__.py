@@ -1,6 +1,13 @@
 """Frame encoders: one observation to tokens, the same way at every step."""
 
 from torchrl_tit.frames.encoder import FrameEncoder
+from torchrl_tit.frames.normalized import NormalizedFrames
 from torchrl_tit.frames.observation import Observation, read_observation, read_observations
 
-__all__ = ["FrameEncoder", "Observation", "read_observation", "read_observations"]
+__all__ = [
+    "FrameEncoder",
+    "NormalizedFrames",
+    "Observation",
+    "read_observation",
+    "read_observations",
+]

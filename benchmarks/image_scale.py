@@ -1,0 +1,169 @@
+"""How pictures must be scaled for a network to compare what it sees with what it saw.
+
+``python -m benchmarks.image_scale``: in MiniGrid-Memory S7 a script looks at the cue, walks to the
+junction and looks at one of the two objects there. A network learns from these episodes, without
+any reinforcement, whether that object is the cue. A row has the number of gradient steps until it
+is right in 97 % of the episodes that it was not trained on; between the rows of a network and a
+seed, nothing but the scale of the pixels differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from minigrid.wrappers import ImgObsWrapper, RGBImgPartialObsWrapper
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from recipes.presets.ppo_memory import memory_networks
+from torchrl_tit.frames.normalized import NormalizedFrames
+from torchrl_tit.layers.initialization import init_orthogonal_
+from torchrl_tit.networks import HistoryNetwork, build_network
+from torchrl_tit.settings import Flat, Network
+
+COLUMNS = ["network", "pixels", "seed", "gradient_steps", "accuracy"]
+NUM_FRAMES = 16
+_SIZE, _TILE = 7, 8
+_LEFT, _RIGHT, _FORWARD, _WAIT = 0, 1, 2, 6
+_EAST, _NORTH = 0, 3
+
+PIXELS: dict[str, Callable[[Tensor], Tensor]] = {
+    "0 to 1": lambda pictures: pictures,
+    "0 to 4": lambda pictures: 4 * pictures,
+    "-1 to 1": lambda pictures: 2 * pictures - 1,
+    "without their mean": lambda pictures: pictures - pictures.mean(0),
+    "normalised by channel": lambda pictures: _normalized(pictures),
+}
+"""What is done to pictures [N, 3, H, W] of 0 to 1; the last is ``normalize_observations``."""
+
+
+def _normalized(pictures: Tensor) -> Tensor:
+    frames = NormalizedFrames(Flat().build(pictures.shape[1:]))
+    frames.update(pictures)
+    return frames.normalize(pictures)
+
+
+class Episodes:
+    """Scripted episodes that end in front of an object.
+
+    Args:
+        count: how many.
+        seed: of the tasks and the script.
+    """
+
+    def __init__(self, count: int, seed: int = 0) -> None:
+        task = gymnasium.make(f"MiniGrid-MemoryS{_SIZE}-v0", agent_view_size=3, max_steps=500)
+        self._task = ImgObsWrapper(RGBImgPartialObsWrapper(task, tile_size=_TILE))
+        self._rng = np.random.default_rng(seed)
+        histories, matches = zip(*(self._episode() for _ in range(count)), strict=True)
+        pictures, places = np.unique(np.concatenate(histories), axis=0, return_inverse=True)
+        self.pictures = torch.tensor(pictures).permute(0, 3, 1, 2).float() / 255
+        """What is to be seen in all of them, float [N, 3, H, W] of 0 to 1."""
+        self.histories = torch.tensor(places).view(count, NUM_FRAMES)
+        """The place of each picture of an episode among these, int64 [E, K]."""
+        self.matches = torch.tensor(matches, dtype=torch.float32)
+        """Whether the object at the end is the cue, 0 or 1, [E]."""
+
+    def _episode(self) -> tuple[np.ndarray, bool]:
+        """The last K pictures of an episode, and whether the object at its end is the cue."""
+        self._task.reset(seed=int(self._rng.integers(2**31)))
+        maze: Any = self._task.unwrapped
+        maze.agent_pos, maze.agent_dir = np.array((1, _SIZE // 2)), int(self._rng.integers(4))
+        seen = [self._step(_WAIT)]
+        seen += [self._step(int(turn)) for turn in self._rng.integers(2, size=3)]
+        for direction in (_NORTH, _EAST):  # the cue is in the north
+            while maze.agent_dir != direction:
+                seen.append(self._step(_RIGHT))
+        while maze.agent_pos[0] < _SIZE - 2:
+            seen.append(self._step(_FORWARD))
+        left = bool(self._rng.integers(2))
+        seen.append(self._step(_LEFT if left else _RIGHT))
+        cue = maze.grid.get(1, _SIZE // 2 - 1)
+        target = maze.grid.get(_SIZE - 2, _SIZE // 2 + (-2 if left else 2))
+        padding = [seen[0]] * (NUM_FRAMES - len(seen))
+        return np.stack(padding + seen)[-NUM_FRAMES:], cue.type == target.type
+
+    def _step(self, action: int) -> np.ndarray:
+        return self._task.step(action)[0]
+
+
+def gradient_steps(
+    settings: Network,
+    pixels: Callable[[Tensor], Tensor],
+    episodes: Episodes,
+    *,
+    seed: int,
+    limit: int,
+    batch_size: int = 64,
+    held_out: int = 512,
+    learning_rate: float = 3e-4,
+) -> tuple[int, float]:
+    """Trains a network; the number of gradient steps, and the accuracy that it ends at."""
+    torch.manual_seed(seed)
+    pictures = pixels(episodes.pictures)
+    network = build_network(replace(settings, num_frames=NUM_FRAMES), pictures.shape[1:])
+    assert isinstance(network, HistoryNetwork)
+    init_orthogonal_(network)
+    head = nn.Linear(network.features_dim, 1)
+    optimizer = torch.optim.Adam([*network.parameters(), *head.parameters()], learning_rate)
+    train = len(episodes.matches) - held_out
+    accuracy = 0.0
+
+    def logits(chosen: Tensor) -> Tensor:
+        tokens = network.frames[0](pictures)  # a picture is encoded once
+        return head(network.encode_history(tokens[episodes.histories[chosen]])).squeeze(-1)
+
+    for step in range(1, limit + 1):
+        chosen = torch.randint(train, (batch_size,))
+        loss = F.binary_cross_entropy_with_logits(logits(chosen), episodes.matches[chosen])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        if step % 50 == 0 or step == limit:
+            others = torch.arange(train, train + held_out)
+            with torch.no_grad():
+                right = (logits(others) > 0) == episodes.matches[others].bool()
+            accuracy = right.float().mean().item()
+            if accuracy >= 0.97:
+                break
+    return step, accuracy
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Trains every network with every scale and writes a row each."""
+    parser = argparse.ArgumentParser("python -m benchmarks.image_scale")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--episodes", type=int, default=5512)
+    parser.add_argument("--limit", type=int, default=3000, help="gradient steps of a row")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True, help="new CSV")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(options.threads)
+    episodes = Episodes(options.episodes)
+    networks = memory_networks(NUM_FRAMES, patch_size=_TILE)
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    with options.out.open("x", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for name in ("lstm", "gtrxl", "enhanced-tit"):
+            for scale, pixels in PIXELS.items():
+                for seed in options.seeds:
+                    steps, accuracy = gradient_steps(
+                        networks[name], pixels, episodes, seed=seed, limit=options.limit
+                    )
+                    row = [name, scale, seed, steps, round(accuracy, 3)]
+                    writer.writerow(row)
+                    file.flush()
+                    print(*row, sep=", ", flush=True)
+
+
+if __name__ == "__main__":
+    main()
