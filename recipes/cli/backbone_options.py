@@ -106,7 +106,7 @@ def option_fields(recipe: Recipe) -> list[tuple[str, Any, str]]:
     Their values are those of the recipe; :func:`choose_network` has read them already.
     """
     help_texts = {
-        "backbone.network": "A network of the paper by name, with the recipe's number of frames.",
+        "backbone.network": "A network by its name, with the recipe's number of frames.",
         "backbone.frame": "Frame encoder; its fields are --backbone.frame.FIELD. Of one of several "
         "observations: --backbone.frames.KEY, with the fields --backbone.frames.KEY.FIELD.",
         "backbone.history": "History encoder; its fields are --backbone.history.FIELD.",

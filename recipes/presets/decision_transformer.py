@@ -8,7 +8,7 @@ from ..decision_transformer import DT, ODT
 from ..recipe import Recipe
 
 # Task name: environment and target returns (arXiv 2106.01345, appendix). The paper ran the tasks'
-# v3, as D4RL's data are; v4 is nearer to that than v5.
+# D4RL's data are of the tasks' v2; v4 is nearer to that than v5.
 _TASKS = {
     "halfcheetah": ("HalfCheetah-v4", (12000.0, 6000.0)),
     "hopper": ("Hopper-v4", (3600.0, 1800.0)),

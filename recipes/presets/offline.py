@@ -13,7 +13,7 @@ from ..iql import IQL
 from ..td3bc import TD3BC
 from ..transition_recipe import TransitionRecipe
 
-# D4RL's data are of the tasks' v3; v4 is nearer to that than v5.
+# D4RL's data are of the tasks' v2; v4 is nearer to that than v5.
 _TASKS = {"halfcheetah": "HalfCheetah-v4", "hopper": "Hopper-v4", "walker2d": "Walker2d-v4"}
 _KINDS = ("medium", "medium-replay", "medium-expert")
 # The MLP of the papers of IQL and TD3+BC. For TIT the whole observation is one patch, as in the
