@@ -236,8 +236,11 @@ class PPOAlgorithm(Algorithm[PPO]):
         recipe, agent = self.recipe, self.agent
         learning_rate = recipe.learning_rate_at(step) * self.rate.factor
         self._set_learning_rate(learning_rate)
+        left = 1 - step / recipe.final_step
         if recipe.decay_clip_epsilon:
-            self.loss.clip_epsilon.fill_(recipe.clip_epsilon * (1 - step / recipe.final_step))
+            self.loss.clip_epsilon.fill_(recipe.clip_epsilon * left)
+        if recipe.decay_entropy_coeff:
+            self.loss.entropy_coeff.fill_(recipe.entropy_coeff * left)
         reward = batch["next", "reward"]
         reward = reward.sign() if recipe.clip_rewards else reward
         batch["next", "reward"] = reward * recipe.reward_scale

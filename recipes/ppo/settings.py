@@ -75,7 +75,9 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     decay_clip_epsilon: bool = False
     """Whether the clipping range falls linearly to 0 over the run."""
     entropy_coeff: Real = 0.0
-    """Weight of the entropy bonus."""
+    """Weight of the entropy bonus, before it decays."""
+    decay_entropy_coeff: bool = False
+    """Whether that weight falls linearly to 0 over the run."""
     critic_coeff: Positive = 0.5
     """Weight of the mean squared value error."""
     contrastive_coeff: Weight = 0.0
@@ -218,8 +220,8 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
 
     @property
     def schedules(self) -> tuple[str, ...]:
-        """The learning rate and the clipping range, where they fall to 0 at the end."""
-        fields = ("decay_learning_rate", "decay_clip_epsilon")
+        """What falls to 0 at the end: learning rate, clipping range, weight of the entropy."""
+        fields = ("decay_learning_rate", "decay_clip_epsilon", "decay_entropy_coeff")
         return tuple(field for field in fields if getattr(self, field))
 
     def learning_rate_at(self, step: int) -> float:

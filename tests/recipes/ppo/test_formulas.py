@@ -275,12 +275,20 @@ def test_backbone_runs_once_a_step_and_once_a_minibatch(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("decay", [True, False])
 def test_schedules_fall_linearly(decay, tmp_path, monkeypatch):
-    recipe = replace(SMALL, total_steps=128, decay_learning_rate=decay, decay_clip_epsilon=decay)
-    ranges = []
+    recipe = replace(
+        SMALL,
+        total_steps=128,
+        decay_learning_rate=decay,
+        decay_clip_epsilon=decay,
+        entropy_coeff=0.1,
+        decay_entropy_coeff=decay,
+    )
+    ranges, weights = [], []
     forward = ClipPPOLoss.forward
 
     def spy(self, *args, **kwargs):
         ranges.append(round(self.clip_epsilon.item(), 6))
+        weights.append(round(self.entropy_coeff.item(), 6))
         return forward(self, *args, **kwargs)
 
     monkeypatch.setattr(ClipPPOLoss, "forward", spy)
@@ -292,6 +300,7 @@ def test_schedules_fall_linearly(decay, tmp_path, monkeypatch):
     fractions = [1, 0.75, 0.5, 0.25] if decay else [1, 1, 1, 1]
     assert rates == pytest.approx([3e-4 * fraction for fraction in fractions])
     assert sorted(set(ranges)) == sorted({round(0.2 * fraction, 6) for fraction in fractions})
+    assert sorted(set(weights)) == sorted({round(0.1 * fraction, 6) for fraction in fractions})
 
 
 def test_continuous_actions_are_stored_unclipped_and_evaluated_at_the_mean():
