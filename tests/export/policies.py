@@ -53,9 +53,13 @@ def make_policy(
 
 @torch.no_grad()
 def shake(policy: nn.Module) -> None:
-    """Moves all weights, so that a policy's decisions depend on what it reads."""
+    """Moves all weights, so that a policy's decisions depend on what it reads.
+
+    Less where many are added up: otherwise a wide network turns rounding into large differences.
+    """
     for parameter in policy.parameters():
-        parameter.add_(torch.randn_like(parameter) / 3)
+        entries = parameter.shape[-1] if parameter.ndim else 1
+        parameter.add_(torch.randn_like(parameter) / max(3.0, entries**0.5))
 
 
 def program_of(policy: TensorDictModuleBase, task: MakeEnv, **form: bool) -> Program:

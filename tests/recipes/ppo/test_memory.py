@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import pytest
 
+pytest.importorskip("minigrid")
+
 from recipes.algorithm import make_algorithm
 from recipes.presets.ppo_memory import MEMORY_RECIPES
 from recipes.registry import RECIPES
 from torchrl_tit.settings import Inner
 
-TASKS = {name.rpartition("/")[0] for name in MEMORY_RECIPES}
+TASKS = sorted({name.rpartition("/")[0] for name in MEMORY_RECIPES})
+T_MAZES = [task for task in TASKS if "tmaze" in task]
 
 
-@pytest.mark.parametrize("task", sorted(TASKS))
+@pytest.mark.parametrize("task", TASKS)
 def test_only_the_memory_differs(task):
     recipes = {name: recipe for name, recipe in MEMORY_RECIPES.items() if name.startswith(task)}
     frames = set()
@@ -29,15 +32,22 @@ def test_only_the_memory_differs(task):
         algorithm = make_algorithm(recipe)
         algorithm.check()
         history = algorithm.make_env(1, seed=0).reset()["history"]
-        assert history.shape == (1, recipe.backbone.num_frames, 2)
+        shape = (2,) if task in T_MAZES else (3, 24, 24)
+        assert history.shape == (1, recipe.backbone.num_frames, *shape)
         sizes.append(sum(weights.numel() for weights in algorithm.policy.parameters()))
     assert max(sizes) < 1.1 * min(sizes), "about the same number of weights"
 
 
-@pytest.mark.parametrize("task", sorted(TASKS))
+@pytest.mark.parametrize("task", T_MAZES)
 def test_the_cue_is_within_reach_of_those_that_should_solve_it(task):
     length = int(task.rpartition("-")[2])
     for name, recipe in MEMORY_RECIPES.items():
         if name.startswith(f"{task}/"):
             reaches = recipe.backbone.num_frames > length or recipe.backbone.carries_state
             assert reaches == ("frames" not in name)
+
+
+@pytest.mark.parametrize("name", [name for name in MEMORY_RECIPES if "memory-s" in name])
+def test_a_patch_of_minigrid_is_a_tile(name):
+    (frames,) = make_algorithm(MEMORY_RECIPES[name]).policy[0].module.frames
+    assert frames.encoder.patch_embedding.num_patches == 3 * 3

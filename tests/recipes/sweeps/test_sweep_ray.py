@@ -164,9 +164,19 @@ def test_without_ray_the_message_says_what_to_install(tmp_path, monkeypatch, cap
 )
 def test_addresses_without_a_cluster_are_refused(monkeypatch, address, reason):
     pytest.importorskip("ray")
+    monkeypatch.setenv("RAY_AUTH_TOKEN", "0" * 64)
     monkeypatch.setattr(ray_cluster, "_PATIENCE", 30.0 if address == "nowhere" else 2.0)
     with pytest.raises(ValueError, match=reason):
         ask_for_machines(address)
+
+
+def test_who_has_no_token_is_told_where_it_comes_from(monkeypatch, tmp_path):
+    pytest.importorskip("ray")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ValueError, match="no authentication token in common: `ray get-auth-token"):
+        ask_for_machines("127.0.0.1:1")
 
 
 def test_a_machine_that_does_not_see_the_folder_says_so(tmp_path):
