@@ -20,6 +20,7 @@ from torchrl_tit.analysis.targets import (
     find_network,
     run_policy,
 )
+from torchrl_tit.layers.images import bytes_to_floats
 
 
 def integrated_gradients(
@@ -90,7 +91,7 @@ def integrated_gradients(
     if state.get("action", None) is None:
         with evaluating(policy), torch.no_grad():
             state = state.copy().set("action", run_policy(policy, state)[0]["action"])
-    inputs = {name: _as_floats(state[key]) for name, key in keys.items()}
+    inputs = {name: bytes_to_floats(state[key]) for name, key in keys.items()}
     starts = tuple(
         torch.zeros_like(x) if name not in baselines else baselines[name].to(x).expand_as(x)
         for name, x in inputs.items()
@@ -108,11 +109,6 @@ def integrated_gradients(
     with evaluating(policy), torch.enable_grad():
         shares = method(compute).attribute(tuple(inputs.values()), starts, n_steps=steps)
     return {name: share.detach() for name, share in zip(inputs, shares, strict=True)}
-
-
-def _as_floats(history: Tensor) -> Tensor:
-    """Bytes as 0..1, which is how networks read them."""
-    return history.float() / 255 if history.dtype == torch.uint8 else history
 
 
 def _captum() -> type[Any]:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrl_tit.frames.encoder import FrameEncoder
+from torchrl_tit.layers.images import bytes_to_floats
 
 _IMAGES = 256
 """Images that become floats at a time, which take four times the memory of bytes."""
@@ -58,7 +59,7 @@ class NormalizedFrames(FrameEncoder):
     def update(self, observations: Tensor) -> None:
         """Adds observations to the statistics, float or uint8 [N, *observation_shape]."""
         for part in observations.split(_IMAGES) if self.is_image else [observations]:
-            self._add(self._as_floats(part))
+            self._add(bytes_to_floats(part, self.mean.dtype))
 
     def _add(self, observations: Tensor) -> None:
         over = (0, -2, -1) if self.is_image else (0,)
@@ -73,13 +74,9 @@ class NormalizedFrames(FrameEncoder):
 
     def normalize(self, observation: Tensor) -> Tensor:
         """Normalises observations, float or uint8 [..., *observation_shape] -> float."""
-        normal = (self._as_floats(observation) - self.mean) * (self.variance + 1e-8).rsqrt()
+        floats = bytes_to_floats(observation, self.mean.dtype)
+        normal = (floats - self.mean) * (self.variance + 1e-8).rsqrt()
         return normal.clamp(-self.limit, self.limit)
-
-    def _as_floats(self, observation: Tensor) -> Tensor:
-        if observation.dtype == torch.uint8:
-            return observation.to(self.mean.dtype) / 255
-        return observation
 
     def forward(self, observation: Tensor) -> Tensor:
         """See :meth:`FrameEncoder.forward`."""

@@ -9,6 +9,16 @@ import torch
 from torch import Tensor, nn
 
 
+def bytes_to_floats(x: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Converts bytes (uint8) to floats of 0 to 1, and leaves floats as they are.
+
+    Example:
+        >>> bytes_to_floats(torch.tensor([0, 51, 255], dtype=torch.uint8))
+        tensor([0.0000, 0.2000, 1.0000])
+    """
+    return x.to(dtype) / 255 if x.dtype == torch.uint8 else x
+
+
 class ImageConv2d(nn.Conv2d):
     """2-d convolution that reads floats as they are and divides bytes (uint8) by 255.
 

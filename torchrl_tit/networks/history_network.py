@@ -14,6 +14,7 @@ from torchrl_tit.frames.flat import Flat
 from torchrl_tit.frames.observation import Observation, Observations, read_observations
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, RecurrentEncoder
 from torchrl_tit.layers.activations import make_activation
+from torchrl_tit.layers.images import bytes_to_floats
 from torchrl_tit.layers.initialization import init_normal_
 from torchrl_tit.networks.by_kind import frames_by_kind
 from torchrl_tit.networks.frame_encoders import build_frames, module_names
@@ -234,9 +235,9 @@ class HistoryNetwork(nn.Module):
         """Converts flat frames to floats: one-hot vectors, and bytes for encoders of tokens."""
         if tokens.dtype == torch.bool:
             return tokens.to(weights_dtype(self))
-        if tokens.dtype == torch.uint8 and not self.history_encoder.reads_frames:
-            return tokens.to(weights_dtype(self)) / 255
-        return tokens
+        if self.history_encoder.reads_frames:
+            return tokens
+        return bytes_to_floats(tokens, weights_dtype(self))
 
     def attention_maps(self, *inputs: Tensor) -> AttentionMaps:
         """Returns the attention weights of every inner and outer block.

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_tit.frames import FrameEncoder
+from torchrl_tit.layers.images import bytes_to_floats
 
 
 class NextFrameLoss(nn.Module):
@@ -132,10 +133,8 @@ class ReconstructionLoss(nn.Module):
         """
         total = features.new_zeros(())
         for decoder, observation in zip(self.decoders, observations, strict=True):
-            wanted = observation.flatten(features.ndim - 1).to(features.dtype)
-            if observation.dtype == torch.uint8:
-                wanted = wanted / 255
-            total = total + F.mse_loss(decoder(features), wanted)
+            wanted = bytes_to_floats(observation, features.dtype).flatten(features.ndim - 1)
+            total = total + F.mse_loss(decoder(features), wanted.to(features.dtype))
         return total
 
 
