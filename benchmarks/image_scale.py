@@ -24,31 +24,33 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from recipes.presets.ppo_memory import memory_networks
-from torchrl_tit.frames.normalized import NormalizedFrames
+from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.layers.initialization import init_orthogonal_
 from torchrl_tit.networks import HistoryNetwork, build_network
 from torchrl_tit.settings import Flat, Network
 
 COLUMNS = ["network", "pixels", "seed", "gradient_steps", "accuracy"]
 NUM_FRAMES = 16
+HELD_OUT = 512
 _SIZE, _TILE = 7, 8
 _LEFT, _RIGHT, _FORWARD, _WAIT = 0, 1, 2, 6
 _EAST, _NORTH = 0, 3
-
-PIXELS: dict[str, Callable[[Tensor], Tensor]] = {
-    "0 to 1": lambda pictures: pictures,
-    "0 to 4": lambda pictures: 4 * pictures,
-    "-1 to 1": lambda pictures: 2 * pictures - 1,
-    "without their mean": lambda pictures: pictures - pictures.mean(0),
-    "normalised by channel": lambda pictures: _normalized(pictures),
-}
-"""What is done to pictures [N, 3, H, W] of 0 to 1; the last is ``normalize_observations``."""
 
 
 def _normalized(pictures: Tensor) -> Tensor:
     frames = NormalizedFrames(Flat().build(pictures.shape[1:]))
     frames.update(pictures)
     return frames.normalize(pictures)
+
+
+PIXELS: dict[str, Callable[[Tensor], Tensor]] = {
+    "0 to 1": lambda pictures: pictures,
+    "0 to 4": lambda pictures: 4 * pictures,
+    "-1 to 1": lambda pictures: 2 * pictures - 1,
+    "without their mean": lambda pictures: pictures - pictures.mean(0),
+    "normalised by channel": _normalized,
+}
+"""What is done to pictures [N, 3, H, W] of 0 to 1; the last is ``normalize_observations``."""
 
 
 class Episodes:
@@ -103,7 +105,7 @@ def gradient_steps(
     seed: int,
     limit: int,
     batch_size: int = 64,
-    held_out: int = 512,
+    held_out: int = HELD_OUT,
     learning_rate: float = 3e-4,
 ) -> tuple[int, float]:
     """Trains a network; the number of gradient steps, and the accuracy that it ends at."""
@@ -146,6 +148,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="new CSV")
     options = parser.parse_args(arguments)
+    if options.out.exists():
+        parser.error(f"--out {options.out} exists already: name a new file")
+    if options.episodes <= HELD_OUT or options.limit < 1:
+        parser.error(f"--episodes must be above {HELD_OUT}, and --limit at least 1")
     torch.set_num_threads(options.threads)
     episodes = Episodes(options.episodes)
     networks = memory_networks(NUM_FRAMES, patch_size=_TILE)

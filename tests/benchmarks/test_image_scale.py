@@ -44,6 +44,22 @@ def test_a_transformer_learns_from_normalised_pixels(episodes: image_scale.Episo
     assert accuracy >= 0.97, f"{accuracy} after {steps} steps"
 
 
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--out", __file__], "exists already: name a new file"),
+        (["--out", "new.csv", "--episodes", "512"], "--episodes must be above 512"),
+        (["--out", "new.csv", "--limit", "0"], "--limit at least 1"),
+    ],
+)
+def test_mistakes_are_one_line(
+    words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        image_scale.main(words)
+    assert reason in capsys.readouterr().err
+
+
 def test_a_row_for_each_network_scale_and_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episodes: image_scale.Episodes
 ) -> None:
