@@ -86,7 +86,7 @@ kill: $(VENV)/installed-test  ## Kill runs at random moments and resume them, bi
 fuzz: $(VENV)/installed-test  ## Give 1,000 wrong inputs to recipes, networks, data sets and commands
 	$(ONE_THREAD) $(BIN)/python -m tests.reliability.fuzz $(ARGS)
 
-soak: $(VENV)/installed-test  ## Watch memory, files and speed of three runs for MINUTES=120
+soak: $(VENV)/installed-test  ## Watch memory, files and speed of four runs for MINUTES=120
 	$(ONE_THREAD) $(BIN)/python -m tests.reliability.soak --runs $(RUNS)/soak --minutes $(MINUTES) $(ARGS)
 
 # Debian: apt-get install chromium chromium-driver

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import filelock
+import msgspec
 
 from torchrl_tit.checkpoint import (
     CheckpointError,
@@ -32,10 +33,11 @@ from .registry import find_recipe
 
 _IMPORTS = "imports.json"
 _WEIGHTS = "initial_weights"
+_LENGTHS = "earlier_lengths.json"
 _WRITTEN_BEFORE = ("versions.json", _IMPORTS, _WEIGHTS)
 _WRITTEN_WHOLE = (
     *("recipe.json", "versions.json", _IMPORTS, "metrics.csv", "learning_curve.png"),
-    *("evaluation.json", "evaluation_best.json"),
+    *("evaluation.json", "evaluation_best.json", _LENGTHS),
 )
 _PACKAGES = ["torchrl-tit", "torch", "torchrl", "tensordict", "gymnasium", "mujoco", "numpy"]
 
@@ -53,6 +55,8 @@ class Run:
         learning_curve.png
         evaluation.json    returns of the evaluation episodes, with the last weights
         evaluation_best.json   the same with the best ones, if they were evaluated
+        earlier_lengths.json   if it was trained further: until which step it had which length,
+                               where its schedules follow the length
 
     Use :meth:`create` or :meth:`open`, and the folder as a context: one process at a time.
 
@@ -152,8 +156,32 @@ class Run:
                 f"{field} {length} ends at step {recipe.final_step}, but {self.folder} is trained "
                 f"for {done} steps already: name a larger number"
             )
+        if done and recipe != self.recipe and recipe.schedules:
+            earlier = [*self.earlier_lengths(), (done, getattr(self.recipe, field))]
+            write_text_atomic(self.folder / _LENGTHS, json.dumps(earlier) + "\n")
         write_text_atomic(self.folder / "recipe.json", recipe_to_json(recipe))
         self.recipe = recipe
+
+    def earlier_lengths(self) -> list[tuple[int, int]]:
+        """Returns the lengths that the run's schedules followed before the recipe's.
+
+        Returns:
+            A pair for each time that :meth:`lengthen` changed what the schedules of a run follow
+            that had begun: the step until which the run had the length, and that length.
+
+        Raises:
+            ValueError: if their file is damaged.
+        """
+        path = self.folder / _LENGTHS
+        try:
+            return msgspec.json.decode(path.read_bytes(), type=list[tuple[int, int]])
+        except FileNotFoundError:
+            return []
+        except msgspec.MsgspecError as error:
+            raise ValueError(
+                f"{path} is damaged: expected pairs of step and length, "
+                f"such as [[1024, 4096]] ({error})"
+            ) from error
 
     def __enter__(self) -> Run:
         try:

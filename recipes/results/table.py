@@ -14,6 +14,7 @@ import numpy as np
 from torchrl_tit.datasets import has_reference
 
 from ..recipe import Recipe
+from ..run import Run
 from .cell import Cell
 from .experiments import Experiment, find_runs, group_runs
 from .interval import interval_of
@@ -29,8 +30,9 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         folders: run folders, or folders with run folders somewhere below.
 
     Returns:
-        The cells, in the paper's order, and a note for each run that is left out, or was
-        evaluated over another number of episodes than its recipe says.
+        The cells, in the paper's order, and a note for each run that is left out, was evaluated
+        over another number of episodes than its recipe says, or was trained further with
+        schedules that follow its length.
 
     Raises:
         ValueError: if there is no evaluated run, or two of the same settings have the same seed.
@@ -54,6 +56,8 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         asked = run.recipe.evaluation_episodes
         if (episodes := evaluation.get("episodes", asked)) != asked:  # `evaluate --episodes`
             notes.append(f"{run.folder} was evaluated over {episodes} episodes, not {asked}")
+        if lengths := run.earlier_lengths():
+            notes.append(_trained_further(run, lengths))
         evaluations[run.folder] = evaluation
         runs.append(run)
     if not runs:
@@ -116,6 +120,12 @@ def _value(evaluation: dict) -> float:
 
 def _measure(recipe: Recipe, evaluation: dict) -> str:
     return "normalized score" if "score" in evaluation and has_reference(recipe.env) else "return"
+
+
+def _trained_further(run: Run, lengths: Sequence[tuple[int, int]]) -> str:
+    field, schedules = run.recipe.length, ", ".join(run.recipe.schedules)
+    before = ", ".join(f"{length} until step {step}" for step, length in lengths)
+    return f"{run.folder} was trained further: for {schedules}, {field} was {before}"
 
 
 def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:

@@ -1,10 +1,12 @@
 """Long runs of several kinds side by side: what memory, open files and speed do over time.
 
-``make soak`` runs PPO, CQL and a memory task for two hours and samples each every 30 seconds:
+``make soak`` runs PPO, CQL and two memory tasks for two hours and samples each every 30 seconds:
 
 - ``soak.csv``: a row a sample, written as it is taken, so that a shorter run says something too;
 - ``soak.md``: slopes over time with 95 % intervals. What leaks has a slope above zero.
 
+Resident memory has two parts. A run's own memory is what it has allocated. Pages of files are
+mostly the code of libraries: the kernel takes them from a process that waits and reads them again.
 Speed is steps per second of processor time, which other work on the machine changes little.
 """
 
@@ -26,9 +28,10 @@ from scipy import stats
 
 from torchrl_tit.files import write_text_atomic
 
-COLUMNS = ["run", "seconds", "memory_mb", "descriptors", "processor_seconds", "steps"]
+COLUMNS = ["run", "seconds", "memory_mb", "file_mb", "descriptors", "processor_seconds", "steps"]
 MEASURES = {
-    "memory_mb": "resident memory, MB",
+    "memory_mb": "memory of its own, MB",
+    "file_mb": "pages of files, MB",
     "descriptors": "open files",
     "speed": "steps per processor second",
 }
@@ -39,7 +42,8 @@ _FOREVER = "1000000000"
 _TASKS = {
     "PPO": ["ppo/cartpole/enhanced-tit", "--num-envs", "8", "--total-steps", _FOREVER],
     "CQL": ["cql/hopper-medium-v0/mlp", "--env", "Reacher-v5", "--dataset", "{data}/random.hdf5"],
-    "memory task": ["ppo/cartpole-no-velocity/lstm", "--num-envs", "8", "--total-steps", _FOREVER],
+    "LSTM": ["ppo/cartpole-no-velocity/lstm", "--num-envs", "8", "--total-steps", _FOREVER],
+    "images": ["ppo/memory-s7/enhanced-tit", "--total-steps", _FOREVER],
 }
 _DATA = ["data", "collect", "Reacher-v5", "--sets", "random", "--transitions", "2000"]
 _PROGRAM = [sys.executable, "-m", "recipes"]
@@ -56,12 +60,18 @@ class Worker:
     def sample(self, begin: float) -> list[object]:
         """Reads what the run takes from the machine, and how far it is."""
         root = Path("/proc", str(self.process.pid))
-        pages = int((root / "statm").read_text().split()[1])
+        status = dict(line.split(":", 1) for line in (root / "status").read_text().splitlines())
+        kilobytes = {
+            field: int(value.split()[0])
+            for field, value in status.items()
+            if field.startswith("Rss")
+        }
         times = (root / "stat").read_text().rpartition(")")[2].split()[11:15]
         return [
             self.name,
             round(time.monotonic() - begin, 1),
-            round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 3),
+            round(kilobytes["RssAnon"] * 1024 / 1e6, 3),
+            round((kilobytes["RssFile"] + kilobytes["RssShmem"]) * 1024 / 1e6, 3),
             len(list((root / "fd").iterdir())),
             sum(map(int, times)) / os.sysconf("SC_CLK_TCK"),
             last_step(self.folder / "metrics.csv"),
@@ -84,7 +94,7 @@ def soak(folder: Path, out: Path, minutes: float, interval: float) -> None:
     subprocess.run([*_PROGRAM, *_DATA, "--out", str(folder / "data")], check=True)
     workers = []
     for name, words in _TASKS.items():
-        run = folder / name.replace(" ", "-")
+        run = folder / name
         words = [word.format(data=folder / "data") for word in words]
         more = ["--total-updates", _FOREVER] if name == "CQL" else []
         command = [*_PROGRAM, "train", *words, *more, "--compile", "off", "--out", str(run)]

@@ -15,6 +15,7 @@ from recipes.registry import RECIPES, get_recipe
 from recipes.results import plot
 from recipes.results.reported import paper_results, published_results
 from recipes.results.table import make_table, to_csv, to_markdown
+from recipes.run import Run
 from torchrl_tit.settings import Linear
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
@@ -217,6 +218,39 @@ def test_fewer_episodes_are_named(tmp_path):
     }.items():
         (folder / "evaluation.json").write_text(json.dumps(evaluation | {"episodes": episodes}))
         assert make_table([tmp_path])[1] == notes
+
+
+def test_runs_whose_schedules_followed_other_lengths_are_named(tmp_path):
+    """A learning rate that fell to 0 once is not that of a run with the whole length."""
+    folder = write_run(tmp_path / "run", "ppo/cartpole/mlp", 0, [20.0], total_steps=1024)
+    run = Run.open(folder)
+    run.lengthen(2048)  # nothing is trained yet
+    for step, length in {1024: 3072, 2048: 3072, 3072: 4096}.items():
+        run.save(step, {"networks": {}})
+        run.lengthen(length)
+    evaluation = json.loads((folder / "evaluation.json").read_text())
+    (folder / "evaluation.json").write_text(json.dumps(evaluation | {"steps": 4096}))
+    assert make_table([tmp_path])[1] == [
+        f"{folder} was trained further: for decay_learning_rate, total_steps was "
+        "2048 until step 1024, 3072 until step 3072"
+    ]
+
+
+def test_runs_without_schedules_may_have_any_length(tmp_path):
+    name = "ppo/cartpole/vanilla-tit-protocol"
+    folder = write_run(tmp_path / "run", name, 0, [20.0], total_steps=2048)
+    run = Run.open(folder)
+    run.save(2048, {"networks": {}})
+    run.lengthen(4096)
+    assert run.earlier_lengths() == []
+
+
+@pytest.mark.parametrize("text", ["[[1024]]", "1024", '[["many", 1024]]', ""])
+def test_damaged_lengths_are_named(tmp_path, text):
+    folder = write_run(tmp_path / "run", "ppo/cartpole/mlp", 0, [20.0])
+    (folder / "earlier_lengths.json").write_text(text)
+    with pytest.raises(ValueError, match=r"earlier_lengths\.json is damaged: expected pairs of"):
+        make_table([tmp_path])
 
 
 def test_what_was_changed_is_named(tmp_path):
