@@ -71,7 +71,7 @@ RESOLUTION_pinned := -c constraints.txt
 
 versions/%: TESTED = $(VENV)-$*/bin
 versions/%: $(VENV)/installed-versions
-	$(BIN)/uv venv --clear --python $(word 1,$(subst -, ,$*)) $(VENV)-$*
+	$(BIN)/uv venv --clear --seed --python $(word 1,$(subst -, ,$*)) $(VENV)-$*
 	$(BIN)/uv pip install --compile-bytecode --python $(TESTED)/python \
 	  $(RESOLUTION_$(word 2,$(subst -, ,$*))) -e '.[test]'
 	$(PYTEST) $(ARGS)

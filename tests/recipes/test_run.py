@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import gymnasium
@@ -224,7 +225,7 @@ def test_version_changes(tmp_path):
     run = Run.create(tmp_path / "run", SMALL)
     assert run.version_changes() == []
     edit(run.folder / "versions.json", torch="1.0")
-    assert run.version_changes() == [f"torch 1.0 -> {torch.__version__}"]
+    assert run.version_changes() == [f"torch 1.0 -> {version('torch')}"]
     for text in ("{", "[]"):
         (run.folder / "versions.json").write_text(text)
         assert run.version_changes() == []

@@ -5,6 +5,7 @@ import random
 import signal
 import time
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -198,7 +199,7 @@ def test_run_folder_holds_what_it_says(tmp_path):
     assert (evaluation["env"], evaluation["steps"]) == ("CartPole-v1", 128)
     assert evaluation["seed"] == recipe.evaluation_seed
     assert (run.folder / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
-    assert json.loads((run.folder / "versions.json").read_text())["torch"] == torch.__version__
+    assert json.loads((run.folder / "versions.json").read_text())["torch"] == version("torch")
     assert Run.open(run.folder).recipe == recipe
 
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -201,7 +202,7 @@ def test_provenance_is_in_both_formats(
             assert noted["seed"] == 0
             assert noted["command"] == "the command"
             assert json.loads(noted["settings"])["total_steps"] == settings.total_steps
-            assert json.loads(noted["versions"])["torch"] == torch.__version__
+            assert json.loads(noted["versions"])["torch"] == version("torch")
             if kind == "random":
                 assert noted["algorithm"] == "uniform actions"
                 assert "agent_steps" not in noted
