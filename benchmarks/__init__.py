@@ -1,1 +1,1 @@
-"""Speed against peers, as ratios measured in one run."""
+"""Speed compared with peers, as ratios measured in one run."""

@@ -1,4 +1,4 @@
-"""Runs benchmarks by name: ``python -m benchmarks [NAME ...]``, all of them without a name."""
+"""Runs benchmarks by name, or all of them without a name: ``python -m benchmarks [NAME ...]``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BENCHMARKS = [
 def main() -> None:
     """Runs benchmarks, prints their Markdown, and writes it and the numbers as JSON.
 
-    If all benchmarks run, benchmarks.md and benchmarks.json gather their results.
+    If all benchmarks run, their results are collected in benchmarks.md and benchmarks.json.
     """
     parser = argparse.ArgumentParser("python -m benchmarks")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(BENCHMARKS)}")

@@ -1,10 +1,10 @@
-"""A step of acting: the backbone with cached tokens, against encoding the whole window each time.
+"""A step of acting: the backbone with cached tokens, compared with encoding the whole window.
 
-Windows move by one observation a step, as in an environment; every 25 steps, one environment begins
-a new episode. Ours is the ``Backbone`` in acting mode, including its comparison of frames,
+Windows advance by one observation per step, as in an environment; every 25 steps, one environment
+begins a new episode. Ours is the ``Backbone`` in acting mode, including its comparison of frames,
 both eager and with its two parts compiled. The peer is the straightforward network on the same
-windows. Times are milliseconds a step; on a CPU, they are the processor time of one thread, which
-other programs on the machine hardly change.
+windows. Times are milliseconds per step; on a CPU, they are the processor time of one thread, which
+other programs on the machine hardly affect.
 """
 
 from __future__ import annotations

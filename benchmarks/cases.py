@@ -1,4 +1,4 @@
-"""The networks that the benchmarks measure: ours, and the same ones written straightforwardly."""
+"""The networks that the benchmarks measure: ours, and straightforward implementations of them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Case:
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
-        """Four entries as in CartPole, or an Atari picture."""
+        """Four entries as in CartPole, or an Atari image."""
         return (4,) if self.inputs == "arrays" else (84, 84)
 
     @property
@@ -86,7 +86,7 @@ COLUMNS = ["variant", "inputs", "K", "patch", "width", "heads", "blocks", "batch
 
 
 def same_number_of_weights(case: Case) -> bool:
-    """Whether both networks of a case have equally many weights."""
+    """Whether both networks of a case have the same number of weights."""
     counts = [
         sum(p.numel() for p in network.parameters())
         for network in (case.ours(), case.straightforward())

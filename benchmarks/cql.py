@@ -1,12 +1,13 @@
-"""One update of CQL_TIT: this library against d3rlpy, with the same networks and batches.
+"""One update of CQL_TIT: this library compared with d3rlpy, with the same networks and batches.
 
 The networks are those of the paper's hopper-medium-replay: batch 256, two critics of three layers
 of 256, 30 actions in each state, an Enhanced_TIT of width 128 as actor, K = 1. Both update
 everything once: temperature, critics, actor, targets. The floor is the time of the critics' matrix
-products alone, each as one product in PyTorch.
+products alone, each computed as one product in PyTorch.
 
-d3rlpy pins another version of Gymnasium than this project, for environments that are not needed
-here. Install it without its requirements: ``pip install --no-deps -r benchmarks/d3rlpy.txt``.
+d3rlpy pins a different version of Gymnasium from this project's, for environments that are not
+needed here. Install it without its dependencies:
+``pip install --no-deps -r benchmarks/d3rlpy.txt``.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class _WithoutData(CQLAlgorithm):
 
 
 def make_theirs() -> Callable[[TensorDictBase], Any]:
-    """The update of d3rlpy, whose weight of the conservative term is that of each critic."""
+    """The update of d3rlpy, where the weight of the conservative term applies to each critic."""
     recipe = get_recipe()
     algorithm = CQLConfig(
         actor_learning_rate=recipe.actor_learning_rate,
@@ -160,10 +161,10 @@ def make_floor() -> Callable[[TensorDictBase], Any]:
                     x, y = rows[:, :a].contiguous(), rows[:, :b].contiguous()
                     x @ weight
                     x.T @ y
-                    if index:  # nothing asks for the gradient of states and actions
+                    if index:  # gradients of states and actions are not needed
                         y @ weight.T
                     x[:256] @ weight  # target
-                    x[:256] @ weight  # the actor's loss, and back to its action
+                    x[:256] @ weight  # the actor's loss, and the backward pass to its action
                     y[:256] @ weight.T
 
     return products
@@ -196,7 +197,7 @@ def main(out: Path | None) -> None:
         update(batches[0])
     for _ in range(ROUNDS):
         for name, update in updates.items():
-            start = time.process_time()  # other processes on the machine do not count
+            start = time.process_time()  # excludes other processes on the machine
             for batch in batches:
                 update(batch)
             times[name].append((time.process_time() - start) / STEPS)

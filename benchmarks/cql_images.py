@@ -1,4 +1,4 @@
-"""An update of CQL_TIT on images: frames shared by s and s', against encoding each window.
+"""An update of CQL_TIT on images: frames shared by s and s', compared with encoding each window.
 
 Actor and both critics read the last four 84 x 84 images with an Enhanced_TIT each (patch 12, width
 64, 2 blocks); 10 action samples, so 31 actions in each state; 64 transitions. The same program runs
@@ -120,7 +120,7 @@ def update():
     target.step()
 """
 
-CASES = {  # compiled, slice length, and with which of the earlier commit's it is compared
+CASES = {  # compiled, slice length, and the earlier commit's case that it is compared with
     "eager": (False, 1, "earlier, eager"),
     "policy compiled": (True, 1, "earlier, policy compiled"),
     "eager, slices of 8": (False, 8, "earlier, eager"),

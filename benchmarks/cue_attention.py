@@ -1,6 +1,6 @@
-"""What agents read of a cue when they decide: ``python -m benchmarks.cue_attention RUN ...``.
+"""Attention of agents to a cue when they decide: ``python -m benchmarks.cue_attention RUN ...``.
 
-Runs are trained ones on tasks whose first observation is the cue: ppo/tmaze-10/enhanced-tit.
+The runs must be trained, on tasks whose first observation is the cue: ppo/tmaze-10/enhanced-tit.
 """
 
 from __future__ import annotations

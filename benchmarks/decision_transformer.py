@@ -1,8 +1,8 @@
-"""Decision Transformer: a training step against TorchRL's, and evaluation side by side.
+"""Decision Transformer: a training step compared with TorchRL's, and evaluation side by side.
 
 The training step is that of the protocol (batch 64, 20 steps of Hopper, width 128, 3 layers), with
-the same batches, masks, optimizer and clipping for all, alternating. TorchRL's DTActor is GPT-2 of
-the transformers library; it has no embedding of time steps, which ours computes in addition. The
+the same batches, masks, optimizer and clipping for all, alternating. TorchRL's DTActor is GPT-2
+from the transformers library; it has no time step embedding, which ours computes in addition. The
 floor is the time that our step's matrix products take at the rate of one large product.
 """
 
@@ -97,7 +97,7 @@ def make_step(loss: nn.Module, buffer: ReplayBuffer) -> Callable[[], None]:
 
 
 def seconds(function: Callable[[], Any], repeats: int = 1) -> float:
-    """Seconds of processor time of one call, which other processes do not change."""
+    """Seconds of processor time of one call, which other processes do not affect."""
     start = time.process_time()
     for _ in range(repeats):
         function()
@@ -105,13 +105,13 @@ def seconds(function: Callable[[], Any], repeats: int = 1) -> float:
 
 
 def matrix_rate() -> float:
-    """Floating point operations a second of a product of the step's largest sizes."""
+    """Floating-point operations per second of a product of the step's largest sizes."""
     a, b = torch.randn(64 * 59, 128), torch.randn(128, 512)
     return 2 * a.shape[0] * b.numel() / min(seconds(lambda: a @ b, 20) for _ in range(3))
 
 
 def count_operations(buffer: ReplayBuffer) -> int:
-    """Floating point operations in the matrix products of DT's gradient step."""
+    """Floating-point operations in the matrix products of DT's gradient step."""
     predictor, batch = make_dt_predictor(*make_network("DT")), buffer.sample()
     with FlopCounterMode(display=False) as counter:
         predictor(batch)["action"].sum().backward()

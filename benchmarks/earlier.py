@@ -1,7 +1,7 @@
-"""An earlier commit of this library, measured beside the present one.
+"""Measures an earlier commit of this library next to the present one.
 
 The commit's files are taken from the clone's own history into a temporary folder. Programs of
-either tree run in processes of their own, which measure when they are asked to, so they take turns.
+either tree run in their own processes, which measure on request, so they take turns.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def earlier_tree() -> Iterator[Path]:
     """Yields a temporary folder with the files of the earlier commit.
 
     Raises:
-        SystemExit: if this is no clone with that commit.
+        SystemExit: if this is not a clone with that commit.
     """
     command = ["git", "archive", "--format=tar", COMMIT]
     try:

@@ -1,8 +1,8 @@
-"""Exported policies: the size of the files, and steps a second of each form and format.
+"""Exported policies: the size of the files, and steps per second of each form and format.
 
 The live policy is the TensorDict policy in acting mode, which keeps tokens too. Every policy acts
-on the same frames, which move by one a step, in one environment or several side by side. Times are
-the processor time of one thread, which other programs on the machine hardly change.
+on the same frames, which advance by one per step, in one environment or several side by side. Times
+are the processor time of one thread, which other programs on the machine hardly affect.
 """
 
 from __future__ import annotations
@@ -84,11 +84,11 @@ def seconds(act: Act, frames: Tensor, num_frames: int) -> float:
 
 @torch.no_grad()
 def measure(case: Case, steps: int, repeats: int) -> dict[str, Any]:
-    """Exports the policy of a case in every way; measures sizes, and steps a second, alternating.
+    """Exports the policy of a case in every way; measures sizes, and steps per second, alternating.
 
     Returns:
-        For each form, "kB" (None for the live policy) and, for each number of environments, steps a
-        second of all of them together, of each repeat.
+        For each form, "kB" (None for the live policy) and, for each number of environments, the
+        total steps per second of each repeat.
     """
     torch.manual_seed(0)
     num_frames = case.num_frames

@@ -1,6 +1,6 @@
 """The paper's claims about its pictures as numbers: ``python -m benchmarks.figure_claims RUN ...``.
 
-Runs are trained ones on images, several seeds of each recipe; see docs/analysis.md.
+The runs must be trained on images, with several seeds of each recipe; see docs/analysis.md.
 """
 
 from __future__ import annotations

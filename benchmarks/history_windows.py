@@ -1,4 +1,4 @@
-"""Histories sampled a second: HistoryStorage against a replay buffer with CatFrames.
+"""Histories sampled per second: HistoryStorage compared with a replay buffer with CatFrames.
 
 Both sample batches of 256 transitions, with the histories of the observation and of the next one,
 from the same episodes in memory, on one thread, alternating. CatFrames' sampler draws whole slices
@@ -45,13 +45,13 @@ def make_stream(shape: tuple[int, ...], dtype: torch.dtype, steps: int) -> dict[
 
 
 def make_ours(stream: dict[str, torch.Tensor], num_frames: int) -> ReplayBuffer:
-    """Makes our buffer of the stream."""
+    """Builds our buffer with the stream."""
     episodes = episodes_from_arrays(**stream)
     return make_replay_buffer(HistoryStorage(episodes, num_frames), BATCH)
 
 
 def make_catframes(stream: dict[str, torch.Tensor], num_frames: int) -> ReplayBuffer:
-    """Makes TorchRL's buffer of the same stream."""
+    """Builds TorchRL's buffer with the same stream."""
     ends = stream["terminals"].unsqueeze(-1)
     data = TensorDict(
         {
@@ -92,7 +92,7 @@ def make_catframes(stream: dict[str, torch.Tensor], num_frames: int) -> ReplayBu
 
 
 def windows_per_second(sample: Callable[[], Any]) -> float:
-    """Measures the transitions sampled a second."""
+    """Measures the transitions sampled per second."""
     batches, start = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - start) < SECONDS:
         assert len(sample()) == BATCH

@@ -1,10 +1,10 @@
-"""How pictures must be scaled for a network to compare what it sees with what it saw.
+"""How images must be scaled for a network to compare what it sees with what it saw earlier.
 
 ``python -m benchmarks.image_scale``: in MiniGrid-Memory S7 a script looks at the cue, walks to the
-junction and looks at one of the two objects there. A network learns from these episodes, without
-any reinforcement, whether that object is the cue. A row has the number of gradient steps until it
-is right in 97 % of the episodes that it was not trained on; between the rows of a network and a
-seed, nothing but the scale of the pixels differs.
+junction and looks at one of the two objects there. A network learns from these episodes,
+supervised, whether that object is the cue. A row has the number of gradient steps until it is right
+in 97 % of the episodes that it was not trained on. The rows of a network and a seed differ only in
+the scale of the pixels.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ PIXELS: dict[str, Callable[[Tensor], Tensor]] = {
     "without their mean": lambda pictures: pictures - pictures.mean(0),
     "normalised by channel": _normalized,
 }
-"""What is done to pictures [N, 3, H, W] of 0 to 1; the last is ``normalize_observations``."""
+"""The transforms of images [N, 3, H, W] from 0 to 1; the last is ``normalize_observations``."""
 
 
 class Episodes:
     """Scripted episodes that end in front of an object.
 
     Args:
-        count: how many.
-        seed: of the tasks and the script.
+        count: number of episodes.
+        seed: seed of the tasks and the script.
     """
 
     def __init__(self, count: int, seed: int = 0) -> None:
@@ -68,14 +68,14 @@ class Episodes:
         histories, matches = zip(*(self._episode() for _ in range(count)), strict=True)
         pictures, places = np.unique(np.concatenate(histories), axis=0, return_inverse=True)
         self.pictures = torch.tensor(pictures).permute(0, 3, 1, 2).float() / 255
-        """What is to be seen in all of them, float [N, 3, H, W] of 0 to 1."""
+        """The distinct images of all episodes, float [N, 3, H, W] from 0 to 1."""
         self.histories = torch.tensor(places).view(count, NUM_FRAMES)
-        """The place of each picture of an episode among these, int64 [E, K]."""
+        """The index of each image of an episode among these, int64 [E, K]."""
         self.matches = torch.tensor(matches, dtype=torch.float32)
         """Whether the object at the end is the cue, 0 or 1, [E]."""
 
     def _episode(self) -> tuple[np.ndarray, bool]:
-        """The last K pictures of an episode, and whether the object at its end is the cue."""
+        """The last K images of an episode, and whether the object at its end is the cue."""
         self._task.reset(seed=int(self._rng.integers(2**31)))
         maze: Any = self._task.unwrapped
         maze.agent_pos, maze.agent_dir = np.array((1, _SIZE // 2)), int(self._rng.integers(4))
@@ -108,7 +108,7 @@ def gradient_steps(
     held_out: int = HELD_OUT,
     learning_rate: float = 3e-4,
 ) -> tuple[int, float]:
-    """Trains a network; the number of gradient steps, and the accuracy that it ends at."""
+    """Trains a network; returns the number of gradient steps and the final accuracy."""
     torch.manual_seed(seed)
     pictures = pixels(episodes.pictures)
     network = build_network(replace(settings, num_frames=NUM_FRAMES), pictures.shape[1:])
@@ -120,7 +120,7 @@ def gradient_steps(
     accuracy = 0.0
 
     def logits(chosen: Tensor) -> Tensor:
-        tokens = network.frames[0](pictures)  # a picture is encoded once
+        tokens = network.frames[0](pictures)  # each image is encoded once
         return head(network.encode_history(tokens[episodes.histories[chosen]])).squeeze(-1)
 
     for step in range(1, limit + 1):
@@ -140,7 +140,7 @@ def gradient_steps(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Trains every network with every scale and writes a row each."""
+    """Trains every network with every scale, and writes a row for each."""
     parser = argparse.ArgumentParser("python -m benchmarks.image_scale")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--episodes", type=int, default=5512)

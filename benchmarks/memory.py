@@ -1,4 +1,4 @@
-"""Bytes of each stored transition: frames stored once, against stacked histories.
+"""Bytes of each stored transition: frames stored once, compared with stacked histories.
 
 ``HistoryStorage`` stores each observation once and cuts histories when they are sampled. A buffer
 of stacked frames stores the history of the observation and that of the next one.
@@ -57,7 +57,7 @@ def stacked_bytes(stream: dict[str, torch.Tensor], num_frames: int) -> float:
 
 
 def our_bytes(stream: dict[str, torch.Tensor], num_frames: int) -> float:
-    """Measures the bytes of a transition in ours, including the index of windows."""
+    """Measures the bytes of a transition in our storage, including the index of windows."""
     episodes = episodes_from_arrays(**stream)
     storage = HistoryStorage(episodes, num_frames)
     tensors = [value for value in vars(storage).values() if isinstance(value, torch.Tensor)]

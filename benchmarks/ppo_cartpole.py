@@ -1,9 +1,9 @@
-"""PPO on CartPole end to end: our recipe against Stable-Baselines3 with the same network.
+"""PPO on CartPole end to end: our recipe compared with Stable-Baselines3 on the same network.
 
 Both: Enhanced_TIT with K = 1 or 8, width 32, 2 blocks, 1 head and 64 features; 8 environments, 2048
-steps a batch, minibatches of 64, 10 epochs, one thread. With K = 8, theirs reads stacked frames,
-and ours trains on sequences. Speed is environment steps a second over whole batches, collection and
-update together, without the first batch, in which libraries warm up and compile.
+steps per batch, minibatches of 64, 10 epochs, one thread. With K = 8, theirs reads stacked frames,
+and ours trains on sequences. Speed is environment steps per second over whole batches, collection
+and update together, without the first batch, in which libraries warm up and compile.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ STEPS, ENVS = 2048, 8
 
 @dataclass(frozen=True)
 class Setting:
-    """A number of frames, and how long and often it is measured."""
+    """A number of frames, and for how long and how often it is measured."""
 
     num_frames: int
     batches: int
@@ -80,7 +80,7 @@ class Outcome:
     parameters: int
 
     def speed(self, clock: int = 0) -> float:
-        """Environment steps a second of wall time (0) or processor time (1)."""
+        """Environment steps per second of wall time (0) or processor time (1)."""
         seconds = self.laps[-1][clock] - self.laps[0][clock]
         return (len(self.laps) - 1) * STEPS / seconds
 
@@ -224,7 +224,7 @@ def profile(setting: Setting, compile: Compile) -> dict[str, float]:
         (nn.utils, "clip_grad_norm_", "update: gradient norm"),
         (torch.optim.Adam, "step", "update: optimizer"),
     ]
-    if compile == "off":  # compiled code cannot be timed part by part
+    if compile == "off":  # parts of compiled code cannot be timed
         parts.append((Backbone, "forward", "{}: backbone"))
     with ExitStack() as stack:
         for owner, name, part in parts:
@@ -245,7 +245,7 @@ def profile(setting: Setting, compile: Compile) -> dict[str, float]:
 
 
 def draw(shares: dict[str, dict[str, float]], picture: Path) -> None:
-    """Draws the shares of the parts in the time of a PPO step, one bar for each mode."""
+    """Draws each part's share of the time of a PPO step, one bar for each mode."""
     figure = Figure(figsize=(8, 3.2), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -331,7 +331,7 @@ def take_turns(setting: Setting) -> dict[str, list[Outcome]]:
 
 
 def section(setting: Setting, runs: dict[str, list[Outcome]]) -> str:
-    """Makes the table of a number of frames."""
+    """Makes the table for a number of frames."""
     (parameters,) = {outcome.parameters for outcomes in runs.values() for outcome in outcomes}
     return (
         f"K = {setting.num_frames}: {parameters} parameters with the heads, {setting.repeats} "

@@ -32,7 +32,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def conditions() -> dict[str, Any]:
-    """Returns the date, the machine and the versions of a measurement."""
+    """Returns the date, machine and versions of a measurement."""
     return {
         "date": datetime.date.today().isoformat(),
         "python": platform.python_version(),

@@ -1,8 +1,8 @@
-"""Peak memory of PPO with images, from K = 4 to 64: frames kept once, against stored histories.
+"""Peak memory of PPO on images, from K = 4 to 64: frames kept once, compared with histories.
 
-Eight environments with random 84 x 84 images, 2,048 steps a batch, a linear frame encoder with an
-outer transformer. Each program runs in a process of its own, at the present commit and at the last
-one whose rollouts held histories. The peak is that of the resident memory, in MB: with the networks
+Eight environments with random 84 x 84 images, 2,048 steps per batch, a linear frame encoder with an
+outer transformer. Each program runs in its own process, at the present commit and at the last one
+whose rollouts held histories. The peak is that of resident memory, in MB: once the networks are
 built, and after a batch is collected and trained on.
 """
 
@@ -95,7 +95,7 @@ print("peak", json.dumps([built, peak()]), flush=True)
 
 
 def peaks(tree: Path, program: str, num_frames: int) -> tuple[float, float]:
-    """Returns the peak memory in MB with the networks built, and at the end."""
+    """Returns the peak memory in MB once the networks are built, and at the end."""
     result = subprocess.run(
         [sys.executable, "-c", _COMMON + program + _REPORT, str(num_frames)],
         cwd=tree,

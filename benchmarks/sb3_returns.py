@@ -1,6 +1,6 @@
 """Stable-Baselines3's PPO with its defaults: ``python -m benchmarks.sb3_returns ENV ...``.
 
-A row a run is added to --out as soon as it ends; what is there already is not run again.
+A row is added to --out as soon as a run ends; runs that have a row are not repeated.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""A training step on segments, in which each frame is encoded once, against full windows.
+"""A training step on segments, which encode each frame once, compared with full windows.
 
 64 samples, forward, backward and Adam, one thread. Ours reads segments of consecutive steps in
 TorchRL's recurrent mode: one of 64, or four of 16, which is the default of the PPO recipes. The
 peers read 64 full windows of K frames: this library at the last commit that trained on those, and
-the straightforward network. The floor is what the matrix products of our step would take at the
+the straightforward network. The floor is the time that our step's matrix products would take at the
 rate of one large product on this core.
 """
 
@@ -147,7 +147,7 @@ def measure(row: Row, tree: Path, rounds: int, seconds: float) -> dict[str, Any]
 
 
 def ratios(result: dict[str, Any], peer: str, ours: str) -> list[float]:
-    """Returns how many times as fast ours is, round by round; nothing if not measured."""
+    """Returns our speedup in each round; empty if not measured."""
     times = result["ms"]
     if peer not in times:
         return []
@@ -177,7 +177,7 @@ def cells(result: dict[str, Any], rate: float) -> list[str]:
 
 
 def growth(results: list[dict[str, Any]], variant: str, program: str) -> float:
-    """Returns how many times as long a step on images takes with K = 64 as with K = 4."""
+    """Returns the time of a step on images with K = 64, relative to K = 4."""
     medians = {
         result["num_frames"]: statistics.median(result["ms"][program])
         for result in results

@@ -1,4 +1,4 @@
-"""Both TITs as one would write them first, on nn.MultiheadAttention.
+"""Straightforward implementations of both TITs, on nn.MultiheadAttention.
 
 Every block computes every token of every frame of the window.
 """

@@ -1,4 +1,4 @@
-"""Times of ours, ours compiled and the straightforward network, as a record and as table cells."""
+"""Times of our network, eager and compiled, and the straightforward one, for JSON and tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ HEADER = ["dtype", "ours", "ours, compiled", "straightforward", "ratio", "ratio,
 
 
 def record(times: Mapping[str, list[float]]) -> dict[str, Any]:
-    """Milliseconds of each round by name, and ratios to "straightforward", round by round."""
+    """Milliseconds of each round by name, and ratios to "straightforward" in each round."""
     row: dict[str, Any] = {}
     for name, values in times.items():
         row[f"{name}_ms"] = values

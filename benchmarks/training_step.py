@@ -1,8 +1,8 @@
-"""A training step: forward, backward and Adam, against the straightforward network.
+"""A training step (forward, backward and Adam), compared with the straightforward network.
 
 Both train on the same minibatch with the same loss and the same fused Adam. Ours is measured eager
 and compiled. In bfloat16 on a CPU, the straightforward network runs under the same autocast. Times
-are milliseconds a step.
+are milliseconds per step.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def make_step(
 def make_descent(
     network: nn.Module, loss_of: Callable[[Any], Tensor], inputs: Any, compiled: bool
 ) -> Callable[[], None]:
-    """Returns a function that takes one step of Adam down the gradient of a loss on its inputs."""
+    """Returns a function that takes one Adam step on a loss of its inputs."""
     optimizer = torch.optim.Adam(network.parameters(), fused=True)
     loss = torch.compile(loss_of, dynamic=False) if compiled else loss_of
 
@@ -94,7 +94,7 @@ def measure(
     autocast = torch.bfloat16 if bfloat16 else None
     steps = {
         "ours": make_step(case.ours().to(device), history, autocast, compiled=False),
-        # On a GPU, the peer is float32: that is how one would write it first.
+        # On a GPU, the peer is float32, as in a first implementation.
         "straightforward": make_step(
             case.straightforward().to(device),
             history,

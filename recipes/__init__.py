@@ -1,6 +1,6 @@
 """Experiments: settings, algorithms, one training loop, and a command line.
 
-Installed, this package is ``torchrl_tit.recipes``, the name to import it by.
+When installed, this package is named ``torchrl_tit.recipes``; import it by that name.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _HOMES = {
     "train": "runner",
     "weights_from": "initial_weights",
 }
-"""Where the public names live: PyTorch is loaded with the first of them that needs it."""
+"""The modules of the public names; PyTorch is loaded with the first name that needs it."""
 
 __all__ = [*_HOMES]
 

@@ -79,7 +79,7 @@ class Algorithm(ABC, Generic[RecipeT]):
         """Returns the networks with all weights, for evaluation and checkpoints."""
 
     def acting_networks(self) -> nn.Module:
-        """Returns those that acting needs, for trained agents: by default the policy.
+        """Returns the networks that acting needs, for trained agents; by default, the policy.
 
         Override it if :meth:`make_env` has weights or statistics too.
         """
@@ -157,7 +157,7 @@ def make_algorithm(recipe: Recipe) -> Algorithm[Any]:
     """
     try:
         return resolve(recipe.builds)(recipe)
-    except TypeError as error:  # a kind of observation, say, that no network here reads
+    except TypeError as error:  # for example, no network here reads this kind of observation
         raise ValueError(str(error)) from error
 
 
@@ -175,9 +175,9 @@ def torch_device(device: str) -> torch.device:
 
 
 def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
-    """Loads weights exactly: of the same names, shapes and dtypes, and finite.
+    """Loads weights strictly: names, shapes and dtypes must match, and values must be finite.
 
-    Loading by itself converts dtypes, and takes what is not a number.
+    ``load_state_dict`` alone converts dtypes, and accepts NaNs.
 
     Args:
         networks: the networks.

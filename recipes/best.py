@@ -1,4 +1,4 @@
-"""The weights with the highest return so far, which a run keeps beside its last ones."""
+"""The weights with the highest return so far, which a run keeps in addition to its last ones."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Best:
     """Keeps a copy of the weights with the highest return so far.
 
     Online, that is the mean return of the last 20 training episodes, and the weights are those that
-    collected the last of them. Offline, it is the mean return of an evaluation. Of equal returns
-    the later one counts. The copy is part of each checkpoint.
+    collected the last of them. Offline, it is the mean return of an evaluation. If returns are
+    equal, the later weights are kept. The copy is part of each checkpoint.
 
-    The highest of many noisy means is too high: evaluate the weights to learn what they reach.
+    The maximum of many noisy means is biased upwards: evaluate the weights to learn their return.
 
     Args:
         networks: the networks that are trained.
@@ -40,7 +40,7 @@ class Best:
 
         Args:
             step: number of steps that the weights which collected them were trained for.
-            returns: of the episodes that ended in a batch.
+            returns: returns of the episodes that ended in a batch.
         """
         self._returns += returns
         if returns and len(self._returns) == EPISODES:

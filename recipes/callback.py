@@ -13,9 +13,9 @@ from .outcomes import Outcome
 class Callback:
     """Hooks that the training loop calls; by default they do nothing.
 
-    For each batch they are called in the order in which they stand here. Of several callbacks, each
-    hook is called in the order of the callbacks. A resumed run calls them from the batch after its
-    checkpoint on. What raises in a hook ends the run, as a kill would.
+    For each batch, the hooks are called in the order in which they are defined here. If there are
+    several callbacks, each hook is called on all of them in turn. A resumed run calls the hooks
+    from the batch after its checkpoint on. An exception in a hook ends the run, as a kill would.
 
     Example:
         >>> class Steps(Callback):
@@ -25,7 +25,7 @@ class Callback:
     """
 
     last_step: int | None = None
-    """The step at which it will end training at the latest; None if it does not know."""
+    """The step by which it will end training at the latest; None if unknown."""
 
     def collected(self, step: int, batch: Any) -> None:
         """Called with each batch, before the update.
@@ -49,7 +49,7 @@ class Callback:
         return False
 
     def evaluated(self, step: int, outcomes: Sequence[Outcome]) -> None:
-        """Called after each evaluation, that of a complete run included.
+        """Called after each evaluation, including that of a complete run.
 
         Args:
             step: number of steps that the policy was trained for.
@@ -61,7 +61,7 @@ class Callback:
 
         Args:
             step: number of steps so far.
-            row: the numbers by column; NaN stands for one that does not exist at this step.
+            row: the numbers by column; NaN means that a number does not exist at this step.
         """
 
     def saving(self, step: int) -> None:

@@ -1,4 +1,4 @@
-"""The frame encoders that the kinds of observations decide, where a recipe names none."""
+"""Frame encoders that are chosen by the kinds of observations, where a recipe names none."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ from .recipe import Recipe
 
 
 def with_chosen_frames(recipe: Recipe, algorithm: Algorithm[Any]) -> tuple[Recipe, str]:
-    """Names in a recipe the frame encoders that the kinds of observations decided.
+    """Adds to a recipe the frame encoders that were chosen by the kinds of observations.
 
-    So a run's recipe.json tells them, and a resumed run has them in later versions too.
+    The run's recipe.json then records them, and a resumed run keeps them in later versions too.
 
     Args:
         recipe: the recipe.
         algorithm: its algorithm, with the networks.
 
     Returns:
-        The recipe that a run with these settings has, and a description of what was chosen, which
-        is empty if nothing was.
+        The recipe for the run, and a description of what was chosen, which is empty if nothing was.
     """
     modules = algorithm.policy.modules()
     network = next((module for module in modules if isinstance(module, HistoryNetwork)), None)

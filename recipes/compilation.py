@@ -1,4 +1,4 @@
-"""Whether torch.compile works on this machine, and whether it is worth its time."""
+"""Whether torch.compile works on this machine, and whether it is worth the time."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
-"""How torch.compile is called: which kernels run must not depend on the sizes seen before, or a
+"""Arguments of torch.compile: the choice of kernels must not depend on the sizes seen before, or a
 resumed run would differ in the last bit."""
 ONLY_TENSORS: dict[str, Any] = {
     **STATIC_SHAPES,
     "options": {"guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe},
 }
-"""The same for functions where only tensors change between calls. Checking everything else that was
-compiled in would take as long as several small layers, at every call."""
+"""The same for functions where only tensors change between calls. Guards on everything else would
+take as long as several small layers, at every call."""
 
-# About a minute of compiling is earned back by gradient steps that each save a few milliseconds.
+# Compiling takes about a minute, and each gradient step then saves a few milliseconds.
 _PAYS_FROM = 10_000
 _COMPILERS = (os.environ.get("CXX", "c++"), "g++", "clang++", "cl")
 
@@ -39,7 +39,7 @@ def should_compile(setting: Compile, gradient_steps: int) -> bool:
     Args:
         setting: "on" and "off" are final; "auto" compiles, if that works, in runs long enough to
             make up for the minute it takes.
-        gradient_steps: how many the whole run has.
+        gradient_steps: number of gradient steps in the whole run.
 
     Raises:
         ValueError: if it is "on" and there is no C++ compiler.
@@ -55,7 +55,7 @@ def should_compile(setting: Compile, gradient_steps: int) -> bool:
 
 
 def check_compiler(setting: Compile) -> None:
-    """Checks that what must be compiled can be, without compiling anything yet.
+    """Checks that compilation is possible if it is required, without compiling anything yet.
 
     Raises:
         ValueError: if the setting is "on" and there is no C++ compiler.
@@ -71,10 +71,10 @@ def check_compiler(setting: Compile) -> None:
 
 
 def compile_and_time(function: Callable[P, T], name: str) -> Callable[P, T]:
-    """Compiles a function, and prints how long its first call took, which does the compiling.
+    """Compiles a function, and prints how long its first call took, which includes compilation.
 
     Args:
-        function: what to compile; between its calls, only tensors change (no mode, no setting).
+        function: the function; only tensors may change between its calls (no mode, no setting).
         name: what it is, for the message.
     """
     fast = torch.compile(function, **ONLY_TENSORS)
@@ -98,8 +98,8 @@ def autocast_type(precision: Precision, device: torch.device) -> torch.dtype | N
     """Returns the dtype of matrix products for autocast; None is the dtype of the weights.
 
     Args:
-        precision: "auto" is bfloat16 on a GPU that supports it, which makes them several times as
-            fast. CPUs gain from it only if they have instructions for it.
+        precision: "auto" is bfloat16 on a GPU that supports it, which is several times as fast.
+            CPUs gain from it only if they have instructions for it.
         device: the device of the networks.
 
     Example:
@@ -118,9 +118,9 @@ def _has_compiler() -> bool:
 
 @cache
 def _works() -> bool:
-    """Compiles something small: a compiler can be there and still lack headers or OpenMP."""
+    """Compiles a small function: a compiler can be installed and still lack headers or OpenMP."""
     try:
         torch.compile(lambda x: x.sin() + 1)(torch.ones(8))
-    except Exception:  # whatever the toolchain says, "auto" then does not compile
+    except Exception:  # whatever the toolchain reports, "auto" then does not compile
         return False
     return True

@@ -32,17 +32,17 @@ def make_critic(
         action_dim: number A of entries of an action; 0 if it is not read.
         hidden: widths of the MLP's hidden layers.
         network: settings of the backbone; if None, the MLP reads the newest observation.
-        values: how many values there are, such as one for each of a few discrete actions.
+        values: number of values, such as one for each discrete action.
         out_key: key of the values.
-        slices: whether the backbone is to read slices of consecutive steps [..., T], if it is
-            within TorchRL's recurrent mode; it then reads "observation" and "is_init" too.
+        slices: whether the backbone reads slices of consecutive steps [..., T] in TorchRL's
+            recurrent mode; it then also reads "observation" and "is_init".
 
     Returns:
         A module that reads "observation" [..., D], or "history" [..., K, *obs], and "action"
         [..., A], and writes ``out_key``, float [..., values].
 
     Raises:
-        ValueError: if there is no backbone to read observations other than one array.
+        ValueError: if there is no backbone, and the observation is not a single array.
     """
     modules: list[TensorDictModuleBase] = []
     if network is not None:
@@ -63,7 +63,7 @@ def make_critic(
 
 
 def _array_size(observation: Observations) -> int:
-    """The number of entries of the only observation, an array."""
+    """Returns the number of entries of the only observation, which must be an array."""
     read = read_observations(observation)
     first = next(iter(read.values()))
     if len(read) > 1:

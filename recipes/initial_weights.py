@@ -21,9 +21,9 @@ _IN_A_BACKBONE = re.compile(r"(.*?)(frame_encoders?|history_encoder)\.")
 def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Tensor], str]:
     """Takes the weights of another run's newest checkpoint that fit an algorithm's networks.
 
-    Weights fit if they have the same name and shape. Of a run of another algorithm, only the
+    Weights fit if they have the same name and shape. From a run of another algorithm, only the
     policy's backbone is taken, by the names within it. Hyperparameters that a loss keeps among its
-    tensors, such as the discount, are the recipe's own.
+    tensors, such as the discount, always come from the recipe.
 
     Args:
         folder: the other run's folder.
@@ -88,13 +88,13 @@ def _tensors(state: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def _kind(tensor: Tensor) -> str:
-    """A tensor's shape, and its dtype where that is not the usual one."""
+    """A tensor's shape, and its dtype if that is not the default."""
     dtype = "" if tensor.dtype == torch.get_default_dtype() else f" {tensor.dtype}"
     return f"{list(tensor.shape)}{dtype}"
 
 
 def _hyperparameters(networks: Stateful) -> set[str]:
-    """Names of tensors that are not weights: those that losses hold themselves."""
+    """Names of tensors that are not weights: the buffers of the losses themselves."""
     if not isinstance(networks, nn.Module):
         return set()
     return {
@@ -106,6 +106,6 @@ def _hyperparameters(networks: Stateful) -> set[str]:
 
 
 def _policy_backbone(names: Iterable[str]) -> str:
-    """What the names of the first backbone begin with, which is the policy's."""
+    """Prefix of the names in the first backbone, which is the policy's."""
     matches = map(_IN_A_BACKBONE.match, names)
     return next((match[1] for match in matches if match), "no backbone")

@@ -13,8 +13,8 @@ class Interrupt:
     """Turns the first Ctrl-C (or SIGTERM) into a request that the training loop reads.
 
     The loop completes its batch, saves a checkpoint and stops. A second Ctrl-C stops at once, with
-    the last checkpoint kept. A RuntimeError in the batch also stops at once: the first Ctrl-C
-    interrupts a C++ compiler that the batch runs.
+    the last checkpoint kept. A RuntimeError in the batch also stops at once, because the first
+    Ctrl-C also interrupts a C++ compiler that the batch may be running.
 
     Example:
         >>> with Interrupt() as interrupt:

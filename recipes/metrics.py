@@ -35,11 +35,11 @@ class Metrics:
         self._columns = ["step", "time", "steps_per_second", *columns]
         self._last = (last_step, time.monotonic())
         kept = [row for row in read_metrics(self.path) if row["step"] <= last_step]
-        # Written at once: a process that is killed here loses no row.
+        # Written atomically: a process that is killed here loses no row.
         lines = [self._line(self._columns), *(self._line(self._cells(row)) for row in kept)]
         write_text_atomic(self.path, "".join(lines))
         events = folder / "tensorboard"
-        if events.is_symlink():  # what it leads to is not ours
+        if events.is_symlink():  # its target is not ours
             events.unlink()
         shutil.rmtree(events, ignore_errors=True)
         self._tensorboard = TensorboardLogger(exp_name="tensorboard", log_dir=str(folder))
@@ -48,7 +48,7 @@ class Metrics:
         self._file = self.path.open("a", encoding="utf-8", newline="")
 
     def log(self, step: int, **values: float) -> dict[str, float]:
-        """Adds a row and returns it; NaN stands for a number that does not exist at this step."""
+        """Adds a row and returns it; NaN means that a number does not exist at this step."""
         before, then = self._last
         self._last = (step, time.monotonic())
         speed = (step - before) / max(self._last[1] - then, 1e-9)
@@ -108,7 +108,7 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
         return []
     rows: list[dict[str, float]] = []
     try:
-        # A row without its line end was left by a killed process; it does not count.
+        # A row without a line end was left by a killed process and is skipped.
         lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
         for cells in csv.DictReader(line for line in lines if line.endswith("\n")):
             row = {name: float(value) for name, value in cells.items()}

@@ -1,8 +1,8 @@
 """One set of modules, whichever of its two names the package is imported by.
 
-In a clone the package is called ``recipes``, installed it is ``torchrl_tit.recipes``, the name that
-packages of users' own import it by. An editable install has both. Were every module loaded twice,
-what such a package registers would be unknown to the command line.
+In a clone, the package is called ``recipes``; installed, it is ``torchrl_tit.recipes``, the name
+that users' packages import. An editable install has both. If modules were loaded twice, the command
+line would not see what such a package registers.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class SameModules(MetaPathFinder, Loader):
         return importlib.import_module(self._own(spec.name))
 
     def exec_module(self, module: ModuleType) -> None:
-        """Gives the module, which is loaded, its own specification back."""
+        """Restores the specification of the module, which is already loaded."""
         assert module.__spec__ is not None
         module.__spec__ = module.__spec__.loader_state
 
@@ -54,7 +54,7 @@ class SameModules(MetaPathFinder, Loader):
 def share_modules(name: str) -> None:
     """Makes ``recipes`` and ``torchrl_tit.recipes`` one package; called while it is imported.
 
-    A package of somebody else's that is called ``recipes`` is left alone.
+    An unrelated package that is called ``recipes`` is left alone.
 
     Args:
         name: the name that the package is being imported by.

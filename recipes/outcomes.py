@@ -33,10 +33,10 @@ class Outcome:
 def summarize(
     outcomes: Sequence[Outcome], earlier: Sequence[Outcome], recipe: Recipe
 ) -> dict[str, Any]:
-    """Returns what ``evaluation.json`` holds.
+    """Returns the contents of ``evaluation.json``.
 
     Args:
-        outcomes: of the newest step, one for each target return.
+        outcomes: outcomes of the newest step, one for each target return.
         earlier: those of earlier steps; may be empty.
         recipe: the settings.
 

@@ -1,4 +1,4 @@
-"""Backbones of actors and critics, and policies besides those of torchrl_tit.modules."""
+"""Backbones of actors and critics, and policies in addition to those of torchrl_tit.modules."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def make_backbone(
         network: its settings.
         observation: spec of the observation, or of each by name.
         out_key: key of the features.
-        slices: whether it is to read slices of consecutive steps [..., T], if it is within
-            TorchRL's recurrent mode; it then reads the observations and "is_init" too.
+        slices: whether it reads slices of consecutive steps [..., T] in TorchRL's recurrent mode;
+            it then also reads the observations and "is_init".
     """
     histories = history_keys(observation)
     return Backbone(
@@ -49,10 +49,10 @@ def make_cloning_policy(
 ) -> ProbabilisticTensorDictSequential:
     """Builds a policy that gives every action in a data set a finite likelihood.
 
-    Actions within bounds have a Gaussian whose mean a tanh keeps within them, and whose standard
-    deviation does not depend on the state (Kostrikov et al., arXiv 2110.06169, and its authors'
-    code). A squashed Gaussian would have an infinite density at the bounds, where data have many
-    actions. Other actions have the head of :func:`~torchrl_tit.modules.make_actor`.
+    Bounded actions have a Gaussian whose mean is kept within the bounds by a tanh, and whose
+    standard deviation does not depend on the state (Kostrikov et al., arXiv 2110.06169, and its
+    authors' code). A squashed Gaussian would have an infinite density at the bounds, where data
+    sets have many actions. Other actions use the head of :func:`~torchrl_tit.modules.make_actor`.
 
     Args:
         backbone: the backbone.
@@ -88,12 +88,12 @@ def make_deterministic_policy(backbone: Backbone, action_spec: Bounded) -> Tenso
 def make_value_policy(
     backbone: Backbone, action_spec: Categorical, *, mask_key: str | None = None
 ) -> TensorDictSequential:
-    """Builds a policy that takes the action of the highest value, with a linear layer of values.
+    """Builds a policy that takes the action with the highest value, which a linear layer predicts.
 
     Args:
         backbone: the backbone.
         action_spec: spec of an action, without batch dimensions.
-        mask_key: key of the actions that are allowed, if it reads them.
+        mask_key: key of the mask of allowed actions, if the policy reads it.
     """
     values = nn.Linear(backbone.features_dim, action_spec.space.n)
     head = TensorModule(values, ["features"], ["action_value"])
@@ -107,7 +107,7 @@ def is_continuous(spec: TensorSpec) -> bool:
 
 
 def is_discrete(spec: TensorSpec) -> bool:
-    """Whether an action is one of a few; TorchRL's specs of several are subclasses of that spec."""
+    """Whether an action is a single discrete choice; TorchRL's specs of several are subclasses."""
     return type(spec) is Categorical and spec.ndim == 0
 
 

@@ -1,7 +1,7 @@
 """Connections to a Ray cluster, whose machines share a file system.
 
-Whoever reaches a cluster can run anything on its machines, so Ray's authentication by token is on
-unless the user says otherwise.
+Anyone who reaches a cluster can run anything on its machines, so Ray's token authentication is on
+unless the user switches it off.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torchrl_tit.settings.imports import allowed_modules
 
 _MODE, _LOOPBACK = "RAY_AUTH_MODE", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 os.environ.setdefault(_MODE, "token")  # here, since Ray reads it when TorchRL imports it
-_PATIENCE = 30.0  # seconds that a cluster has to answer; it needs two or three
+_PATIENCE = 30.0  # seconds to wait for a cluster's answer, which takes two or three
 _ASK = """
 import json, sys, ray
 ray.init(sys.argv[1], log_to_driver=False)
@@ -28,7 +28,7 @@ print(json.dumps([node["Resources"] for node in ray.nodes() if node["Alive"]]))
 
 
 def ask_for_machines(address: str) -> list[dict[str, float]]:
-    """Returns the resources of each machine of a cluster, and does not stay connected to it.
+    """Returns the resources of each machine of a cluster, without staying connected to it.
 
     Args:
         address: "auto" or ``HOST:PORT`` on a machine of the cluster, ``ray://HOST:PORT`` elsewhere.
@@ -70,7 +70,7 @@ def connect(address: str) -> None:
     """Connects this process to a cluster, unless it is connected already.
 
     Args:
-        address: as that of :func:`ask_for_machines`.
+        address: as in :func:`ask_for_machines`.
 
     Raises:
         ValueError: if Ray is missing, or no cluster answers there.
@@ -85,9 +85,9 @@ def connect(address: str) -> None:
 
 
 def import_variables() -> dict[str, str]:
-    """Environment variables with which Ray's workers import what this process can.
+    """Returns environment variables that let Ray's workers import what this process can.
 
-    That is what is in the working directory, and the modules that the user named.
+    These are the modules in the working directory, and those that the user named.
     """
     modules = [
         str(Path(module).absolute()) if module.endswith(".py") else module

@@ -25,17 +25,17 @@ class ClusterCollector(RayCollector):
 
     Each collector is an actor on a machine of the cluster, with its share of the environments and a
     copy of the policy, on CPUs. All collect at the same time, with the weights that this process
-    sent last. Weights travel by TorchRL's scheme for Ray. It has none for an actor that Ray
-    restarts, so if one dies, with its process or its machine, the iteration ends in an error.
+    sent last. Weights are sent by TorchRL's scheme for Ray. It does not support actors that Ray
+    restarts, so if one dies, with its process or its machine, the iteration raises an error.
 
     Args:
         make_shares: builds the environments of each collector, in that collector's process.
         policy: the policy, whose weights :meth:`update_policy_weights_` sends.
         address: the cluster's address.
         threads: CPUs that each collector takes.
-        collector_class: what collects in each actor.
-        settings: settings of each of those.
-        device: device of the batches that this one yields.
+        collector_class: class of the collector in each actor.
+        settings: settings of each of these collectors.
+        device: device of the batches that this collector yields.
         **kwargs: further arguments of ``RayCollector``.
 
     Raises:
@@ -81,7 +81,7 @@ class ClusterCollector(RayCollector):
 
     def iterator(self) -> Iterator[TensorDictBase]:
         """Yields batches [envs, time], those of the first collector's environments first."""
-        self.update_policy_weights_()  # those of a checkpoint may have come after the copies
+        self.update_policy_weights_()  # a checkpoint may have been loaded since the copy
         with _one_line():
             for batch in super().iterator():
                 yield batch.flatten(0, 1).to(self._batch_device)
@@ -93,7 +93,7 @@ class ClusterCollector(RayCollector):
 
 
 def check_cluster(address: str | None, collectors: int, threads: int) -> None:
-    """Checks that a cluster, if there is to be one, has room for collectors.
+    """Checks that the cluster, if one is used, has room for the collectors.
 
     Raises:
         ValueError: if Ray is missing, no cluster answers, or it has too few CPUs.
@@ -105,10 +105,10 @@ def check_cluster(address: str | None, collectors: int, threads: int) -> None:
 def check_room(
     machines: Sequence[dict[str, float]], address: str, collectors: int, threads: int
 ) -> None:
-    """Checks that machines have enough CPUs, which may be taken by others for now.
+    """Checks that machines have enough CPUs, even if others are using them now.
 
     Raises:
-        ValueError: if not. Ray would wait, without a word.
+        ValueError: if they do not; Ray itself would wait silently.
 
     Example:
         >>> check_room([{"CPU": 4.0}, {"CPU": 3.0}], "auto", collectors=4, threads=2)
@@ -130,7 +130,7 @@ def _check_own_name(addresses: set[str]) -> None:
     try:
         own = socket.gethostbyname(name)
     except OSError:
-        own = "127.0.0.1"  # which TorchRL takes, too
+        own = "127.0.0.1"  # which TorchRL uses, too
     if own.startswith("127.") and len(addresses) > 1:
         raise ValueError(
             f"this machine's name {name} stands for {own}, where collectors on other machines "
@@ -140,7 +140,7 @@ def _check_own_name(addresses: set[str]) -> None:
 
 @contextmanager
 def _one_line() -> Iterator[None]:
-    """Says in one line what happened to a collector.
+    """Raises errors that say in one line what happened to a collector.
 
     Raises:
         RuntimeError: if one died or failed.
@@ -161,7 +161,7 @@ def _one_line() -> Iterator[None]:
     except RayError as error:
         raise RuntimeError(f"Ray failed: {str(error).splitlines()[0]}") from error
     except RuntimeError as error:
-        if "gloo" not in str(error):  # by which the weights travel
+        if "gloo" not in str(error):  # which sends the weights
             raise
         raise RuntimeError(
             f"a collector on Ray died: its connection for weights broke. {_RESUME}"

@@ -24,9 +24,9 @@ ImageLayout = Literal["auto", "HWC", "CHW"]
 class Recipe:
     """Settings that every experiment has.
 
-    The recipes of an algorithm are a subclass, which is registered when it is defined:
-    ``algorithm`` is the name that JSON and the command line use, ``builds`` the
-    :class:`~recipes.algorithm.Algorithm` that they drive, as "module:Class".
+    Each algorithm has a subclass, which is registered when it is defined: ``algorithm`` is the name
+    that JSON and the command line use, ``builds`` the :class:`~recipes.algorithm.Algorithm` that
+    its recipes configure, as "module:Class".
     """
 
     algorithm: ClassVar[str]
@@ -36,17 +36,17 @@ class Recipe:
     offline: ClassVar[bool] = False
     """Whether it trains offline: steps are gradient steps, and returns are from evaluations."""
     supplies_actions: ClassVar[bool] = False
-    """Whether networks read past actions and returns to go in addition to observations."""
+    """Whether networks read past actions and returns-to-go in addition to observations."""
     length: ClassVar[str] = "total_steps"
-    """The field that says how long a run is, which ``train --resume RUN`` can raise."""
+    """The field that sets the length of a run, which ``train --resume RUN`` can raise."""
 
     name: Annotated[str, tyro.conf.Suppress] = ""
     """The recipe's name, such as ppo/cartpole/enhanced-tit."""
     backbone: Network
     """The network: its frame encoder, its history encoder, and the number of frames it reads."""
     env: str
-    """Name of a Gymnasium environment: the task. Also module:Name, for a name that the module
-    registers, or for a TorchRL environment in it."""
+    """The task: the name of a Gymnasium environment, or module:Name for one that the module
+    registers or for a TorchRL environment in it."""
     env_settings: tuple[str, ...] = ()
     """Settings of the task, such as is_slippery=False map_name=8x8."""
     wrappers: tuple[str, ...] = ()
@@ -55,7 +55,7 @@ class Recipe:
     observation_keys: tuple[str, ...] = ()
     """Which observations are read, if the task has several; all by default."""
     image_layout: ImageLayout = "auto"
-    """Order of an image's dimensions, where it cannot be told from their sizes."""
+    """Order of an image's dimensions, for images whose sizes do not determine it."""
     seed: Seed = 0
     """Seed of the networks, the environments and the order of minibatches."""
     device: Literal["cpu", "cuda", "auto"] = "cpu"
@@ -109,12 +109,12 @@ class Recipe:
 
     @property
     def schedules(self) -> tuple[str, ...]:
-        """The fields that are on and make training depend on how long the whole run is."""
+        """The active fields that make training depend on the length of the whole run."""
         return ()
 
     @property
     def unit(self) -> str:
-        """What its steps are: "updates" offline, else "steps" of the environment."""
+        """The unit of its steps: "updates" offline, else "steps" of the environment."""
         return "updates" if self.offline else "steps"
 
     @property
@@ -136,7 +136,7 @@ _OF_THE_MACHINE = ("device", "threads", "compile", "checkpoint_interval")
 
 
 def experiment_of(recipe: Recipe) -> Recipe:
-    """Returns what runs of one experiment have in common: all settings but seed and machine.
+    """Returns the settings that runs of one experiment share: all settings but seed and machine.
 
     Example:
         >>> from torchrl_tit.settings.networks import mlp
@@ -152,7 +152,7 @@ def experiment_of(recipe: Recipe) -> Recipe:
 
 
 def _check_all(settings: object) -> None:
-    """Checks settings and those within: a part of a user's own need not have done so."""
+    """Checks settings and nested settings, because a user's own part may not check its fields."""
     check_fields(settings)
     for value in vars(settings).values():
         for part in value.values() if isinstance(value, PerKey) else [value]:
@@ -161,7 +161,7 @@ def _check_all(settings: object) -> None:
 
 
 def get_recipe_class(algorithm: str) -> type[Recipe]:
-    """Looks up the recipes of an algorithm, in installed plugins too.
+    """Looks up the recipe class of an algorithm, including those of installed plugins.
 
     Raises:
         ValueError: if there is no such algorithm, or more than one.

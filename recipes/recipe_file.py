@@ -34,7 +34,7 @@ def recipes_from_file(source: str) -> dict[str, Recipe]:
         source: a Python file, or ``FILE:NAME`` of one of its recipes.
 
     Returns:
-        Each recipe by the source that names it alone, ``FILE:NAME``.
+        Each recipe by the source that identifies it, ``FILE:NAME``.
 
     Raises:
         ImportError: if there is no such file, it is not Python, or it raises.

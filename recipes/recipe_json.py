@@ -59,7 +59,7 @@ def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
 
 
 def _convert(kind: type[T], fields: Any, prefix: str = "") -> T:
-    """Builds settings from a dictionary, each field strictly of its type."""
+    """Builds settings from a dictionary; each value must have exactly its field's type."""
     if not isinstance(fields, dict):
         raise ValueError(f"field {prefix[:-1]!r}: expected an object, not {fields!r}")
     types = field_types(kind)

@@ -1,4 +1,4 @@
-"""The named recipes: the paper's experiments as data, and those of packages of users' own."""
+"""The named recipes: the paper's experiments as data, and those of users' packages."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ RECIPES: Names[Recipe] = Names("recipe")
 def register_recipes(*recipes: Recipe) -> None:
     """Adds named recipes, which ``list`` prints and every command takes by name.
 
-    A package of your own calls it in the module that its entry point, or ``--import``, names.
+    Call it in the module that ``--import``, or the entry point of your own package, names.
 
     Raises:
-        ValueError: if a recipe has no name, or that of a recipe from another module.
+        ValueError: if a recipe has no name, or the name of a recipe from another module.
 
     Example:
         >>> from dataclasses import replace
@@ -39,7 +39,7 @@ def register_recipes(*recipes: Recipe) -> None:
         >>> get_recipe("mine/first").env
         'CartPole-v1'
     """
-    home = sys._getframe(1).f_globals["__name__"]  # the module that calls, for messages
+    home = sys._getframe(1).f_globals["__name__"]  # the calling module, for messages
     for recipe in recipes:
         if not recipe.name:
             raise ValueError(
@@ -65,7 +65,7 @@ for _named in (
 
 
 def get_recipe(name: str) -> Recipe:
-    """Looks up a recipe, in installed plugins too.
+    """Looks up a recipe, including those of installed plugins.
 
     Raises:
         ValueError: if no recipe, or more than one, has that name; the message suggests similar

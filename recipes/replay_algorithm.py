@@ -50,8 +50,8 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
     """
 
     draws_random_steps: ClassVar[bool] = True
-    """Whether the collector draws the actions of the random steps at the start, and not
-    :attr:`behaviour`."""
+    """Whether the collector, not :attr:`behaviour`, draws the actions of the random steps at the
+    start."""
 
     loss: LossModule
     """The losses, with all weights."""
@@ -68,12 +68,12 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """History in, action out; its weights are among those of the loss."""
+        """The policy, from histories to actions; its weights are among those of the loss."""
         return self._policy
 
     @property
     def behaviour(self) -> TensorDictModuleBase:
-        """What acts in the collector: the policy, by default."""
+        """The policy that the collector runs; by default, :attr:`policy`."""
         return self._policy
 
     def networks(self) -> nn.Module:
@@ -130,7 +130,7 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
         return finished_returns(batch)
 
     def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
-        """Stores a batch, then takes gradient steps on samples of what is stored."""
+        """Stores a batch, then takes gradient steps on samples from the buffer."""
         recipe = self.recipe
         self.buffer.extend(self.stored(batch))
         self.collector_state.step = step + batch.numel()
@@ -148,7 +148,7 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
         return dict(zip(self.columns, values, strict=True))
 
     def stored(self, batch: TensorDictBase) -> TensorDictBase:
-        """Selects what of a batch is stored."""
+        """Selects the entries of a batch to store."""
         return batch.select(*_STORED, strict=False)
 
     def play(self, step: int) -> list[Outcome]:
@@ -210,8 +210,8 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
 
         Args:
             batch: transitions [B] or slices [N, T].
-            number: how many gradient steps were taken before.
+            number: number of gradient steps taken before.
 
         Returns:
-            The terms of ``columns``, float [columns].
+            The values of ``columns``, float [columns].
         """

@@ -19,7 +19,7 @@ class ReplayRecipe(OnlineRecipe):
     padding: Padding = "same"
     """What fills a history before the first observation: that observation, or zeros."""
     hide_velocities: bool = False
-    """Whether observations lack the velocities, so that one observation is not enough."""
+    """Whether to remove velocities from observations, so that one observation is not enough."""
     num_envs: Copies = 1
     """Number of environments; they share the steps of a batch."""
     collectors: Copies = 1
@@ -37,12 +37,12 @@ class ReplayRecipe(OnlineRecipe):
     updates_per_step: Weight = 1.0
     """Gradient steps for each environment step."""
     buffer_size: Batch = 1_000_000
-    """Steps in the replay buffer; when it is full, new ones take the place of the oldest."""
+    """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
     batch_size: Batch = 256
     """Transitions in one gradient step, sampled with replacement from the buffer."""
     slice_length: Batch = 1
-    """Consecutive steps that are drawn together, so that a backbone encodes their frames once; must
-    divide batch_size. 1 draws transitions one by one."""
+    """Number of consecutive steps that are drawn together, so that a backbone encodes their frames
+    once; must divide batch_size. 1 draws transitions one by one."""
     gamma: Fraction = 0.99
     """Discount factor."""
     log_interval: Steps = 1000

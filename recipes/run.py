@@ -46,19 +46,20 @@ class Run:
     """The folder of one training run.
 
         recipe.json        the recipe, from which the run can be repeated
-        initial_weights/   the weights that it took from another run, if it did
+        initial_weights/   the weights that it took from another run, if any
         versions.json      the versions of Python and packages that it ran with
-        imports.json       the modules of the user's own that it was started with
-        metrics.csv        one row of numbers a batch
+        imports.json       the user's own modules that it was started with
+        metrics.csv        one row of numbers per batch
         tensorboard/       the same for TensorBoard
         checkpoints/       numbered by step; the newest complete one is loaded
         learning_curve.png
         evaluation.json    returns of the evaluation episodes, with the last weights
         evaluation_best.json   the same with the best ones, if they were evaluated
-        earlier_lengths.json   if it was trained further: until which step it had which length,
-                               where its schedules follow the length
+        earlier_lengths.json   the lengths that its schedules followed before it was trained
+                               further, and until which step each applied
 
-    Use :meth:`create` or :meth:`open`, and the folder as a context: one process at a time.
+    Use :meth:`create` or :meth:`open`, and the run as a context manager, which only one process at
+    a time can enter.
 
     Args:
         folder: the folder.
@@ -77,7 +78,7 @@ class Run:
         recipe: Recipe,
         initial_weights: dict[str, Any] | None = None,
     ) -> Run:
-        """Makes a new run folder.
+        """Creates a new run folder.
 
         Args:
             folder: the folder.
@@ -87,14 +88,14 @@ class Run:
 
         Raises:
             FileExistsError: if the folder exists already and is not empty.
-            RuntimeError: if another process is making it.
+            RuntimeError: if another process is creating it.
         """
         cls.check_new(folder)
         run = cls(folder, recipe)
         folder = run.folder
         folder.mkdir(parents=True, exist_ok=True)
         with run:
-            cls.check_new(folder)  # another process can have made it since
+            cls.check_new(folder)  # another process may have created it since
             versions = json.dumps(package_versions(), indent=2) + "\n"
             write_text_atomic(folder / "versions.json", versions)
             if modules := allowed_modules():
@@ -139,13 +140,13 @@ class Run:
             raise ValueError(f"{error}{_import_hint(folder)}") from error
 
     def lengthen(self, length: int) -> None:
-        """Makes the run shorter or longer, which is open; training then goes on to its new end.
+        """Changes the length of an open run; training then continues to the new end.
 
         Args:
             length: the new value of the recipe's ``length``, such as its ``total_steps``.
 
         Raises:
-            ValueError: if the run is past that end already, or the recipe refuses it.
+            ValueError: if the run is already past that end, or the recipe rejects the length.
         """
         field = self.recipe.length
         changes: dict[str, Any] = {field: length}
@@ -166,8 +167,8 @@ class Run:
         """Returns the lengths that the run's schedules followed before the recipe's.
 
         Returns:
-            A pair for each time that :meth:`lengthen` changed what the schedules of a run follow
-            that had begun: the step until which the run had the length, and that length.
+            A pair for each time that :meth:`lengthen` changed the length of a run that had begun
+            and has schedules: the step until which the run had the earlier length, and that length.
 
         Raises:
             ValueError: if their file is damaged.
@@ -246,7 +247,7 @@ class Run:
     def restoring(self, step: int) -> Iterator[None]:
         """Raises ValueError if a checkpoint's state does not fit what the recipe builds.
 
-        Its sums only say that it is as it was written. What is wrong inside can fail in any way.
+        Its checksums only show that it is as it was written. Wrong contents can fail in any way.
         """
         try:
             yield
@@ -264,7 +265,7 @@ class Run:
         return Metrics(self.folder, columns, last_step)
 
     def save_evaluation(self, evaluation: dict[str, Any], path: Path | None = None) -> Path:
-        """Writes an evaluation as JSON, to ``evaluation.json`` unless told otherwise."""
+        """Writes an evaluation as JSON, by default to ``evaluation.json``."""
         path = path or self.folder / "evaluation.json"
         write_text_atomic(path, json.dumps(evaluation, indent=2) + "\n")
         return path
@@ -296,7 +297,10 @@ class Run:
 
 
 def _import_hint(folder: Path) -> str:
-    """Names what the user imported when the run began; nothing is imported on a file's word."""
+    """Lists the modules that the user imported when the run began.
+
+    Modules named in a file are never imported automatically.
+    """
     try:
         began_with = json.loads((folder / _IMPORTS).read_text(encoding="utf-8"))
         missing = [str(module) for module in began_with if module not in allowed_modules()]

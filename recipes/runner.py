@@ -122,7 +122,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             if due or evaluation_due or enough or interrupt.requested:
                 with _naming(step, saved_step):
                     record.check()
-                metrics.sync()  # the checkpoint's rows are on the disk before it is
+                metrics.sync()  # the checkpoint's rows must be on the disk before it
                 for callback in callbacks:
                     callback.saving(step)
                 _save(run, step, parts)
@@ -221,7 +221,7 @@ class Record:
 
 @dataclass(frozen=True)
 class _RecordState:
-    """What a checkpoint holds of a :class:`Record`."""
+    """The state of a :class:`Record` in a checkpoint."""
 
     outcomes: list[Outcome]
     evaluation_seed: int
@@ -285,8 +285,8 @@ def evaluate(
         best: whether to evaluate the best weights of the checkpoint instead of the last ones.
 
     Returns:
-        See :func:`~recipes.outcomes.summarize`, the "seed" of the first episode, and which
-        "weights" they are of: "last" or "best".
+        The entries of :func:`~recipes.outcomes.summarize`, the "seed" of the first episode, and
+        which "weights" were evaluated: "last" or "best".
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
@@ -364,7 +364,7 @@ def _load_part(part: Stateful, state: dict[str, Any]) -> None:
 
 
 def _check_moments(optimizer: torch.optim.Optimizer, state: Mapping[int, Any]) -> None:
-    """Raises ValueError if what an optimizer keeps for a weight is not like the weight."""
+    """Raises ValueError if an optimizer's state has another shape or dtype than its weight."""
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
     for index, kept in state.items():
         for name, value in kept.items():

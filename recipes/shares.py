@@ -20,7 +20,7 @@ def make_share(
 ) -> EnvBase:
     """Builds the environments of one collector; called in that collector's process.
 
-    Random numbers follow from the run's seed and the step at which the process starts.
+    Random numbers depend on the run's seed and on the step at which the process starts.
 
     Args:
         make_envs: builds environments, given their number and the seed of the first one.

@@ -101,5 +101,5 @@ class BufferState:
         self.buffer.writer.load_state_dict(state_dict["writer"])
 
     def _needed(self, count: int) -> list[int]:
-        """The parts with steps that items were made of when a number of steps were written."""
+        """The parts that the buffer's items need once ``count`` steps are written."""
         return [number for number in self._parts if number > count - self.storage.reach]

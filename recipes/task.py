@@ -22,10 +22,10 @@ def make_task(
 
     Args:
         recipe: the settings.
-        num_envs: environments that are stepped side by side.
-        seed: of the first environment.
-        **settings: further settings of :func:`~torchrl_tit.envs.make_env` and of the task, before
-            those of the recipe.
+        num_envs: number of environments, which are stepped side by side.
+        seed: seed of the first environment.
+        **settings: further settings of :func:`~torchrl_tit.envs.make_env` and of the task, which
+            override those of the recipe.
 
     Raises:
         ValueError: if the task, a wrapper or one of its settings is unknown or wrong, or

@@ -28,18 +28,18 @@ RecipeT = TypeVar("RecipeT", bound=TransitionRecipe)
 
 
 class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
-    """An algorithm whose loss holds the weights of all networks, the policy's among them.
+    """An algorithm whose loss holds the weights of all networks, including the policy's.
 
     Args:
         recipe: the settings.
 
     Raises:
-        ValueError: if the task has several observations, or some are to be normalised that are not
-            floats.
+        ValueError: if the task has several observations, or observations that are to be normalised
+            are not floats.
     """
 
     clips_actions: ClassVar[bool] = False
-    """Whether the task clips actions, because the policy does not keep within the bounds."""
+    """Whether the task clips actions, because the policy may exceed the bounds."""
 
     loss: LossModule
     """The losses, with all weights."""
@@ -58,7 +58,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
             )
         self.observation: TensorSpec = observation
         self.statistics = nn.Module()
-        """What normalises observations; the data fill it in."""
+        """The statistics that normalise observations, filled in from the data."""
         if recipe.normalize_observations:
             if not observation.dtype.is_floating_point:
                 raise ValueError(
@@ -76,7 +76,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """History in, action out; its weights are among those of the loss."""
+        """The policy, from histories to actions; its weights are among those of the loss."""
         return self._policy
 
     def networks(self) -> nn.Module:
@@ -102,8 +102,8 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
         """Builds the policy's backbone.
 
         Args:
-            slices: as that of :func:`~recipes.policies.make_backbone`; it is on anyway if the
-                recipe draws slices.
+            slices: as in :func:`~recipes.policies.make_backbone`; always on if the recipe draws
+                slices.
         """
         slices = slices or self.recipe.slice_length > 1
         return make_backbone(self.recipe.backbone, self.observation, slices=slices)
@@ -149,7 +149,8 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
     def named(self, terms: Tensor) -> Mapping[str, Tensor]:
         """Checks and names the terms of an update, float [columns].
 
-        Checking on a GPU would mean waiting for it, so there the runner checks, less often.
+        On a GPU, checking would have to wait for it, so the runner checks there instead, less
+        often.
         """
         if terms.device.type == "cpu":
             check_finite(self.columns, terms)
@@ -177,7 +178,7 @@ def parameters_of(params: Any) -> list[nn.Parameter]:
 
 
 def descend(loss: Tensor, *optimizers: torch.optim.Optimizer) -> None:
-    """Takes a step down a loss's gradient."""
+    """Takes a gradient descent step on a loss."""
     for optimizer in optimizers:
         optimizer.zero_grad()
     loss.backward()

@@ -24,11 +24,11 @@ class TransitionRecipe(DatasetRecipe):
     batch_size: Batch = 256
     """Transitions in one gradient step, sampled with replacement."""
     slice_length: Batch = 1
-    """Consecutive transitions that are drawn together, so that a backbone encodes their frames
-    once; must divide batch_size. 1 draws transitions one by one."""
+    """Number of consecutive transitions that are drawn together, so that a backbone encodes their
+    frames once; must divide batch_size. 1 draws transitions one by one."""
     normalize_observations: bool = False
-    """Whether networks read observations minus their mean in the data, divided by their standard
-    deviation there; only for arrays of floats."""
+    """Whether to normalise observations by their mean and standard deviation in the data; only for
+    arrays of floats."""
     time_limits: Literal["keep", "drop"] = "drop"
     """Whether to keep the last transition of an episode that a time limit truncated. D4RL's own
     function and d3rlpy 1.1.1, which the paper used, drop it."""
@@ -73,14 +73,14 @@ class TransitionRecipe(DatasetRecipe):
 
 @dataclass(frozen=True, kw_only=True)
 class ActorCriticRecipe(TransitionRecipe):
-    """Settings of an actor with two critics, as IQL and TD3+BC have them."""
+    """Settings of algorithms with an actor and two critics, IQL and TD3+BC."""
 
     total_updates: Steps = 1_000_000
     """Gradient steps to train for."""
     gamma: Fraction = 0.99
     """Discount factor."""
     tau: Fraction = 0.005
-    """Step of the target networks towards the networks at each of their updates, from 0 to 1."""
+    """Coefficient of the soft update of the target networks, from 0 to 1."""
     critic: Literal["mlp", "backbone"] = "mlp"
     """Whether value networks read the newest observation, or each has a backbone with the actor's
     settings."""

@@ -26,10 +26,10 @@ _NOT_DRAWN = ("step", "time")
 class WandbMetrics(Callback):
     """Sends each row of ``metrics.csv`` to Weights & Biases, with TorchRL's logger.
 
-    A resumed run goes on in the run of W&B whose name is in ``wandb.json``. Rows that it has had
-    already are the same again, and are not sent twice. A run that is resumed with W&B for the first
-    time sends its earlier rows too. Everything else is as W&B's own variables say:
-    ``WANDB_MODE=offline`` keeps all in the run folder's ``wandb/``, which ``wandb sync`` uploads.
+    A resumed run continues the W&B run whose name is in ``wandb.json``. Rows that were sent before
+    are not sent again. A run that is resumed with W&B for the first time sends its earlier rows
+    too. W&B's own environment variables control everything else: ``WANDB_MODE=offline`` keeps the
+    metrics in the run folder's ``wandb/``, which ``wandb sync`` uploads.
 
     Args:
         run: the open run folder.
@@ -37,7 +37,7 @@ class WandbMetrics(Callback):
 
     Raises:
         ValueError: if wandb is not installed, or the run is in another project.
-        RuntimeError: if W&B cannot start: nobody is logged in, say.
+        RuntimeError: if W&B cannot start, for example because nobody is logged in.
     """
 
     def __init__(self, run: Run, project: str) -> None:
@@ -93,7 +93,7 @@ class WandbMetrics(Callback):
 
 
 def check_wandb(project: str) -> None:
-    """Raises ValueError if metrics cannot be sent to a project, before anything is begun."""
+    """Raises ValueError if metrics cannot be sent to a project, before anything starts."""
     if importlib.util.find_spec("wandb") is None:
         raise ValueError("--wandb needs wandb: pip install 'torchrl-tit[wandb]'")
     if not project or any(letter in project for letter in "/\\#?%:"):
@@ -103,7 +103,7 @@ def check_wandb(project: str) -> None:
 
 
 def _name_of(run: Run, project: str) -> tuple[str, bool]:
-    """The name of the run on W&B, a new one if it has none, and whether it had one."""
+    """Returns the run's name on W&B, which is new if it had none, and whether it had one."""
     path = run.folder / _FILE
     if path.exists():
         found = _read(path)

@@ -1,7 +1,6 @@
 """Trained agents: from a run to an agent's files, and from either to a policy that acts.
 
-The folders and how they are found are the library's: :mod:`torchrl_tit.agents`, which calls what
-stands here.
+The library, :mod:`torchrl_tit.agents`, finds and reads the folders, and calls these functions.
 """
 
 from .building import agent_from_files, agent_from_run

@@ -30,9 +30,9 @@ def agent_from_files(files: AgentFiles, name: str, device: Device) -> TrainedAge
     """Builds an agent from its files.
 
     Args:
-        files: what they hold.
+        files: the contents of the files.
         name: the agent's name.
-        device: of the policy and of the environments.
+        device: device of the policy and of the environments.
 
     Raises:
         AgentError: if the weights do not fit the recipe.
@@ -63,25 +63,25 @@ def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
 
     Args:
         folder: the run folder.
-        device: of the policy and of the environments.
+        device: device of the policy and of the environments.
 
     Raises:
         FileNotFoundError: if there is no run or no checkpoint.
         CheckpointError: if it cannot be used.
-        ValueError: as :func:`agent_from_files`.
+        ValueError: as in :func:`agent_from_files`.
     """
     run = Run.open(folder)
     check_named_parts(run.recipe)
     evaluation = read_evaluation(folder, latest_step(run.checkpoints))
     recipe = _acting(run.recipe, evaluation, device)
-    # Loading sets the number of PyTorch's threads, which is the caller's here.
+    # Loading sets the number of PyTorch's threads, which is up to the caller here.
     steps, algorithm, _ = load_trained(run, replace(recipe, threads=torch.get_num_threads()))
     versions = read_json(folder / "versions.json")
     return _agent(str(folder), run.recipe, algorithm, steps, evaluation, versions)
 
 
 def read_evaluation(folder: Path, steps: int | None) -> dict[str, Any]:
-    """Reads a run's evaluation; empty if there is none, or none of the checkpoint of a step."""
+    """Reads a run's evaluation of the checkpoint of a step; empty if there is none."""
     evaluation = read_json(folder / EVALUATION)
     with suppress(ValueError):
         check_evaluation(evaluation)
@@ -91,7 +91,7 @@ def read_evaluation(folder: Path, steps: int | None) -> dict[str, Any]:
 
 
 def read_json(file: Path) -> dict[str, Any]:
-    """Reads a JSON object that a run wrote; empty if it is lost or damaged."""
+    """Reads a JSON object that a run wrote; empty if it is missing or damaged."""
     with suppress(OSError, ValueError):
         found = json.loads(file.read_bytes())
         if isinstance(found, dict):
@@ -130,7 +130,7 @@ def _agent(
 
 
 def _plays(algorithm: Algorithm[Any], steps: int) -> Callable[[int, int], list[float]]:
-    """Plays episodes as the evaluation of its algorithm does."""
+    """Returns a function that plays episodes as the algorithm's evaluation does."""
     recipe = algorithm.recipe
 
     def plays(episodes: int, seed: int) -> list[float]:

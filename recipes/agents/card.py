@@ -13,16 +13,16 @@ from ..recipe import Recipe
 
 @dataclass(frozen=True)
 class Facts:
-    """What a card says.
+    """The contents of a card.
 
     Args:
         name: the agent's name.
-        source: what it is loaded by.
+        source: what ``load_agent`` takes to load it.
         license: identifier of its licence, if one is to be named.
         recipe: the settings of its run.
         steps: the steps that it was trained for.
         evaluation: the returns of its episodes.
-        versions: of packages, by name.
+        versions: versions of packages, by name.
         parameters: number of the policy's weights.
     """
 
@@ -40,7 +40,7 @@ def make_card(facts: Facts) -> str:
     """Writes the card of an agent: metadata in YAML, and Markdown.
 
     Args:
-        facts: what it says.
+        facts: the contents.
 
     Raises:
         AgentError: if huggingface_hub is missing.
@@ -117,7 +117,7 @@ def _target(evaluation: Mapping[str, Any]) -> str:
 
 
 def _metadata(facts: Facts) -> str:
-    """The metadata in YAML, by the Hub's own library."""
+    """The metadata in YAML, written by the Hub's own library."""
     hub = import_hub()
     recipe, evaluation = facts.recipe, facts.evaluation
     task = "reinforcement-learning"

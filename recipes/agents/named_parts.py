@@ -1,8 +1,8 @@
-"""What an agent's recipe may name: tasks and wrappers that only compute.
+"""The tasks and wrappers that an agent's recipe may name: those that only compute.
 
-An agent can come from a stranger. Modules of gymnasium and torchrl may be named by any recipe, but
-some of their classes import other modules, start programs, write files or download: GymEnv,
-UnityMLAgentsEnv, RecordVideo, R3MTransform. Whoever wants these names their module.
+Agents can come from strangers. Any recipe may name modules of gymnasium and torchrl, but some of
+their classes import other modules, start programs, write files or download: GymEnv,
+UnityMLAgentsEnv, RecordVideo, R3MTransform. To use these, users must name their module.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ _LIBRARIES = ("gymnasium", "torchrl")
 def check_named_parts(recipe: Recipe) -> None:
     """Raises AgentError if a recipe names a task or a wrapper that may do more than compute.
 
-    Those in a module that the user named may.
+    Those in a module that the user named are allowed.
 
     Raises:
         AgentError: if it does.
@@ -116,7 +116,7 @@ def _check(target: str, found: Any) -> None:
     home = str(getattr(found, "__module__", "")).partition(".")[0]
     if isinstance(found, type):
         safe = home not in _LIBRARIES or found.__name__ in _COMPUTING
-    else:  # a function that takes names of further tasks, say
+    else:  # such as a function that takes names of further tasks
         safe = home not in TRUSTED
     if not safe:
         raise AgentError(

@@ -29,8 +29,8 @@ def pack(
 ) -> tuple[dict[str, bytes], int]:
     """Makes the files of an agent from a run's newest checkpoint and its evaluation.
 
-    They hold what acting needs and what tells how the agent came about: no optimizer, no replay
-    buffer, no networks that only training reads, and no names of folders or machines.
+    They hold what acting needs and a record of how the agent was trained: no optimizer, no replay
+    buffer, no networks that only training uses, and no names of folders or machines.
 
     Args:
         folder: the run folder.
@@ -45,7 +45,7 @@ def pack(
 
     Raises:
         FileNotFoundError: if there is no run or no checkpoint.
-        AgentError: if the newest checkpoint was not evaluated, a name is not one, or
+        AgentError: if the newest checkpoint was not evaluated, a name is invalid, or
             huggingface_hub, which writes the card's metadata, is missing.
         ValueError: if the run's networks cannot be built.
     """
@@ -80,7 +80,7 @@ def pack(
 def without_places(recipe: Recipe) -> Recipe:
     """Returns a recipe without the folders and addresses of the machines that it ran on.
 
-    Of a data set in a file, the file's name stays.
+    If the data set is a file, the file's name is kept.
 
     Example:
         >>> from recipes.registry import get_recipe
@@ -91,7 +91,7 @@ def without_places(recipe: Recipe) -> Recipe:
     changed: dict[str, Any] = {}
     if isinstance(recipe, DatasetRecipe):
         path = PurePath(recipe.dataset)
-        if path.is_absolute() or path.suffix:  # otherwise it is a name of D4RL's or Minari's
+        if path.is_absolute() or path.suffix:  # otherwise it is a name from D4RL or Minari
             changed["dataset"] = path.name
     if "ray" in {field.name for field in fields(recipe)}:
         changed["ray"] = None
@@ -99,7 +99,7 @@ def without_places(recipe: Recipe) -> Recipe:
 
 
 def _weights(networks: nn.Module) -> dict[str, Tensor]:
-    """The tensors of networks by name, each with memory of its own."""
+    """The tensors of networks by name, each with its own memory."""
     weights = {}
     for name, value in networks.state_dict().items():
         if not isinstance(value, Tensor):

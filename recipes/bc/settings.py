@@ -12,7 +12,7 @@ from ..transition_recipe import TransitionRecipe
 
 @dataclass(frozen=True, kw_only=True)
 class BC(TransitionRecipe, algorithm="bc", builds=f"{__package__}.algorithm:BCAlgorithm"):
-    """Behaviour cloning: the most likely policy of a data set, whatever its actions are."""
+    """Behaviour cloning: maximises the likelihood of a data set's actions, of any kind."""
 
     learning_rate: Rate = 3e-4
     """Learning rate of Adam."""

@@ -1,4 +1,4 @@
-"""The command line: main.py names the commands, each of which parses its arguments and runs."""
+"""The command line: main.py lists the commands; each parses its arguments and runs."""
 
 from .main import main
 

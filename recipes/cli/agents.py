@@ -1,4 +1,4 @@
-"""`play` and `share`: trained agents act, and runs become agents that others can load."""
+"""`play` and `share`: let trained agents act, and turn runs into agents that others can load."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MOST = 1_000_000
 
 
 def play(arguments: list[str]) -> None:
-    """Lets a trained agent play, or lists those that come with this package."""
+    """Lets a trained agent play, or lists the agents that come with this package."""
     parser = Parser(
         f"{program()} play",
         description="Let a trained agent play whole episodes; without AGENT, list those that come "
@@ -71,7 +71,7 @@ def play(arguments: list[str]) -> None:
 
 
 def share(arguments: list[str]) -> None:
-    """Makes an agent of a run, in a folder or on the Hugging Face Hub."""
+    """Turns a run into an agent, in a folder or on the Hugging Face Hub."""
     parser = Parser(
         f"{program()} share",
         description="Make an agent of a run: its weights, recipe, evaluation, versions and a model "
@@ -118,7 +118,7 @@ def _upload(folder: Path, repository: str, private: bool) -> None:
     from torchrl_tit.agents.folder import read_agent
     from torchrl_tit.agents.hub import PREFIX, upload
 
-    read_agent(folder)  # only what is whole and unchanged is uploaded
+    read_agent(folder)  # only complete, unmodified agents are uploaded
     address = upload(folder, repository, private=private)
     print(f"uploaded to {address}\nload_agent({PREFIX + repository!r}) loads it")
 

@@ -1,4 +1,4 @@
-"""Reading a command's arguments, and reporting in one line what is wrong with them."""
+"""Parsing of a command's arguments, with one-line error messages."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        # For the help: the option itself is read before the command is known.
+        # Only for the help text: the option itself is parsed before the command is known.
         self.add_argument(OPTION, metavar="MODULE", help=HELP)
 
     def error(self, message: str) -> NoReturn:
-        """Ends the program with one line that says what is wrong with the arguments."""
+        """Exits with a one-line message that says what is wrong with the arguments."""
         fail(f"{message} (see `{self.prog} --help`)")
 
 
 def add_machine_options(parser: argparse.ArgumentParser) -> None:
-    """Adds the options that say where to compute, which may differ from the recipe's."""
+    """Adds the options for device and threads, which override those of the recipe."""
     parser.add_argument("--device", choices=["cpu", "cuda", "auto"], help="default: the recipe's")
     parser.add_argument("--threads", type=int, help="default: the recipe's")
 
 
 def check_seed(seed: int | None) -> None:
-    """Ends the program if a seed is none that environments take; None is."""
+    """Exits with an error unless the seed is None or one that environments accept."""
     if seed is not None and not 0 <= seed <= MAX_SEED:
         fail(f"--seed must be from 0 to {MAX_SEED}, not {seed}")
 
 
 def option(field: str) -> str:
-    """Returns a field as it is typed.
+    """Returns a field as the option that users type.
 
     Example:
         >>> option("total_steps")
@@ -91,7 +91,7 @@ def _unboxed(message: str) -> str:
     lines = [line.strip("│ ") for line in message.splitlines()]
     reason = " ".join(takewhile(lambda line: line[:1] not in "─╰", lines[1:]))
     words = [line.split()[0] for line in lines if line.startswith("--") and line != "--help"]
-    similar = [word for word in words if not word.endswith((".", ","))]  # those are in a help text
+    similar = [word for word in words if not word.endswith((".", ","))]  # not those of help texts
     hint = (
         f"; did you mean {' or '.join(similar)}?"
         if similar and "Perhaps you meant" in message
@@ -107,6 +107,6 @@ def program() -> str:
 
 
 def fail(message: str) -> NoReturn:
-    """Ends the program with one line that gives the reason."""
+    """Exits with a one-line error message."""
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)

@@ -1,8 +1,9 @@
-"""The options that choose a network by names: ``--backbone.frame``, ``.history`` and ``.network``.
+"""The options that choose a network by name: ``--backbone.frame``, ``.history`` and ``.network``.
 
-And ``--backbone.frames.KEY``, for one of several observations.
+``--backbone.frames.KEY`` chooses the frame encoder of one of several observations.
 
-They are read before all others, because the other options include the fields of the chosen parts.
+These options are parsed before all others, because the other options include the fields of the
+chosen parts.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _OPTIONS: dict[str, Iterable[str]] = {
 """The options and the names that each takes."""
 
 _PER_KEY = "backbone.frames."
-"""The options for one observation, whose name follows, begin so."""
+"""Prefix of the options for one observation, whose name follows."""
 
 
 def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
@@ -43,10 +44,11 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
     before. ``--backbone.frame`` and ``--backbone.history`` then replace an encoder. A new encoder
     inherits the old one's non-default values in fields that both have; its other fields have their
     defaults. ``--backbone.frames.KEY`` names the frame encoder of one of several observations,
-    which also inherits the width; ``--backbone.frames.KEY.FIELD`` alone takes the recipe's.
+    which also inherits the width; ``--backbone.frames.KEY.FIELD`` alone starts from the recipe's
+    frame encoder.
 
-    The result is not checked: arguments that are read later may be needed for it to be valid, such
-    as ``--backbone.num-frames``.
+    The result is not checked, because arguments that are parsed later, such as
+    ``--backbone.num-frames``, may be needed to make it valid.
 
     Args:
         recipe: the recipe.
@@ -88,7 +90,7 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
 
 
 def check_recipe(recipe: RecipeT) -> RecipeT:
-    """Returns the recipe after all checks of its fields, which :func:`choose_network` leaves out.
+    """Runs all checks of a recipe's fields, which :func:`choose_network` skips, and returns it.
 
     Raises:
         ValueError: if a field has an invalid value.
@@ -103,7 +105,7 @@ def check_recipe(recipe: RecipeT) -> RecipeT:
 def option_fields(recipe: Recipe) -> list[tuple[str, Any, str]]:
     """Returns the options as :func:`~dataclasses.make_dataclass` takes them, for tyro and its help.
 
-    Their values are those of the recipe; :func:`choose_network` has read them already.
+    Their values are those of the recipe, because :func:`choose_network` has already applied them.
     """
     help_texts = {
         "backbone.network": "A network by its name, with the recipe's number of frames.",
@@ -138,14 +140,14 @@ def option_fields(recipe: Recipe) -> list[tuple[str, Any, str]]:
 
 
 def _choices(option: str) -> Iterable[str]:
-    """The names that an option takes; none if there is no such option."""
+    """The names that an option accepts; empty if there is no such option."""
     if option.startswith(_PER_KEY) and "." not in option.removeprefix(_PER_KEY):
         return FrameSettings.registered
     return _OPTIONS.get(option, ())
 
 
 def _read(arguments: list[str]) -> dict[str, str]:
-    """Reads the options, as ``--option NAME`` or ``--option=NAME``; the last of several counts."""
+    """Reads the options, as ``--option NAME`` or ``--option=NAME``; the last occurrence counts."""
     names = {}
     for argument, after in pairwise([*arguments, ""]):
         option, equals, name = argument.removeprefix("--").partition("=")
@@ -174,7 +176,7 @@ def _keys_with_fields(arguments: list[str]) -> list[str]:
 
 
 def _replace_part(old: Part, new: type[Any]) -> Any:
-    """Builds the settings of another part, with the fields that were chosen for the old one."""
+    """Builds settings of a new part, with the old part's non-default values in common fields."""
     if type(old) is new:
         return old
     old_types, new_types = field_types(type(old)), field_types(new)
@@ -187,14 +189,14 @@ def _replace_part(old: Part, new: type[Any]) -> Any:
 
 
 def _with_width_of(old: Part, new: Any) -> Any:
-    """Returns settings with the width of other ones: tokens of all observations have the same."""
+    """Returns settings with the old ones' width: tokens of all observations have the same width."""
     if "embed_dim" in field_types(type(old)) and "embed_dim" in field_types(type(new)):
         return _replace_unchecked(new, embed_dim=getattr(old, "embed_dim"))  # noqa: B009
     return new
 
 
 def _replace_unchecked(settings: T, **values: Any) -> T:
-    """Returns a copy of frozen settings with other values, which ``__post_init__`` does not see."""
+    """Returns a copy of frozen settings with other values, without running ``__post_init__``."""
     copied = copy.copy(settings)
     for name, value in values.items():
         object.__setattr__(copied, name, value)

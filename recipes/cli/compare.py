@@ -23,7 +23,7 @@ def compare(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     if options.out.suffix != ".png":
         fail(f"--out {options.out} must end in .png: the figure is a PNG")
-    # Beside the runs of a sweep lie its logs, which `sweep/*/seed-*` names too.
+    # The logs of a sweep lie next to its runs, so `sweep/*/seed-*` matches them too.
     folders = {path.resolve(): path for path in options.runs if path.suffix != ".log"}
     if not folders:
         fail(f"{options.runs[0]} is not a run folder, but a log: name the folder beside it")
@@ -39,7 +39,7 @@ def compare(arguments: list[str]) -> None:
 
 
 def table(arguments: list[str]) -> None:
-    """Prints the paper's tables with the runs in folders."""
+    """Prints the paper's tables for the runs in the folders."""
     parser = Parser(f"{program()} table")
     parser.add_argument("folders", type=Path, nargs="+", help="folders that contain run folders")
     parser.add_argument("--format", choices=["md", "csv"], default="md", help="format to print")

@@ -1,6 +1,6 @@
-"""`data`: reads the arguments; the rest is imported only after that.
+"""`data`: parses the arguments, and only then imports the rest.
 
-So help and errors are quick: they need no PyTorch.
+Help and errors are therefore fast: they do not need PyTorch.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What the commands of `data` do."""
+"""The commands of `data`."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> str:
 
 
 def describe(episodes: Episodes) -> str:
-    """Describes how much a data set holds, and of what kind.
+    """Describes the size and the contents of a data set.
 
     Args:
         episodes: The data.
@@ -105,7 +105,7 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
             one, if Gymnasium knows it.
 
     Returns:
-        What was written, and what was not.
+        A message that says what was written and what was left out.
 
     Raises:
         FileExistsError: If there is something at the target already.
@@ -137,7 +137,7 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
 
 
 def _scored_name(episodes: Episodes) -> str | None:
-    """The first name of the data for which there are reference returns."""
+    """Returns the first of the data set's names that has reference returns."""
     recorded = str(episodes.attributes.get("env_id", ""))
     names = [episodes.source, Path(episodes.source).name, recorded]
     return next((name for name in names if has_reference(name)), None)

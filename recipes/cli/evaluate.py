@@ -42,7 +42,7 @@ def evaluate(arguments: list[str]) -> None:
     )
     if options.out is not None and not options.out.absolute().parent.is_dir():
         fail(f"--out {options.out} cannot be written: there is no folder {options.out.parent}")
-    # What is written into the run folder is written by one process at a time.
+    # Only one process at a time may write to the run folder.
     lock: AbstractContextManager[Any] = run if options.out is None else nullcontext()
     with lock:
         evaluation = runner.evaluate(run, recipe, best=options.best)
@@ -52,7 +52,7 @@ def evaluate(arguments: list[str]) -> None:
 
 
 def _file_name(own: Recipe, recipe: Recipe, best: bool) -> str:
-    """Names an evaluation by what distinguishes it from the run's own."""
+    """Builds a file name from the settings that differ from the run's own evaluation."""
     parts = ["evaluation", *(["best"] if best else [])]
     for field in ("episodes", "seed"):
         value = getattr(recipe, f"evaluation_{field}")

@@ -1,4 +1,4 @@
-"""`export`: a trained agent as a file that acts without this package."""
+"""`export`: writes a trained agent to a file that runs without this package."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .arguments import Parser, program
 
 
 def export(arguments: list[str]) -> None:
-    """Writes an agent's policy as a program of PyTorch or ONNX."""
+    """Exports an agent's policy as a PyTorch or ONNX program."""
     parser = Parser(
         f"{program()} export",
         description="Write an agent's policy, with its normalisation, to a file that acts without "
@@ -62,7 +62,7 @@ def export(arguments: list[str]) -> None:
 
 
 def _facts(recipe: Any, steps: int) -> dict[str, Any]:
-    """What else to say about an agent: its task, as `gymnasium.make` takes it, and its origin."""
+    """Further facts about an agent: its task, as `gymnasium.make` takes it, and its origin."""
     return {
         "task": {"id": recipe["env"], **parse_assignments(recipe["env_settings"])},
         "wrappers": list(recipe["wrappers"]),

@@ -1,4 +1,4 @@
-"""Modules of users' own: ``--import MODULE``, and tasks and wrappers named as MODULE:NAME."""
+"""Users' own modules: ``--import MODULE``, and tasks and wrappers named as MODULE:NAME."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def import_what_is_typed(arguments: list[str]) -> list[str]:
 
 
 def _named(arguments: list[str]) -> Iterator[str]:
-    """Modules in arguments such as ``module:Task-v0``: who types one wants it imported."""
+    """Modules in arguments such as ``module:Task-v0``: users who type one want it imported."""
     for argument in arguments:
         found = _MODULE_AND_NAME.fullmatch(argument)
         if found and not found[1].endswith((".", ".py")):

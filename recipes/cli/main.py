@@ -32,7 +32,7 @@ COMMANDS = {
 """The commands by name, each a "module:function" of this package."""
 
 _OF_USERS = (ValueError, OSError, RuntimeError, FloatingPointError, ImportError, MemoryError)
-"""What a mistake of the user's, or a limit of the machine, raises."""
+"""Errors caused by a user's mistake or by a limit of the machine."""
 
 USAGE = """\
 usage: {program} COMMAND ...
@@ -78,10 +78,10 @@ def main(arguments: list[str] | None = None) -> None:
             with one_line_warnings():
                 _run(import_what_is_typed(sys.argv[1:] if arguments is None else arguments))
         finally:
-            sys.stdout.flush()  # here, where a reader who is gone can be met
+            sys.stdout.flush()  # here, because a closed pipe is handled below
     except KeyboardInterrupt:
         sys.exit(130)
-    except BrokenPipeError:  # `list | head`: what is left goes nowhere
+    except BrokenPipeError:  # `list | head`: discard the rest of the output
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except _OF_USERS as error:
         fail(_describe(error))
@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _describe(error: Exception) -> str:
     text = str(error) or type(error).__name__
-    # PyTorch's, of a processor and of a GPU, are RuntimeErrors.
+    # PyTorch raises RuntimeErrors when a CPU or a GPU runs out of memory.
     if isinstance(error, MemoryError) or "allocate memory" in text or "out of memory" in text:
         return (
             "there is not enough memory: a smaller network, num_frames, num_envs, minibatch_size "

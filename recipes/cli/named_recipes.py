@@ -13,7 +13,7 @@ from .arguments import Parser, fail, program
 
 
 def list_recipes(arguments: list[str]) -> None:
-    """Prints the names of recipes, those of installed packages too."""
+    """Prints the names of recipes, including those of installed packages."""
     parser = Parser(f"{program()} list")
     parser.add_argument("pattern", nargs="?", default="", help="part of a name; * is any text")
     pattern = parser.parse_args(arguments).pattern

@@ -1,4 +1,4 @@
-"""Run folders that commands are given, which may be a stranger's."""
+"""Opening run folders that commands are given, which may come from strangers."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from ..run import Run
 
 
 def open_run(folder: Path) -> Run:
-    """Opens a run that is to act: as of an agent, what its recipe names may only compute.
+    """Opens a run that will act; as for agents, the parts that its recipe names may only compute.
 
     Raises:
-        AgentError: if its recipe names a task or a wrapper that may do more, which the user did not
-            name.
+        AgentError: if its recipe names a task or a wrapper that may do more than compute, and that
+            the user did not name.
         FileNotFoundError: if the folder is not a run folder.
-        ValueError: if its recipe cannot be read, or what it names is not there.
+        ValueError: if its recipe cannot be read, or a part that it names does not exist.
     """
     run = Run.open(folder)
     check_named_parts(run.recipe)

@@ -1,6 +1,6 @@
-"""`train`: reads the arguments; the rest is in training.py, which is imported only after that.
+"""`train`: parses the arguments; only then is the rest, training.py, imported.
 
-So help and errors are quick: they need no PyTorch.
+Help and errors are therefore fast: they do not need PyTorch.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def train(arguments: list[str]) -> None:
 
 
 def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
-    """Overrides a recipe's fields, its network's included, and reads --out and --init-from."""
+    """Overrides a recipe's fields, including its network's, and reads --out and --init-from."""
     out = tyro.conf.arg(help="Run folder to make; runs/NAME/seed-SEED-DATE if missing.")
     init_from = tyro.conf.arg(
         help="Run folder whose newest checkpoint gives the first weights, as far as they fit.",
@@ -48,7 +48,7 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
     )
     wandb = tyro.conf.arg(help=WANDB_HELP, metavar="PROJECT")
     if not {"-h", "--help"}.isdisjoint(arguments):
-        load_plugins()  # whose parts are choices, too
+        load_plugins()  # their parts are choices too
     _check_length(recipe, arguments)
     recipe = choose_network(recipe, arguments)
     parsed = parse_fields(
@@ -67,7 +67,7 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
 
 
 def _check_length(recipe: Recipe, arguments: list[str]) -> None:
-    """Ends the program with a hint if the length is that of another algorithm's runs."""
+    """Exits with a hint if the arguments set the length by another algorithm's field."""
     typed = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
     for length in _lengths().keys() - {recipe.length}:
         if option(length) in typed and length not in field_types(type(recipe)):
@@ -100,7 +100,7 @@ def _parse_resume(arguments: list[str]) -> argparse.Namespace:
 
 
 def _lengths() -> dict[str, list[str]]:
-    """The fields that say how long runs are, each with its algorithms."""
+    """Returns the fields that set the length of a run, each with its algorithms."""
     lengths: dict[str, list[str]] = {}
     for algorithm, kind in Recipe.registered.items():
         lengths.setdefault(kind.length, []).append(algorithm)

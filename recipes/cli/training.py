@@ -67,7 +67,7 @@ def resume(
         threads: the number of PyTorch's threads; the recipe's if None.
         lengths: the run's new length by the name of its field, such as ``total_steps``; the
             recipe's if None.
-        wandb: as that of :func:`start`.
+        wandb: as in :func:`start`.
     """
     if wandb is not None:
         check_wandb(wandb)
@@ -81,7 +81,7 @@ def resume(
 
 
 def _lengthen(run: Run, lengths: Mapping[str, int]) -> None:
-    """Gives a run another length, and says what that changes besides."""
+    """Changes the length of a run, and says which schedules that affects."""
     field = run.recipe.length
     if wrong := [name for name in lengths if name != field]:
         raise ValueError(
@@ -99,7 +99,7 @@ def _lengthen(run: Run, lengths: Mapping[str, int]) -> None:
 
 
 def _finish(run: Run, wandb: str | None) -> None:
-    """Finishes a run, which is open: trains, evaluates and plots what is left."""
+    """Finishes an open run: trains, evaluates and plots what is left."""
     recipe, folder = run.recipe, run.folder
     if run.is_complete():
         print(
@@ -126,7 +126,7 @@ def _finish(run: Run, wandb: str | None) -> None:
 
 
 def _make_folder(recipe: Recipe) -> Path:
-    """Creates a folder at once, so that runs started in the same second get different ones."""
+    """Creates a folder immediately, so that runs started in the same second get different ones."""
     name = recipe.name or recipe.algorithm
     base = Path("runs", name, f"seed-{recipe.seed}-{time.strftime('%Y%m%d-%H%M%S')}")
     base.parent.mkdir(parents=True, exist_ok=True)

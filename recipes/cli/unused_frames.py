@@ -1,4 +1,4 @@
-"""A hint to those whose network reads more frames than their task's episodes have."""
+"""A hint for users whose network reads more frames than their task's episodes have."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from ..callback import Callback
 from ..recipe import Recipe
 
 _SHARE = 5
-"""A run is judged once this part of it is over: the first episodes are often short."""
+"""A run is checked after one part in this many, because the first episodes are often short."""
 _ENOUGH = 100
-"""Episodes that say something."""
+"""Minimum number of episodes for a warning."""
 
 
 class UnusedFrames(Callback):
@@ -30,7 +30,7 @@ class UnusedFrames(Callback):
         self._longest = self._episodes = 0
 
     def collected(self, step: int, batch: Any) -> None:
-        """Measures the episodes of a batch [envs, time], and judges when it is time."""
+        """Measures the episodes of a batch [envs, time], and warns when it is time."""
         if self._over:
             return
         for env, dones in enumerate(batch["next", "done"].squeeze(-1).tolist()):

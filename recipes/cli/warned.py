@@ -1,4 +1,4 @@
-"""Warnings on the command line: a line each, and each once."""
+"""Warnings on the command line: one line each, and each only once."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _OURS = (str(Path(torchrl_tit.__file__).parent), str(Path(__file__).parents[1]))
 def one_line_warnings() -> Iterator[None]:
     """Writes warnings as "warning: TEXT", without the source that Python shows.
 
-    Those of other libraries are followed by their place. Python repeats a warning whenever the
-    filters have changed since, as TorchRL and Gymnasium do; here its text stands once.
+    Warnings of other libraries are followed by their location. Python repeats a warning whenever
+    the filters have changed, and TorchRL and Gymnasium change them; here each text is printed once.
     """
     shown: set[str] = set()
 

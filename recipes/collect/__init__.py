@@ -1,4 +1,4 @@
-"""`data collect`: data sets of a task, made the way D4RL's were. Begin with collect.py."""
+"""`data collect`: data sets of a task, made the way D4RL's were. Start reading at collect.py."""
 
 from .settings import Collection
 

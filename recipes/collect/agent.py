@@ -62,7 +62,7 @@ class Agent(ABC):
 
     @abstractmethod
     def load_policy(self, score: Score) -> TensorDictModuleBase:
-        """Loads the policy that had a score, one of :meth:`reach`, in evaluation mode."""
+        """Loads the policy that had a score returned by :meth:`reach`, in evaluation mode."""
 
     def score(self, policy: TensorDictModuleBase, step: int) -> Score:
         """Evaluates a policy that was trained for a number of environment steps."""

@@ -46,7 +46,7 @@ class AgentInTraining(Agent, Callback):
         algorithm: the recipe's algorithm, for environments and policies.
         settings: the settings of the collection.
         folder: the folder; created if missing.
-        action_space: the task's.
+        action_space: action space of the task.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class AgentInTraining(Agent, Callback):
         return next(reached, None)
 
     def _load(self) -> None:
-        """Reads what belongs to the newest checkpoint; what came after it is repeated."""
+        """Reads the state of the newest checkpoint; later work is repeated."""
         self._step = max(checkpoint_steps(self._folder / "checkpoints"), default=0)
         path = self._folder / "evaluations.json"
         scores = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []

@@ -40,7 +40,7 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
 
     Raises:
         ValueError: if the settings are invalid, the folder holds sets with other settings, or a
-            mark is never reached. What was made before stays.
+            mark is never reached. Sets that were made before are kept.
         FileExistsError: if the folder holds anything else.
         RuntimeError: if another process uses the folder.
         OSError: if something cannot be written.
@@ -76,7 +76,7 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
 
 
 def _is_recorded_as_it_is(task: TaskSpaces) -> bool:
-    """Whether tensordicts hold the observations and the actions that the task writes and reads."""
+    """Whether tensordicts hold the task's observations and actions unchanged."""
     if not (isinstance(task.observation, Box) and isinstance(task.action, Box | Discrete)):
         return False
     if task.observation.dtype.kind != "f" and task.observation.dtype != "uint8":
@@ -84,7 +84,7 @@ def _is_recorded_as_it_is(task: TaskSpaces) -> bool:
     try:
         observation = ObservationReader(task.observation).spec
         action = ActionWriter(task.action, clip=False).spec
-    except (TypeError, ValueError):  # an image whose layout is not known, say
+    except (TypeError, ValueError):  # such as an image of unknown layout
         return False
     return (
         observation.shape == task.observation.shape

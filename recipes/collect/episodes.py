@@ -32,19 +32,20 @@ def play_episodes(
     seed: int,
     deterministic: bool = False,
 ) -> None:
-    """Plays episodes until the parts hold enough transitions; the last episode is whole.
+    """Plays episodes until the parts hold enough transitions; the last episode is complete.
 
-    Each part holds one episode of every environment, begun together. So short episodes are not
-    preferred, and a part depends on its number and the seed only, not on the parts before it.
+    Each part holds one episode of every environment, started together. Short episodes are therefore
+    not favoured, and a part depends only on its number and the seed, not on earlier parts.
 
     Args:
-        parts: where the episodes are written; those that are there already count.
+        parts: where the episodes are written; existing ones count.
         env: environments [N], which are reset with seeds.
         policy: writes the action into the tensordict that it is given.
-        transitions: number of transitions. A longer episode is cut off there.
-        action_space: the task's; actions are recorded as the task receives them, clipped to it.
+        transitions: number of transitions. A single episode that is longer is cut off there.
+        action_space: action space of the task; actions are recorded as the task receives them,
+            clipped to it.
         seed: seed of all episodes.
-        deterministic: whether the policy's most likely action is taken instead of a drawn one.
+        deterministic: whether the policy's most likely action is taken instead of a sampled one.
     """
     parts.drop_after(max(parts.numbers(), default=-1))  # removes half-written files only
     number, rows = len(parts.numbers()), parts.num_rows()
@@ -62,7 +63,7 @@ def play_episodes(
         while rows < transitions:
             state = np.random.SeedSequence([seed, number]).generate_state(2)
             torch.manual_seed(int(state[0]))
-            with acting(policy):  # discards the frames of the part before
+            with acting(policy):  # discards the frames of the previous part
                 episodes = _play(env, policy, action_space, int(state[1]) >> 1, transitions)
             chosen = []
             for episode in episodes:
@@ -89,8 +90,8 @@ def _play(
     Args:
         env: environments [N].
         policy: writes the action into the tensordict that it is given.
-        action_space: the task's.
-        seed: of the first environment; the others' follow one by one.
+        action_space: action space of the task.
+        seed: seed of the first environment; the others' follow one by one.
         max_steps: steps after which an episode is cut off.
 
     Returns:
@@ -119,12 +120,12 @@ def _play(
 
 
 def as_fields(batch: TensorDictBase, action_space: Space) -> dict[str, Tensor]:
-    """Names the steps of an environment as D4RL does, on the CPU.
+    """Converts steps of an environment to D4RL's fields, on the CPU.
 
     Args:
         batch: steps, of any shape [...].
-        action_space: the task's; actions that a Gaussian policy sampled beyond its bounds are
-            clipped to them.
+        action_space: action space of the task; actions that a Gaussian policy sampled beyond its
+            bounds are clipped to them.
 
     Returns:
         Tensors [...]; observations [..., *obs] and actions [..., *action].

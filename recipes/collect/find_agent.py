@@ -20,7 +20,7 @@ from .agent_in_training import AgentInTraining
 from .settings import Collection
 
 _CHANGES = ("env_settings", "wrappers", "observation_keys")
-"""Fields of a recipe with which observations, actions or rewards are not those of the task."""
+"""Fields of a recipe that change the observations, actions or rewards of the task."""
 
 
 def find_agent(settings: Collection, folder: Path, action_space: Space) -> Agent | None:
@@ -29,7 +29,7 @@ def find_agent(settings: Collection, folder: Path, action_space: Space) -> Agent
     Args:
         settings: the settings of the collection.
         folder: where an agent is trained; not touched here.
-        action_space: the task's.
+        action_space: action space of the task.
 
     Returns:
         The agent; None if no set needs one.
@@ -59,7 +59,7 @@ def _default_sac(settings: Collection) -> SAC:
 
 def _adapted(recipe: Recipe, settings: Collection) -> Recipe:
     """The recipe with the collection's seed, threads and checkpoints, and a single collector."""
-    # With several collectors, batches do not continue one another.
+    # With several collectors, a batch does not continue the one before.
     single: dict[str, Any] = {"collectors": 1, "async_collection": False, "ray": None}
     names = {field.name for field in fields(recipe)}
     return replace(
@@ -72,7 +72,7 @@ def _adapted(recipe: Recipe, settings: Collection) -> Recipe:
 
 
 def _check(recipe: Recipe, env: str) -> None:
-    """Raises ValueError if a recipe does not make the data of a task."""
+    """Raises ValueError if a recipe cannot produce the data of a task."""
     problem = None
     if recipe.offline:
         problem = "is trained on a data set, not in its task"

@@ -83,14 +83,14 @@ def _check(folder: Path, before: dict[str, Any], now: dict[str, Any], settings: 
             values.pop(name, None)
     changes = [f"{k}: {old.get(k)!r} -> {new[k]!r}" for k in new if old.get(k) != new[k]]
     recipes = [dict(recipe) for recipe in (before["recipe"], now["recipe"]) if recipe is not None]
-    # The recipe has these from the settings, which are compared above.
+    # The recipe takes these from the settings, which are compared above.
     adapted = ["seed", "threads", "checkpoint_interval"]
     for recipe in recipes:
         for name in [*adapted, "total_steps"] if settings.agent == "sac" else adapted:
             recipe.pop(name, None)
     if len(recipes) == 2 and recipes[0] != recipes[1]:
         changes.append(f"the recipe {settings.agent}")
-    # A longer training ends with another agent.
+    # Longer training ends with another agent.
     of_the_end = [k for k in KINDS if k != "random" and settings.mark(k)[1] is None]
     if settings.total_steps < steps or (
         settings.total_steps > steps and any(hdf5_path(folder, k).exists() for k in of_the_end)

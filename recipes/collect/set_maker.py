@@ -1,4 +1,4 @@
-"""One data set after the other, each written as HDF5 and for Minari."""
+"""Makes data sets one after another, each as an HDF5 file and as a Minari data set."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class SetMaker:
         folder: the output folder.
         task: the task's spaces.
         agent: the agent; None if only random actions are needed.
-        provenance: what every set records.
+        provenance: the provenance that every set records.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class SetMaker:
         assert agent is not None
         score = agent.reach(*self._settings.mark(kind))
         if kind == "mixed":
-            assert isinstance(agent, AgentInTraining)  # a finished run is refused before
+            assert isinstance(agent, AgentInTraining)  # a finished run was rejected earlier
             episodes = agent.parts.episodes(score.step, task=self._task)
         else:
             env = agent.algorithm.make_env(self._settings.num_envs)
@@ -106,7 +106,7 @@ class SetMaker:
         kind: Kind,
         folder: Path,
     ) -> Episodes:
-        """Episodes of a policy that no longer learns; closes the environment."""
+        """Plays episodes of a policy that no longer learns; closes the environment."""
         settings, parts = self._settings, TransitionParts(folder)
         seed = np.random.SeedSequence([settings.seed, KINDS.index(kind)]).generate_state(1)
         with closing(env):

@@ -20,9 +20,9 @@ class Collection:
     """Data sets of one task and one agent, made the way D4RL's were (arXiv 2004.07219).
 
     An agent is trained until its mean return reaches a mark. The mixed set ("medium-replay")
-    holds everything that it saw until then; the medium set holds episodes with the weights of that
-    moment. At a second mark the agent becomes the expert. The random set has uniformly random
-    actions.
+    holds everything that the agent saw until then; the medium set holds episodes played with the
+    weights of that point. At a second mark, the agent becomes the expert. The random set has
+    uniformly random actions.
     """
 
     env: Annotated[str, tyro.conf.Positional]
@@ -85,6 +85,6 @@ class Collection:
             )
 
     def mark(self, kind: Kind) -> tuple[str, float | None]:
-        """The name of the mark that the agent of a set must reach, and the mark."""
+        """Returns the name and the value of the mark that the agent of a set must reach."""
         name = "expert_return" if kind == "expert" else "medium_return"
         return name, getattr(self, name)

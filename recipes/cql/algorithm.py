@@ -24,13 +24,13 @@ from ..transition_algorithm import descend, parameters_of
 from .q_algorithm import QAlgorithm
 from .settings import CQL
 
-# The activations of critics with three layers of 256 for so many actions, 8 MB, fit into a CPU's
+# For this many actions, the activations of critics with three layers of 256, 8 MB, fit into a CPU's
 # cache.
 _ACTIONS_IN_CACHE = 2000
 
 
 class CQLAlgorithm(QAlgorithm[CQL]):
-    """Actor on a backbone, two critics and a temperature, each with an optimizer of its own.
+    """Actor on a backbone, two critics and a temperature, each with its own optimizer.
 
     Args:
         recipe: the settings.
@@ -41,7 +41,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
     """
 
     compiles_on = ("cpu", "cuda")
-    # The losses are in the order of the steps: the first that is not finite is the one to blame.
+    # The losses are in the order of the steps: the first that is not finite is the cause.
     columns = ("loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy")
 
     def __init__(self, recipe: CQL) -> None:
@@ -74,7 +74,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
             num_random=recipe.action_samples,
             over_critics=recipe.over_critics,
             alpha_init=recipe.temperature_init,
-            # On a CPU two products are faster than a stacked one.
+            # On a CPU, two matrix products are faster than one batched product.
             deactivate_vmap=self.device.type == "cpu",
         )
         self.loss.make_value_estimator(gamma=recipe.gamma)
@@ -100,7 +100,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
         compiled = self.should_compile()
         if compiled:
             self.sample_policy = compile_and_time(loss.sample_policy, "the policy")
-        if compiled and self.chunk_size is None:  # what critics do on a CPU is matrix products
+        if compiled and self.chunk_size is None:  # on a CPU, matrix products dominate
             self.critic_losses = compile_and_time(loss.critic_losses, "the critics' loss")
             self.actor_loss = compile_and_time(loss.actor_loss, "the actor's loss")
 
@@ -114,12 +114,12 @@ class CQLAlgorithm(QAlgorithm[CQL]):
         }
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
-        """Steps temperature, critics, actor and targets, in this order.
+        """Updates temperature, critics, actor and targets, in this order.
 
         A batch is transitions [B], or slices [N, T].
 
-        The actor runs once for all of them; the actor's loss sees critics and temperature after
-        their steps, as in d3rlpy.
+        The actor runs once for all losses; the actor's loss uses the critics and the temperature
+        after their updates, as in d3rlpy.
         """
         samples = self.sample_policy(batch)
         loss_alpha = self.loss.alpha_loss(samples)

@@ -65,7 +65,7 @@ class DiscreteCQLAlgorithm(QAlgorithm[DiscreteCQL]):
         return {"optimizer": self.optimizer, "buffer": self.buffer}
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
-        """Steps the values, then moves the target network, on transitions [B] or slices [N, T]."""
+        """Updates the values, then the target network, on transitions [B] or slices [N, T]."""
         losses = self.objective(batch)
         names = ("loss_qvalue", "loss_cql", "pred_value")
         terms = self.named(torch.stack([losses[name].detach() for name in names]))

@@ -1,4 +1,4 @@
-"""Shared by conservative Q-learning with continuous and with discrete actions."""
+"""The base class of conservative Q-learning with continuous and with discrete actions."""
 
 from __future__ import annotations
 

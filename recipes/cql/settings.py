@@ -18,7 +18,7 @@ class QRecipe(TransitionRecipe):
     gamma: Fraction = 0.99
     """Discount factor."""
     tau: Fraction = 0.005
-    """Step of the target networks towards the networks at each gradient step, from 0 to 1."""
+    """Coefficient of the soft update of the target networks at each gradient step, from 0 to 1."""
     conservative_weight: Weight = 5.0
     """Weight of the conservative term."""
     adam_eps: Weight = 1e-8
@@ -30,7 +30,7 @@ class QRecipe(TransitionRecipe):
     """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
     at the start. "auto" compiles if the run is long enough to be worth it. On a CPU, continuous CQL
     compiles only the policy, because compiling does not speed up the critics' matrix products.
-    Discrete CQL is compiled only on a GPU, and slices of several transitions are not."""
+    Discrete CQL is compiled only on a GPU, and slices of several transitions are never compiled."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,7 +59,7 @@ class CQL(QRecipe, algorithm="cql", builds=f"{__package__}.algorithm:CQLAlgorith
     temperature_learning_rate: Rate = 1e-4
     """Learning rate of Adam for the temperature."""
     temperature_init: Positive = 1.0
-    """Weight of the entropy at the start."""
+    """Initial weight of the entropy."""
     action_samples: Count = 10
     """Actions sampled in each state from each of: uniform, the policy at s, the policy at s'."""
     over_critics: Literal["mean", "sum"] = "mean"
@@ -76,7 +76,7 @@ class CQL(QRecipe, algorithm="cql", builds=f"{__package__}.algorithm:CQLAlgorith
 class DiscreteCQL(
     QRecipe, algorithm="discrete-cql", builds=f"{__package__}.discrete:DiscreteCQLAlgorithm"
 ):
-    """Conservative Q-learning (arXiv 2006.04779) with a value for each action, on TorchRL's loss.
+    """Conservative Q-learning (arXiv 2006.04779) with a value for each action, and TorchRL's loss.
 
     The squared error is halved, as in TorchRL. The paper ran no discrete task offline.
     """

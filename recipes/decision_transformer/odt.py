@@ -105,10 +105,10 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
         return dict(zip(self.columns, [*values, *others], strict=True))
 
     def explore(self, number: int) -> Episodes:
-        """Plays a round's episodes side by side, with actions that are drawn, without dropout.
+        """Plays a round's episodes side by side, with sampled actions, without dropout.
 
         Args:
-            number: number of the round, which together with the recipe's seed sets its seeds.
+            number: number of the round, which determines its seeds together with the recipe's seed.
         """
         recipe = self.recipe
         seed = int(np.random.SeedSequence([recipe.seed, number]).generate_state(1)[0]) % 2**31
@@ -125,9 +125,9 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
 def make_lamb(parameters: list[nn.Parameter], learning_rate: float, weight_decay: float) -> Lamb:
     """Builds LAMB (arXiv 1904.00962) as in the release of Online Decision Transformer.
 
-    Weight decay is part of the update whose norm is compared with that of the weights. The latter
-    norm is not clipped at 10, which wide layers reach, and the step is not divided by a bias
-    correction, which the norms cancel.
+    Weight decay is part of the update whose norm is compared with the norm of the weights. The
+    latter is not clipped at 10, which wide layers reach. The step is not divided by a bias
+    correction, because the norms would cancel it.
     """
     optimizer = Lamb(
         parameters,

@@ -19,20 +19,20 @@ from torchrl_tit.datasets import (
 )
 
 _LIMIT = 1 - 1e-6
-"""The largest action that a squashed Gaussian gives a finite likelihood."""
+"""The largest action to which a squashed Gaussian assigns a finite likelihood."""
 
 
 class OnlineData:
     """Draws batches from a data set; after the first rollout, from a first-in first-out store.
 
-    The store begins with the best episodes of the data set. Each episode that is added replaces the
-    oldest one; those of the data set go first, from the worst to the best.
+    The store initially holds the best episodes of the data set. Each added episode replaces the
+    oldest one; those of the data set are replaced first, from the worst to the best.
 
     Args:
         episodes: the data set.
         make_storage: cuts windows out of episodes.
         batch_size: windows in a batch.
-        capacity: episodes in the store.
+        capacity: number of episodes in the store.
         seed: seed for sampling.
     """
 
@@ -57,7 +57,7 @@ class OnlineData:
         self._buffer = self._make_buffer()
 
     def sample(self) -> TensorDictBase:
-        """Draws a batch, with actions clipped to those that a squashed Gaussian can give."""
+        """Draws a batch, with actions clipped to those that a squashed Gaussian can produce."""
         batch = self._buffer.sample()
         batch["action"].clamp_(-_LIMIT, _LIMIT)
         return batch

@@ -37,11 +37,11 @@ def scale_noise(actor: TensorDictModuleBase, factor: float) -> TensorDictModuleB
 
 
 def play_episodes(env: EnvBase, policy: TensorDictModuleBase) -> Episodes:
-    """Plays one episode in each of the environments that are stepped side by side.
+    """Plays one episode in each of several environments, which are stepped side by side.
 
     Args:
         env: the environments, [N].
-        policy: acts in them.
+        policy: the policy that acts in them.
     """
     steps: list[TensorDictBase] = []
     tensordict = env.reset()
@@ -54,7 +54,7 @@ def play_episodes(env: EnvBase, policy: TensorDictModuleBase) -> Episodes:
 
 
 def _first_episode(steps: TensorDictBase) -> Episodes:
-    """Makes an episode of the steps [T] of an environment, up to its first end."""
+    """Builds an episode from the steps [T] of an environment, up to the first end."""
     ends = steps["next", "done"].flatten().nonzero()
     steps = steps[: int(ends[0]) + 1]
     terminated = steps["next", "terminated"].flatten()

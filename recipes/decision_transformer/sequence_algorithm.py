@@ -1,4 +1,4 @@
-"""Shared by Decision Transformer and Online Decision Transformer: network, task and data."""
+"""Network, task and data that Decision Transformer and Online Decision Transformer share."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         return self.agent
 
     def acting_networks(self) -> nn.Module:
-        """The same: the environments normalise observations."""
+        """The same networks, because the environments normalise observations."""
         return self.agent
 
     def make_env(
@@ -105,7 +105,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         Episodes of a task without a time limit are truncated after ``max_ep_len`` steps.
 
         Args:
-            num_envs: environments that are stepped side by side.
+            num_envs: number of environments, which are stepped side by side.
             seed: seed of the first environment.
             target_return: the return that the network aims for; the recipe's first one if None.
             **settings: further settings of the task.
@@ -119,7 +119,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         key = "observation"
         transforms = [TargetReturn(target_return)]
         if self.normalizes:
-            key = "normalized_observation"  # new data keep the observation as it is
+            key = "normalized_observation"  # new data keep the original observation
             normalization = ObservationNorm(
                 agent.mean,
                 agent.std,
@@ -211,7 +211,7 @@ def check_data(recipe: SequenceRecipe, episodes: Episodes) -> None:
 
 
 def warn_of_targets(target_returns: Sequence[float], episodes: Episodes) -> None:
-    """Warns of target returns that lie outside the returns of the data's episodes."""
+    """Warns about target returns that lie outside the returns of the data's episodes."""
     returns = episodes.returns[episodes.finished.cpu()]
     low, high = returns.min().item(), returns.max().item()
     outside = [target for target in target_returns if not low <= target <= high]

@@ -38,15 +38,16 @@ class SequenceRecipe(DatasetRecipe):
     """The network: linear frames (DT) or an inner transformer (DT_TIT), and a decision-transformer
     as the history encoder. Its number of frames is that of a training window."""
     action_space: ActionSpace = "continuous"
-    """How actions are predicted: "continuous" ones within -1..1 by a tanh; "gaussian" ones by mean
-    and standard deviation of a Gaussian that a tanh squashes; "discrete" ones by logits."""
+    """How actions are predicted: "continuous" predicts actions within -1..1 with a tanh; "gaussian"
+    predicts the mean and standard deviation of a tanh-squashed Gaussian; "discrete" predicts
+    logits."""
     target_returns: Reals
     """Target returns of the evaluations."""
     return_scale: Positive = 1000.0
     """Divisor of the returns-to-go."""
     acting_num_frames: Frames | None = None
-    """Number of steps that the network reads when it acts; at most, and by default, the length of a
-    training window."""
+    """Number of steps that the network reads when it acts; the length of a training window by
+    default and at most."""
     batch_size: Batch = 64
     """Windows in one gradient step."""
     learning_rate: Rate = 1e-4
@@ -56,7 +57,7 @@ class SequenceRecipe(DatasetRecipe):
     weight_decay: Weight = 1e-4
     """Weight decay, on every parameter."""
     max_grad_norm: Weight = 0.25
-    """Gradients are scaled down to this norm."""
+    """Maximum gradient norm; larger gradients are scaled down to it."""
     evaluation_episodes: Episodes = 100
     """Episodes for each target return, in every evaluation."""
 
@@ -144,8 +145,8 @@ class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorit
     action_space: ActionSpace = "gaussian"
     """How actions are predicted; always "gaussian" here."""
     acting_num_frames: Frames | None = 5
-    """Number of steps that the network reads when it acts; at most, and if null, the length of a
-    training window."""
+    """Number of steps that the network reads when it acts, at most the length of a training window;
+    null is that length."""
     batch_size: Batch = 256
     """Windows in one gradient step."""
     learning_rate: Rate = 1e-4
@@ -153,13 +154,13 @@ class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorit
     weight_decay: Weight = 5e-4
     """Weight decay, on every parameter."""
     alpha_init: Positive = 0.1
-    """Weight of the entropy at the start (the temperature)."""
+    """Initial weight of the entropy (the temperature)."""
     alpha_learning_rate: Rate = 1e-4
     """Learning rate of Adam for the temperature."""
     pretraining_updates: Steps = 5000
     """Gradient steps on the data set."""
     rounds: StepsOrNone = 1500
-    """Rounds after pre-training, each of new episodes and gradient steps."""
+    """Rounds after pre-training, each with new episodes and gradient steps."""
     episodes_per_round: Copies = 1
     """New episodes at the beginning of a round, played side by side."""
     updates_per_round: Steps = 300
@@ -167,10 +168,10 @@ class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorit
     online_return: Real
     """Target return of the episodes that are played for training."""
     exploration_scale: Positive = 1.0
-    """Factor on the actions' standard deviation in those episodes; below 1 for data of noisy
-    policies, because the network learns the noise too."""
+    """Factor on the actions' standard deviation in those episodes; use less than 1 for data of
+    noisy policies, because the network learns the noise too."""
     capacity: Batch = 1000
-    """Number of episodes in the store that the network trains on."""
+    """Number of episodes in the replay buffer."""
     evaluation_interval: Steps = 10
     """Rounds between evaluations; there is also one before the first round and one after the
     last."""

@@ -19,7 +19,7 @@ from .settings import DQN
 
 
 class DQNAlgorithm(ReplayAlgorithm[DQN]):
-    """TorchRL's loss of a value for each action on a backbone, and its exploration.
+    """TorchRL's DQN loss and exploration, with a value for each action on a backbone.
 
     Args:
         recipe: the settings.
@@ -64,7 +64,7 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
 
     @property
     def behaviour(self) -> TensorDictModuleBase:
-        """The policy, and random actions with a probability that falls."""
+        """The policy, with random actions whose probability falls."""
         return self._behaviour
 
     def prepare(self, step: int, folder: Path) -> None:
@@ -91,7 +91,7 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         return terms
 
     def stored(self, batch: TensorDictBase) -> TensorDictBase:
-        """Selects what of a batch is stored, with clipped rewards if requested."""
+        """Selects the entries of a batch to store, with clipped rewards if requested."""
         stored = super().stored(batch)
         if self.recipe.clip_rewards:
             stored["next", "reward"] = stored["next", "reward"].sign()

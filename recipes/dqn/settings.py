@@ -27,33 +27,33 @@ class DQN(ReplayRecipe, algorithm="dqn", builds=f"{__package__}.algorithm:DQNAlg
     updates_per_step: Weight = 0.1
     """Gradient steps for each environment step."""
     buffer_size: Batch = 10_000
-    """Steps in the replay buffer; when it is full, new ones take the place of the oldest."""
+    """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
     batch_size: Batch = 128
     """Transitions in one gradient step, sampled with replacement from the buffer."""
     learning_rate: Rate = 2.5e-4
     """Learning rate of Adam."""
     double: bool = True
-    """Whether the trained network chooses the action whose value the target network gives, or the
-    target network does both."""
+    """Whether the trained network chooses the next action and the target network evaluates it
+    (double Q-learning); otherwise the target network does both."""
     loss_function: Literal["l2", "smooth_l1"] = "l2"
-    """What is minimised of the temporal difference error: its square, or Huber's loss, whose
-    gradient is clipped as in the Nature paper."""
+    """Loss on the temporal difference error: its square, or the Huber loss, whose gradient is
+    clipped as in the Nature paper."""
     final_epsilon: Fraction = 0.05
     """Probability of a random action at the end of exploration; at the start it is 1."""
     exploration_fraction: Fraction = 0.5
-    """Part of all steps during which that probability falls, linearly, after the random steps."""
+    """Fraction of all steps over which that probability falls linearly, after the random steps."""
     target_interval: Steps = 50
     """Gradient steps between updates of the target network."""
     tau: Fraction = 1.0
-    """Step of the target network towards the network at each of its updates; 1 copies it."""
+    """Coefficient of the soft update of the target network; 1 copies the network."""
     mask_actions: bool = False
-    """Whether actions that the task does not allow are never taken; see docs/environments.md."""
+    """Whether to mask actions that the task does not allow; see docs/environments.md."""
     clip_rewards: bool = False
     """Whether the network learns from the signs of rewards, as is usual for Atari."""
 
     @property
     def schedules(self) -> tuple[str, ...]:
-        """Exploration, which takes a part of the run."""
+        """Exploration, which takes a fraction of the run."""
         return ("exploration_fraction",) if self.exploration_fraction else ()
 
     @property

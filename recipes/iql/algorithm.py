@@ -25,7 +25,7 @@ _RETURN_RANGE = 1000.0
 
 
 class IQLAlgorithm(TransitionAlgorithm[IQL]):
-    """TorchRL's losses of an actor on a backbone, two critics and a state value.
+    """TorchRL's IQL losses, with an actor on a backbone, two critics and a state value.
 
     Args:
         recipe: the settings.
@@ -46,7 +46,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
                 f"iql needs arrays of continuous actions or a few discrete ones, but those of "
                 f"{recipe.env} are {describe(spec)}: use a bc recipe"
             )
-        # TorchRL's loss hides from the critics what the actor does not declare: "observation".
+        # TorchRL's loss hides keys from the critics that the actor does not declare: "observation".
         backbone = self.make_backbone(slices=True)
         self._policy = make_cloning_policy(backbone, spec).to(self.device)
         critics = [self._make_critic("state_action_value") for _ in range(2)]
@@ -61,7 +61,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
             expectile=recipe.expectile,
             **({"action_space": "categorical"} if make_loss is DiscreteIQLLoss else {}),
         )
-        if self.device.type == "cpu":  # where two products are faster than a stacked one
+        if self.device.type == "cpu":  # two matrix products are faster there than a batched one
             self.loss.deactivate_vmap = True
             self.loss._make_vmap()
         self.loss.make_value_estimator(gamma=recipe.gamma)
@@ -83,7 +83,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         return {"optimizer": self.optimizer, "buffer": self.buffer}
 
     def load_data(self) -> Episodes:
-        """As :meth:`TransitionAlgorithm.load_data`, with rewards as the paper scales them.
+        """As :meth:`TransitionAlgorithm.load_data`, with rewards scaled as in the paper.
 
         Raises:
             DatasetError: if rewards are to be scaled, but the returns of all episodes are the same.
@@ -104,7 +104,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         return replace(episodes, rows=rows)
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
-        """Steps value, critics and actor at once, then the targets.
+        """Updates value, critics and actor together, then the targets.
 
         A batch is transitions [B], or slices [N, T].
         """
@@ -124,7 +124,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         return named
 
     def _make_critic(self, out_key: str) -> TensorDictModuleBase:
-        """Builds a state value, or Q: of the action, or of each discrete action."""
+        """Builds a state value, or Q of the action or of each discrete action."""
         recipe, spec = self.recipe, self.action_spec
         discrete = is_discrete(spec)
         of_actions = out_key == "state_action_value"

@@ -11,7 +11,7 @@ from ..transition_recipe import ActorCriticRecipe
 
 @dataclass(frozen=True, kw_only=True)
 class IQL(ActorCriticRecipe, algorithm="iql", builds=f"{__package__}.algorithm:IQLAlgorithm"):
-    """Implicit Q-learning (arXiv 2110.06169), with continuous or with discrete actions.
+    """Implicit Q-learning (arXiv 2110.06169), with continuous or discrete actions.
 
     The defaults are those of the paper for MuJoCo.
     """
@@ -19,7 +19,7 @@ class IQL(ActorCriticRecipe, algorithm="iql", builds=f"{__package__}.algorithm:I
     learning_rate: Rate = 3e-4
     """Learning rate of Adam for all networks."""
     decay_learning_rate: bool = True
-    """Whether the actor's learning rate falls to 0 along a cosine."""
+    """Whether the actor's learning rate decays to 0 on a cosine schedule."""
     expectile: Inside = 0.7
     """Expectile of Q(s, a) over the data's actions that V(s) estimates; 0.5 is the mean."""
     temperature: Weight = 3.0
@@ -30,5 +30,5 @@ class IQL(ActorCriticRecipe, algorithm="iql", builds=f"{__package__}.algorithm:I
 
     @property
     def schedules(self) -> tuple[str, ...]:
-        """The actor's learning rate, where it falls to 0 at the end."""
+        """The actor's learning rate, if it decays to 0."""
         return ("decay_learning_rate",) if self.decay_learning_rate else ()

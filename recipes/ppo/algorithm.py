@@ -98,29 +98,29 @@ class Agent(nn.Module):
             return self.backbone(samples)
 
     def rollout(self, batch: TensorDictBase) -> Rollout:
-        """Lays the frames of a collected batch out for windows; see :class:`Rollout`."""
+        """Arranges the frames of a collected batch for windows; see :class:`Rollout`."""
         backbone, network = self.backbone, self.recipe.backbone
         keys = backbone.sequence_keys.observations
         return Rollout(batch, network.num_frames, self.recipe.padding, keys)
 
     @property
     def state_keys(self) -> list[str]:
-        """What the network reads besides observations: its state, if it carries one."""
+        """The keys that the network reads besides observations: its state, if it carries one."""
         states = self.backbone.state_shapes
         return [*states, "is_init"] if states else []
 
     @property
     def step_keys(self) -> list[str]:
-        """What a step is trained on besides its observation."""
+        """The keys of a step that training needs besides its observation."""
         masks = [] if self.mask_key is None else [self.mask_key]
         results = ["action", "action_log_prob", "advantage", "value_target"]
         return [*self.state_keys, *masks, *results]
 
     def update_statistics(self, frames: Sequence[Tensor]) -> None:
-        """Adds a batch to the statistics by which observations are normalised.
+        """Adds a batch to the statistics that normalise observations.
 
         Args:
-            frames: of each observation, [R, *observation_shape].
+            frames: frames of each observation, [R, *observation_shape].
         """
         for trunk in trunks_of(self.backbone.module).values():
             for encoder, table in zip(trunk.frame_encoders.values(), frames, strict=True):
@@ -129,7 +129,7 @@ class Agent(nn.Module):
 
     @property
     def policy(self) -> TensorDictModuleBase:
-        """History in; features, action, its log-probability and the state's value out."""
+        """The policy: histories in; features, action, its log-probability and state value out."""
         return TensorDictSequential(self.backbone, self.actor, self.critic)
 
 
@@ -195,7 +195,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         self.optimizer = torch.optim.Adam(
             [self.parameters], lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
         )
-        # The length of sequences depends on where episodes begin, so those are not compiled.
+        # Sequence lengths depend on where episodes begin, so recurrent networks are not compiled.
         compiled = not recipe.is_recurrent and should_compile(recipe.compile, recipe.gradient_steps)
         self.objective: Callable[[TensorDict], tuple[Tensor, Tensor]] = self._objective
         if compiled:
@@ -220,7 +220,7 @@ class PPOAlgorithm(Algorithm[PPO]):
     def batches(self) -> Iterator[TensorDictBase]:
         """Yields collected batches, [envs, time]."""
         for batch in self.collector:
-            # Of several synchronous collectors: [collectors, envs, time].
+            # Several synchronous collectors yield [collectors, envs, time].
             yield batch.flatten(0, 1) if batch.ndim == 3 else batch
 
     def size(self, batch: TensorDictBase) -> int:
@@ -313,14 +313,14 @@ class PPOAlgorithm(Algorithm[PPO]):
             self.policy(env.reset())
 
     def close(self) -> None:
-        """Ends environments and processes."""
+        """Closes environments and processes."""
         self.collector.shutdown()
 
     def _step(self, minibatch: TensorDict) -> Tensor:
         """Takes a gradient step; returns its terms, float [terms]."""
         total, values = self.objective(minibatch)
         assert self.parameters.grad is not None
-        self.parameters.grad.zero_()  # those of all layers are views of it
+        self.parameters.grad.zero_()  # the gradients of all layers are views of it
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.recipe.max_grad_norm)
         self.optimizer.step()
@@ -332,7 +332,7 @@ class PPOAlgorithm(Algorithm[PPO]):
             group["lr"] = learning_rate
 
     def _gradient_norms(self, minibatch: TensorDict) -> list[Tensor]:
-        """Norms of the gradients of the policy's and the value's loss on the backbone's weights."""
+        """The gradient norms of the policy's and the value's loss over the backbone's weights."""
         self.agent.encode(minibatch)
         terms = self.loss(minibatch)
         weights = list(self.agent.backbone.parameters())
@@ -361,7 +361,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         return total, torch.stack(values)
 
     def _contrastive_loss(self, steps: TensorDict) -> Tensor:
-        """CoBERL's contrastive loss, in a pass of its own: its transformer looks both ways."""
+        """CoBERL's contrastive loss, in a separate pass, because its attention is bidirectional."""
         backbone = self.agent.backbone
         histories = [steps[key] for key in backbone.history_keys]
         draws = torch.rand(histories[0].shape[:2], device=histories[0].device)
@@ -376,7 +376,7 @@ class PPOAlgorithm(Algorithm[PPO]):
             terms = torch.stack(steps)  # [gradient steps, terms]
             first = terms.isfinite().all(1).int().argmin()  # the first that is not finite, if any
             check_finite(self.terms, terms[first])
-        # A step that was too long shows in the next forward pass only, not in its own losses.
+        # A step that was too large shows only in the next forward pass, not in its own losses.
         value = self.agent.critic(self.agent.encode(samples))["state_value"].mean()
         weights = nn.utils.get_total_norm(self.parameters)
         check_finite(["weights", "value"], torch.stack([weights, value]))
@@ -450,7 +450,7 @@ def minibatches(
     Args:
         batch: [envs, time].
         rollout: its observations.
-        agent: the agent, for what its backbone reads.
+        agent: the agent, whose backbone determines the entries.
         recipe: the settings.
 
     Yields:

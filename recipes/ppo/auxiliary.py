@@ -1,4 +1,4 @@
-"""The self-supervised losses of a recipe, beside PPO's own."""
+"""The self-supervised losses of a recipe, in addition to PPO's own."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from .settings import PPO
 
 
 class AuxiliaryLosses(nn.Module):
-    """What ``next_frame_coeff`` and ``reconstruction_coeff`` add to the loss.
+    """The losses that ``next_frame_coeff`` and ``reconstruction_coeff`` add.
 
     They train the policy's trunk, if there are two. Without these settings it has no parameters.
 
     Args:
         recipe: the settings.
         backbone: reads the observations.
-        action_spec: of one action.
+        action_spec: spec of one action.
 
     Raises:
-        ValueError: if categories were to be reconstructed.
+        ValueError: if categories are to be reconstructed.
     """
 
     def __init__(self, recipe: PPO, backbone: Backbone, action_spec: TensorSpec) -> None:
@@ -80,7 +80,7 @@ class AuxiliaryLosses(nn.Module):
         return torch.stack(weighted).sum(), [loss.detach() for loss in losses]
 
     def update_targets(self, backbone: Backbone) -> None:
-        """Moves what is predicted towards the frame encoders, after a gradient step."""
+        """Moves the prediction targets towards the frame encoders, after a gradient step."""
         if "loss_next_frame" in self.weights:
             self.next_frame.update_target(_trunk(backbone).frames)
 
@@ -93,7 +93,7 @@ class ActionEntries(nn.Module):
     """Actions as rows of floats; categories are one-hot.
 
     Args:
-        spec: of one action.
+        spec: spec of one action.
 
     Example:
         >>> entries = ActionEntries(Categorical(3))

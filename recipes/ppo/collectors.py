@@ -28,12 +28,12 @@ def make_collector(
 ) -> BaseCollector:
     """Builds the collector of batches [num_envs, time]: in this process, in several, or on Ray.
 
-    Several share the environments, each with a copy of the policy. If they are asynchronous, a
-    batch comes from one of them.
+    Several processes share the environments, each with a copy of the policy. If they are
+    asynchronous, each batch comes from one of them.
 
     Args:
         recipe: the settings.
-        policy: history in, action out.
+        policy: the policy, from histories to actions.
         backbone: the policy's backbone.
         step: number of steps already done.
         compiled: whether to compile the policy where that pays off.
@@ -42,7 +42,7 @@ def make_collector(
     own: dict[str, Any] = {
         "trust_policy": True,  # ours is on the right device already
         "auto_register_policy_transforms": False,
-        "use_buffers": False,  # they would have the histories, which steps lack
+        "use_buffers": False,  # they would hold the histories, which steps lack
     }
     settings = {"frames_per_batch": recipe.steps_per_batch, "device": device, **own}
     share = recipe.num_envs // recipe.collectors
@@ -64,7 +64,7 @@ def make_collector(
             settings=own,
         )
     if recipe.collectors == 1:
-        # Which tokens are reused is decided between two parts that are compiled separately.
+        # The tokens to reuse are chosen between two parts that are compiled separately.
         whole = compiled and not backbone.keeps_frames
         return FrameCollector(
             _make_envs(recipe, backbone, recipe.num_envs, recipe.seed),

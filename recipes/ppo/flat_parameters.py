@@ -9,14 +9,14 @@ from torch import nn
 
 
 class FlatParameters:
-    """Lays parameters out in one tensor, and their gradients in another.
+    """Stores parameters in one tensor, and their gradients in another.
 
-    The parameters stay what they are, as views. On a network of small layers, the norm of the
-    gradients, their clipping and Adam's step take a third of the time on ``flat`` alone.
+    The parameters keep their values and become views. For a network of small layers, the gradient
+    norm, clipping and Adam's step take a third of the time if they run on ``flat`` alone.
 
     Args:
-        parameters: on one device and of one dtype. They must stay there: moving or casting a module
-            gives it memory of its own.
+        parameters: parameters on one device and of one dtype. They must stay there: moving or
+            casting a module gives it new memory.
 
     Example:
         >>> linear = nn.Linear(2, 2)

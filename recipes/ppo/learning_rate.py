@@ -31,7 +31,7 @@ class KLAdaptiveRate:
         self.factor = 1.0
 
     def update(self, kl: float) -> None:
-        """Adapts the factor to the divergence that an epoch measured."""
+        """Adapts the factor to the divergence measured in an epoch."""
         if kl > 2 * self.target:
             self.factor /= 1.5
         elif kl < self.target / 2:

@@ -40,13 +40,13 @@ class FrameCollector(ActingCollector):
 
 
 class Rollout:
-    """The frames of a batch, each once, and where the windows of its steps are.
+    """The frames of a batch, each stored once, and the positions of its steps' windows.
 
-    The frames of an environment are in order of time: the K - 1 that precede the batch, then the
-    observation of each step. Where an episode or the batch ends, the true next observation follows,
-    since it is the observation of no other step. That is at most
-    ``steps x envs + envs x K + episode ends`` frames. A frame consists of one tensor for each of
-    the observations, whose windows are the same.
+    The frames of an environment are in chronological order: the K - 1 that precede the batch, then
+    the observation of each step. Where an episode or the batch ends, the true next observation
+    follows, since it is the observation of no other step. That is at most
+    ``steps x envs + envs x K + episode ends`` frames. A frame consists of one tensor for each
+    observation; all observations have the same windows.
 
     Args:
         batch: of a :class:`FrameCollector`, [envs, time]. Its observations are removed.
@@ -86,18 +86,18 @@ class Rollout:
         self.padding = padding
         done = batch["next", "done"].squeeze(-1)
         is_init = done.roll(1, dims=1)
-        is_init[:, 0] = False  # whether or not: the window there is known
+        is_init[:, 0] = False  # even if one begins there: its window is known
         self.is_init = is_init.flatten()
         """Whether an episode begins, other than at the start of the batch, bool [steps]."""
         self.ends = done.clone()
-        """Whether the true next observation is none of the batch's, bool [envs, time]."""
+        """Whether the true next observation is not in the batch, bool [envs, time]."""
         self.ends[:, -1] = True
 
         envs, steps = done.shape
         ends = self.ends.flatten()
         past = num_frames - 1
-        # The row of a step: the frames that precede the batches of the environments up to its own,
-        # the steps before it, and the true next observations that follow some of these.
+        # The rows before a step are the frames that precede the batch in the environments up to its
+        # own, the earlier steps, and the true next observations that follow some of them.
         precede = torch.arange(1, envs + 1, device=done.device).repeat_interleave(steps) * past
         before = torch.arange(len(ends), device=done.device) + ends.cumsum(0) - ends.long()
         self.newest = precede + before
@@ -141,7 +141,7 @@ class Rollout:
         """Yields the windows of the true next states at ``ends``, in their order.
 
         Args:
-            max_frames: frames to encode at once, if there are more than a window has.
+            max_frames: maximum number of frames to encode at once, but at least one window.
 
         Yields:
             Frames, each once, [R, *observation_shape] of each observation, and windows on them,
@@ -159,5 +159,5 @@ class Rollout:
 
 
 def _in_pieces(entries: Tensor, count: int) -> Tensor:
-    """Cuts rows into equal pieces, the last ones filled up; [N, entries] -> [N, count, size]."""
+    """Cuts rows into equal pieces and pads the last ones; [N, entries] -> [N, count, size]."""
     return pad(entries, (0, -entries.shape[1] % count)).unflatten(1, (count, -1))

@@ -1,4 +1,4 @@
-"""Running scales of rewards and values, for tasks whose returns are of any size."""
+"""Running scales of rewards and values, for tasks with returns of any scale."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch import Tensor, nn
 class ReturnScale:
     """The running standard deviation of the discounted return, by which rewards are divided.
 
-    As `VecNormalize` of Stable-Baselines3 and OpenAI Baselines: the return of the rewards so far,
-    ``r_t + gamma * R_{t-1}``, begins at 0 with each episode. Here the statistics are those up to
+    As in `VecNormalize` of Stable-Baselines3 and OpenAI Baselines, the return of the rewards so
+    far, ``r_t + gamma * R_{t-1}``, starts at 0 in each episode. Here the statistics are those up to
     the end of a batch. TorchRL's `VecNormV2` and `RewardScaling` scale by single rewards, or by a
-    number that is known before.
+    number that is known in advance.
 
     Args:
         gamma: discount factor.
@@ -72,10 +72,11 @@ class ReturnScale:
 
 
 class AdvantageScale:
-    """The running deviation of advantages: the root mean square over all batches so far.
+    """The running standard deviation of advantages: the root mean square over all batches so far.
 
-    Once a task is solved, advantages are all but noise, ten to a hundred times smaller than before.
-    Divided by their own deviation alone, they would move the policy as far as ever.
+    Once a task is solved, advantages are almost pure noise, ten to a hundred times smaller than
+    before. Divided only by their own standard deviation, they would move the policy as far as
+    before.
 
     Example:
         >>> scale = AdvantageScale()
@@ -115,17 +116,17 @@ def normalize_advantages(advantage: Tensor, floor: float) -> Tensor:
 
 
 class ValueHead(nn.Module):
-    """A value head whose output follows the scale of the returns, and which can spare the features.
+    """A value head that adapts to the scale of the returns and can scale its gradient on features.
 
     The value is ``linear(features) * std + mean``, with the running mean and standard deviation of
-    the value targets (PopArt, arXiv 1602.07714). When these change, the linear layer is changed so
-    that all values stay what they were. A squared error divided by ``std ** 2`` is that of the
-    normalised values.
+    the value targets (PopArt, arXiv 1602.07714). When these change, the linear layer is adjusted so
+    that all values stay the same. A squared error divided by ``std ** 2`` is that of the normalised
+    values.
 
     Args:
         linear: the value head, [..., F] -> [..., 1].
         gradient: factor on the gradient that reaches the features; 0 stops it.
-        decay: share of the old statistics that each batch keeps.
+        decay: fraction of the old statistics that each batch keeps.
 
     Example:
         >>> head = ValueHead(nn.Linear(4, 1))

@@ -26,7 +26,7 @@ from ..recipe import Compile, Padding, Precision
 
 VectorizationMode = Literal["sync", "async"]
 
-# Longer sequences are faster, but their steps resemble each other more.
+# Longer sequences are faster, but their steps are more correlated.
 _LONGEST = 16
 
 
@@ -40,13 +40,14 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     padding: Padding = "same"
     """What fills a history before the first observation: that observation, or zeros."""
     hide_velocities: bool = False
-    """Whether observations lack the velocities, so that one observation is not enough."""
+    """Whether to remove velocities from observations, so that one observation is not enough."""
     mask_actions: bool = False
-    """Whether the policy chooses only actions that the task allows, by its action_mask."""
+    """Whether the policy chooses only actions that the task's action_mask allows."""
     num_envs: Copies = 1
     """Number of environments; they share the steps of a batch."""
     vectorization_mode: VectorizationMode = "sync"
-    """Whether environments run in this process or in one process each, for slow tasks."""
+    """Whether environments run in this process ("sync") or in one process each ("async", for slow
+    tasks)."""
     total_steps: Steps = 100_000
     """Environment steps to train for, rounded up to whole batches."""
     steps_per_batch: Batch = 2048
@@ -54,8 +55,8 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     minibatch_size: Batch = 64
     """Steps in one gradient step."""
     sequence_length: Batch | None = None
-    """Length of the sequences of consecutive steps of which minibatches consist, for networks that
-    read several frames or carry a state; others train on single steps. In a sequence each frame is
+    """Length of the sequences of consecutive steps that make up a minibatch, for networks that read
+    several frames or carry a state; others train on single steps. Within a sequence, each frame is
     encoded once for all steps that read it. Must divide minibatch_size and an environment's steps
     in a batch; by default the largest divisor of both and of 16."""
     epochs: Steps = 10
@@ -69,7 +70,7 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     adam_eps: Weight = 1e-5
     """Epsilon of Adam."""
     max_grad_norm: Weight = 0.5
-    """Gradients are scaled down to this norm."""
+    """Maximum gradient norm; larger gradients are scaled down to it."""
     clip_epsilon: Fraction = 0.2
     """Clipping range of the probability ratio, before it decays."""
     decay_clip_epsilon: bool = False
@@ -99,28 +100,28 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     """Whether rewards are divided by the running standard deviation of the discounted return, as
     in VecNormalize of Stable-Baselines3 (arXiv 2005.12729, "reward scaling")."""
     advantage_floor: Weight = 0.0
-    """Least standard deviation by which a minibatch's advantages are divided. With 0, advantages
-    that are all but noise, as of a task that is solved, move the policy as far as any others. With
-    normalize_rewards, 1 is the deviation of the discounted return (DreamerV3 divides by at least 1
-    in the same way, arXiv 2301.04104)."""
+    """Lower bound on the standard deviation by which a minibatch's advantages are divided. With 0,
+    advantages that are almost pure noise, as on a solved task, move the policy as far as any
+    others. With normalize_rewards, 1 is the standard deviation of the discounted return (DreamerV3
+    also divides by at least 1, arXiv 2301.04104)."""
     running_advantage_floor: Weight = 0.0
-    """The same, as a share of the running deviation of the advantages of all batches so far, for
-    tasks whose advantages differ in size. The larger of both floors counts."""
+    """The same, as a fraction of the running standard deviation of the advantages of all batches so
+    far, for tasks whose advantages differ in scale. The larger of the two floors applies."""
     normalize_values: bool = False
-    """Whether the critic learns values with the running mean 0 and standard deviation 1 (PopArt,
-    arXiv 1602.07714; arXiv 2006.05990, "value function normalization")."""
+    """Whether the critic learns values normalised to a running mean of 0 and standard deviation of
+    1 (PopArt, arXiv 1602.07714; arXiv 2006.05990, "value function normalization")."""
     value_gradient: Weight = 1.0
     """Factor on the gradient of the value loss where it enters a backbone that policy and value
-    share; 0 trains the backbone on the policy's loss alone (arXiv 2009.04416 compares)."""
+    share; 0 trains the backbone on the policy's loss alone (compared in arXiv 2009.04416)."""
     normalize_observations: bool = False
-    """Whether the network reads observations with the running mean 0 and standard deviation 1 (as
-    in VecNormalize; arXiv 2006.05990, "observation normalization"): those of each entry of an
-    array, and of each channel of an image."""
+    """Whether the network reads observations normalised to a running mean of 0 and standard
+    deviation of 1, per entry of an array and per channel of an image (as in VecNormalize; arXiv
+    2006.05990, "observation normalization")."""
     target_kl: Positive | None = None
-    """KL divergence that an update should have; see at_target_kl."""
+    """Target KL divergence of an update; see at_target_kl."""
     at_target_kl: Literal["stop", "adapt"] = "stop"
     """With a target_kl: "stop" ends an update after the epoch that exceeds it (as in OpenAI's
-    Spinning Up), "adapt" follows it with the learning rate (as in rl_games and skrl)."""
+    Spinning Up), "adapt" adjusts the learning rate to approach it (as in rl_games and skrl)."""
     residual_gain: Weight = 1.0
     """Factor on the initial output weights of attention and FFN in each block; 0 makes every block
     the identity at the start (arXiv 1901.09321, 2003.04887)."""
@@ -129,8 +130,8 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     gae_lambda: Fraction = 0.95
     """Lambda of generalised advantage estimation (arXiv 1506.02438)."""
     bootstrap_time_limit: bool = True
-    """Whether the value of the last state continues an episode that a time limit truncated. The
-    paper's runs (SB3 1.3.0) treated time limits as terminations."""
+    """Whether to bootstrap from the value of the last state when a time limit truncates an episode.
+    The paper's runs (SB3 1.3.0) treated time limits as terminations."""
     initialization: Literal["orthogonal", "own"] = "orthogonal"
     """Initialisation of the backbone: orthogonal, as in Stable-Baselines3 and so in the paper's
     online runs, or the network's own (TIT: normal with a standard deviation of 0.02)."""
@@ -140,14 +141,14 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     """Environment steps between checkpoints."""
     collectors: Copies = 1
     """Number of processes that collect, each with its share of the environments; 1 collects in the
-    training process, if ray is not set. Several are for slow environments. A run with several can
+    training process, unless ray is set. Use several for slow environments. A run with several can
     be resumed, but then draws other random numbers than an uninterrupted run."""
     ray: str | None = None
     """Address of a Ray cluster whose machines the collectors run on: auto, or HOST:PORT. See
     docs/recipes.md."""
     async_collection: bool = False
-    """Whether several collectors continue to collect during updates. A batch then comes from one of
-    them, and its policy is up to one update old."""
+    """Whether several collectors continue to collect during updates. Each batch then comes from one
+    collector, whose policy is up to one update old."""
     compile: Compile = "auto"
     """Whether collection and update run through torch.compile, which needs a C++ compiler and about
     a minute at the start. "auto" compiles if that works and the run is long enough to be worth it.
@@ -160,7 +161,7 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
         super().__post_init__()
         if self.steps_per_batch < 2:
             raise ValueError(f"steps_per_batch must be at least 2, not {self.steps_per_batch}")
-        check_at_least(self, minibatch_size=2)  # an advantage alone has no standard deviation
+        check_at_least(self, minibatch_size=2)  # a single advantage has no standard deviation
         _check_divides(self, "num_envs", "steps_per_batch", self.steps_per_batch)
         _check_divides(self, "collectors", "num_envs", self.num_envs)
         if self.contrastive_coeff and not isinstance(self.backbone.history, CoBERL):
@@ -201,7 +202,7 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
 
     @property
     def steps_per_sequence(self) -> int:
-        """``sequence_length``, or its default; 1 where it has no meaning."""
+        """``sequence_length``, or its default; 1 where it does not apply."""
         if not self.reads_sequences:
             return 1
         steps = self.steps_per_batch // self.num_envs
@@ -220,7 +221,7 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
 
     @property
     def schedules(self) -> tuple[str, ...]:
-        """What falls to 0 at the end: learning rate, clipping range, weight of the entropy."""
+        """What falls to 0 over the run: learning rate, clipping range, weight of the entropy."""
         fields = ("decay_learning_rate", "decay_clip_epsilon", "decay_entropy_coeff")
         return tuple(field for field in fields if getattr(self, field))
 
@@ -233,7 +234,7 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
 
 
 def _check_divides(recipe: PPO, field: str, name: str, value: int) -> None:
-    """Raises ValueError if a field does not divide something."""
+    """Raises ValueError if a field does not divide a value."""
     if value % getattr(recipe, field):
         raise ValueError(
             f"{field} {getattr(recipe, field)} does not divide {name} {value}: change one of them"

@@ -13,7 +13,7 @@ from ..cql.settings import QRecipe
 from .ppo_atari import ATARI_RECIPES
 
 # Task name: environment and entries of an observation. The paper evaluated in D4RL's own
-# environments, MuJoCo's v2; v4 is nearest to that.
+# environments, MuJoCo's v2; v4 is closest to it.
 _TASKS = {
     "halfcheetah": ("HalfCheetah-v4", 17),
     "hopper": ("Hopper-v4", 11),

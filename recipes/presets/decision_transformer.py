@@ -7,8 +7,8 @@ from torchrl_tit.settings.networks import decision_transformer, dt_tit
 from ..decision_transformer import DT, ODT
 from ..recipe import Recipe
 
-# Task name: environment and target returns (arXiv 2106.01345, appendix). The paper ran the tasks'
-# D4RL's data are of the tasks' v2; v4 is nearer to that than v5.
+# Task name: environment and target returns (arXiv 2106.01345, appendix). D4RL's data are from v2 of
+# the tasks; v4 is closer to it than v5.
 _TASKS = {
     "halfcheetah": ("HalfCheetah-v4", (12000.0, 6000.0)),
     "hopper": ("Hopper-v4", (3600.0, 1800.0)),
@@ -46,8 +46,9 @@ def _online() -> list[ODT]:
                         embed_dim=512, num_blocks=4, num_heads=4, timestep_embedding=False
                     ),
                 ),
-                # What a CPU can do in minutes: a smaller network that learns faster, is asked for
-                # returns that are in the data, and sees as much when it acts as in training.
+                # Small runs, which a CPU finishes in minutes: a smaller network that learns faster,
+                # has target returns that occur in the data, and reads as many frames when it acts
+                # as in training.
                 ODT(
                     name=f"odt/{dataset}/{network}-small",
                     dataset=dataset,

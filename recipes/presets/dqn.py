@@ -1,6 +1,6 @@
 """DQN, which the paper does not use, with TIT and with the usual networks.
 
-CartPole has the settings of rl-baselines3-zoo and Pong those of CleanRL, but for the number of
+CartPole has the settings of rl-baselines3-zoo and Pong those of CleanRL, except for the number of
 environments and TIT's learning rate on CartPole.
 """
 
@@ -49,7 +49,7 @@ def _named() -> list[DQN]:
         exploration_fraction=0.1,
         target_interval=250,
         clip_rewards=True,
-        # Games cannot be saved: new ones begin at each checkpoint (docs/environments.md).
+        # Games cannot be saved, so new ones begin at each checkpoint (docs/environments.md).
         checkpoint_interval=500_000,
     )
     return [

@@ -1,4 +1,4 @@
-"""Behaviour cloning, IQL and TD3+BC on D4RL's sets of version 2, as in the papers of the latter."""
+"""Behaviour cloning, IQL and TD3+BC on D4RL's sets of version 2, as in the last two's papers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..iql import IQL
 from ..td3bc import TD3BC
 from ..transition_recipe import TransitionRecipe
 
-# D4RL's data are of the tasks' v2; v4 is nearer to that than v5.
+# D4RL's data are from v2 of the tasks; v4 is closer to it than v5.
 _TASKS = {"halfcheetah": "HalfCheetah-v4", "hopper": "Hopper-v4", "walker2d": "Walker2d-v4"}
 _KINDS = ("medium", "medium-replay", "medium-expert")
 # The MLP of the papers of IQL and TD3+BC. For TIT the whole observation is one patch, as in the

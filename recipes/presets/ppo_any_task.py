@@ -1,4 +1,4 @@
-"""The named recipes for tasks of one's own: PPO on whatever ``--env`` names."""
+"""The named recipes for your own tasks: PPO on any task that ``--env`` names."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torchrl_tit.settings.networks import lstm, mlp
 from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
 
-# Patches, and the encoders of several observations, follow from the task.
+# The task determines the patches, and the encoders of several observations.
 _NETWORKS: dict[str, Network] = {
     "enhanced-tit": reliable_tit("enhanced-tit", 4),
     "vanilla-tit": reliable_tit("vanilla-tit", 4),

@@ -1,7 +1,7 @@
 """The named recipes of classic control and MuJoCo (arXiv 2212.14538, table 2).
 
-All networks train with one set of settings. Those whose names end in "-protocol" have the paper's
-and its release's settings instead.
+All networks train with one set of settings. Recipes whose names end in "-protocol" use the settings
+of the paper and its release instead.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ _NETWORKS: dict[str, Network] = {
     "vanilla-tit": reliable_tit("vanilla-tit"),
     "enhanced-tit": reliable_tit("enhanced-tit"),
 }
-# The paper leaves open which settings of TIT were used where, within patch 1, width 32 or 64, two
-# blocks; these are the networks' defaults.
+# The paper does not say which settings of TIT were used for which task, within patch 1, width 32 or
+# 64, two blocks; these are the networks' defaults.
 _PROTOCOL: dict[str, Network] = {
     **_BASELINES,
     "vanilla-tit": vanilla_tit(),
     "enhanced-tit": enhanced_tit(),
 }
-# Published by the authors for this task alone.
+# The authors published these for this task only.
 _MOUNTAINCAR_PROTOCOL: dict[str, Network] = {
     "vanilla-tit": vanilla_tit(embed_dim=32, num_heads_inner=4, num_heads_outer=8, features_dim=64),
     "enhanced-tit": enhanced_tit(

@@ -23,8 +23,8 @@ _GAMES = {
     "pong": "ALE/Pong-v5",
     "spaceinvaders": "ALE/SpaceInvaders-v5",
 }
-# The paper leaves open which settings of TIT were used where, within two or four blocks, patch 6,
-# 12 or 42, width 64 or 128 and two or four heads.
+# The paper does not say which settings of TIT were used for which game, within two or four blocks,
+# patch 6, 12 or 42, width 64 or 128 and two or four heads.
 _HYPERPARAMETERS: dict[str, Any] = {
     "patch_size": 12,
     "embed_dim": 64,
@@ -53,7 +53,7 @@ _BASELINES: dict[str, Network] = {
 
 
 def _named(game: str) -> list[PPO]:
-    """All recipes of a game: the settings are those of rl-baselines3-zoo."""
+    """All recipes of a game, with the settings of rl-baselines3-zoo."""
     base = PPO(
         env=_GAMES[game],
         padding="constant",
@@ -69,12 +69,12 @@ def _named(game: str) -> list[PPO]:
         decay_clip_epsilon=True,
         entropy_coeff=0.01,
         clip_rewards=True,
-        # Games cannot be saved: new ones begin at each checkpoint (docs/environments.md).
+        # Games cannot be saved, so new ones begin at each checkpoint (docs/environments.md).
         checkpoint_interval=500_000,
     )
     recipes = {name: replace(base, backbone=network) for name, network in _BASELINES.items()}
-    # The skills of the baselines' own papers (for CoBERL arXiv 2107.05431); how long the warm-up is
-    # and which of their other skills "+tuned" had, arXiv 2212.14538 does not say.
+    # The techniques of the baselines' own papers (for CoBERL arXiv 2107.05431). arXiv 2212.14538
+    # does not say how long the warm-up is, or which of their other techniques "+tuned" had.
     tuned = replace(base, warmup_steps=200_000, initialization="own")
     recipes |= {
         "catformer-tuned": replace(

@@ -1,8 +1,8 @@
-"""The named recipes of tasks that only memory solves, for four kinds of memory.
+"""The named recipes of tasks that require memory, for four kinds of memory.
 
 All networks have the same frame encoder and about the same number of weights, and train with the
-one set of PPO settings. They differ in how they remember: the last four observations side by side,
-a recurrent state, a gated transformer over the last K observations, and TIT's outer blocks.
+same PPO settings. They differ in how they remember: the last four observations side by side, a
+recurrent state, a gated transformer over the last K observations, and TIT's outer blocks.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
 
 _T_MAZES = {10: 50_000, 50: 200_000}
-"""The number of steps by the corridor's length. At the junction, K just reaches the cue."""
+"""The number of steps by the corridor's length. At the junction, K frames just reach the cue."""
 
 _MINIGRIDS = {7: 1_000_000, 9: 2_000_000, 11: 4_000_000}
 """The number of steps by the size of the maze."""
@@ -32,12 +32,12 @@ def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[s
     """Returns the four memories by name.
 
     Args:
-        num_frames: number K of observations; 4 frames and the LSTM have none to choose.
+        num_frames: number K of observations; ``frames-4`` and ``lstm`` do not use it.
         patch_size: pixels along a side of an image's patch; an array is one patch.
     """
     patch: dict[str, Any] = {"patch_size": patch_size or "auto", "patch_weights": "own"}
     tit = reliable_tit("enhanced-tit", num_frames, **patch)
-    # TIT's inner transformer, of which the others read the class token of the last block alone.
+    # TIT's inner transformer; the other networks read only the class token of its last block.
     last = Inner(every_block=False, **patch)
     return {
         "frames-4": replace(tit, frame=last, history=MLP(hidden_dim=96), num_frames=4),

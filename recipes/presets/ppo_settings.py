@@ -1,6 +1,6 @@
-"""The one set of PPO settings with which transformers, and all other networks here, learn reliably.
+"""The set of PPO settings with which transformers, and all other networks here, learn reliably.
 
-docs/results/ppo_settings.md says how it was found, what each setting does, and what it reaches.
+docs/results/ppo_settings.md describes how it was found, what each setting does, and the results.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ PPO_SETTINGS: dict[str, Any] = {
     "steps_per_batch": 1024,
     "minibatch_size": 256,
     "decay_learning_rate": True,
-    # Observations, rewards and so values of size 1, whatever the task.
+    # Observations and rewards, and therefore values, are of scale 1 in every task.
     "normalize_observations": True,
     "normalize_rewards": True,
     # Once a task is solved, advantages are mostly noise, which must not count as much as a signal.
     "running_advantage_floor": 0.5,
-    # An update that has moved the policy so far ends early.
+    # An update that has moved the policy this far ends early.
     "target_kl": 0.02,
 }
 """Fields of the recipe; the others have their defaults, which are Stable-Baselines3's."""
@@ -29,10 +29,10 @@ _TIT: dict[str, Any] = {"patch_size": "auto", "patch_weights": "own"}
 
 
 def reliable_tit(name: str, num_frames: int = 1, **settings: Any) -> Network:
-    """Returns a TIT network that goes with these settings.
+    """Returns a TIT network that suits these settings.
 
-    An array is one patch, which has a bias; of an image, "auto" chooses the patch. Where several
-    frames are read, they are told apart.
+    An array is one patch, which has a bias; for an image, "auto" chooses the patch size. If several
+    frames are read, learned positions tell them apart.
 
     Args:
         name: enhanced-tit or vanilla-tit.

@@ -21,14 +21,14 @@ class Cell:
     recipe: str
     runs: int
     steps: int
-    """Steps of training, the fewest of all runs."""
+    """Training steps; the minimum over the runs."""
     mean: float
     """Mean of the runs' values."""
     std: float
     """Standard deviation of the runs' values (population)."""
     std_episodes: float
-    """Standard deviation over the episodes of a run, as the paper's online tables seem to give it;
-    the mean over the runs."""
+    """Standard deviation over the episodes of a run, as the paper's online tables seem to report
+    it; the mean over the runs."""
     iqm: float
     """Interquartile mean of the runs' values (arXiv 2108.13264)."""
     low: float
@@ -37,7 +37,7 @@ class Cell:
     """Upper end."""
     paper_mean: float
     """The paper's value; NaN if it has none. Recipes with other settings (-protocol, -tuned) have
-    that of the plain one."""
+    the value of the plain recipe."""
     paper_std: float
     changes: str = ""
     """Fields in which the runs differ from the recipe of that name, with the runs' values."""
@@ -46,7 +46,7 @@ class Cell:
     """What the values are: "return" or "normalized score"."""
 
     published: tuple[Published, ...] = ()
-    """What others report of the same task and kind of network."""
+    """What others report for the same task and kind of network."""
 
     @property
     def label(self) -> str:

@@ -1,4 +1,4 @@
-"""How much a trained agent reads of the observation that says what it has to do."""
+"""How much attention a trained agent pays to the observation that tells it what to do."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ class Decision:
     right: bool
     """Whether the episode's return is positive."""
     shares: list[float]
-    """What each outer block reads of the frames that show the cue, mean over heads."""
+    """Attention of each outer block to the frames that show the cue, mean over heads."""
     even: float
     """These frames' share of all K."""
 
 
 def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None) -> list[Decision]:
-    """Plays episodes whose first observation is the cue, and measures what their last step reads.
+    """Plays episodes whose first observation is the cue, and measures attention in their last step.
 
     The frames before an episode's first observation are copies of it, and count as the cue.
 
     Args:
         run: a run on a task whose first observation is the cue, such as TMaze-v0.
         episodes: number of episodes.
-        seed: seed of the first one; by default the evaluation's.
+        seed: seed of the first episode; by default the evaluation's.
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
@@ -73,7 +73,7 @@ def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None)
 
 
 def to_markdown(groups: dict[str, list[Decision]]) -> str:
-    """Writes a table of means: a row for the right and one for the wrong decisions of each run."""
+    """Writes a table of means: a row each for the right and the wrong decisions of a run."""
     lines = [
         "| run | decisions | episodes | each block reads of the cue "
         "| the block that reads most of it | an even share |",

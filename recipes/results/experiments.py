@@ -1,4 +1,4 @@
-"""Runs of the same settings, whatever their seed: what every comparison puts together."""
+"""Groups of runs with the same settings but different seeds, the unit of every comparison."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def find_runs(folders: Iterable[Path]) -> list[Run]:
 
 
 def group_runs(runs: Iterable[Run]) -> list[Experiment]:
-    """Puts the runs of the same settings together, whatever their seed and machine.
+    """Groups runs of the same settings, ignoring seed and machine.
 
     Args:
         runs: the runs.
@@ -87,10 +87,10 @@ def group_runs(runs: Iterable[Run]) -> list[Experiment]:
 
 
 def check_together(experiments: Sequence[Experiment]) -> None:
-    """Checks that experiments can be compared: that they have the same task and unit of steps.
+    """Checks that experiments can be compared, with the same task and unit of steps.
 
     Raises:
-        ValueError: if returns or steps of some do not share an axis.
+        ValueError: if their returns or steps cannot share an axis.
     """
     first = experiments[0]
     for other in experiments:
@@ -118,7 +118,7 @@ def label(name: str, changes: str) -> str:
 
 
 def changed_fields(before: Recipe, after: Recipe) -> str:
-    """Names the fields in which settings differ, whatever their seed and machine.
+    """Names the fields in which settings differ, ignoring seed and machine.
 
     Example:
         >>> from recipes.registry import get_recipe
@@ -137,7 +137,7 @@ def changed_fields(before: Recipe, after: Recipe) -> str:
 
 
 def fields_of(recipe: Recipe) -> dict[str, Any]:
-    """Returns all settings as in JSON, nested ones by their full names.
+    """Returns all settings as in JSON, with nested ones by their full names.
 
     Example:
         >>> from recipes.registry import get_recipe

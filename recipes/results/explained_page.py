@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from .explained_step import Choice, ExplainedStep, Seen
 
 _SIZE, _DPI = (9.6, 5.4), 80  # 768 x 432 pixels: films need even sides
-_SMALLEST = 84  # images are enlarged to that many pixels a side
+_SMALLEST = 84  # images are enlarged to this many pixels per side
 _STRIP = (740, 90)  # the frames under a timeline: twice the pixels that they take on the page
 _MOST_LABELS = 24
 _OPACITY = 0.65
@@ -29,7 +29,7 @@ class Page:
     the K steps with the frames under it, and the value so far.
 
     Args:
-        step: a step of the episode, which says what there is to draw.
+        step: a step of the episode, which determines the panels to draw.
         title: title of the page; without one, nothing is written above it.
         dpi: dots per inch; the page is 9.6 x 5.4 inches.
     """
@@ -78,7 +78,7 @@ class Page:
         Args:
             step: the step.
             pictures: the rendered task in the last steps, this one last, uint8 [height, width, 3].
-            values: of all steps so far, if the policy computes them.
+            values: values of all steps so far, if the policy computes them.
             number: number of the step, counted from 0.
 
         Returns:
@@ -100,7 +100,7 @@ class Page:
         if self._timeline is not None:
             assert step.attention is not None
             frames = step.attention.shape[-1]
-            # Before the episode's first step, its first picture stands for what was not there.
+            # The episode's first picture fills the frames before its first step.
             missing = [pictures[0]] * (frames - len(pictures))
             self._timeline.show(step.attention, strip or [*missing, *pictures[-frames:]])
         if self._trace is not None:
@@ -111,17 +111,17 @@ class Page:
 
 
 def lay_over(seen: Seen) -> list[np.ndarray]:
-    """Lays maps over images.
+    """Overlays maps on images.
 
     Args:
-        seen: K images and their maps. A map of all together is laid over the newest one.
+        seen: K images and their maps. A single map of all images is laid over the newest one.
 
     Returns:
-        K images, uint8 [H, W, 3], of at least 84 pixels a side.
+        K images, uint8 [H, W, 3], of at least 84 pixels per side.
     """
     images = [as_picture(frame) for frame in seen.frames]
     maps = [np.zeros_like(seen.maps[0])] * (len(images) - len(seen.maps)) + list(seen.maps)
-    largest = max(float(x.max()) for x in maps)  # frames compare within a step
+    largest = max(float(x.max()) for x in maps)  # makes frames of a step comparable
     return [
         _blend(image, x / largest if largest > 0 else x)
         for image, x in zip(images, maps, strict=True)
@@ -131,13 +131,13 @@ def lay_over(seen: Seen) -> list[np.ndarray]:
 def as_picture(frame: np.ndarray) -> np.ndarray:
     """Turns an observed image, [H, W] or [C, H, W] of any scale, into uint8 [H', W', 3].
 
-    Three channels are taken as colours, others averaged. Small images are enlarged.
+    Three channels are taken as colours; other channels are averaged. Small images are enlarged.
     """
     image = frame if frame.ndim == 3 else frame[None]
     image = image if len(image) == 3 else image.mean(0, keepdims=True).repeat(3, 0)
     image = image.astype(np.float64)
     if frame.dtype == np.uint8:
-        # Few values are symbols, such as MiniGrid's, not brightness.
+        # A small range of values means symbols, such as MiniGrid's, not brightness.
         scaled = image / max(image.max(), 1) if image.max() < 32 else image / 255
     elif image.min() >= 0 and image.max() <= 1:
         scaled = image
@@ -149,7 +149,7 @@ def as_picture(frame: np.ndarray) -> np.ndarray:
 
 
 def _blend(picture: np.ndarray, strength: np.ndarray) -> np.ndarray:
-    """Colours a picture [H, W, 3] by a map [h, w] of 0 to 1; where it is 0, the picture stays."""
+    """Colours a picture [H, W, 3] by a map [h, w] from 0 to 1; where it is 0, nothing changes."""
     sides = picture.shape[:2]
     cells = torch.from_numpy(np.ascontiguousarray(strength, dtype=np.float64))[None, None]
     smooth = F.interpolate(cells, sides, mode="bilinear")[0, 0].numpy().clip(0, 1)
@@ -175,7 +175,7 @@ class _Picture:
 
 
 class _Bars:
-    """A panel with a bar for each entry of an array: of the newest step, and of all before it."""
+    """A panel with bars for each entry of an array: the newest step's, and all earlier steps'."""
 
     def __init__(self, axes: Any, title: str, entries: int) -> None:
         places = np.arange(entries)
@@ -190,12 +190,12 @@ class _Bars:
         self._reach = 1e-9
 
     def show(self, maps: np.ndarray) -> None:
-        """Shows other shares, [K, entries]."""
+        """Shows new shares, [K, entries]."""
         newest, before = maps[-1], maps[:-1].sum(0)
         for bars, values in ((self._newest, newest), (self._before, before)):
             for bar, value in zip(bars, values, strict=True):
                 bar.set_width(float(value))
-        # The scale only grows, so that steps compare.
+        # The scale only grows, so that steps are comparable.
         self._reach = max(self._reach, 1.1 * float(np.abs(np.stack([newest, before])).max()))
         self._axes.set_xlim(-self._reach, self._reach)
 
@@ -263,7 +263,7 @@ class _Timeline:
     def show(self, attention: np.ndarray, pictures: list[np.ndarray]) -> None:
         """Shows the attention of another step, [blocks, heads, K], and the K frames."""
         self._image.set_data(attention.reshape(-1, attention.shape[-1]))
-        self._most = max(self._most, float(attention.max()))  # so that steps compare
+        self._most = max(self._most, float(attention.max()))  # so that steps are comparable
         self._image.set_clim(0, self._most)
         slot = (max(_STRIP[0] // len(pictures), 8), _STRIP[1])
         strip = np.concatenate([_thumbnail(picture, slot) for picture in pictures], 1)
@@ -294,7 +294,7 @@ class _Trace:
 
 
 def _thumbnail(picture: np.ndarray, slot: tuple[int, int]) -> np.ndarray:
-    """A small copy in the middle of a white rectangle of this width and height."""
+    """A small copy of a picture, centred in a white rectangle of this width and height."""
     scale = min((slot[0] - 2) / picture.shape[1], (slot[1] - 2) / picture.shape[0], 1)
     height, width = (max(1, round(side * scale)) for side in picture.shape[:2])
     pixels = torch.tensor(picture).permute(2, 0, 1).unsqueeze(0).float()

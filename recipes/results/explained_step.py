@@ -30,12 +30,12 @@ class Choice:
     """An action, and what it was chosen from."""
 
     title: str
-    """What the heights are."""
+    """The meaning of the heights."""
     labels: list[str]
     heights: np.ndarray
     """Probabilities or values of the options, or the entries of a continuous action, [n]."""
     spreads: np.ndarray | None
-    """The standard deviations of these entries, if the policy draws them, [n]."""
+    """The standard deviations of these entries, if the policy samples them, [n]."""
     chosen: list[bool]
     """Which were chosen; all entries of a continuous action."""
 
@@ -60,9 +60,9 @@ class ExplainedStep:
     """What a policy looked at in one step, and what it chose."""
 
     seen: dict[str, Seen]
-    """By the name of the observation; those that have no map are left out."""
+    """By the name of the observation; observations without a map are left out."""
     attention: np.ndarray | None
-    """How much the newest step reads of each, [blocks, heads, K], if there is attention."""
+    """Attention of the newest step to each step, [blocks, heads, K], if there is attention."""
     choice: Choice
     value: float | None
     """The value of the state, or of the action, if the policy computes one."""
@@ -74,9 +74,9 @@ class Explainer:
     Args:
         policy: the policy.
         target: what is explained; see :data:`~torchrl_tit.analysis.targets.Target`.
-        kind: which maps: Grad-CAM of images, integrated gradients, or attention rolled out over the
-            inner blocks. By default Grad-CAM of images that a convolution or an inner transformer
-            reads, and integrated gradients of everything else but categories.
+        kind: kind of maps: Grad-CAM of images, integrated gradients, or attention rolled out over
+            the inner blocks. By default Grad-CAM of images that a convolution or an inner
+            transformer reads, and integrated gradients of everything else but categories.
         layer: name of another layer for Grad-CAM.
 
     Raises:
@@ -107,10 +107,10 @@ class Explainer:
         """Explains a step.
 
         Args:
-            tensordict: of one environment, [1], after the policy has acted.
+            tensordict: tensordict of one environment, [1], after the policy has acted.
 
         Raises:
-            ValueError: if there are no such maps of this network, or its policy does not compute
+            ValueError: if there are no such maps for this network, or its policy does not compute
                 the target.
         """
         state = tensordict.detach()
@@ -160,7 +160,7 @@ def describe_choice(
 
     Args:
         outputs: what the policy wrote, [1].
-        distribution: that of its actions, if there is one.
+        distribution: distribution of its actions, if there is one.
     """
     action = outputs["action"][0]
     base: Any = getattr(distribution, "base_dist", distribution)
@@ -191,7 +191,7 @@ def describe_choice(
         )
     components = probabilities.flatten(0, -2)
     likely = components.argmax(-1)
-    # A component with fewer options than another has probabilities of 0 behind them.
+    # A component with fewer options than another is padded with probabilities of 0.
     pairs = [(c, o) for c, row in enumerate(components) for o in range(_options(row))]
     return Choice(
         "action probabilities",
@@ -203,7 +203,7 @@ def describe_choice(
 
 
 def _options(probabilities: Tensor) -> int:
-    """Options up to the last that is possible."""
+    """The number of options up to the last possible one."""
     return int(probabilities.nonzero().max()) + 1
 
 

@@ -27,7 +27,7 @@ _SUFFIXES = (*_FILMS, ".png")
 
 
 class _Enough(Exception):
-    """All that was asked for is drawn."""
+    """Everything that was requested is drawn."""
 
 
 def explain_policy(
@@ -47,14 +47,14 @@ def explain_policy(
     Args:
         make_env: makes the task, given the number of copies and ``render_mode``.
         policy: the policy.
-        name: what it is called in messages.
+        name: name of the policy in messages.
         out: the file to write, which must not exist yet: a film (GIF or MP4) of the episode, or a
             picture (PNG) of one step.
         seed: seed of the episode.
-        step: of a picture, the step to show, counted from 0, which is the default.
-        max_steps: of a film, the most steps to show; by default the whole episode.
-        title: what it is called on the page; by default ``name``.
-        **explanation: what :class:`~recipes.results.explained_step.Explainer` takes.
+        step: for a picture, the step to show, counted from 0, which is the default.
+        max_steps: for a film, the maximum number of steps to show; by default the whole episode.
+        title: name of the policy on the page; by default ``name``.
+        **explanation: arguments of :class:`~recipes.results.explained_step.Explainer`.
 
     Returns:
         The number of steps that are shown.
@@ -62,7 +62,7 @@ def explain_policy(
     Raises:
         FileExistsError: if there is such a file already.
         ValueError: if the file is of another kind, the episode ends before the step, the task
-            cannot be rendered, or the network has no such maps.
+            cannot be rendered, or there are no such maps for the network.
     """
     check_explanation(out, step, max_steps)
     explainer = Explainer(policy, **explanation)
@@ -77,7 +77,7 @@ def explain_policy(
     try:
         with (
             whole_or_not_at_all(out) as hidden,
-            # The writer chooses the format by the suffix, which the hidden name lacks.
+            # The writer infers the format from the suffix, which the hidden name lacks.
             TemporaryDirectory(prefix=".", dir=out.absolute().parent) as folder,
         ):
             reel = Path(folder, out.name)
@@ -114,7 +114,7 @@ def explain_policy(
 
 
 def check_explanation(out: Path, step: int | None, max_steps: int | None) -> None:
-    """Raises ValueError if a file, or the steps to show in it, are none that can be."""
+    """Raises ValueError if a file, or the steps to show in it, are invalid."""
     if out.suffix not in _SUFFIXES:
         raise ValueError(
             f"an explanation is a film (.gif, .mp4) or a picture of one step (.png), not "
@@ -131,7 +131,7 @@ def check_explanation(out: Path, step: int | None, max_steps: int | None) -> Non
 
 
 def _open(file: Path, fps: float) -> Any:
-    """Opens a film, or a picture, which takes one frame only."""
+    """Opens a film, or a picture, which holds only one frame."""
     if file.suffix == ".png":
         return imageio.get_writer(file, format="PNG-PIL", mode="i")
     return open_film(file, fps)

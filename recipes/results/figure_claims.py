@@ -1,4 +1,4 @@
-"""The paper's claims about its pictures as numbers, of trained runs on images."""
+"""The paper's claims about its pictures, measured on trained runs on images."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ _BATCH = 32
 
 @dataclass(frozen=True)
 class FigureClaims:
-    """What the paper reads off its pictures, measured on one run (arXiv 2212.14538, appendix)."""
+    """What the paper reads from its pictures, measured on one run (arXiv 2212.14538, appendix)."""
 
     share_on_objects: float
     """Share of the newest frame's Grad-CAM map that lies on objects, mean over steps."""
     area_of_objects: float
-    """The share that a uniform map has there, mean over the same steps."""
+    """The same share for a uniform map, mean over the same steps."""
     change: float
     """Share of the map that lies elsewhere in the next frame of the episode, mean over steps."""
     change_of_any: float
-    """The same between frames at random, mean: what a map changes that follows nothing."""
+    """The same between random pairs of frames, mean: the change of a map that follows nothing."""
     empty_maps: float
     """Share of the steps whose map is 0 everywhere, which the other means leave out."""
     attention: list[float] | None
-    """How much the newest step reads of each of the K steps, the oldest first: mean over steps,
+    """Attention of the newest step to each of the K steps, the oldest first: mean over steps,
     blocks and heads; None without attention over time, or with one frame."""
 
 
@@ -63,7 +63,7 @@ def measure_figure_claims(
     """Measures the paper's claims about its pictures on a trained run.
 
     The agent plays episodes with its most likely actions until there are enough steps. Objects are
-    what differs from the background of these frames.
+    everything that differs from the background of these frames.
 
     Args:
         run: a run on a task whose observation, or one of them, is an image.
@@ -111,7 +111,7 @@ def measure_figure_claims(
 
 
 def to_markdown(groups: dict[str, list[FigureClaims]]) -> str:
-    """Writes what was measured as Markdown: a table of maps, and one of attention over time."""
+    """Writes the measurements as Markdown: a table of maps, and one of attention over time."""
     lines = [
         "| recipe | runs | share of the map on objects | objects' share of the area "
         "| change to the next frame | change between any frames | empty maps |",
@@ -148,13 +148,13 @@ def to_markdown(groups: dict[str, list[FigureClaims]]) -> str:
 
 
 class _Enough(Exception):
-    """There are as many steps as were asked for."""
+    """There are as many steps as were requested."""
 
 
 def _play(
     make_env: Callable[[int], EnvBase], policy: TensorDictModuleBase, steps: int, seed: int
 ) -> tuple[list[TensorDictBase], Tensor]:
-    """Plays until there are so many steps: what the policy read and wrote, and their episodes."""
+    """Plays for a number of steps; returns what the policy read and wrote, and their episodes."""
     states: list[TensorDictBase] = []
     episodes: list[int] = []
     env = make_env(1)
@@ -181,7 +181,7 @@ def _attention(shares: list[Tensor], episode: Tensor, num_frames: int) -> list[f
     """The mean attention to each of the K steps, of windows that lie within their episode."""
     if not shares or num_frames == 1:
         return None
-    # Before that, an episode's first observation or zeros stand for what was not there.
+    # Earlier windows are padded with the episode's first observation or zeros.
     within = torch.zeros(len(episode), dtype=torch.bool)
     within[num_frames - 1 :] = episode[num_frames - 1 :] == episode[: len(episode) - num_frames + 1]
     if not within.any():

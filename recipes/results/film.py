@@ -30,7 +30,7 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
         recipe: The run's recipe; episode i begins from its ``evaluation_seed + i``.
         run: A run folder with a checkpoint.
         video: The GIF or MP4 file to write, which must not exist yet.
-        episodes: Number of episodes, one after the other in one film.
+        episodes: Number of episodes, shown one after another in one film.
 
     Returns:
         The return of each episode.
@@ -49,7 +49,7 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
 
 
 def check_film(video: Path) -> None:
-    """Raises ValueError if a file is not to be a GIF or MP4."""
+    """Raises ValueError if a file is neither a GIF nor an MP4."""
     if video.suffix not in _SUFFIXES:
         raise ValueError(f"a film is one of {', '.join(_SUFFIXES)}, not {video.name!r}")
 
@@ -68,19 +68,19 @@ def film_policy(
     Args:
         make_env: Makes the task, given the number of copies and ``render_mode``.
         policy: The policy.
-        name: What it is called in messages.
-        video: As that of :func:`film`.
-        episodes: Number of episodes, one after the other in one film.
+        name: Name of the policy in messages.
+        video: As in :func:`film`.
+        episodes: Number of episodes, shown one after another in one film.
         seed: Seed of the first episode; episode i begins from ``seed + i``.
-        max_pictures: Length of the film, after which the policy plays on unseen; by default all is
-            shown.
+        max_pictures: Length of the film, after which the policy plays on without being filmed; by
+            default, everything is shown.
 
     Returns:
         The return of each episode.
 
     Raises:
         FileExistsError: If there is such a file already.
-        ValueError: As :func:`film`.
+        ValueError: As in :func:`film`.
     """
     check_film(video)
     env = make_rendered(make_env, name)
@@ -88,7 +88,7 @@ def film_policy(
     try:
         with (
             whole_or_not_at_all(video) as hidden,
-            # The writer chooses the format by the suffix, which the hidden name lacks.
+            # The writer infers the format from the suffix, which the hidden name lacks.
             TemporaryDirectory(prefix=".", dir=video.absolute().parent) as folder,
         ):
             reel = Path(folder, video.name)
@@ -121,7 +121,7 @@ def take_picture(env: Any, name: str | Path) -> Any:
     """Renders a task, uint8 [height, width, 3]; raises ValueError if it cannot be rendered."""
     try:
         return env.render()[0]
-    except Exception as error:  # each task renders in its own way and has its own errors
+    except Exception as error:  # each task has its own renderer, with its own errors
         raise ValueError(
             f"{name} cannot be rendered: {str(error).rstrip('.')}; for MuJoCo without a "
             "screen, set the environment variable MUJOCO_GL to egl or osmesa"

@@ -11,7 +11,7 @@ from scipy.stats import bootstrap, trim_mean
 
 @dataclass(frozen=True)
 class Interval:
-    """An interquartile mean over runs, and its 95% interval; NaN of a single run."""
+    """An interquartile mean over runs, and its 95% interval, which is NaN for a single run."""
 
     iqm: float
     low: float
@@ -25,13 +25,13 @@ class Interval:
 
 
 def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
-    """Summarises a number of each run, as the tables of results do.
+    """Summarises one number per run, as in the tables of results.
 
     Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv
     2108.13264.
 
     Args:
-        values: one of each run (seed).
+        values: one value of each run (seed).
 
     Example:
         >>> interval_of([1.0, 2.0, 3.0, 10.0]).iqm
@@ -46,13 +46,13 @@ def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
 
 
 def intervals_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Summarises curves: as :func:`interval_of`, at every point.
+    """Summarises curves, as :func:`interval_of` does, at every point.
 
     Args:
         values: float [runs, points].
 
     Returns:
-        Interquartile means and both ends of their 95% intervals, float [points] each. Of a single
+        Interquartile means and both ends of their 95% intervals, float [points] each. For a single
         run, the ends are NaN.
 
     Example:

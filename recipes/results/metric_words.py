@@ -1,4 +1,4 @@
-"""What each metric says, in words: the one source of the reports and of docs/recipes.md."""
+"""Descriptions of the metrics: the single source of the reports and of docs/recipes.md."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TIMES = " * "
 
 @dataclass(frozen=True)
 class MetricWords:
-    """What a column of ``metrics.csv`` is, and how to read it. Code stands between backticks."""
+    """What a column of ``metrics.csv`` is, and how to read it. Code is between backticks."""
 
     column: str
     what: str
@@ -29,15 +29,15 @@ class MetricWords:
     high: str = ""
     """What it should not rise above."""
     needs: str = ""
-    """A column without whose change it means nothing."""
+    """A column that must vary for this one to be meaningful."""
 
 
 def words_of(algorithm: str, column: str) -> MetricWords:
-    """Looks up what a column of an algorithm's metrics says.
+    """Looks up the description of a column of an algorithm's metrics.
 
     Args:
         algorithm: the name of the algorithm.
-        column: the column; one that is not known is described by nothing but its name.
+        column: the column; an unknown one is described by its name alone.
 
     Example:
         >>> words_of("ppo", "clip_fraction").what
@@ -54,12 +54,12 @@ def words_of(algorithm: str, column: str) -> MetricWords:
 
 
 def known_columns(algorithm: str) -> list[str]:
-    """Lists the columns of an algorithm that are described, those that say most first."""
+    """Lists the described columns of an algorithm, the most informative first."""
     return [column for of, column in _read() if of in ("", algorithm)]
 
 
 def to_markdown(algorithm: str) -> str:
-    """Writes the table of an algorithm's metrics for the documents."""
+    """Writes the table of an algorithm's metrics for the documentation."""
     lines = ["| column | what it is | healthy | otherwise |", "|---|---|---|---|"]
     for column in known_columns(algorithm):
         words = words_of(algorithm, column)
@@ -94,7 +94,7 @@ def limit(formula: str, recipe: Recipe, values: Mapping[str, float]) -> float | 
 
 @cache
 def _read() -> dict[tuple[str, str], MetricWords]:
-    """All words, by algorithm (empty for all of them) and column."""
+    """All descriptions, by algorithm (empty for all of them) and column."""
     text = resources.files(__package__).joinpath("metrics.csv").read_text(encoding="utf-8")
     return {
         (algorithm, words.column): words

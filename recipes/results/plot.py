@@ -18,9 +18,9 @@ from ..metrics import read_metrics
 from ..run import Run
 from .cell import Cell
 
-# The longest name, in letters, for which two fit side by side below a figure.
+# Maximum length of names, in letters, for which two fit side by side below a figure.
 _WIDEST_OF_TWO = 40
-# Letters of a line beside a panel.
+# Maximum number of letters in a line beside a panel.
 _WIDEST_LABEL = 26
 
 
@@ -55,7 +55,7 @@ def plot_learning_curve(
     batch, batches = ("an evaluation", "evaluations") if offline else ("a batch", "batches")
     if not len(steps):
         axes.text(0.5, 0.5, "no episode has ended", ha="center", transform=axes.transAxes)
-    marker = "o" if len(steps) == 1 else "None"  # a line through one point cannot be seen
+    marker = "o" if len(steps) == 1 else "None"  # a line through one point is invisible
     axes.plot(
         steps, returns, marker=marker, ls="-", c="C0", alpha=0.35, lw=1, label=f"mean of {batch}"
     )
@@ -113,13 +113,13 @@ def plot_comparison(
 
 
 def plot_table(cells: Sequence[Cell], picture: Path) -> None:
-    """Draws cells beside the paper's values, one panel for each task and measure.
+    """Draws cells next to the paper's values, one panel for each task and measure.
 
     Args:
         cells: what :func:`~recipes.results.table.make_table` returns.
         picture: the PNG file to write.
     """
-    tasks: dict[tuple[str, str], list[Cell]] = {}  # of one measure: scores are no returns
+    tasks: dict[tuple[str, str], list[Cell]] = {}  # of one measure: scores are not returns
     for cell in cells:
         tasks.setdefault((cell.recipe.rpartition("/")[0], cell.measure), []).append(cell)
     columns = min(3, len(tasks))

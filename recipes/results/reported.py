@@ -1,4 +1,4 @@
-"""What others report of the same task, network and data: the paper's numbers and published ones."""
+"""What others report for the same task, network and data: the paper and published results."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TASK = (
     *("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions"),
     "backbone",
 )
-"""The fields that say which task is learned, and by which network."""
+"""The fields that determine which task is learned, and by which network."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def reported_of(recipe: Recipe) -> tuple[Result | None, tuple[Published, ...]]:
 
 
 def plain_name(name: str) -> str:
-    """The name without what says that its settings are others: "-tuned", "-protocol"."""
+    """The name without the suffix that marks other settings: "-tuned", "-protocol"."""
     if name in paper_results():
         return name
     return name.removesuffix("-tuned").removesuffix("-protocol")
@@ -113,5 +113,5 @@ def _part(recipe: Recipe, field: str) -> Any:
 
 
 def _stem(dataset: str) -> str:
-    """A data set's name, also if given as D4RL's file: "hopper_medium-v2.hdf5"."""
+    """A data set's name, also if it is given as D4RL's file: "hopper_medium-v2.hdf5"."""
     return Path(dataset).name.removesuffix(".hdf5").replace("_", "-")

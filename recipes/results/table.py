@@ -24,18 +24,19 @@ OTHER = "not in the paper"
 
 
 def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
-    """Reads run folders and puts the runs of the same settings together, whatever their seed.
+    """Reads run folders and groups runs of the same settings, ignoring seeds.
 
     Args:
         folders: run folders, or folders with run folders somewhere below.
 
     Returns:
         The cells, in the paper's order, and a note for each run that is left out, was evaluated
-        over another number of episodes than its recipe says, or was trained further with
+        over a different number of episodes than its recipe says, or was trained further with
         schedules that follow its length.
 
     Raises:
-        ValueError: if there is no evaluated run, or two of the same settings have the same seed.
+        ValueError: if there is no evaluated run, or two runs of the same settings have the same
+            seed.
     """
     evaluations: dict[Path, dict] = {}
     runs, notes = [], []
@@ -81,7 +82,7 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
 def to_markdown(cells: Sequence[Cell]) -> str:
     """Writes cells as Markdown, one table for each of the paper's.
 
-    A table in which others have published results of the same task and network has a column for
+    Where others have published results for the same task and network, the table has a column for
     them.
     """
     parts = []

@@ -50,8 +50,8 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
             )
         self._policy = _make_actor(self.make_backbone(), spec).to(self.device)
         size = spec.shape[0]
-        # Two critics keep their initial weights; TorchRL would copy a single one and initialise the
-        # copy anew.
+        # Two critics keep their initial weights; TorchRL would copy a single one and re-initialise
+        # the copy.
         critics = [
             make_critic(
                 self.observation,

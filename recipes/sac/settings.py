@@ -17,7 +17,7 @@ class SAC(ReplayRecipe, algorithm="sac", builds=f"{__package__}.algorithm:SACAlg
     learning_rate: Rate = 3e-4
     """Learning rate of Adam for actor, critics and temperature."""
     tau: Fraction = 0.005
-    """Step of the target critics towards the critics at each gradient step, from 0 to 1."""
+    """Coefficient of the soft update of the target critics at each gradient step, from 0 to 1."""
     critic: Literal["mlp", "backbone"] = "mlp"
     """Whether the critics read the newest observation, or each has a backbone with the actor's
     settings."""

@@ -1,1 +1,1 @@
-"""Many runs: recipes and seeds in worker processes on this machine or a cluster, and searches."""
+"""Many runs: sweeps over recipes and seeds on this machine or a cluster, and searches."""

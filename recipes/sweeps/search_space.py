@@ -1,4 +1,4 @@
-"""Search spaces as data: which fields of a recipe are searched, and in which ranges."""
+"""Search spaces as data: the fields of a recipe that are searched, and their ranges."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ..recipe_json import recipe_from_json, recipe_to_json
 
 Number = float | int
 
-# Fields that define the search, so it cannot vary them. A search has its own seeds.
+# Fields that define the search, which therefore cannot vary them. A search has its own seeds.
 _FIXED = {"algorithm", "name", "seed"}
 
 
@@ -93,7 +93,7 @@ def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
 
     Raises:
         ValueError: if it is not a search space, or names a field or a value that the recipe
-            refuses.
+            rejects.
     """
     if source is None:
         text = resources.files(__package__).joinpath("search_spaces.json").read_bytes()
@@ -119,11 +119,11 @@ def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Reci
 
     Args:
         recipe: the recipe.
-        values: by the full name of a field, such as "backbone.frame.patch_size".
+        values: the values, by the full name of a field, such as "backbone.frame.patch_size".
         source: where they come from, for messages.
 
     Raises:
-        ValueError: if there is no such field, or the recipe refuses a value.
+        ValueError: if there is no such field, or the recipe rejects a value.
 
     Example:
         >>> from recipes.registry import get_recipe

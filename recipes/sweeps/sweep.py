@@ -28,7 +28,8 @@ from ..registry import RECIPES, find_recipe
 from ..run import Run
 
 PROGRAM = str(__package__).rpartition(".")[0]
-"""What ``python -m`` runs: ``recipes``, or ``torchrl_tit.recipes`` if it is installed."""
+"""The module that ``python -m`` runs: ``recipes``, or ``torchrl_tit.recipes`` if it is
+installed."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Job:
 
     @property
     def log(self) -> Path:
-        """What the worker prints."""
+        """The worker's output."""
         return self.folder.with_name(self.folder.name + ".log")
 
     def arguments(self) -> list[str]:
@@ -70,7 +71,7 @@ class Job:
         return self._exists() and Run.open(self.folder).is_complete()
 
     def is_in_use(self) -> bool:
-        """Whether a process works on the run, such as one that a killed sweep left behind."""
+        """Whether a process is using the run, such as one that a killed sweep left behind."""
         if not self._exists():
             return False
         try:
@@ -92,7 +93,7 @@ class Job:
 
 
 def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[Job]:
-    """Lists the runs of a sweep, and checks all of them before any begins.
+    """Lists the runs of a sweep, and checks all of them before any starts.
 
     Args:
         patterns: names of recipes, patterns such as ``ppo/*/mlp``, JSON files that hold a
@@ -194,7 +195,7 @@ def run_jobs(
         jobs: the runs.
         workers: runs at a time.
         start: starts or resumes a run; by default in a process on this machine.
-        count_begun: counts the started runs that are not waiting for a machine.
+        count_begun: counts the started runs that no longer wait for a machine.
 
     Returns:
         The runs that failed; their output is in their logs.
@@ -226,8 +227,9 @@ def run_jobs(
                     if code is None:
                         continue
                     del running[job]
-                    # Code 2: refused, because another process has just begun the run. If a worker
-                    # on Ray is lost (code 1), the process that it left may still use the run.
+                    # Code 2: refused, because another process has just started the run. If a worker
+                    # on Ray is lost (code 1), the process that it left behind may still use the
+                    # run.
                     if code == 2 and job.is_in_use():
                         waiting.append(job)
                         continue

@@ -1,7 +1,7 @@
 """The runs of a sweep on the machines of a Ray cluster, which share a file system.
 
-Each run has an actor, which starts it in its own process, as a sweep on one machine does. The
-sweep polls the actor until the run has ended.
+Each run has an actor, which starts the run in its own process, as a sweep on one machine does. The
+sweep polls the actor until the run ends.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ def _actor_class() -> type:
 
 
 def _main() -> None:
-    """Runs the command line, and stops it as Ctrl-C does once its actor is gone."""
+    """Runs the command line, and stops it as Ctrl-C would once its actor is gone."""
 
     def follow() -> None:
         os.read(sys.stdin.fileno(), 1)

@@ -15,7 +15,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from torchrl_tit.files import write_text_atomic
 
-_FEWEST = 4  # complete trials from which importances are computed
+_FEWEST = 4  # minimum number of complete trials for computing importances
 
 
 def write_trials(study: Study, fields: Sequence[str], folder: Path) -> None:
@@ -40,8 +40,8 @@ def write_trials(study: Study, fields: Sequence[str], folder: Path) -> None:
 def importances(study: Study) -> dict[str, float]:
     """Computes how much each field mattered for the values of complete trials.
 
-    The shares of PED-ANOVA (arXiv 2304.10255), which compares the best tenth of the trials with
-    all of them; they add up to 1, the largest first.
+    These are the shares of PED-ANOVA (arXiv 2304.10255), which compares the best tenth of the
+    trials with all of them. They add up to 1; the largest comes first.
 
     Returns:
         The shares by the fields' names; empty with fewer than four complete trials, or if all of
@@ -55,7 +55,7 @@ def importances(study: Study) -> dict[str, float]:
 
 def _row(trial: FrozenTrial, fields: Sequence[str]) -> list[Any]:
     value = trial.value
-    if value is None and trial.intermediate_values:  # it was pruned: the last return that it had
+    if value is None and trial.intermediate_values:  # it was pruned: report its last return
         value = trial.intermediate_values[max(trial.intermediate_values)]
     return [
         trial.number,

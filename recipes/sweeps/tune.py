@@ -36,16 +36,16 @@ _WINDOW = 5  # batches over which a trial's return is averaged when trials are c
 
 @dataclass(frozen=True)
 class Settings:
-    """What defines a search; a search is resumed only with the same settings."""
+    """The settings of a search, which can only be resumed with the same settings."""
 
     recipe: Recipe
     space: SearchSpace
     seeds: tuple[int, ...] = (0,)
-    """Seeds that every trial is run with, one after the other."""
+    """Seeds that every trial is run with, one after another."""
     startup_trials: int = 5
-    """Trials that run to their end before any is pruned, and that are drawn at random."""
+    """Trials that are drawn at random, and that run to their end before any trial is pruned."""
     warmup: float = 0.3
-    """Share of a trial's first run before which it is not pruned."""
+    """Share of a trial's first run during which it is not pruned."""
 
     def __post_init__(self) -> None:
         for seed in self.seeds:
@@ -53,7 +53,7 @@ class Settings:
 
 
 class Search:
-    """A search in a folder, which another process can resume after the first was killed.
+    """A search in a folder, which another process can resume if the first is killed.
 
         settings.json   recipe, seeds and pruning
         space.json      the search space
@@ -101,15 +101,15 @@ class Search:
         """Runs trials, some at a time, until the given number has ended.
 
         Args:
-            trials: trials of the whole search, those of earlier calls included.
-            workers: trials at a time, a process each.
+            trials: number of trials in the whole search, including those of earlier calls.
+            workers: number of trials at a time, each in its own process.
 
         Returns:
-            Numbers of the trials that failed; what they printed is in their logs.
+            Numbers of the trials that failed; their output is in their logs.
 
         Raises:
             KeyboardInterrupt: after Ctrl-C, once all workers have saved a checkpoint.
-            RuntimeError: if another process works on the search.
+            RuntimeError: if another process is using the search.
         """
         try:
             with filelock.FileLock(self.folder / ".lock", timeout=0):
@@ -125,7 +125,7 @@ class Search:
 
     def _run(self, trials: int, workers: int) -> list[int]:
         ended = [trial for trial in self.study.trials if trial.state.is_finished()]
-        # Trials that a killed process left are resumed.
+        # Trials that a killed process left behind are resumed.
         running = [
             _Trial(self, Trial(self.study, trial._trial_id))
             for trial in self.study.trials
@@ -142,7 +142,7 @@ class Search:
                     while len(running) < room:
                         running.append(_Trial(self, self.study.ask()))
                     time.sleep(0.2)
-                    for trial in running[:room]:  # a search that was killed may have left more
+                    for trial in running[:room]:  # a killed search may have left more
                         state = trial.advance()
                         if state is not None:
                             running.remove(trial)
@@ -178,7 +178,7 @@ class Search:
 
 
 class _Trial:
-    """A running trial: its runs, one seed after the other, each in its own process."""
+    """A running trial: its runs, one seed after another, each in its own process."""
 
     def __init__(self, search: Search, trial: Trial) -> None:
         self.study = search.study
@@ -227,12 +227,12 @@ class _Trial:
                 for job in self.jobs
             ]
             return self._end(TrialState.COMPLETE, sum(means) / len(means))
-        if not job.is_in_use():  # by a process that a killed search left
+        if not job.is_in_use():  # by a process that a killed search left behind
             self.process = start(job)
         return None
 
     def stop(self) -> None:
-        """Lets the process save a checkpoint, and waits for its end."""
+        """Lets the process save a checkpoint, and waits until it exits."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
             self.process.wait()
@@ -261,7 +261,7 @@ def _journal(path: Path) -> Iterator[JournalStorage]:
     """Optuna's storage; raises ValueError if it cannot read what is in the file."""
     try:
         yield JournalStorage(JournalFileBackend(str(path)))
-    except (AssertionError, KeyError, TypeError, ValueError) as error:  # what a line makes it raise
+    except (AssertionError, KeyError, TypeError, ValueError) as error:  # of damaged lines
         raise ValueError(
             f"{path} is no whole journal of Optuna's ({type(error).__name__}: {error}): name "
             "another folder with --out, or take the damaged line out"

@@ -20,7 +20,7 @@ from .settings import TD3BC
 
 
 class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
-    """TorchRL's losses of a deterministic actor on a backbone and two critics.
+    """TorchRL's TD3+BC losses, with a deterministic actor on a backbone and two critics.
 
     Args:
         recipe: the settings.
@@ -40,7 +40,7 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
                 f"td3bc needs continuous actions within bounds, but those of {recipe.env} are "
                 f"{describe(spec)}: use a bc or iql recipe"
             )
-        # TorchRL's loss hides from the critics what the actor does not declare: "observation".
+        # TorchRL's loss hides keys from the critics that the actor does not declare: "observation".
         backbone = self.make_backbone(slices=True)
         self._policy = make_deterministic_policy(backbone, spec).to(self.device)
         critics = [
@@ -62,7 +62,8 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
             alpha=recipe.alpha,
             policy_noise=recipe.policy_noise * half_range,
             noise_clip=recipe.noise_clip * half_range,
-            # On a CPU two products are faster than a stacked one; slices cannot be stacked.
+            # On a CPU, two matrix products are faster than one batched product; slices cannot be
+            # batched.
             deactivate_vmap=self.device.type == "cpu" or recipe.slice_length > 1,
         )
         self.loss.make_value_estimator(gamma=recipe.gamma)
@@ -80,11 +81,11 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
         self.target = SoftUpdate(loss, tau=recipe.tau)
         self.buffer = self.make_buffer()
         self.actor_terms = nn.Module()
-        """The actor's terms at its last step, which the steps without one report again."""
+        """The actor's terms at its last update, which steps without an update report again."""
         self.actor_terms.register_buffer("values", torch.zeros(2, device=self.device))
 
     def state(self) -> Mapping[str, Stateful]:
-        """Optimizers, the sampling state of the replay buffer, and the terms last seen."""
+        """Optimizers, the sampling state of the replay buffer, and the actor's last terms."""
         return {
             "critic_optimizer": self.critic_optimizer,
             "actor_optimizer": self.actor_optimizer,
@@ -93,10 +94,10 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
         }
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
-        """Steps the critics, and every ``policy_delay`` steps the actor and the targets.
+        """Updates the critics, and every ``policy_delay`` steps the actor and the targets.
 
-        A batch is transitions [B], or slices [N, T]. The actor's loss sees the critics after their
-        step.
+        A batch is transitions [B], or slices [N, T]. The actor's loss uses the critics after their
+        update.
         """
         values = self.actor_terms.get_buffer("values")
         loss_qvalue, _ = self.loss.qvalue_loss(batch)

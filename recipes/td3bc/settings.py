@@ -14,16 +14,16 @@ class TD3BC(ActorCriticRecipe, algorithm="td3bc", builds=f"{__package__}.algorit
     """TD3 with a behaviour cloning term (arXiv 2106.06860), with the paper's defaults."""
 
     normalize_observations: bool = True
-    """Whether networks read observations minus their mean in the data, divided by their standard
-    deviation there; only for arrays of floats."""
+    """Whether to normalise observations by their mean and standard deviation in the data; only for
+    arrays of floats."""
     actor_learning_rate: Rate = 3e-4
     """Learning rate of Adam for the actor."""
     critic_learning_rate: Rate = 3e-4
     """Learning rate of Adam for the critics."""
     alpha: Weight = 2.5
-    """Weight of the value in the actor's loss, beside that of the data's actions."""
+    """Weight of the value in the actor's loss, relative to the behaviour cloning term."""
     policy_delay: Steps = 2
-    """Gradient steps of the critics between two of the actor and of the targets."""
+    """Gradient steps of the critics for each update of the actor and the targets."""
     policy_noise: Weight = 0.2
     """Standard deviation of the noise on the target's actions; 1 is half the range of actions."""
     noise_clip: Weight = 0.5

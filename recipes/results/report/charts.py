@@ -25,12 +25,13 @@ COLOURS = (
     "#3d4d57",
     "#007482",
 )
-"""Each at least 4.5 to 1 on white, and apart from its neighbours for colour-blind readers."""
+"""Each has a contrast of at least 4.5 to 1 on white, and colour-blind readers can tell neighbours
+apart."""
 FAR = 0.9
-"""Share of the longest run that a run has to have for its part in bold lines."""
+"""Minimum length of a run, as a share of the longest, to be included in bold lines."""
 DASHES = ("solid", "dash", "dot", "dashdot")
-_POINTS = 400  # of a curve; where there are more rows, neighbours are averaged
-_GRID = 200  # points at which runs whose rows differ are compared
+_POINTS = 400  # per curve; if there are more rows, neighbours are averaged
+_GRID = 200  # points at which runs with different rows are compared
 _WINDOW = 5  # batches over which bold returns are averaged
 _ROWS_TO_SMOOTH = 40
 _MOST_HOVERED = 9
@@ -40,19 +41,19 @@ _INK, _LINES = "#1c2733", "#e3e8ed"
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart and what it says in words."""
+    """A chart and its description in words."""
 
     column: str
     title: str
     words: MetricWords
     figure: str
-    """What Plotly draws, as JSON."""
+    """The figure for Plotly, as JSON."""
     alt: str
-    """What is seen, for those who do not see it."""
+    """A text alternative for those who cannot see the chart."""
     can_be_log: bool
     """Whether all values are above 0."""
     is_cut: bool
-    """Whether the axis leaves out extreme values at first."""
+    """Whether the axis initially leaves out extreme values."""
     has_limit: bool
     """Whether a dashed line shows a healthy limit."""
 
@@ -69,7 +70,7 @@ def return_charts(groups: Sequence[Group]) -> list[Chart]:
 
 
 def health_charts(groups: Sequence[Group]) -> list[Chart]:
-    """Charts of all other metrics but the constant ones, those that say most first."""
+    """Charts of all other metrics except constant ones, the most informative first."""
     order = known_columns(groups[0].recipe.algorithm)
     columns = [c for c in _columns(groups) if "return" not in c and c not in constants(groups)]
     known = [column for column in order if column in columns]
@@ -77,7 +78,7 @@ def health_charts(groups: Sequence[Group]) -> list[Chart]:
 
 
 def constants(groups: Sequence[Group]) -> dict[str, float]:
-    """The metrics that have one value in all rows of all runs, but for returns."""
+    """The metrics that have the same value in all rows of all runs, except returns."""
     found = {}
     for column in _columns(groups):
         values = np.concatenate([run.metrics.get(column, []) for g in groups for run in g.runs])
@@ -88,7 +89,7 @@ def constants(groups: Sequence[Group]) -> dict[str, float]:
 
 
 def episode_chart(groups: Sequence[Group]) -> Chart | None:
-    """A chart of the returns of all evaluation episodes; None if there are no two that differ."""
+    """A chart of the returns of all evaluation episodes; None if all are equal."""
     figure = go.Figure()
     words, seen = [], []
     evaluated = [(g, r) for g, group in enumerate(groups) for r in group.runs if r.evaluation]
@@ -168,7 +169,7 @@ def _add_box(
 
 
 def last_value(run: RunData, column: str) -> float:
-    """The mean of a metric over the last tenth of a run's rows; NaN if it is not known there."""
+    """The mean of a metric over the last tenth of a run's rows; NaN if it is unknown there."""
     values = run.metrics.get(column, np.array([np.nan]))
     tail = values[-max(1, len(values) // 10) :]
     known = tail[np.isfinite(tail)]
@@ -181,7 +182,7 @@ def _columns(groups: Sequence[Group]) -> list[str]:
 
 
 def _is_curve(groups: Sequence[Group], column: str) -> bool:
-    """Whether any run has more than one value, or it is all that there is of training."""
+    """Whether any run has more than one value, or there is nothing else to show of training."""
     counts = [
         np.isfinite(run.metrics[column]).sum()
         for group in groups
@@ -284,7 +285,7 @@ def _add_middle(
     curves: list[tuple[np.ndarray, np.ndarray]],
     is_return: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draws what the runs of a group have in common; returns its steps and values."""
+    """Draws the summary of a group's runs; returns its steps and values."""
     group = groups[index]
     colour, dash = style(index)
     if is_return:
@@ -372,7 +373,7 @@ def _draw_limits(figure: go.Figure, groups: Sequence[Group], words: MetricWords)
 
 
 def _cut(figure: go.Figure, values: np.ndarray) -> bool:
-    """Leaves extreme values out of the axis, if the others would be a flat line beside them."""
+    """Leaves extreme values out of the axis if they would flatten the others to a line."""
     low, high = np.percentile(values, [2, 98])
     if high <= low or values.max() - values.min() <= 4 * (high - low):
         return False

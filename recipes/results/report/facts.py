@@ -1,4 +1,4 @@
-"""What a report says in tables and sentences."""
+"""The contents of a report's tables and sentences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..metric_words import MetricWords, limit, words_of
 from .charts import last_value
 from .run_data import Group, RunData
 
-_OFTEN = 0.25  # share of the batches outside a limit from which a metric is pointed out
+_OFTEN = 0.25  # minimum share of batches outside a limit for a metric to be pointed out
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Difference:
 
     field: str
     values: tuple[str, ...]
-    """Of each of the settings that are compared."""
+    """The values in each of the compared settings."""
 
 
 @dataclass(frozen=True)
@@ -34,18 +34,18 @@ class Finding:
 
     words: MetricWords
     text: str
-    """Which limit, and in how many batches of which experiment."""
+    """The limit, and in how many batches of which experiment it was exceeded."""
 
 
 def settings_of(recipe: Recipe) -> dict[str, str]:
-    """Returns all settings, nested ones by their full names, such as "backbone.num_frames"."""
+    """Returns all settings, with nested ones by their full names, such as "backbone.num_frames"."""
     return {name: _text(value) for name, value in fields_of(recipe).items()}
 
 
 def differences(recipes: Sequence[Recipe]) -> list[Difference]:
-    """Lists the fields in which the settings of experiments differ, whatever seed and machine.
+    """Lists the fields in which the settings of experiments differ, ignoring seed and machine.
 
-    Fields that not all of them have, such as those of an encoder that others replace, are left out.
+    Fields that some lack, such as those of an encoder that others replace, are left out.
     """
     settings = [settings_of(experiment_of(recipe)) for recipe in recipes]
     shared = [name for name in settings[0] if all(name in one for one in settings)]
@@ -54,7 +54,7 @@ def differences(recipes: Sequence[Recipe]) -> list[Difference]:
 
 
 def changes(named: Recipe, recipe: Recipe) -> list[Difference]:
-    """Lists the fields in which settings differ from those of the recipe of their name."""
+    """Lists the fields in which settings differ from the recipe of the same name."""
     before, now = settings_of(experiment_of(named)), settings_of(experiment_of(recipe))
     return [
         Difference(name, (before.get(name, "-"), value))
@@ -100,7 +100,7 @@ def checked_metrics(groups: Sequence[Group]) -> list[str]:
 
 
 def headline(group: Group, cell: Cell | None) -> tuple[str, str, str]:
-    """Says what an experiment reached: a number, its interval, and a sentence about both."""
+    """Returns an experiment's result: a number, its interval, and a sentence about both."""
     steps = f"{max(run.steps for run in group.runs):,} {unit_of(group.recipe)}"
     if cell is None:
         values = [last_value(run, "return_mean") for run in group.runs]
@@ -123,7 +123,7 @@ def headline(group: Group, cell: Cell | None) -> tuple[str, str, str]:
 
 
 def unit_of(recipe: Recipe) -> str:
-    """What its steps are."""
+    """The unit of a recipe's steps."""
     return "gradient steps" if recipe.offline else "environment steps"
 
 
@@ -137,7 +137,7 @@ def number(value: float) -> str:
 
 
 def spread(value: float) -> str:
-    """Formats a standard deviation, whose second digit is the last that matters."""
+    """Formats a standard deviation, of which only two digits matter."""
     return number(value) if value != value or abs(value) >= 10 else number(float(f"{value:.2g}"))
 
 
@@ -151,7 +151,7 @@ def duration(seconds: float) -> str:
 
 
 def _share_outside(run: RunData, words: MetricWords, formula: str, sign: int) -> float | None:
-    """Share of the rows in which a metric is beyond a limit; None if there is no limit."""
+    """The share of rows in which a metric is beyond a limit; None if there is no limit."""
     values = run.metrics.get(words.column)
     if not formula or values is None:
         return None

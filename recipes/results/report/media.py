@@ -22,7 +22,7 @@ from ..explained_step import ExplainedStep, Explainer, read_value
 from ..film import film_policy, make_rendered, take_picture
 from .run_data import RunData
 
-_MOST_PICTURES = 1500  # of a film: half a minute of CartPole, and a few megabytes at most
+_MOST_PICTURES = 1500  # per film: half a minute of CartPole, and a few megabytes at most
 _FEWEST_PICTURES, _MOST_EPISODES = 100, 10  # more episodes make a short film longer
 _SHARP = 160  # dots per inch of explained steps
 
@@ -33,13 +33,13 @@ class _Enough(Exception):
 
 @dataclass(frozen=True)
 class Film:
-    """Episodes as MP4."""
+    """Episodes as an MP4 film."""
 
     video: bytes
     poster: bytes
-    """A picture of its middle, PNG."""
+    """A picture from its middle, PNG."""
     seed: int
-    """Of the first episode."""
+    """Seed of the first episode."""
     first_steps: int
     """Steps of the first episode."""
     steps: int
@@ -59,7 +59,7 @@ class Explained:
 
 @dataclass
 class Media:
-    """What was filmed and explained of each group, and why something was not."""
+    """Films and explanations of each group, and the reasons for missing ones."""
 
     films: dict[int, Film] = field(default_factory=dict)
     explained: dict[int, list[Explained]] = field(default_factory=dict)
@@ -118,7 +118,7 @@ def explain_steps(agent: TrainedAgent, steps: list[int]) -> list[Explained]:
         steps: the steps, counted from 0; those after the episode's end are left out.
 
     Raises:
-        ValueError: if its task cannot be rendered, or there are no maps of its network.
+        ValueError: if its task cannot be rendered, or there are no maps for its network.
     """
     explainer = Explainer(agent.policy)
     found: list[Explained] = []

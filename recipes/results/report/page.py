@@ -26,7 +26,7 @@ from .facts import duration, number, spread
 from .media import Explained, Film, Media
 from .run_data import Group, RunData
 
-_MOST_SINGLE = 9  # runs whose single curves are shown at first
+_MOST_SINGLE = 9  # maximum number of runs whose single curves are initially shown
 _ROWS = 11
 
 
@@ -40,7 +40,7 @@ def write_page(
 
     Args:
         groups: the experiments.
-        cells: the row of the table of results of each, and what is to be noted about it.
+        cells: the row of the table of results for each, and notes on it.
         media: their films and explanations.
         title: the page's title; by default what the names of the recipes have in common.
     """
@@ -232,7 +232,7 @@ def _curves_text(groups: Sequence[Group]) -> str:
 
 
 def _short_runs(groups: Sequence[Group]) -> list[str]:
-    """Names the runs that bold lines leave out, because they are not as far as the others."""
+    """Names the runs that bold lines leave out, because they are shorter than the others."""
     return [
         f"{group.label}, {data.label} is at {data.steps:,} of {longest:,} "
         f"{facts.unit_of(group.recipe)}: bold lines leave it out."
@@ -244,7 +244,7 @@ def _short_runs(groups: Sequence[Group]) -> list[str]:
 
 
 def _same_returns(runs: Sequence[tuple[Group, RunData]]) -> str:
-    """What stands in place of the chart of evaluation episodes if all of them are the same."""
+    """The text that replaces the chart of evaluation episodes if all returns are the same."""
     returns = [value for _, run in runs if run.evaluation for value in run.evaluation["returns"]]
     if not returns:
         return ""
@@ -278,7 +278,7 @@ def _explained(step: Explained) -> dict[str, Any]:
 
 
 def _frames(groups: Sequence[Group]) -> int:
-    """How many observations networks read at most; 0 if they read one."""
+    """The maximum number of observations that networks read; 0 if they read one."""
     most = max((group.recipe.backbone.num_frames for group in groups), default=0)
     return most if most > 1 else 0
 
@@ -325,7 +325,7 @@ def _run(group: Group, data: RunData) -> dict[str, Any]:
 
 
 def _versions(runs: Sequence[RunData]) -> dict[str, Any]:
-    """A column for each set of versions; runs of the same ones share it."""
+    """A column for each set of versions, which runs of the same versions share."""
     columns: dict[str, list[RunData]] = {}
     for data in runs:
         if data.versions:
@@ -346,7 +346,7 @@ def _versions(runs: Sequence[RunData]) -> dict[str, Any]:
 
 
 def _charts_json(charts: Sequence[Chart]) -> str:
-    """The charts for the page's script; "<" is written so that no text can end the script."""
+    """The charts for the page's script; "<" is escaped so that no text can end the script."""
     parts = (f'{{"column": {json.dumps(c.column)}, "figure": {c.figure}}}' for c in charts)
     return f"[{', '.join(parts)}]".replace("<", "\\u003c")
 
@@ -370,11 +370,11 @@ def _render(context: dict[str, Any]) -> str:
 
 
 def _code(text: str) -> str:
-    """Escapes a text, and sets what stands between backticks as code; it is HTML then."""
+    """Escapes a text and formats what is between backticks as code; returns HTML."""
     return re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(text))
 
 
 def _sentence(text: str) -> str:
-    """As :func:`_code`, from a capital letter to a full stop."""
+    """As :func:`_code`, with a capital letter at the start and a full stop at the end."""
     text = text if text[0] in "`0123456789" else f"{text[0].upper()}{text[1:]}"
     return _code(f"{text}.")

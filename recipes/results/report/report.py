@@ -1,4 +1,4 @@
-"""Writes the report of runs: one HTML file that holds everything and loads nothing."""
+"""Writes the report of runs: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def report(
         out: the HTML file to write.
         title: its title; by default what the names of the runs' recipes have in common.
         pictures: whether to film and explain the agents, which takes most of the time.
-        say: called with a line when a part that takes long begins.
+        say: called with a line before each slow part.
 
     Raises:
         OSError: if the file cannot be written, or a checkpoint is damaged.
-        ValueError: if a folder holds no run, a run is damaged, or runs do not go together.
+        ValueError: if a folder holds no run, a run is damaged, or runs cannot be compared.
     """
     _check_out(out)
     groups = read_groups(folders)
@@ -46,7 +46,7 @@ def report(
 
 
 def _check_out(out: Path) -> None:
-    """Raises an error before the work if the file could not be written after it."""
+    """Raises an error early if the file could not be written at the end."""
     if out.suffix not in (".html", ".htm"):
         raise ValueError(f"a report is an .html file, not {out.name!r}")
     if out.is_dir():
@@ -59,7 +59,7 @@ def _check_out(out: Path) -> None:
 
 
 def _cell(group: Group) -> tuple[Cell | None, list[str]]:
-    """The row of a table of results, and what is to be noted about it."""
+    """The row of a table of results, and notes on it."""
     try:
         (cell,), notes = make_table([data.run.folder for data in group.runs])
     except ValueError:  # none of the runs is trained and evaluated
@@ -69,7 +69,7 @@ def _cell(group: Group) -> tuple[Cell | None, list[str]]:
 
 def _make_media(groups: Sequence[Group], say: Callable[[str], None]) -> Media:
     media = Media()
-    # One experiment is shown at three moments, each of several at one.
+    # A single experiment is shown at three moments, each of several experiments at one.
     without = []
     moments = (0.05, 0.5, 0.95) if len(groups) == 1 else (0.5,)
     for index, group in enumerate(groups):
@@ -95,9 +95,9 @@ def _make_media(groups: Sequence[Group], say: Callable[[str], None]) -> Media:
 
 
 def _typical(group: Group) -> RunData:
-    """The run in the middle by its evaluation, so that films show neither the best nor the worst.
+    """The run with the median evaluation, so that films show neither the best nor the worst.
 
-    Those that can act come first.
+    Runs that can act come first.
     """
     can_act = [run for run in group.runs if checkpoint_steps(run.run.checkpoints)]
     runs = can_act or list(group.runs)

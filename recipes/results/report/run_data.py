@@ -28,7 +28,7 @@ class RunData:
     metrics: dict[str, np.ndarray]
     """The columns of ``metrics.csv``, float [rows]."""
     evaluation: dict[str, Any] | None
-    """None if it is not evaluated yet."""
+    """The run's evaluation; None if it is not evaluated yet."""
     versions: dict[str, Any]
 
     @property
@@ -43,7 +43,7 @@ class RunData:
 
     @property
     def seconds(self) -> float:
-        """How long it took to train, without interruptions: the steps over their speeds."""
+        """Training time without interruptions: the steps divided by their speeds."""
         steps, speed = self.metrics["step"], self.metrics["steps_per_second"]
         done = np.diff(steps, prepend=0)
         return float((done[speed > 0] / speed[speed > 0]).sum())
@@ -51,16 +51,16 @@ class RunData:
 
 @dataclass(frozen=True)
 class Group:
-    """The runs of an experiment, and what it is called in the report."""
+    """The runs of an experiment, and its name in the report."""
 
     experiment: Experiment
     label: str
-    """Its name without what the names of all experiments begin with."""
+    """Its name without the common prefix of all experiments."""
     runs: tuple[RunData, ...]
 
     @property
     def recipe(self) -> Recipe:
-        """The settings of its runs, but for seed and machine."""
+        """The settings of its runs, except seed and machine."""
         return self.experiment.settings
 
     @property
@@ -75,14 +75,14 @@ class Group:
 
 
 def read_groups(folders: Iterable[Path]) -> list[Group]:
-    """Reads runs and puts those of the same settings together.
+    """Reads runs and groups those of the same settings.
 
     Args:
         folders: run folders, or folders with run folders somewhere below.
 
     Raises:
         ValueError: if a folder holds no run, a run is damaged or has no metrics, two runs are the
-            same, or they are of different tasks or of different kinds of steps.
+            same, or runs have different tasks or different kinds of steps.
     """
     experiments = group_runs(find_runs(folders))
     check_together(experiments)
@@ -107,7 +107,7 @@ def _read(run: Run) -> RunData:
     missing = [name for name in ("step", "return_mean") if name not in metrics]
     if missing:
         raise ValueError(f"{run.folder / 'metrics.csv'} is damaged: it has no column {missing[0]}")
-    if "steps_per_second" not in metrics:  # a run of an earlier version
+    if "steps_per_second" not in metrics:  # a run from an earlier version
         metrics["steps_per_second"] = np.diff(metrics["step"], prepend=np.nan) / np.diff(
             metrics.get("time", metrics["step"]), prepend=np.nan
         )
@@ -133,13 +133,13 @@ def _evaluation(path: Path) -> dict[str, Any] | None:
 def _versions(folder: Path) -> dict[str, Any]:
     try:
         found = json.loads((folder / "versions.json").read_bytes())
-    except (OSError, ValueError):  # lost or damaged: the report says that they are unknown
+    except (OSError, ValueError):  # missing or damaged: the report says that they are unknown
         return {}
     return found if isinstance(found, dict) else {}
 
 
 def _labels(experiments: Sequence[Experiment]) -> list[str]:
-    """Short names: what differs in the recipes' names, or else in the names of the folders."""
+    """Short names: the parts in which the names of recipes, or else of folders, differ."""
     if len(experiments) == 1:
         return [_last_part(experiments[0].name)]
     names = _without_common_part([experiment.label.split("/") for experiment in experiments])
@@ -152,7 +152,7 @@ def _labels(experiments: Sequence[Experiment]) -> list[str]:
 
 
 def _folder(experiment: Experiment) -> Path:
-    """The folder of all runs of an experiment; their names are seeds."""
+    """The common folder of an experiment's runs, whose names are seeds."""
     folders = [run.folder.resolve() for run in experiment.runs]
     if len(folders) == 1:
         return folders[0].parent if re.fullmatch(r"seed-\d+", folders[0].name) else folders[0]
