@@ -20,7 +20,7 @@ _HOMES = {
     "VanillaTIT": "torchrl_tit.networks",
     "load_agent": "torchrl_tit.agents",
 }
-"""Where the public names live: PyTorch is loaded with the first of them that needs it."""
+"""The module of each public name. PyTorch is imported when a name that needs it is first used."""
 
 __all__ = [*_HOMES]
 

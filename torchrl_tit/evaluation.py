@@ -38,10 +38,10 @@ def evaluate(
     NumPy and Python.
 
     Args:
-        env: An environment of any batch size, whose `reset` takes a seed as those of
+        env: An environment of any batch size whose `reset` takes a seed, as those of
             :func:`~torchrl_tit.envs.make_env` and TorchRL's `GymWrapper` do, and whose rewards are
             the task's own, not clipped. It is reset, which ends its current episodes. Or a function
-            that makes an environment, given the number of copies: it is called with ``episodes``,
+            that makes an environment with a given number of copies; it is called with ``episodes``,
             and the environment is closed at the end.
         policy: Writes the action into the tensordict. It acts in evaluation mode.
         episodes: Number of episodes.
@@ -115,7 +115,7 @@ def _play_all(
     reward_key: NestedKey,
     shrink: bool,
 ) -> Tensor:
-    """Returns the return of each episode, [episodes]; one runs in each environment at a time."""
+    """Computes the return of each episode, [episodes]; each environment runs one at a time."""
     starts = range(seed, seed + episodes, env.batch_size.numel())
     returns = [_play(env, policy, start, reward_key, shrink) for start in starts]
     return torch.cat(returns)[:episodes]
@@ -128,7 +128,7 @@ def _play(
     reward_key: NestedKey,
     shrink: bool,
 ) -> Tensor:
-    """Returns the return of one episode in each environment, float64 [N]."""
+    """Computes the return of one episode in each environment, float64 [N]."""
     tensordict = env.reset(seed=seed)
     returns = torch.zeros(env.batch_size.numel(), dtype=torch.float64, device=env.device)
     playing = torch.ones_like(returns, dtype=torch.bool)
@@ -204,7 +204,7 @@ def _acting(
             set_exploration_type(exploration),
             acting(policy),  # encodes the newest frames only
         ):
-            # A policy that samples actions samples the same ones each time.
+            # Makes sampled actions reproducible.
             torch.manual_seed(seed)
             if isinstance(policy, nn.Module):
                 policy.eval()

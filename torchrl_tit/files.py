@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 
 _HIDDEN = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp")
-"""Names of what is being written, or was when its process was killed."""
+"""Hidden names of files that are being written, or whose writer was killed."""
 
 
 def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
@@ -47,7 +47,7 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, path)
-        except BaseException:  # Ctrl-C as well must leave nothing behind
+        except BaseException:  # Ctrl-C must leave nothing behind either
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
             raise
@@ -56,15 +56,15 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Let an error of the system name the file that was to be written.
+    """Add the name of the file being written to system errors.
 
-    A full disk shows when an open file is flushed, which by itself does not say which one.
+    If the disk is full, flushing an open file fails, and the error does not name the file.
 
     Args:
         path: The file.
 
     Raises:
-        OSError: As raised within, with the file's name.
+        OSError: The original error, with the file's name.
 
     Example:
         >>> import errno
@@ -109,7 +109,7 @@ def remove_leftovers(folder: str | os.PathLike[str], names: Collection[str] | No
 
     Args:
         folder: A folder into which no other process writes.
-        names: The files that were written; any if None.
+        names: Names of the files that were being written; any if None.
 
     Example:
         >>> import tempfile
@@ -169,7 +169,7 @@ def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
         if path.exists():  # another process made it in the meantime
             raise FileExistsError(f"{path} exists already; choose another name or delete it.")
         os.replace(hidden, path)
-    except BaseException:  # Ctrl-C as well must leave nothing behind
+    except BaseException:  # Ctrl-C must leave nothing behind either
         shutil.rmtree(hidden, ignore_errors=True)
         with contextlib.suppress(OSError):
             hidden.unlink(missing_ok=True)
@@ -184,7 +184,7 @@ def fsync_file(path: str | os.PathLike[str]) -> None:
         path: An existing file.
 
     Raises:
-        OSError: The disk refused it.
+        OSError: The flush failed.
 
     Example:
         >>> import tempfile
@@ -206,7 +206,7 @@ def fsync_directory(path: str | os.PathLike[str]) -> None:
         path: An existing folder.
 
     Raises:
-        OSError: The disk refused it.
+        OSError: The flush failed.
 
     Example:
         >>> import tempfile

@@ -1,8 +1,9 @@
-"""The one place where it is decided which frames a window holds.
+"""Decides which frames a window holds.
 
-Frames are kept once, in rows. A window is the newest frame and the K - 1 rows before it, but never
-one of another episode: padding takes the place of rows before the oldest one that belongs. Training
-on segments, rollouts, and replay buffers of data sets and of environments all cut windows here.
+Each frame is stored once, as a row of a table. A window holds the newest frame and the K - 1 rows
+before it, but never a row of another episode: padding replaces rows before the oldest valid one.
+All windows are cut here: those of training segments, of rollouts, and of replay buffers of data
+sets and environments.
 """
 
 from __future__ import annotations
@@ -13,12 +14,11 @@ import torch
 from torch import Tensor
 
 Padding = Literal["same", "constant"]
-"""What fills the steps before an episode's first: that observation ("same"), or zeros ("constant").
-"""
+"""Padding before an episode's first step: its first observation ("same") or zeros ("constant")."""
 
 
 class Windows(NamedTuple):
-    """Which rows of a table of frames some windows hold.
+    """The rows of a table of frames that each window holds.
 
     Example:
         >>> newest, oldest = torch.tensor([3, 4]), torch.tensor([2, 4])
@@ -28,12 +28,12 @@ class Windows(NamedTuple):
     """
 
     rows: Tensor
-    """int64 [..., K], the oldest frame first; where a frame is missing, the oldest that belongs."""
+    """int64 [..., K], oldest frame first; a missing frame has the row of the oldest valid one."""
     missing: Tensor | None
-    """bool [..., K], True where zeros take the place of a missing frame; None if nothing does."""
+    """bool [..., K], True where zeros replace a missing frame; None if they replace none."""
 
     def used(self) -> tuple[Tensor, Windows]:
-        """Finds the rows that are used at all, to encode only those.
+        """Finds the rows that are used, so that only those are encoded.
 
         Returns:
             The rows, int64 [U], and the same windows on a table of these U rows.
@@ -55,7 +55,7 @@ class Windows(NamedTuple):
         Returns:
             [..., K, *frame], a copy.
         """
-        # index_select is several times as fast as indexing, on a CPU.
+        # On a CPU, index_select is several times faster than indexing.
         windows = frames.index_select(0, self.rows.flatten())
         windows = windows.view(*self.rows.shape, *frames.shape[1:])
         if self.missing is None:
@@ -71,11 +71,12 @@ def find_windows(
 
     Args:
         newest: row of the newest frame of each window, int64 [...].
-        oldest: the first row that belongs to it, such as that of its episode's first frame, int64
+        oldest: first valid row of each window, such as that of its episode's first frame, int64
             [...]; at most ``newest``.
         num_frames: number K of frames in a window.
-        padding: what takes the place of frames before ``oldest``: that frame, or zeros.
-        stride: rows from one step to the next, if the steps of several environments take turns.
+        padding: what replaces frames before ``oldest``: that frame, or zeros.
+        stride: rows from one step to the next, if the steps of several environments are
+            interleaved.
     """
     steps = torch.arange(1 - num_frames, 1, device=newest.device) * stride
     rows = newest.unsqueeze(-1) + steps

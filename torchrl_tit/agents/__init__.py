@@ -1,4 +1,4 @@
-"""Trained agents: a policy with its weights, its task, and how well it did.
+"""Trained agents: a policy with its weights, its task and its evaluation.
 
 An agent is a folder of six files (:mod:`~torchrl_tit.agents.folder`): in this package, anywhere on
 the disk, or in a repository of the Hugging Face Hub. Reading one executes nothing.

@@ -8,8 +8,8 @@ folder/
     versions.json        the packages that it was trained with
     agent.json           the format, and size and SHA-256 of each of the files above
 
-The checksums tell a file that was damaged or edited. They are no signature: who can change a file
-can change its checksum too. Therefore nothing in these files is ever executed.
+The checksums detect files that were damaged or edited. They are not a signature: anyone who can
+change a file can also change its checksum. Therefore nothing in these files is ever executed.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ _EVALUATION: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "mean": ("a number", lambda x: _is_number(x)),
     "std": ("a number", lambda x: _is_number(x)),
 }
-"""What others rely on, and whether it is."""
+"""The entries that others rely on, and their checks."""
 
-# Far beyond any agent: so that no file fills the memory before it is checked.
+# Far larger than any agent, so that no file fills the memory before it is checked.
 _MOST_BYTES = {WEIGHTS: 2**32}
 _MOST_BYTES_OF_TEXT = 2**24
 _FORMAT = "torchrl-tit agent"
@@ -67,16 +67,16 @@ class AgentError(ValueError):
 
 @dataclass(frozen=True)
 class AgentFiles:
-    """What the files of an agent hold, after all checks.
+    """The contents of an agent's files, after all checks.
 
     Args:
-        folder: where they are.
+        folder: the agent's folder.
         steps: the steps that the agent was trained for.
         card: the model card, in Markdown.
         recipe: the recipe, as JSON.
         weights: tensors by name, on the CPU.
         evaluation: the returns of its episodes; see :func:`check_evaluation`.
-        versions: of packages, by name.
+        versions: versions of packages, by name.
     """
 
     folder: Path
@@ -89,7 +89,7 @@ class AgentFiles:
 
 
 def is_agent(folder: str | os.PathLike[str]) -> bool:
-    """Returns whether a folder says that it is an agent's.
+    """Returns whether a folder claims to be an agent's.
 
     Example:
         >>> is_agent("nowhere")
@@ -103,7 +103,7 @@ def write_agent(folder: str | os.PathLike[str], contents: Mapping[str, bytes], s
 
     Args:
         folder: the folder to make; its parent must exist.
-        contents: each of ``CONTENTS`` as it is to be written.
+        contents: the bytes to write for each of ``CONTENTS``.
         steps: the steps that the agent was trained for.
 
     Raises:
@@ -145,11 +145,11 @@ def read_agent(folder: str | os.PathLike[str]) -> AgentFiles:
         folder: the folder.
 
     Returns:
-        What its files hold. Nothing in them was executed.
+        The contents of its files. Nothing in them was executed.
 
     Raises:
-        AgentError: if a file is missing, was changed after it was written, or is of another program
-            or version. The message names the file.
+        AgentError: if a file is missing, was changed after it was written, or is from another
+            program or version. The message names the file.
     """
     folder = Path(folder)
     try:
@@ -171,10 +171,10 @@ def read_agent(folder: str | os.PathLike[str]) -> AgentFiles:
 
 
 def check_evaluation(evaluation: Mapping[str, Any]) -> None:
-    """Raises ValueError if an evaluation lacks what others rely on, or has something else there.
+    """Raises ValueError if an evaluation lacks an entry that others rely on, or one is invalid.
 
-    That is the task ``env``, the number of ``episodes``, the ``seed`` of the first, their
-    ``returns``, and ``mean`` and ``std`` of these. The command ``evaluate`` writes them.
+    The entries are the task ``env``, the number of ``episodes``, the ``seed`` of the first, their
+    ``returns``, and the ``mean`` and ``std`` of these. The command ``evaluate`` writes them.
 
     Example:
         >>> numbers = {"episodes": 1, "seed": 0, "mean": 9.0, "std": 0.0}
@@ -215,7 +215,7 @@ def _read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _read(folder: Path, name: str, listed: dict[str, Any]) -> bytes:
-    """Reads a file once, so that what is used is what was checked."""
+    """Reads a file once, so that the bytes that are used are those that were checked."""
     path = folder / name
     if not path.is_file():
         raise ValueError(f"{name} is missing")
@@ -234,7 +234,7 @@ def _read(folder: Path, name: str, listed: dict[str, Any]) -> bytes:
 def _tensors(content: bytes) -> dict[str, Tensor]:
     try:
         return load(content)
-    except (SafetensorError, LookupError) as error:  # a type that PyTorch lacks
+    except (SafetensorError, LookupError) as error:  # a dtype that PyTorch lacks
         raise ValueError(f"{WEIGHTS} is not a file of safetensors ({error})") from error
 
 
@@ -266,7 +266,7 @@ def _is_whole(value: Any) -> bool:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a value is a finite number; JSON has NaN, and integers that no float holds."""
+    """Whether a value is a finite number; JSON allows NaN, and integers that no float can hold."""
     return (
         isinstance(value, int | float)
         and not isinstance(value, bool)

@@ -11,26 +11,26 @@ from types import ModuleType
 from torchrl_tit.agents.folder import CONTENTS, MANIFEST, AgentError, is_agent
 
 PREFIX = "hf:"
-"""What names of agents on the Hub begin with."""
+"""Prefix of the names of agents on the Hub."""
 
 _FILES = [*CONTENTS, MANIFEST]
 _REPOSITORY = re.compile(r"\w[\w.-]*/\w[\w.-]*")
 
 
 def download(source: str) -> Path:
-    """Downloads the files of an agent into huggingface_hub's cache, unless they are there.
+    """Downloads an agent's files into huggingface_hub's cache, unless they are already there.
 
-    All of them come from one commit. Other files of the repository are left.
+    All files come from one commit. Other files of the repository are not downloaded.
 
     Args:
         source: ``"hf:user/name"`` or ``"hf:user/name@revision"``.
 
     Returns:
-        Their folder; its files are not checked yet.
+        The folder of the files, which are not checked yet.
 
     Raises:
-        AgentError: if the name has another form, there is no such repository or revision or it
-            holds no agent, the Hub cannot be reached, or huggingface_hub is missing.
+        AgentError: if the name has another form; if the repository or revision does not exist or
+            holds no agent; if the Hub cannot be reached; or if huggingface_hub is missing.
     """
     repository, _, revision = source.removeprefix(PREFIX).partition("@")
     check_repository(repository)
@@ -45,19 +45,19 @@ def download(source: str) -> Path:
 
 
 def upload(folder: Path, repository: str, *, private: bool = False) -> str:
-    """Uploads the folder of an agent, in one commit; makes the repository if there is none.
+    """Uploads an agent's folder in one commit; creates the repository if it does not exist.
 
     Args:
-        folder: the folder, whose files were checked.
+        folder: the folder, whose files have been checked.
         repository: ``"user/name"``.
-        private: whether a repository that is made here is private.
+        private: whether a new repository is private.
 
     Returns:
         The address of the commit.
 
     Raises:
-        AgentError: if the name has another form, the Hub refuses it or cannot be reached, nobody is
-            logged in, or huggingface_hub is missing.
+        AgentError: if the name has another form, the Hub rejects it or cannot be reached, the user
+            is not logged in, or huggingface_hub is missing.
     """
     check_repository(repository)
     hub = import_hub()
@@ -107,7 +107,7 @@ def import_hub() -> ModuleType:
 
 @contextmanager
 def _in_one_line(hub: ModuleType, repository: str, revision: str = "") -> Iterator[None]:
-    """Says in one line what went wrong on the Hub."""
+    """Turns errors of the Hub into messages of one line."""
     errors = hub.errors
     try:
         yield
@@ -123,7 +123,7 @@ def _in_one_line(hub: ModuleType, repository: str, revision: str = "") -> Iterat
             f"{PREFIX}{repository} is not on this machine yet, and the Hugging Face Hub cannot be "
             "reached: check the connection"
         ) from error
-    except Exception as error:  # those of its HTTP client too, which differ between versions
+    except Exception as error:  # also the HTTP client's errors, which differ between versions
         reason = " ".join(str(error).split()) or type(error).__name__
         raise AgentError(
             f"the request to the Hugging Face Hub for {PREFIX}{repository} failed: {reason}"

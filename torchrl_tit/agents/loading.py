@@ -34,20 +34,20 @@ def load_agent(
 
     Args:
         source: the name of an agent that comes with this package (:func:`agent_names`); the folder
-            of an agent; a run folder of ``train``, whose newest checkpoint is taken; or
-            ``"hf:user/name"``, a repository of the Hugging Face Hub, of which
+            of an agent; a run folder of ``train``, whose newest checkpoint is loaded; or
+            ``"hf:user/name"``, a repository of the Hugging Face Hub, where
             ``"hf:user/name@revision"`` names a branch, a tag or a commit.
         device: device of the policy and of the environments; ``"auto"`` is the GPU if there is one.
 
     Returns:
-        The policy, its task, and what it reads.
+        The policy, its task and its transforms.
 
     Raises:
-        AgentError: if there is no such agent, its card, its weights or another file was changed
-            after it was written, or its weights do not fit its recipe.
+        AgentError: if there is no such agent, one of its files was changed after it was written, or
+            its weights do not fit its recipe.
         FileNotFoundError: if the run has no checkpoint.
-        ValueError: if its task or a part of its network cannot be built here: a package is missing,
-            say, or a module that the recipe names was not imported by the user.
+        ValueError: if its task or a part of its network cannot be built here, for example because a
+            package is missing, or because the user did not import a module that the recipe names.
 
     Example:
         >>> agent = load_agent("cartpole")
@@ -69,7 +69,7 @@ def find_agent(source: str | os.PathLike[str]) -> Path:
     """Finds the folder of an agent or of a run, and downloads it if it is on the Hub.
 
     Args:
-        source: as that of :func:`load_agent`.
+        source: see :func:`load_agent`.
 
     Raises:
         AgentError: if there is no such agent.
@@ -97,10 +97,10 @@ def find_agent(source: str | os.PathLike[str]) -> Path:
 
 
 def _recipes(name: str) -> Any:
-    """A function of the experiments, which build networks and tasks from recipes.
+    """Returns a function of the recipes package, which builds networks and tasks from recipes.
 
-    By name, because this library does not depend on them; they come with it.
+    It is found by name, because this library does not depend on that package, which comes with it.
     """
     if importlib.util.find_spec("torchrl_tit.recipes") is None:  # a clone that is not installed
-        importlib.import_module("recipes")  # has both names once it is imported
+        importlib.import_module("recipes")  # available under both names once imported
     return resolve(f"torchrl_tit.recipes.agents:{name}")

@@ -17,24 +17,24 @@ _EPISODES = 100
 
 @dataclass(frozen=True, eq=False)
 class TrainedAgent:
-    """A trained policy, the task that it was trained on, and what it reads.
+    """A trained policy, the task that it was trained on, and its transforms.
 
-    :func:`~torchrl_tit.agents.load_agent` makes it.
+    Created by :func:`~torchrl_tit.agents.load_agent`.
 
     Args:
-        name: where it is from.
-        policy: a TensorDict module in evaluation mode. It reads what the transforms write (for most
-            agents ``"history"``) and writes ``"action"``, a sample or the most likely one as
-            TorchRL's exploration type says. :func:`~torchrl_tit.modules.acting` makes it encode
-            each observation once.
-        make_env: makes its task with everything that the policy reads: ``make_env(num_envs, seed)``
-            and further settings of the task, such as ``render_mode="rgb_array"``. For a Decision
-            Transformer also ``target_return``.
+        name: the agent's source.
+        policy: a TensorDict module in evaluation mode. It reads the entries that the transforms
+            write (for most agents ``"history"``) and writes ``"action"``, a sample or the most
+            likely action, according to TorchRL's exploration type.
+            :func:`~torchrl_tit.modules.acting` makes it encode each observation once.
+        make_env: makes its task with all entries that the policy reads. It takes ``num_envs``,
+            ``seed`` and further settings of the task, such as ``render_mode="rgb_array"``; for a
+            Decision Transformer, also ``target_return``.
         recipe: the settings of its training run, as in ``recipe.json``.
-        steps: the steps that it was trained for.
+        steps: the number of steps that it was trained for.
         evaluation: the returns of its episodes, as in ``evaluation.json``; empty for a run whose
             newest checkpoint has not been evaluated.
-        versions: of the packages that it was trained with, by name.
+        versions: versions of the packages that it was trained with, by name.
         plays: plays episodes; :meth:`evaluate` calls it.
     """
 
@@ -49,11 +49,11 @@ class TrainedAgent:
 
     @property
     def first_seed(self) -> int:
-        """Seed of the first episode of its evaluation; episode i has this seed + i."""
+        """Seed of the first episode of its evaluation; episode i is seeded with this seed + i."""
         return int(self.evaluation.get("seed", self.recipe["evaluation_seed"]))
 
     def make_transforms(self) -> Compose:
-        """Makes the transforms that write what the policy reads, for an environment of your own.
+        """Makes the transforms that write the policy's inputs, for your own environment.
 
         They are those of :attr:`make_env`: histories, the statistics that normalise observations,
         the return that a Decision Transformer aims for, the state of a recurrent network. Each call
@@ -78,8 +78,8 @@ class TrainedAgent:
 
         Args:
             episodes: number of episodes; by default as many as in its evaluation, or 100.
-            seed: seed of the first episode, episode i has ``seed + i``; by default that of its
-                evaluation, so its first episodes are repeated.
+            seed: seed of the first episode; episode i has ``seed + i``. By default, the seed of its
+                evaluation, so that its first episodes are repeated.
 
         Returns:
             The undiscounted return of each episode; float64 [episodes].

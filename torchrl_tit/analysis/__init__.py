@@ -1,8 +1,8 @@
-"""What a trained network looks at: maps on observations, attention, and flows of information.
+"""Shows what a trained network attends to: maps, attention, and flows of information.
 
 Grad-CAM on images, integrated gradients on arrays, attention of inner and outer blocks, and the
 paper's table of information flows (arXiv 2212.14538, appendices on visualization and information
-flow). docs/analysis.md says how to read them.
+flow). docs/analysis.md explains how to read them.
 """
 
 from torchrl_tit.analysis.attention import (

@@ -1,4 +1,4 @@
-"""Attention weights of a network, by observation, rolled out, and laid over what was observed."""
+"""Attention weights of a network: per observation, rolled out, and mapped onto observations."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torchrl_tit.networks import HistoryNetwork
 
 
 def inner_attention(network: HistoryNetwork, *histories: Tensor) -> dict[str, list[Tensor]]:
-    """Returns the attention weights of the inner blocks, which look at the patches of observations.
+    """Returns the attention weights of the inner blocks, which read the patches of observations.
 
     Args:
         network: the network.
@@ -20,8 +20,8 @@ def inner_attention(network: HistoryNetwork, *histories: Tensor) -> dict[str, li
 
     Returns:
         By the name of the observation, the weights of each block, float [..., K, heads, S, S], rows
-        (queries) summing to 1: the class token is at position 0, patches follow. Of networks that
-        stack the frames as channels [..., 1, heads, S, S].
+        (queries) summing to 1: the class token is at position 0, patches follow. For networks that
+        stack the frames as channels, [..., 1, heads, S, S].
 
     Raises:
         ValueError: if the network has no inner blocks.
@@ -56,11 +56,11 @@ def inner_attention(network: HistoryNetwork, *histories: Tensor) -> dict[str, li
 
 
 def roll_out(blocks: Sequence[Tensor]) -> Tensor:
-    """Follows attention through all blocks: how much each position reads of each input.
+    """Follows attention through all blocks: how much each position reads from each input.
 
-    Heads are averaged. Residuals hand half of a position through, so each block reads half of what
-    its weights say and half of the position itself: Abnar and Zuidema, "Quantifying Attention Flow
-    in Transformers", arXiv 2005.00928, section 3.
+    Heads are averaged. To account for residuals, each block reads half according to its attention
+    weights and half from the position itself; see Abnar and Zuidema, "Quantifying Attention Flow in
+    Transformers", arXiv 2005.00928, section 3.
 
     Args:
         blocks: the weights of each block, the first one first, float [..., heads, S, S].
@@ -89,18 +89,18 @@ def roll_out(blocks: Sequence[Tensor]) -> Tensor:
 
 
 def map_attention(network: HistoryNetwork, *histories: Tensor) -> dict[str, Tensor]:
-    """Maps how much the class token reads of each patch, rolled out over the inner blocks.
+    """Maps how much the class token reads from each patch, rolled out over the inner blocks.
 
-    The class token is what the outer blocks and the head read of an observation.
+    The outer blocks and the head read only the class token of an observation.
 
     Args:
         network: the network.
         *histories: as in its ``forward``.
 
     Returns:
-        Maps by the name of the observation, float [..., K, h, w] over the patches, summing to 1; of
-        networks that stack the frames as channels [..., 1, h, w]. The patches of arrays and
-        categories are one row.
+        Maps by the name of the observation, float [..., K, h, w] over the patches, summing to 1;
+        for networks that stack the frames as channels, [..., 1, h, w]. The patches of arrays and
+        categories form one row.
 
     Raises:
         ValueError: if the network has no inner blocks.
@@ -113,16 +113,16 @@ def map_attention(network: HistoryNetwork, *histories: Tensor) -> dict[str, Tens
     """
     maps = {}
     for name, blocks in inner_attention(network, *histories).items():
-        row = roll_out(blocks)[..., 0, 1:]  # of the class token; what it reads of itself left out
+        row = roll_out(blocks)[..., 0, 1:]  # of the class token, without its attention to itself
         row = row / row.sum(-1, keepdim=True)
         maps[name] = row.unflatten(-1, patch_grid(network, name))
     return maps
 
 
 def outer_attention(network: HistoryNetwork, *histories: Tensor) -> Tensor:
-    """Returns how much the newest step reads of each of the K steps, in each block and head.
+    """Returns how much the newest step reads from each of the K steps, in each block and head.
 
-    Of Decision Transformer, a step's share is that of its return, state and action together.
+    For Decision Transformer, the weights of a step's return, state and action are added.
 
     Args:
         network: the network.

@@ -39,9 +39,9 @@ class Flows:
     temporal_to_temporal: int
     """Vertical, T-T: from a block over the frames to another one, or to a dense connection."""
     spatial_to_temporal: int
-    """Vertical, S-T: from what encodes a frame to a block over the frames."""
+    """Vertical, S-T: from a frame's encoder to a block over the frames."""
     temporal_to_spatial: int
-    """Vertical, T-S: from a block over the frames to what encodes a frame."""
+    """Vertical, T-S: from a block over the frames to a frame's encoder."""
 
 
 def count_flows(network: settings.Network) -> Flows:
@@ -51,20 +51,19 @@ def count_flows(network: settings.Network) -> Flows:
 
     - A *unit* is a block in one place: an inner block on one of the K frames is a spatial unit, a
       block over the frames is a temporal one. A frame encoder without attention is a single spatial
-      unit on each frame, through which no spatial flow goes: convolutions are local, as the paper
-      says of ResNet.
+      unit per frame, with no spatial flow: convolutions are local, as the paper says of ResNet.
     - A *horizontal* flow goes through each unit whose attention (or recurrence) mixes all patches,
       or all frames.
     - A *vertical* flow goes from a unit to each unit that reads its output directly. A dense
-      connection, which puts the outputs of all blocks side by side, counts as a temporal unit if it
+      connection, which concatenates the outputs of all blocks, counts as a temporal unit if it
       reads temporal ones: so Enhanced_TIT has L flows T-T, although none of its outer blocks reads
       another one.
 
-    With L blocks and K frames, that is for Vanilla_TIT and Enhanced_TIT: spatial LK and LK,
+    With L blocks and K frames, this gives for Vanilla_TIT and Enhanced_TIT: spatial LK and LK,
     temporal L and L, S-S (L - 1)K and (L - 1)K, T-T L - 1 and L, S-T K and LK, T-S 0 and 0.
     Networks that stack the frames as channels, or as entries, mix them without any flow of this
-    kind. Of several observations, only ``network.frame`` is counted.
-    :func:`~torchrl_tit.analysis.measure_flows` finds out what depends on what.
+    kind. With several observations, only ``network.frame`` is counted.
+    :func:`~torchrl_tit.analysis.measure_flows` measures the actual dependencies.
 
     Source: arXiv 2212.14538, appendix "Discussion and Improvement".
 
@@ -72,7 +71,7 @@ def count_flows(network: settings.Network) -> Flows:
         network: the settings.
 
     Raises:
-        ValueError: if the history encoder is one of a user's own, which no rule counts.
+        ValueError: if the history encoder is user-defined, for which there is no rule.
 
     Example:
         >>> from torchrl_tit.settings.networks import enhanced_tit
@@ -133,13 +132,13 @@ def _chained(history: ChainedOuter, tokens: int, dense: bool) -> tuple[int, int,
 
 
 def _catformer(history: Catformer, tokens: int, dense: bool) -> tuple[int, int, int]:
-    # Each block reads all before it; only the first one reads the tokens.
+    # Each block reads all previous ones; only the first one reads the tokens.
     blocks = history.num_blocks
     return blocks, blocks * (blocks - 1) // 2, tokens
 
 
 def _coberl(history: CoBERL, tokens: int, dense: bool) -> tuple[int, int, int]:
-    # Its LSTM is a block, which a gate lets read the tokens too.
+    # Its LSTM is a block, which also reads the tokens through a gate.
     return history.num_blocks + 1, history.num_blocks, 2 * tokens
 
 
@@ -158,5 +157,6 @@ _RULES: dict[type[HistorySettings], Callable[[Any, int, bool], tuple[int, int, i
     D2RL: _nothing,
     StackedCNN: _nothing,
 }
-"""For the settings of a history encoder, the tokens of a frame and whether these are all blocks':
-its temporal units, the flows between them, and those that it reads from a frame."""
+"""Functions of a history encoder's settings, the tokens per frame, and whether these come from all
+blocks. They return its temporal units, the flows between them, and those that it reads from a
+frame."""

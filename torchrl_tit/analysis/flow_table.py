@@ -23,16 +23,16 @@ _SHORT = {"spatial": "spatial", "temporal": "temporal"} | {
 
 
 def flow_table(networks: Mapping[str, settings.Network]) -> str:
-    """Writes the flows of information of networks as a Markdown table.
+    """Formats the flows of information of networks as a Markdown table.
 
-    The numbers are those of :func:`~torchrl_tit.analysis.count_flows`. Beside them stands what
-    :func:`~torchrl_tit.analysis.measure_flows` finds of T-T: blocks over the frames that read
-    another one, and those that the output reads. Where gradients find another number of any other
-    flow, the cell has both: "2, measured 1".
+    The numbers are those of :func:`~torchrl_tit.analysis.count_flows`. The last column has the T-T
+    flows that :func:`~torchrl_tit.analysis.measure_flows` finds: blocks over the frames that read
+    another one, and those that the output reads. If the measured number of any other flow differs,
+    the cell has both: "2, measured 1".
 
     Args:
-        networks: their settings by name. They are built for arrays of 4 entries, or for images of
-            36 x 36 pixels if they read no arrays.
+        networks: their settings by name. The networks are built for arrays of 4 entries, or for
+            images of 36 x 36 pixels if they do not read arrays.
 
     Raises:
         ValueError: if a history encoder is one of a user's own, which no rule counts.
@@ -63,7 +63,7 @@ def flow_table(networks: Mapping[str, settings.Network]) -> str:
 
 
 def _build(network: settings.Network) -> HistoryNetwork:
-    """Builds a network, of two trunks only one."""
+    """Builds a network; if it has two trunks, only one."""
     network = replace(network, trunks="shared")
     try:
         built = build_network(network, _ARRAY, action_dim=1)

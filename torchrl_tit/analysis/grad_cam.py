@@ -1,4 +1,4 @@
-"""Grad-CAM: where in an image lies what raises a target."""
+"""Grad-CAM: the places in an image that raise a target."""
 
 from __future__ import annotations
 
@@ -31,15 +31,16 @@ def grad_cam(
     layer: str | None = None,
     relu: bool = True,
 ) -> dict[str, Tensor]:
-    r"""Maps what in images raises a target, with Grad-CAM.
+    r"""Maps the places in images that raise a target, with Grad-CAM.
 
     .. math:: \mathrm{map} = \mathrm{relu}\Big(\sum_c w_c A_c\Big), \quad
         w_c = \frac{1}{hw} \sum_{ij} \frac{\partial\, \mathrm{target}}{\partial A_{cij}}
 
-    for the output A of a layer with c channels on h x w places. Of inner transformers, places are
-    patches, channels the entries of their tokens, and the layer is the input normalisation of the
-    last block: after it the last block computes the class token only, so that patches get no
-    gradient. The class token is left out. Of convolutional networks it is the last convolution.
+    for the output A of a layer with c channels on h x w places. For inner transformers, places are
+    patches, channels are the entries of their tokens, and the layer is the input normalisation of
+    the last block: after it, the last block computes only the class token, so patches get no
+    gradient. The class token is left out. For convolutional networks, the layer is the last
+    convolution.
 
     Selvaraju et al., "Grad-CAM: Visual Explanations from Deep Networks via Gradient-based
     Localization", arXiv 1610.02391; the pictures of arXiv 2212.14538, appendix "Feature Attention
@@ -47,16 +48,15 @@ def grad_cam(
 
     Args:
         policy: a policy with a :class:`~torchrl_tit.modules.Backbone`; dropout is off.
-        tensordict: what the policy reads, [N] or []; its "action", if there is one, is the chosen
-            one.
-        target: what is explained; see :data:`~torchrl_tit.analysis.targets.Target`.
-        layer: name of another layer in the network (of two trunks, in the target's); then there is
-            a map of its image only.
-        relu: whether to leave out what lowers the target.
+        tensordict: the policy's inputs, [N] or []; its "action", if present, is the chosen one.
+        target: the explained quantity; see :data:`~torchrl_tit.analysis.targets.Target`.
+        layer: name of another layer in the network (with two trunks, in the target's); then only
+            its image is mapped.
+        relu: whether to leave out places that lower the target.
 
     Returns:
-        A map of each image by the name of the observation, float [N, K, h, w]; of networks that
-        stack the frames as channels [N, 1, h, w]: one map for all of them.
+        A map of each image by the name of the observation, float [N, K, h, w]; for networks that
+        stack the frames as channels, [N, 1, h, w]: one map for all frames.
 
     Raises:
         ValueError: if the network reads no image with such a layer, there is no layer of that name,
@@ -110,9 +110,9 @@ def grad_cam(
 
 
 class _Recorder:
-    """Keeps the output of a layer's last call, cut off from what it was computed from.
+    """Keeps the output of a layer's last call, detached from its inputs.
 
-    The last call, because blocks can share their weights.
+    Only the last call counts, because blocks can share their weights.
     """
 
     def __init__(self, module: nn.Module, hooks: ExitStack) -> None:

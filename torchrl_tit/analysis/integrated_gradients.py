@@ -33,22 +33,22 @@ def integrated_gradients(
 ) -> dict[str, Tensor]:
     """Attributes a target to the entries of observations, with captum's integrated gradients.
 
-    The attributions of a state add up to the difference that its observations make to the target,
-    compared with a baseline: gradients are averaged on the straight line from the one to the other
+    The attributions of a state add up to the difference in the target between its observations and
+    a baseline: gradients are averaged on the straight line from the baseline to the observations
     (Sundararajan et al., "Axiomatic Attribution for Deep Networks", arXiv 1703.01365). The chosen
-    action, recurrent states and categories, which have no gradient, stay as they are.
+    action, recurrent states and categories, which have no gradient, are left unchanged.
 
     Args:
         policy: a policy with a :class:`~torchrl_tit.modules.Backbone`; dropout is off.
         tensordict: what the policy reads, [N] or []; its "action", if there is one, is the chosen
             one.
         target: what is explained; see :data:`~torchrl_tit.analysis.targets.Target`.
-        baselines: observations to compare with by name, to be broadcast to [N, K, *observation];
-            zeros for those that it leaves out. Bytes count as 0..1, as networks read them.
-        steps: points on the line. More make the sum more exact.
+        baselines: observations to compare with, by name, broadcast to [N, K, *observation]; zeros
+            if not given. Bytes count as 0..1, as networks read them.
+        steps: number of points on the line. With more points, the sum is more exact.
 
     Returns:
-        Attributions by the name of the observation, float [N, K, *observation], of arrays and
+        Attributions by the name of the observation, float [N, K, *observation], for arrays and
         images.
 
     Raises:

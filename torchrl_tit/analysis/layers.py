@@ -1,4 +1,4 @@
-"""Where in a network the image is still an image: the layers of Grad-CAM."""
+"""The layers of Grad-CAM, whose outputs still have the layout of an image."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from torchrl_tit.settings.checks import nearest
 
 @dataclass(frozen=True)
 class ImageLayer:
-    """A layer whose output is laid out over an image."""
+    """A layer whose output has the layout of an image."""
 
     name: str
     """Its name in the network."""
     module: nn.Module
     """The layer."""
     grid: tuple[int, int] | None
-    """Rows and columns of the patches, if it puts out tokens; None of convolutions."""
+    """Rows and columns of the patches, if it outputs tokens; None for convolutions."""
 
     def lay_out(self, output: Tensor) -> Tensor:
-        """Lays a layer's output over the image: patches row by row, without the class token.
+        """Arranges a layer's output like the image: patches row by row, without the class token.
 
         Args:
             output: float [M, C, h, w], or tokens [M, S, D].
@@ -32,7 +32,7 @@ class ImageLayer:
             float [M, C or D, h, w].
 
         Raises:
-            ValueError: if it has no place for each patch.
+            ValueError: if the number of positions does not match the patches.
         """
         if output.ndim == 4:
             return output
@@ -53,8 +53,9 @@ class ImageLayer:
 def image_layers(network: HistoryNetwork) -> dict[str, ImageLayer]:
     """Finds the layer of Grad-CAM for each image that a network reads.
 
-    Of transformers it is the input normalisation of the last inner block: after it the last block
-    computes the class token only, so patches get no gradient. Of convolutions it is the last one.
+    For transformers, it is the input normalisation of the last inner block: after it, the last
+    block computes only the class token, so patches get no gradient. For convolutional networks, it
+    is the last convolution.
 
     Returns:
         The layers by the name of the observation; images without such a layer are left out.

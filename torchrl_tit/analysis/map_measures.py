@@ -1,4 +1,4 @@
-"""Maps as numbers: how much of them lies on objects, and how much they change."""
+"""Measures of maps: how much of them lies on objects, and how much they change."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ def find_objects(
     """Finds the objects in frames: pixels that differ from the background.
 
     Args:
-        frames: images in order, uint8 or float 0..1, [T, H, W] or [T, C, H, W]. Bytes that are all
-            less than 25 are taken as symbols, which differ more than the tolerance by default.
-        background: what is background: the median over the frames at each place, for cameras that
-            stand still ("place"); or the most common colour of each frame ("colour").
-        tolerance: largest difference to the background, of a range from 0 to 1.
+        frames: images in order, uint8 or float 0..1, [T, H, W] or [T, C, H, W]. If all bytes are
+            less than 25, they are treated as symbols, whose differences exceed the default
+            tolerance.
+        background: the background: the median over the frames at each place, for static cameras
+            ("place"); or the most common colour of each frame ("colour").
+        tolerance: largest difference from the background, in a range from 0 to 1.
 
     Returns:
         bool [T, H, W].
@@ -42,7 +43,7 @@ def find_objects(
         raise ValueError(f"frames have the shape {list(frames.shape)}, not [T, H, W] or with C")
     images = frames if frames.ndim == 4 else frames.unsqueeze(1)
     if images.dtype == torch.uint8:
-        # Few values are symbols, such as MiniGrid's, which differ by one, not by brightness.
+        # Small values are symbols, such as MiniGrid's, which differ by one, not by brightness.
         most = int(images.max())
         images = images.float() / (255 if most >= _SYMBOLS else max(most, 1))
     if background == "place":
@@ -53,20 +54,20 @@ def find_objects(
 
 
 def share_on_objects(maps: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
-    """Measures which share of maps lies on objects, and which share would if they were uniform.
+    """Measures the share of maps that lies on objects, and the share for uniform maps.
 
-    A map says nothing about places within one of its cells, so a cell counts with the share of it
-    that is covered by objects.
+    A map has no detail within a cell, so each cell is weighted by the share of its area that
+    objects cover.
 
     Args:
         maps: not negative, [T, h, w].
         objects: bool [T, H, W].
 
     Returns:
-        The shares of the maps and those of the area, float [T] each; of a map of zeros it is NaN.
+        The shares of the maps and those of the area, float [T] each; NaN for a map of zeros.
 
     Raises:
-        ValueError: if there are not as many maps as frames.
+        ValueError: if the numbers of maps and frames differ.
 
     Example:
         >>> objects = torch.zeros(1, 8, 8, dtype=torch.bool)
@@ -88,16 +89,16 @@ def share_on_objects(maps: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
 def map_change(maps: Tensor, grid: tuple[int, int] = (7, 7)) -> Tensor:
     """Measures how much maps change from each frame to the next.
 
-    Maps are averaged to one grid, so that those of networks with finer ones compare, and scaled to
-    a sum of 1. The change is the share of a map that is somewhere else in the next one (half of the
-    sum of absolute differences): 0 of the same map, 1 where nothing is in common.
+    Maps are averaged to one grid, so that maps of networks with finer grids can be compared, and
+    scaled to a sum of 1. The change is the share of a map that is somewhere else in the next one
+    (half of the sum of absolute differences): 0 for the same map, 1 if they do not overlap.
 
     Args:
         maps: in order, not negative, [T, h, w].
         grid: rows and columns to average to, at most h and w.
 
     Returns:
-        float [T - 1]; NaN beside a map of zeros.
+        float [T - 1]; NaN next to a map of zeros.
 
     Raises:
         ValueError: if there are fewer than two maps.

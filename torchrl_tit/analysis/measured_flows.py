@@ -1,4 +1,4 @@
-"""Flows of information in a network, measured with gradients: what depends on what."""
+"""Flows of information in a network, measured with gradients."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from torchrl_tit.networks import HistoryNetwork
 
 Kind: TypeAlias = Literal["spatial", "temporal"]
 Unit: TypeAlias = tuple[Kind, int, int]
-"""A unit: its kind, its number, and the number of its frame, if it is on one."""
+"""A unit: its kind, its number, and the number of its frame, if it has one."""
 
 
 @dataclass(frozen=True)
 class MeasuredFlows:
-    """Numbers of flows of information in a network, as gradients show them."""
+    """Numbers of flows of information in a network, measured with gradients."""
 
     spatial: int
-    """Blocks on a frame whose output depends on other patches than the one in its place."""
+    """Blocks on a frame whose output depends on other patches than its own."""
     temporal: int
     """Blocks over the frames whose newest output depends on earlier steps."""
     spatial_to_spatial: int
@@ -44,25 +44,25 @@ class MeasuredFlows:
     """Blocks over the frames that the history encoder's output reads: more than one is a dense
     connection, which the paper's table counts as T-T."""
     spatial_to_temporal: int
-    """S-T: blocks over the frames that read what encodes a frame."""
+    """S-T: blocks over the frames that read a frame's encoder."""
     temporal_to_spatial: int
     """T-S: blocks on frames that read a block over the frames."""
 
 
 def measure_flows(network: HistoryNetwork) -> MeasuredFlows:
-    """Measures with gradients which parts of a network read which.
+    """Measures with gradients which parts of a network read which others.
 
-    The output of each block is cut off from what it was computed from. What the gradient of another
-    block's output then reaches is read directly, not by way of a third one. Units are those of
-    :func:`~torchrl_tit.analysis.count_flows`. So the two can be compared; only Enhanced_TIT's T-T
-    differ in kind: its outer blocks read none of each other, and the output reads all of them.
+    The output of each block is detached from its inputs. What the gradient of another block's
+    output then reaches is read directly, not through a third block. Units are those of
+    :func:`~torchrl_tit.analysis.count_flows`, so the two can be compared. Only Enhanced_TIT's T-T
+    differs in kind: its outer blocks do not read each other, and the output reads all of them.
 
     Args:
-        network: a network; it is left as it is. Its inputs are drawn at random, and so are the
-            directions in which its outputs are derived.
+        network: a network, which is left unchanged. Its inputs, and the directions in which its
+            outputs are differentiated, are drawn at random.
 
     Raises:
-        ValueError: if the history encoder has no parts that are known here.
+        ValueError: if the parts of the history encoder are unknown.
 
     Example:
         >>> from torchrl_tit import EnhancedTIT, VanillaTIT
@@ -85,14 +85,14 @@ def measure_flows(network: HistoryNetwork) -> MeasuredFlows:
 
 @dataclass(frozen=True)
 class _Group:
-    """Modules that are called one after the other, each call a unit on each frame or over all."""
+    """Modules that are called in sequence; each call is a unit on each frame or over all frames."""
 
     kind: Kind
     modules: list[nn.Module]
     frames_dim: int | None = None
-    """Dimension of the output that is over frames, each of which is a unit; None if one is."""
+    """Dimension of the output over frames, each of which is a unit; None for a single unit."""
     per_unit: int = 1
-    """How many modules, called one after the other, are one unit."""
+    """Number of modules, called in sequence, that form one unit."""
 
 
 @dataclass(frozen=True)
@@ -101,16 +101,16 @@ class _Call:
 
     group: _Group
     number: int
-    """Number of the unit among those of its kind."""
+    """Index of the unit among those of its kind."""
     x: Tensor
-    """What it read, [N, positions, ...]."""
+    """Its input, [N, positions, ...]."""
     raw: Tensor
-    """What it put out."""
+    """Its output."""
     leaf: Tensor
-    """The same, cut off from what it was computed from: what others read."""
+    """The output detached from its inputs, which others read."""
 
     def units(self, values: Tensor) -> Iterator[tuple[Unit, Tensor]]:
-        """Its units, and the part of its output, or of a gradient of it, that is theirs."""
+        """Its units, and their parts of its output or of the output's gradient."""
         dim = self.group.frames_dim
         parts = [values] if dim is None else values.unbind(dim)
         for frame, part in enumerate(parts):
@@ -131,7 +131,7 @@ class _Call:
 
 
 def _watch(network: HistoryNetwork) -> list[_Call]:
-    """Lets a network's blocks record their calls, in the list that is returned."""
+    """Makes a network's blocks record their calls in the returned list."""
     calls: list[_Call] = []
     numbers: dict[Kind, int] = {"spatial": 0, "temporal": 0}
     frames = [] if network.history_encoder.reads_frames else network.frames
@@ -193,9 +193,9 @@ def _history_groups(encoder: HistoryEncoder) -> list[_Group]:
 
 
 def _blocks(inner: InnerTransformer) -> list[nn.Module]:
-    """The blocks of an inner transformer, each as often as it is called."""
+    """The blocks of an inner transformer, each repeated as often as it is called."""
     blocks = [inner.blocks[i % len(inner.blocks)] for i in range(inner.num_blocks)]
-    if inner.num_blocks == 1:  # a shortcut, which hooks do not see
+    if inner.num_blocks == 1:  # a shortcut that hooks do not see
         (block,) = blocks
         assert isinstance(block, TransformerBlock)
 
@@ -255,7 +255,7 @@ def _count(calls: list[_Call], output: Tensor) -> MeasuredFlows:
 
 
 def _mixes(group: _Group) -> bool:
-    """Whether blocks have attention or a recurrence: encoders of whole frames have not."""
+    """Whether blocks have attention or recurrence, which encoders of whole frames lack."""
     return not (group.kind == "spatial" and isinstance(group.modules[0], FrameEncoder))
 
 

@@ -1,4 +1,4 @@
-"""What is explained: a number for each state that a policy computes."""
+"""The quantity to explain: a number per state that a policy computes."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.networks import HistoryNetwork
 
 Target: TypeAlias = Literal["action", "value"] | Callable[[TensorDictBase], Tensor]
-"""What is explained, a number for each state [N].
+"""The quantity to explain, a number per state [N].
 
 "action" is the chosen action's log-probability. The log-probability of a continuous action has no
-gradient where the action is the mean, as it is while evaluating, so of continuous actions it is
-their size: the sum of the sizes of the entries of the policy's deterministic action. Of policies
-that take the action of the highest value, it is that value.
+gradient where the action is the mean, as in evaluation. So for continuous actions it is their size:
+the sum of the absolute entries of the policy's deterministic action. For policies that take the
+action of the highest value, it is that value.
 
 "value" is the state's value, or the chosen action's if the policy computes those.
 
-A function is given what the policy writes, and returns float [N].
+A function gets the policy's outputs, and returns float [N].
 """
 
 
@@ -39,7 +39,7 @@ def find_backbone(policy: nn.Module) -> Backbone:
     """Returns the backbone of a policy.
 
     Raises:
-        ValueError: if there is none, or its network is not of this library.
+        ValueError: if there is none, or its network is not from this library.
     """
     backbones = (module for module in policy.modules() if isinstance(module, Backbone))
     backbone = next(backbones, None)
@@ -52,10 +52,10 @@ def find_backbone(policy: nn.Module) -> Backbone:
 
 
 def find_network(policy: nn.Module, target: Target = "action") -> HistoryNetwork:
-    """Returns the network that computes a target: of two trunks, the policy's or the value's.
+    """Returns the network that computes a target: with two trunks, the policy's or the value's.
 
     Raises:
-        ValueError: as :func:`find_backbone`.
+        ValueError: see :func:`find_backbone`.
     """
     trunks = trunks_of(find_backbone(policy).module)
     key = "value_" if target == "value" else "policy_"
@@ -63,11 +63,11 @@ def find_network(policy: nn.Module, target: Target = "action") -> HistoryNetwork
 
 
 def histories_of(policy: nn.Module, tensordict: TensorDictBase) -> list[Tensor]:
-    """Returns what the policy's network reads, as its ``forward`` takes it.
+    """Returns the inputs of the policy's network, as its ``forward`` takes them.
 
     Raises:
-        ValueError: as :func:`find_backbone`.
-        KeyError: if the tensordict lacks some of it.
+        ValueError: see :func:`find_backbone`.
+        KeyError: if the tensordict lacks one of them.
     """
     return [tensordict[key] for key in find_backbone(policy).history_keys]
 
@@ -79,10 +79,10 @@ def run_policy(
 
     Args:
         policy: any policy; the deterministic action is taken.
-        tensordict: what it reads, [N]; it is left as it is.
+        tensordict: its inputs, [N], which are left unchanged.
 
     Returns:
-        All that the policy writes, and the distribution of actions, if there is one.
+        The policy's outputs, and the distribution of actions, if there is one.
     """
     outputs, distribution = tensordict.copy(), None
     with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(False):
@@ -100,7 +100,7 @@ def compute_target(
 
     Args:
         policy: the policy.
-        tensordict: what it reads, [N], and "action" if that is not the deterministic one.
+        tensordict: its inputs, [N], and "action" if that is not the deterministic one.
         target: see :data:`Target`.
 
     Returns:
@@ -136,7 +136,7 @@ def compute_target(
 
 @contextmanager
 def evaluating(policy: nn.Module) -> Iterator[None]:
-    """Switches dropout off, and each module back to its mode at the end."""
+    """Switches dropout off, and restores each module's mode at the end."""
     modes = [(module, module.training) for module in policy.modules()]
     try:
         policy.eval()

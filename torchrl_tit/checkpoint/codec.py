@@ -1,4 +1,4 @@
-"""Nested Python state as named tensors and a JSON tree, and back without loss.
+"""Converts nested Python state to named tensors and a JSON tree, and back without loss.
 
 An object whose first key is a tag stands for what JSON cannot express:
 
@@ -36,13 +36,13 @@ def encode(state: Any) -> tuple[dict[str, Tensor], Any]:
     """Split a nested state into tensors and a tree for JSON.
 
     Args:
-        state: Dicts with str or int keys (ordered ones too), lists, tuples, `torch.Size`, None,
-            bools, ints of any size, floats (infinite and NaN too), strings, dense tensors of any
-            dtype and shape, numpy arrays and scalars, and TensorDicts of these.
+        state: Dicts with str or int keys (also ordered ones), lists, tuples, `torch.Size`, None,
+            bools, ints of any size, floats (also infinite ones and NaN), strings, dense tensors of
+            any dtype and shape, numpy arrays and scalars, and TensorDicts of these.
 
     Returns:
         Contiguous CPU tensors that share no memory with the state, by their place in it
-        (`"state['actor']['weight']"`), and the tree. Tensors lose their device and their gradient,
+        (`"state['actor']['weight']"`), and the tree. Tensors lose their device and their gradient;
         parameters become plain tensors.
 
     Raises:
@@ -133,7 +133,7 @@ def _encode_dict(value: dict[Any, Any], path: str, tensors: dict[str, Tensor]) -
 
 
 def _encode_tensor(value: Tensor, path: str, tensors: dict[str, Tensor]) -> Any:
-    # Copied even if it is on the CPU: safetensors refuses tensors that share memory.
+    # Copied even if it is on the CPU, because safetensors rejects tensors that share memory.
     plain = value.detach().resolve_conj().resolve_neg().cpu()
     plain = plain.clone(memory_format=torch.contiguous_format)
     if value.dtype in _NATIVE_DTYPES:

@@ -1,4 +1,4 @@
-"""The state of TorchRL's synchronous collector, environment included."""
+"""The state of TorchRL's synchronous collector, including the environment."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ def collector_state(collector: Collector) -> dict[str, Any]:
     """Return the state of a collector between two of its batches.
 
     TorchRL's own `state_dict` lacks the environment and the tensordict that the collector carries
-    from one batch to the next; this state has both. It lacks the policy, which is saved separately.
+    from one batch to the next; this state has both. The policy is not included and must be saved
+    separately.
 
     Args:
         collector: A synchronous collector.
@@ -56,7 +57,7 @@ def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
 
     Raises:
         ValueError: The state is from another kind of environment, only one of the two collectors
-            tracks trajectories, or a count is none.
+            tracks trajectories, or a count is invalid.
 
     Example:
         >>> from torchrl.collectors import Collector

@@ -29,7 +29,7 @@ def write_contents(path: Path, step: int, tensors: dict[str, Tensor], tree: Any)
         path: The folder.
         step: The checkpoint's number.
         tensors: Tensors by name, see :func:`~torchrl_tit.checkpoint.codec.encode`.
-        tree: The tree that belongs to them.
+        tree: The tree that belongs to the tensors.
 
     Raises:
         OSError: A file could not be written.
@@ -75,7 +75,7 @@ def read_contents(path: Path, step: int) -> Any:
         The state.
 
     Raises:
-        CheckpointError: The checkpoint is damaged, of another program or version, or contains an
+        CheckpointError: The checkpoint is damaged, from another program or version, or contains an
             unknown file.
 
     Example:
@@ -90,8 +90,8 @@ def read_contents(path: Path, step: int) -> Any:
         document = _read_document(path / _STATE, step)
         _check_tensors(path / _TENSORS, document["tensors"])
         return decode(load_file(path / _TENSORS), document["state"])
-    # A foreign tree can be wrong in many ways (a wrong hex number, a wrong shape, a list instead
-    # of an object), so any of these errors means that the checkpoint is unusable.
+    # A tree from elsewhere can be wrong in many ways (a wrong hex number, a wrong shape, a list
+    # instead of an object), so any of these errors means that the checkpoint is unusable.
     except (
         *(ArithmeticError, AttributeError, LookupError, OSError, RuntimeError),
         *(SafetensorError, TypeError, ValueError),

@@ -1,4 +1,4 @@
-"""The state of a TorchRL environment, which resumes bit for bit from it."""
+"""The state of a TorchRL environment, from which it resumes bit for bit."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ from torchrl_tit.envs import GymVectorEnv
 def can_save_env(env: EnvBase) -> bool:
     """Return whether an environment can be saved and resumed.
 
-    This requires that every layer is known: Gymnasium's classic control, toy text and MuJoCo tasks
-    (v4, v5) with the wrappers that `gymnasium.make` adds and a few more, single or in a
-    `SyncVectorEnv`, inside `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`.
-    Others, such as Atari, MiniGrid and all that are TorchRL's own, have to be reset at each
-    checkpoint.
+    All layers must be known: Gymnasium's classic control, toy text and MuJoCo tasks (v4, v5) with
+    the wrappers that `gymnasium.make` adds and a few more, single or in a `SyncVectorEnv`, inside
+    `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`. Other environments, such as
+    Atari, MiniGrid and TorchRL's own, must be reset at each checkpoint.
 
     Args:
         env: A TorchRL environment.
@@ -128,7 +127,7 @@ def _unwrap(env: EnvBase) -> tuple[list[nn.Module], EnvBase]:
 
 
 def _obstacle(env: EnvBase) -> str | None:
-    """Return the name of the class that keeps an environment from being saved, if any."""
+    """Return the name of the class that prevents an environment from being saved, if any."""
     _, base = _unwrap(env)
     if type(base) not in (GymVectorEnv, GymWrapper, GymEnv):
         return class_name(base)
@@ -143,7 +142,7 @@ def _module_state(module: nn.Module) -> dict[str, Any]:
             key: None if isinstance(value, UninitializedBuffer) else _copy(value)
             for key, value in _buffers(module).items()
         },
-        # TorchRL keeps the results of a vector environment's automatic resets here.
+        # TorchRL stores the results of a vector environment's automatic resets here.
         "resets": {
             name: {key: _copy(value) for key, value in part._memo.items()}
             for name, part in module.named_modules()

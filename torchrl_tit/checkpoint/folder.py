@@ -34,15 +34,15 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep:
 
     The checkpoint is written into a hidden folder, flushed to the disk and renamed, so a process
     that is killed at any moment leaves a complete checkpoint or none. Saving a step again replaces
-    its checkpoint, and a complete one exists at any time. Only one process at a time may save into
-    a folder.
+    its checkpoint; a complete one exists at all times. Only one process at a time may save to a
+    folder.
 
     Args:
-        folder: Folder of the run's checkpoints; made if missing.
+        folder: Folder of the run's checkpoints; created if missing.
         step: Environment steps or updates done so far; the checkpoint's number.
-        state: A nested state as :func:`~torchrl_tit.checkpoint.encode` takes it.
+        state: A nested state that :func:`~torchrl_tit.checkpoint.encode` accepts.
         keep: How many checkpoints to keep: this one and the ones before it. Checkpoints of later
-            steps (of a run that was resumed from an earlier one) are kept too.
+            steps (of a run that was resumed from an earlier one) are also kept.
 
     Returns:
         The checkpoint's own folder.
@@ -50,8 +50,8 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep:
     Raises:
         ValueError: `step` is negative or `keep` is not positive.
         TypeError: The state holds something that a checkpoint cannot hold.
-        CheckpointError: It could not be written (the disk is full, say). Earlier checkpoints are
-            still there.
+        CheckpointError: It could not be written (for example, because the disk is full). Earlier
+            checkpoints remain.
 
     Example:
         >>> import tempfile
@@ -97,7 +97,7 @@ def load_checkpoint(folder: str | os.PathLike[str], step: int | None = None) -> 
 
     Raises:
         CheckpointNotFoundError: There is no checkpoint, or none of this step.
-        CheckpointError: The checkpoint is damaged, of another program or version, or contains an
+        CheckpointError: The checkpoint is damaged, from another program or version, or contains an
             unknown file. The message names its folder.
 
     Example:
@@ -186,7 +186,7 @@ def _name(step: int) -> str:
 def _checkpoints(folder: Path) -> dict[int, Path]:
     """Return the folder of each step's checkpoint; of two of the same step, the newer one."""
     found: dict[int, Path] = {}
-    # Sorted, "NAME.new" comes after "NAME" and takes its place.
+    # In sorted order, "NAME.new" comes after "NAME" and replaces it.
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         if match := _NAME.fullmatch(path.name):
             found[int(match[1])] = path
@@ -201,7 +201,7 @@ def _add(folder: Path, step: int, tensors: dict[str, Any], tree: Any) -> Path:
         write_contents(temporary, step, tensors, tree)
         complete = path.with_name(f"{path.name}.new") if path.exists() else path
         os.rename(temporary, complete)
-    except BaseException:  # Ctrl-C as well must leave nothing behind
+    except BaseException:  # Ctrl-C must leave nothing behind either
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     fsync_directory(folder)
@@ -227,7 +227,7 @@ def _remove(path: Path) -> None:
 
 
 def _tidy(folder: Path) -> None:
-    """Finish or remove what a killed process left behind."""
+    """Complete or remove the leftovers of a killed process."""
     for path in list(folder.iterdir()):
         if path.name.startswith(_TEMPORARY):
             shutil.rmtree(path)

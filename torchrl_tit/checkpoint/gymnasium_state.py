@@ -1,4 +1,4 @@
-"""The state of a Gymnasium environment, its wrappers and its vector, layer by layer."""
+"""The state of a Gymnasium environment, its wrappers and its vector environment, by layer."""
 
 from __future__ import annotations
 
@@ -69,8 +69,7 @@ def layer_state(layer: _Layer) -> dict[str, Any]:
         "spaces": {key: _space_generator(space) for key, space in _spaces(layer).items()},
     }
     if _is_core(layer):
-        # This creates a lazy generator, so that the run that is saved and the one that is restored
-        # have the same.
+        # This creates a lazy generator, so that the saved and the restored run have the same one.
         state["np_random"] = _generator_state(layer.np_random)
         state["np_random_seed"] = layer._np_random_seed
         if hasattr(layer, "model"):
@@ -86,7 +85,7 @@ def set_layer_state(layer: _Layer, state: dict[str, Any]) -> None:
         state: What :func:`layer_state` returned.
 
     Raises:
-        ValueError: The state has other attributes than those that change in such a layer.
+        ValueError: The attributes of the state are not those that change in such a layer.
 
     Example:
         >>> import gymnasium as gym

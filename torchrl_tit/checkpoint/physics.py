@@ -70,9 +70,9 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     f"{_WRAPPERS}.transform_reward.ClipReward": (),
 }
 
-# Positions that MuJoCo derives from the state one substep late: after a step they belong to the
-# state before the last substep. Ant, Humanoid and Reacher read them before they step, so they
-# cannot be recomputed from the state.
+# Positions that MuJoCo computes one substep late: after a step, they belong to the state before the
+# last substep. Ant, Humanoid and Reacher read them before they step, so they cannot be recomputed
+# from the state.
 _LATE_POSITIONS = ("xpos", "xipos")
 
 

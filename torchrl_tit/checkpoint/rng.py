@@ -27,7 +27,7 @@ def global_rng_state() -> dict[str, Any]:
         "python": random.getstate(),
         "numpy": np.random.get_state(legacy=False),
         "torch": torch.get_rng_state(),
-        # Reading it would initialize CUDA on every GPU, and unused generators have no state.
+        # Reading the state would initialize CUDA on every GPU, and unused generators have none.
         "cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
     }
 

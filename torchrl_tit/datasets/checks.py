@@ -13,7 +13,7 @@ from torchrl_tit.datasets.errors import DatasetError
 
 FLAGS = ("terminals", "timeouts", "terminations", "truncations")  # D4RL's names and Minari's
 
-# Actions of a squashed policy lie at the bounds, and rounding puts some slightly beyond.
+# Actions of a squashed policy reach the bounds, and rounding moves some slightly beyond them.
 _ACTION_TOLERANCE = 1e-5
 
 
@@ -24,14 +24,14 @@ def check_finite(
     first_row: int = 0,
     kept_as: torch.dtype = torch.float64,
 ) -> None:
-    """Checks that there is no NaN and no infinity, even after conversion.
+    """Checks that values are finite, also after conversion.
 
     Args:
-        source: Where the data came from, for messages.
+        source: Where the data came from, for error messages.
         field: Name of the field.
         values: Some rows of it.
         first_row: Index of the first of these rows.
-        kept_as: The dtype that they are converted to, whose range may be smaller.
+        kept_as: The dtype that they are converted to, which may have a smaller range.
 
     Raises:
         DatasetError: If a value is not finite; the message names the first such row.
@@ -59,13 +59,13 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
     """Checks that actions lie in the action space.
 
     Args:
-        source: Where the data came from, for messages.
+        source: Where the data came from, for error messages.
         values: Some rows of the actions.
         space: A `Box` or `Discrete` action space; others are not checked.
         first_row: Index of the first of these rows.
 
     Raises:
-        DatasetError: If one lies outside; the message names the first.
+        DatasetError: If an action lies outside; the message names the first such row.
 
     Example:
         >>> check_actions("a.hdf5", np.array([[1.5]]), Box(-1.0, 1.0, (1,)))
@@ -94,20 +94,20 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
 
 
 def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | None) -> torch.dtype:
-    """Returns the dtype in which a field is kept.
+    """Returns the dtype in which a field is stored.
 
     Args:
-        source: Where the data came from, for messages.
+        source: Where the data came from, for error messages.
         field: Name of the field.
-        dtype: The dtype it has in the source.
+        dtype: The field's dtype in the source.
         floats: The dtype for floats; None keeps that of the source.
 
     Returns:
         The dtype: bool for flags, floating for rewards, uint8 or int64 for other integers.
 
     Raises:
-        DatasetError: If its values are not numbers.
-        ValueError: If ``floats`` is a dtype of other numbers.
+        DatasetError: If the field's values are not numbers.
+        ValueError: If ``floats`` is not a floating-point dtype.
 
     Example:
         >>> kept_dtype("a.hdf5", "rewards", np.dtype("float64"), torch.float32)

@@ -10,19 +10,19 @@ from torchrl.data import RandomSampler, Storage
 
 
 class ConsecutiveSampler(RandomSampler):
-    """Draws slices of consecutive steps, each of which may contain ends of episodes.
+    """Draws slices of consecutive steps, which may contain ends of episodes.
 
     Slices begin at any step, uniformly and with replacement, so every transition is equally likely
-    to be drawn, ends of episodes included, except the first and last ``slice_length - 1`` steps of
-    all. (TorchRL's `SliceSampler` keeps slices within episodes, which then draws an episode's first
-    and last steps less often, and it reads the whole storage to find them.)
+    to be drawn, including ends of episodes, except the first and last ``slice_length - 1`` steps of
+    the storage. (TorchRL's `SliceSampler` keeps slices within episodes, which then draws an
+    episode's first and last steps less often, and it reads the whole storage to find them.)
 
     Args:
-        slice_length: Number of steps of a slice, at least 1.
+        slice_length: Number of steps in a slice, at least 1.
 
     Raises:
-        ValueError: If it is less than 1, or, when sampling, does not divide the batch size, or
-            there are fewer steps.
+        ValueError: If it is less than 1; or, when sampling, if it does not divide the batch size or
+            the storage has fewer steps.
 
     Example:
         >>> from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays
@@ -47,9 +47,9 @@ class ConsecutiveSampler(RandomSampler):
         """Draws indices, int64 [batch_size / slice_length, slice_length].
 
         Args:
-            storage: Items in the order of steps, of one environment or, in two dimensions, of
-                several. From the newest step to the oldest no slice leads.
-            batch_size: Number of steps in all.
+            storage: Items in the order of their steps, of one environment or, in two dimensions, of
+                several. No slice continues from the newest step to the oldest.
+            batch_size: Total number of steps.
         """
         if batch_size % self.slice_length:
             raise ValueError(

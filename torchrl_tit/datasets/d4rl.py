@@ -18,7 +18,7 @@ from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.stored import damage_named
 from torchrl_tit.files import whole_or_not_at_all, write_text_atomic
 
-_HOST = "rail.eecs.berkeley.edu"  # of all of D4RL's files
+_HOST = "rail.eecs.berkeley.edu"  # hosts all of D4RL's files
 _BLOCK = 2**20
 _TIMEOUT = 60  # seconds without an answer
 
@@ -26,10 +26,10 @@ _TIMEOUT = 60  # seconds without an answer
 def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) -> Path:
     """Downloads one of D4RL's data sets, unless it has been downloaded before.
 
-    Files are written atomically, and come over https. D4RL publishes no checksums, so the first
-    download is what the server says it is: it must have the length that the server states and be a
-    whole HDF5 file. Its size and SHA-256 are stored beside it. They are verified whenever the file
-    is used again, and stay if it is deleted: a second download must be the same file.
+    Files are downloaded over https and written atomically. D4RL publishes no checksums, so the
+    first download is trusted: it must have the length that the server states and be a complete HDF5
+    file. Its size and SHA-256 are stored next to it. They are verified whenever the file is used
+    again, and remain if it is deleted: a second download must be the same file.
 
     Args:
         name: D4RL's name, such as "hopper-medium-replay-v0" or "hopper-medium-v2".
@@ -41,7 +41,8 @@ def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) ->
 
     Raises:
         ValueError: If D4RL has no data set of that name.
-        OSError: If it cannot be downloaded or written, or the server leaves https.
+        OSError: If the file cannot be downloaded or written, or the server redirects away from
+            https.
         DatasetError: If the file is damaged, or not the one that was downloaded first.
 
     Source: D4RL (arXiv 2004.07219); the URLs are those of TorchRL, which begin with http.
@@ -75,7 +76,7 @@ def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) ->
 
 
 def address(name: str) -> str:
-    """Returns where a data set is downloaded from: D4RL's host has https, too.
+    """Returns the URL of a data set, over https, which D4RL's host supports.
 
     Args:
         name: One of D4RL's names.
@@ -110,7 +111,7 @@ def _download(url: str, path: Path) -> None:
 
 
 class _Facts(msgspec.Struct):
-    """What tells one file from another."""
+    """Identifies a file."""
 
     bytes: int
     sha256: str
@@ -123,7 +124,7 @@ def _facts(path: Path) -> _Facts:
 
 
 def _check(record: Path, path: Path, source: str, problem: str) -> None:
-    """Raises DatasetError if a file is not the one that the record describes, if there is one."""
+    """Raises DatasetError if there is a record and the file does not match it."""
     if not record.exists():
         return
     try:

@@ -11,13 +11,13 @@ from torch.utils._pytree import tree_map_only
 
 
 class DeferredTensor(Tensor):
-    """A tensor whose shape and dtype are known, and whose values are computed by the first use.
+    """A tensor with known shape and dtype, whose values are computed on first use.
 
-    Whatever is done with it gives plain tensors. A storage writes it where all items are asked for
-    and few of their entries are read, as TorchRL's `SliceSampler` does.
+    All operations on it return plain tensors. Storages return it if all items are requested but few
+    of their entries are read, as by TorchRL's `SliceSampler`.
 
     Args:
-        compute: makes the values, a tensor of this shape, dtype and device.
+        compute: computes the values, a tensor of this shape, dtype and device.
         shape: the shape.
         dtype: the dtype.
         device: the device.
@@ -39,7 +39,7 @@ class DeferredTensor(Tensor):
         dtype: torch.dtype,
         device: torch.device,
     ) -> DeferredTensor:
-        """Makes a tensor without memory."""
+        """Creates a tensor without memory."""
         made = Tensor._make_wrapper_subclass(cls, tuple(shape), dtype=dtype, device=device)
         made.compute = compute
         return made
@@ -48,7 +48,7 @@ class DeferredTensor(Tensor):
     def __torch_function__(
         cls, func: Callable, types: Any, args: tuple = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        """Answers what needs no values, and computes them for all else."""
+        """Answers calls that need no values, and computes the values for all others."""
         if func in _KNOWN:
             return super().__torch_function__(func, types, args, kwargs)
         return cls.__torch_dispatch__(func, types, args, kwargs)

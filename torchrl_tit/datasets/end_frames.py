@@ -1,4 +1,4 @@
-"""The frames that no step begins with: the last ones of episodes."""
+"""Frames with which no step begins: the last frames of episodes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from torch import Tensor
 
 
 class EndFrames:
-    """A queue of frames, numbered from 0 on, in a table that grows when it is full.
+    """A queue of frames, numbered from 0, in a table that grows when it is full.
 
     Args:
-        like: Frames [N], whose shapes and dtypes these have.
+        like: Frames [N] that give the shapes and dtypes.
 
     Example:
         >>> frames = EndFrames(TensorDict({"observation": torch.zeros(1, 2)}, [1]))
@@ -24,11 +24,11 @@ class EndFrames:
 
     def __init__(self, like: TensorDictBase) -> None:
         self.table = like[:1].clone()
-        """The frame of number n is row n modulo the length."""
+        """Frame number n is in row n modulo the length."""
         self.first = 0
         """Number of the oldest frame."""
         self.stop = 0
-        """Number after that of the newest frame."""
+        """Number of the newest frame, plus one."""
 
     def push(self, frames: TensorDictBase) -> Tensor:
         """Adds frames [N]; returns their numbers, int64 [N]."""
@@ -37,7 +37,7 @@ class EndFrames:
         return numbers
 
     def write(self, frames: TensorDictBase, numbers: Tensor) -> None:
-        """Writes frames [N] of consecutive numbers, the newest ones."""
+        """Writes the newest frames [N], with consecutive numbers."""
         if not len(numbers):
             return
         stop = int(numbers[-1]) + 1
@@ -53,7 +53,7 @@ class EndFrames:
         self.first += count
 
     def read(self, first: int) -> TensorDict:
-        """Copies the frames from a number on."""
+        """Copies the frames from number ``first`` on."""
         return self.table[torch.arange(first, self.stop) % len(self.table)]
 
     def _write(self, frames: TensorDictBase, numbers: Tensor) -> None:

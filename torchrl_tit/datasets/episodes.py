@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_tit.datasets.errors import DatasetError
 
-CHUNK_BYTES = 4 * 2**20  # read, checked and converted at a time
+CHUNK_BYTES = 4 * 2**20  # bytes read, checked and converted at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +28,9 @@ class Episodes:
         rows: [R] with "observation" [R, *obs], "action" [R, *action], and "reward", "terminated"
             and "truncated" [R, 1].
         lengths: Number of steps of each episode; int64 [E], all at least 1.
-        final_known: Whether the final observation of each episode is known (it is zeros otherwise);
+        final_known: Whether the final observation of each episode is known (otherwise it is zeros);
             bool [E].
-        source: Name of the source, for messages.
+        source: Name of the source, for error messages.
         attributes: The source's metadata, as strings and numbers.
         left_out: Names of the source's fields that were not read.
 
@@ -99,7 +99,7 @@ class Episodes:
         return self.terminated | self.truncated
 
     def to(self, device: torch.device | str) -> Episodes:
-        """Copies the data to a device, where windows are then gathered.
+        """Copies the data to a device; windows are then gathered there.
 
         Args:
             device: The device, such as "cuda".

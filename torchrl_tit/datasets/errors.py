@@ -1,8 +1,8 @@
-"""The error about data that cannot be used."""
+"""The error for data that cannot be used."""
 
 
 class DatasetError(ValueError):
-    """A data set is damaged, incomplete, or of another task; names the file, field and row.
+    """A data set is damaged, incomplete, or of another task; the message names file, field and row.
 
     Args:
         source: The file, or another description of the source.

@@ -15,21 +15,21 @@ import h5py
 def new_hdf5(
     hidden: Path, path: str | os.PathLike[str]
 ) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
-    """Makes an HDF5 file, and says in one error why it cannot be written.
+    """Creates an HDF5 file; if it cannot be written, raises a single error with the reason.
 
-    HDF5's library does not survive a write that fails: it tries again whenever one of its objects
-    is freed, and in the end crashes. So it never learns of a failure: it is told that all is
-    written, and the error is raised once it has closed the file.
+    The HDF5 library does not survive a failed write: it tries again whenever one of its objects is
+    freed, and finally crashes. So failures are hidden from it: every write appears to succeed, and
+    the error is raised once the library has closed the file.
 
     Args:
-        hidden: The file to make.
-        path: The name that it will get, for messages.
+        hidden: The file to create.
+        path: The name that it will get, for error messages.
 
     Yields:
         The file, and a function that raises the error early, for long writes.
 
     Raises:
-        OSError: If the disk refused a write.
+        OSError: If a write failed.
 
     Example:
         >>> import tempfile
@@ -54,13 +54,13 @@ def new_hdf5(
 
 @contextlib.contextmanager
 def errors_named(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Adds the name of what is written to errors that lack it.
+    """Adds the name of the file being written to errors that lack it.
 
     Args:
         path: The file or folder.
 
     Raises:
-        OSError: If the disk refused a write.
+        OSError: If a write failed.
 
     Example:
         >>> with errors_named("a-v0"):
@@ -79,7 +79,7 @@ def errors_named(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 class _Disk(io.FileIO):
-    """A file that keeps the first error of a write instead of raising it."""
+    """A file that stores the first write error instead of raising it."""
 
     error: OSError | None = None
 

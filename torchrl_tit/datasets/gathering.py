@@ -18,7 +18,7 @@ from torchrl_tit.datasets.deferred import DeferredTensor
 from torchrl_tit.datasets.indices import find_items
 
 Entries = dict[NestedKey, Callable[[], Tensor]]
-"""What makes each entry of some items."""
+"""Functions that compute the entries of some items, by key."""
 
 
 class StateCheckpointer(StorageCheckpointerBase):
@@ -39,13 +39,13 @@ class GatheringStorage(TensorStorage):
     To TorchRL's buffers, samplers and transforms it is a `TensorStorage`: a `ReplayBuffer` needs no
     ``collate_fn``, and indices are those of a tensor of the storage's shape.
 
-    All items, ``storage[:]``, are not gathered at once, which could take many times the memory of
-    the tables: each entry is a :class:`~torchrl_tit.datasets.deferred.DeferredTensor`. So TorchRL's
+    ``storage[:]`` does not gather all items at once, which could take many times the memory of the
+    tables: each entry is a :class:`~torchrl_tit.datasets.deferred.DeferredTensor`. So TorchRL's
     `SliceSampler`, which looks for episodes there, gathers no histories to find them.
 
     Args:
-        max_size: Number of items that there is room for.
-        device: Where the tables are.
+        max_size: Maximum number of items.
+        device: Device of the tables.
         ndim: Number of dimensions of the storage: 1, or 2 for time and environments.
     """
 
@@ -57,7 +57,7 @@ class GatheringStorage(TensorStorage):
 
     @abstractmethod
     def _entries(self, items: Tensor) -> Entries:
-        """Says how to gather items of these numbers, int64 [...]; each entry is [..., *entry]."""
+        """Returns how to gather items by number, int64 [...]; each entry is [..., *entry]."""
 
     def get(self, index: Any) -> TensorDict:
         """Gathers items.
@@ -70,15 +70,15 @@ class GatheringStorage(TensorStorage):
             The items, with the shape of the selection.
 
         Raises:
-            IndexError: If there is no such item (on a CPU; elsewhere that is not checked), or a
-                mask has another shape than the storage.
+            IndexError: If there is no such item (checked only on a CPU), or a mask does not have
+                the storage's shape.
         """
         items = self._find(index)
         entries = self._entries(items)
         return _nest({key: compute() for key, compute in entries.items()}, items.shape)
 
     def __getitem__(self, index: Any) -> TensorDict:
-        """Gathers items; of all items, and of a tuple, each entry when it is used."""
+        """Gathers items; for all items or a tuple, each entry is gathered when it is used."""
         if not isinstance(index, tuple) and not (isinstance(index, slice) and index == slice(None)):
             return self.get(index)
         items = self._find(index)
@@ -106,7 +106,7 @@ class GatheringStorage(TensorStorage):
         return find_items(index, self.shape, self.device)
 
     def contains(self, item: Any) -> Tensor:
-        """Whether there are items of these indices of the first dimension, bool of their shape."""
+        """Whether items with these indices of the first dimension exist; bool of the same shape."""
         index, count = torch.as_tensor(item, device=self.device), self._len_along_dim0 or 0
         return (index < count) & (index >= -count)
 
@@ -126,7 +126,7 @@ def _nest(entries: dict[NestedKey, Tensor], shape: torch.Size) -> TensorDict:
 
 
 def take(table: Tensor, rows: Tensor) -> Tensor:
-    """Gathers rows; ``index_select`` is several times as fast as indexing.
+    """Gathers rows with ``index_select``, which is several times faster than indexing.
 
     Args:
         table: [R, *entry].

@@ -20,9 +20,9 @@ from torchrl_tit.files import whole_or_not_at_all
 
 
 def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
-    """Reads a file with one row per transition, in chunks: it may be larger than the memory.
+    """Reads a file with one row per transition, in chunks; it may be larger than memory.
 
-    Only what the file itself holds is read, and no more than it can hold: see
+    Only values stored in the file itself are read, and no more than it can hold: see
     :func:`~torchrl_tit.datasets.stored.check_stored`.
 
     Args:
@@ -37,8 +37,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
 
     Raises:
         FileNotFoundError: If there is no such file.
-        DatasetError: If it is not a whole HDF5 file, takes values from other files, declares more
-            than it can hold, or its data cannot be used.
+        DatasetError: If it is not a complete HDF5 file, takes values from other files, declares
+            more than it can hold, or its data cannot be used.
 
     Example:
         >>> import tempfile
@@ -71,13 +71,13 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     Fields keep their dtypes. Every next observation must be known.
 
     Args:
-        episodes: The data. Only the last episode may be unfinished.
+        episodes: The episodes. Only the last one may be unfinished.
         path: The file, which must not exist yet; it is written atomically.
 
     Raises:
         FileExistsError: If the file exists already.
         ValueError: If an episode before the last is unfinished, or the final observation of a
-            truncated one is unknown: the layout cannot represent these.
+            truncated one is unknown; the layout cannot represent either.
         OSError: If the file cannot be written.
 
     Example:

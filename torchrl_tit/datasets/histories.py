@@ -26,7 +26,7 @@ class HistoryStorage(EpisodeStorage):
     under "next" "observation", "history", "reward" [1], "terminated" [1], "truncated" [1] and
     "done" [1], like the steps of an environment with :class:`~torchrl_tit.transforms.History`. A
     history never contains observations of another episode. "episode", int64, is the number of the
-    item's episode, where TorchRL's `SliceSampler` looks for it.
+    item's episode, as TorchRL's `SliceSampler` expects it.
 
     Args:
         episodes: The data.
@@ -38,10 +38,10 @@ class HistoryStorage(EpisodeStorage):
         terminal_observations: ``"zero"`` replaces the observations of terminal states with zeros,
             as d3rlpy 1 does. They are always zeros if unknown.
         unfinished: ``"drop"`` leaves out an episode that is neither terminated nor truncated
-            because the data end there. If it is kept, no flag marks its end.
+            because the data end there. If such an episode is kept, no flag marks its end.
         is_init: Whether items have "is_init" and ("next", "is_init") [1], True at the first step of
-            an episode: for slices of consecutive items, of which a
-            :class:`~torchrl_tit.modules.Backbone` then encodes each frame once.
+            an episode. In slices of consecutive items, a :class:`~torchrl_tit.modules.Backbone`
+            then encodes each frame once.
 
     Raises:
         TypeError: If ``num_frames`` is not an integer.
@@ -86,7 +86,7 @@ class HistoryStorage(EpisodeStorage):
             counts = counts * episodes.finished
         super().__init__(episodes, counts)
         self._num_frames = num_frames
-        # Of one frame nothing is ever missing.
+        # A history of one frame needs no padding.
         self._padding: Padding = padding if num_frames > 1 else "same"
         self._zero_terminals = terminal_observations == "zero"
         self._is_init = is_init
@@ -130,15 +130,15 @@ def frame_entries(
     following: Callable[[], Tensor],
     ndim: int,
 ) -> Entries:
-    """Says how to make an observation and its histories, none of which is a view of another.
+    """Returns how to compute an observation and its histories, without views of each other.
 
     Args:
-        leaf: What follows "observation" and "history" in the keys: nothing, or the name of one of
+        leaf: The rest of the keys after "observation" and "history": empty, or the name of one of
             several observations.
-        newest: Makes the observation, [..., *obs].
-        history: Makes the history, [..., K, *obs].
-        following: Makes the next observation, [..., *obs].
-        ndim: Number of the dimensions before these.
+        newest: Computes the observation, [..., *obs].
+        history: Computes the history, [..., K, *obs].
+        following: Computes the next observation, [..., *obs].
+        ndim: Number of leading dimensions.
     """
     history, following = cache(history), cache(following)
 
@@ -155,12 +155,12 @@ def frame_entries(
 
 
 def episode_entries(episode: Tensor, starts: Tensor | None) -> Entries:
-    """Says how to make what tells the episodes of items apart.
+    """Returns how to compute the entries that tell the episodes of items apart.
 
     Args:
-        episode: A number for each episode, int64 [...].
-        starts: Where an episode begins, bool [...], for "is_init". The next steps have it too:
-            their histories are no continuation either.
+        episode: The number of each item's episode, int64 [...].
+        starts: True where an episode begins, bool [...], for "is_init". It also holds for the next
+            steps, whose histories do not continue others either.
     """
     entries: Entries = {"episode": lambda: episode}
     if starts is not None:
@@ -173,8 +173,8 @@ def check_windows(num_frames: int, padding: str) -> None:
     """Checks the settings of windows.
 
     Args:
-        num_frames: Number of frames of a window.
-        padding: What takes the place of missing ones.
+        num_frames: Number of frames in a window.
+        padding: What replaces missing frames.
 
     Raises:
         TypeError: If the number is not an integer.

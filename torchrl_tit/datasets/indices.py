@@ -1,4 +1,4 @@
-"""Which items of a storage an index selects."""
+"""Finds the items of a storage that an index selects."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ def find_items(index: Any, shape: Sequence[int], device: torch.device) -> Tensor
 
     Args:
         index: an integer, a slice, a range, a list, an array or a tensor of integers (negative ones
-            count from the end) or of booleans (a mask), or a tuple of these, one a dimension.
+            count from the end) or of booleans (a mask), or a tuple of these, one per dimension.
         shape: shape of the storage.
-        device: where the items are.
+        device: device of the items.
 
     Returns:
         The items' numbers, counted along the last dimension first; int64, with the shape of the
         selection.
 
     Raises:
-        IndexError: If there is no such item, or a mask has another shape (on a CPU; elsewhere
-            integers are not checked).
+        IndexError: If there is no such item (checked only on a CPU), or a mask has another shape.
 
     Example:
         >>> find_items([0, -1], (5,), torch.device("cpu"))

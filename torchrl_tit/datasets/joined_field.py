@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 class JoinedField:
     """Joins a field of numbered parts, [S, T, ...] each, into [S * T, ...], stream after stream.
 
-    A slice opens the parts it needs, one at a time. HDF5's own virtual data sets would keep all
-    parts open, and a process may have about a thousand open files.
+    Slicing opens the parts it needs, one at a time. HDF5's own virtual data sets would keep all
+    parts open, but a process can only have about a thousand open files.
 
     Args:
         name: The field.
         numbers: The parts.
         open_part: Opens the file of a part.
-        check: Called with each part's number and shape [S, T, ...]; raises if it does not fit.
+        check: Called with each part's number and shape [S, T, ...]; raises if the shape does not
+            fit.
 
     Example:
         >>> import tempfile
@@ -53,7 +54,7 @@ class JoinedField:
         self._bounds = [
             0,
             *accumulate(steps),
-        ]  # steps before each part, and in all
+        ]  # steps before each part, and the total
         self.shape = (self._streams * self._bounds[-1], *row)
 
     def __len__(self) -> int:
@@ -65,7 +66,7 @@ class JoinedField:
         total = self._bounds[-1]
         streams = range(start // total, (stop - 1) // total + 1)
         for number, (before, after) in zip(self._numbers, pairwise(self._bounds), strict=True):
-            spans = []  # of each stream: first row in the part, and the requested rows in it
+            spans = []  # per stream: first row in the part, and the requested rows in it
             for stream in streams:
                 origin = stream * total + before
                 low, high = max(start, origin), min(stop, origin + after - before)

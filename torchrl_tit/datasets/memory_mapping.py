@@ -1,4 +1,4 @@
-"""Memory-mapped tensors, for data that are larger than the memory."""
+"""Memory-mapped tensors, for data larger than memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def memory_mapped_rows(
     """Creates rows of zeros in memory-mapped files.
 
     The files are unlinked once they are mapped (where the system allows that), so nothing remains
-    of them when the tensors are freed, however the program ends.
+    of them when the tensors are freed or the program ends in any way.
 
     Args:
         num_rows: Number R of rows.
@@ -60,7 +60,7 @@ def memory_mapped_rows(
 def _map(file: Path, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     size = prod(shape)
     if hasattr(os, "posix_fallocate"):
-        # Allocated now: a disk that is full later would kill the program instead of raising.
+        # Allocated now, because a disk that fills up later would kill the program without an error.
         descriptor = os.open(file, os.O_RDWR | os.O_CREAT)
         try:
             os.posix_fallocate(descriptor, 0, max(1, size * dtype.itemsize))

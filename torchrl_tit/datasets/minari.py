@@ -41,7 +41,7 @@ _FAILURES = (
     TypeError,
     ValueError,
 )
-ATTRIBUTES = "attributes"  # the entry of this library in Minari's metadata
+ATTRIBUTES = "attributes"  # this library's entry in Minari's metadata
 # Minari's own metadata fields, by the names of our attributes.
 METADATA_FIELDS = {
     "algorithm": "algorithm_name",
@@ -68,24 +68,24 @@ def read_minari(
     dtype: torch.dtype | None = torch.float32,
     directory: str | os.PathLike[str] | None = None,
 ) -> Episodes:
-    """Reads a Minari data set, one episode at a time: it may be larger than the memory.
+    """Reads a Minari data set, one episode at a time; it may be larger than memory.
 
     Args:
         name: A folder with a data set, or a data set's name such as "mujoco/hopper/medium-v0",
-            which Minari downloads if it is not in its own folder yet.
+            which Minari downloads if it is not in Minari's own folder yet.
         task: The task whose shapes and action bounds the data must have; not checked if None.
         dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
         directory: Folder for the memory-mapped rows; see
             :func:`~torchrl_tit.datasets.memory_mapping.memory_mapped_rows`.
 
     Returns:
-        The episodes. One whose last step has no flag is unfinished. The attributes contain the
-        metadata, and the name of the task as "env_id".
+        The episodes. An episode whose last step has no flag is unfinished. The attributes contain
+        the metadata, and the name of the task as "env_id".
 
     Raises:
         FileNotFoundError: If Minari has no such data set, or cannot download it.
-        DatasetError: If it is damaged, claims more than its files can hold, takes data from other
-            files or is of another task, or a field is missing, has the wrong length, shape or
+        DatasetError: If it is damaged, declares more than its files can hold, takes data from other
+            files or is of another task; or if a field is missing, has the wrong length, shape or
             dtype, or contains NaN, infinity, or actions out of bounds.
 
     Example:
@@ -148,13 +148,13 @@ def is_minari_name(name: str) -> bool:
     """
     try:
         parse_dataset_id(name)
-    except (TypeError, ValueError):  # no version; not of that form
+    except (TypeError, ValueError):  # no version, or another form
         return False
     return True
 
 
 def _folder(name: str | os.PathLike[str]) -> Path:
-    """The folder of a data set's files, which is downloaded if need be."""
+    """The folder of a data set's files, which are downloaded if necessary."""
     folder = Path(name).absolute()  # Minari cannot handle relative paths
     if folder.is_dir():
         return folder / "data" if (folder / "data").is_dir() else folder
@@ -162,7 +162,7 @@ def _folder(name: str | os.PathLike[str]) -> Path:
     if not data.is_dir():
         try:
             minari.download_dataset(str(name))
-        except Exception as error:  # anything that the network or its client raises
+        except Exception as error:  # the network or its client can raise anything
             raise FileNotFoundError(
                 f"There is no Minari data set {str(name)!r} in {data.parent}, and it cannot be "
                 f"downloaded: {error}"
@@ -198,7 +198,7 @@ def _lengths(dataset: minari.MinariDataset, source: str) -> tuple[torch.Tensor, 
         for episode in dataset.storage.get_episode_metadata(dataset.episode_indices):
             steps.append(int(episode["total_steps"]))
             noted |= {name for name in ("seed", "options") if episode.get(name) is not None}
-        lengths = torch.tensor(steps)  # fails if a number is too large
+        lengths = torch.tensor(steps)  # raises if a number is too large
     except _FAILURES as error:
         raise DatasetError(source, f"its episodes cannot be listed ({error}).") from error
     if not len(lengths):
@@ -231,12 +231,12 @@ def _checked(
             raise DatasetError(
                 place, f"has the shape {list(array.shape)}, but needs {length + more} rows.", name
             )
-        # A field of numbers becomes a column, except for actions, which are discrete then.
+        # A field of scalars becomes a column, except for actions, which are then discrete.
         fields[field] = array[:, None] if array.ndim == 1 and field != "action" else array
     if task is not None:
         actions = fields["action"]
         if task.action.shape == () and actions.shape[1:] == (1,):
-            fields["action"] = actions[:, 0]  # discrete, in a column of its own
+            fields["action"] = actions[:, 0]  # discrete, stored as a column
         check_shape(place, "observations", fields["observation"].shape[1:], task.observation, task)
         check_shape(place, "actions", fields["action"].shape[1:], task.action, task)
         check_actions(place, fields["action"], task.action)

@@ -1,4 +1,4 @@
-"""What the folder of a Minari data set says of itself, checked before Minari believes it."""
+"""Checks the folder of a Minari data set before Minari reads it."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ SPACES = ("Box", "Discrete")
 
 
 class _Metadata(msgspec.Struct):
-    """The fields of metadata.json that Minari or this library reads; others may be there."""
+    """The fields of metadata.json that Minari or this library reads; there may be others."""
 
     total_episodes: _Count
     total_steps: _Count
     data_format: str
     dataset_id: str
     minari_version: str
-    # Without spaces, Minari makes the environment that the file names, whatever that runs.
+    # Without spaces, Minari makes the environment that the file names, which may run any code.
     observation_space: str
     action_space: str
     env_spec: str | None = None
@@ -54,14 +54,14 @@ class _Space(msgspec.Struct):
 
 
 def check_folder(source: str, folder: Path) -> None:
-    """Checks the metadata of a data set: their kinds, and that the folder can hold what they claim.
+    """Checks a data set's metadata: their types, and that the folder can hold what they declare.
 
     Args:
-        source: The data set, for messages.
+        source: The data set, for error messages.
         folder: The folder with "metadata.json".
 
     Raises:
-        DatasetError: If they are damaged or cannot be true of the folder, or observations or
+        DatasetError: If the metadata are damaged or cannot match the folder, or observations or
             actions are not one array each.
 
     Example:
@@ -80,7 +80,7 @@ def check_folder(source: str, folder: Path) -> None:
         metadata = msgspec.convert(json.loads(text), _Metadata)
         for space in (metadata.observation_space, metadata.action_space):
             entries = math.prod(_space(space).shape)
-            if entries > len(space):  # the bounds of each are listed
+            if entries > len(space):  # each entry's bounds are listed
                 raise ValueError(f"a space of {entries} entries lists bounds of fewer")
     except (OSError, RecursionError, ValueError) as error:
         raise DatasetError(
@@ -105,15 +105,15 @@ def episodes_checked(source: str, folder: Path, count: int) -> Iterator[str]:
     """Checks each episode of a data set in HDF5 before it is read.
 
     Args:
-        source: The data set, for messages.
+        source: The data set, for error messages.
         folder: The folder with "main_data.hdf5"; data in another format are not checked.
         count: Number of the episodes.
 
     Yields:
-        The place of each episode, for messages.
+        The place of each episode, for error messages.
 
     Raises:
-        DatasetError: If an episode takes data from other places, or cannot be read.
+        DatasetError: If an episode takes data from elsewhere, or cannot be read.
     """
     path = folder / "main_data.hdf5"
     if not path.exists():
@@ -129,10 +129,10 @@ def episodes_checked(source: str, folder: Path, count: int) -> Iterator[str]:
 
 
 def check_rows(source: str, folder: Path, num_rows: int, row_bytes: int) -> None:
-    """Checks that a data set can hold as many rows as it claims.
+    """Checks that a data set can hold as many rows as it declares.
 
     Args:
-        source: The data set, for messages.
+        source: The data set, for error messages.
         folder: The folder with its files.
         num_rows: Number of the rows.
         row_bytes: Bytes of a row.
@@ -149,7 +149,7 @@ def _space(text: str) -> _Space:
 
 
 def _num_entries(source: str, folder: Path, data_format: str) -> int:
-    """Counts what may be episodes, each of which must be in the file itself."""
+    """Counts the possible episodes, each of which must be in the file itself."""
     if data_format != "hdf5":
         return sum(1 for _ in folder.iterdir())
     with open_hdf5(folder / "main_data.hdf5") as file, damage_named(source, "cannot be read"):

@@ -30,17 +30,17 @@ def write_minari(
 ) -> None:
     """Writes episodes as a Minari data set, one at a time.
 
-    Fields keep their dtypes. Minari writes its metadata, and this function the episodes in its
-    layout, since it survives a full disk. The attributes "algorithm", "description", "author",
-    "author_email" and "code_permalink" also go into Minari's own metadata.
+    Fields keep their dtypes. Minari writes its metadata; this function writes the episodes, in
+    Minari's layout, because it survives a full disk. The attributes "algorithm", "description",
+    "author", "author_email" and "code_permalink" also go into Minari's own metadata.
 
     Args:
         episodes: The data.
         name: The folder to create, an absolute path or one that begins with a dot, whose last part
             ends in a version such as "-v0"; or the name of a data set in Minari's own folder.
         env_name: The Gymnasium task of the data, from which Minari can recreate the environment.
-            For Atari games it only determines the action space, because the environment that
-            Minari recreates has other images than :func:`~torchrl_tit.envs.make_env`.
+            For Atari games it only determines the action space, because the environment that Minari
+            recreates has different images from :func:`~torchrl_tit.envs.make_env`.
 
     Raises:
         FileExistsError: If the data set exists already.
@@ -68,7 +68,7 @@ def write_minari(
             observation_space=_box(episodes.rows["observation"]),
             action_space=action_space,
             env_spec=_env_spec(env_name),
-            jpeg_encoding=False,  # images are stored exactly
+            jpeg_encoding=False,  # images are stored losslessly
         )
         data = hidden / "data" / "main_data.hdf5"
         with new_hdf5(data, folder) as (file, check):
@@ -76,7 +76,7 @@ def write_minari(
                 group = file.create_group(f"episode_{number}")
                 group.attrs.update({"id": number, "total_steps": len(steps["rewards"])})
                 for field, values in steps.items():
-                    shape = (None, *values.shape[1:])  # as Minari's own, which can grow
+                    shape = (None, *values.shape[1:])  # resizable, like Minari's own
                     group.create_dataset(field, data=values, chunks=True, maxshape=shape)
                 check()
         storage.update_metadata(
@@ -96,7 +96,7 @@ def _target(name: str | os.PathLike[str]) -> tuple[Path, str]:
     """Returns the folder to write to, and the data set's name."""
     path = Path(name)
     if path.is_absolute() or str(name).startswith("."):
-        folder, dataset_id = path.absolute(), path.name  # Minari cannot handle relative ones
+        folder, dataset_id = path.absolute(), path.name  # Minari cannot handle relative paths
     else:
         folder, dataset_id = get_dataset_path(str(name)), str(name)
     if not is_minari_name(dataset_id):
@@ -112,7 +112,7 @@ def _env_spec(env_name: str | None) -> EnvSpec | None:
 
 
 def _listed(episodes: Episodes) -> dict[str, Any]:
-    """The attributes that Minari's metadata have a field for."""
+    """The attributes that have a field in Minari's metadata."""
     known = {place: episodes.attributes.get(name) for name, place in METADATA_FIELDS.items()}
     people = {place: known.pop(place) for place in ("author", "author_email")}
     texts = {place: value for place, value in known.items() if isinstance(value, str)}

@@ -23,30 +23,30 @@ _OPTIONAL = ("action_mask", "is_init", "truncated")
 
 
 class OnlineHistoryStorage(GatheringStorage):
-    """The newest collected steps, whose items have histories as those of :class:`HistoryStorage`.
+    """The newest collected steps, as items with histories like those of :class:`HistoryStorage`.
 
-    When it is full, each new step takes the place of the oldest one. Each observation is stored
-    once. In addition, there is a frame for each end of an episode (its last observation, which the
-    next step does not have), one for each environment (its newest next observation), and the K - 1
-    frames before the oldest step. So every item can be drawn, and its histories equal those of
-    :class:`~torchrl_tit.transforms.History` in the environment, also where their first steps were
-    overwritten. Actions, masks of actions, rewards and flags are stored as they come.
+    When it is full, each new step replaces the oldest one. Each observation is stored once. It also
+    stores a frame for each end of an episode (its last observation, which the next step does not
+    have), one for each environment (its newest next observation), and the K - 1 frames before the
+    oldest step. So every item can be drawn, and its histories equal those of
+    :class:`~torchrl_tit.transforms.History` in the environment, even if their first steps were
+    overwritten. Actions, action masks, rewards and flags are stored unchanged.
 
-    As in TorchRL's storages, a collector's batches [envs, T] need ``ndim=2``. They are extended
-    as they are, and items are numbered by time and environment. An episode ends where a step is
-    done, where the next one has "is_init", and where its observation is not the next observation of
-    the step before (an environment that was reset in between). It begins at the latest with the
-    first step that was ever written.
+    As in TorchRL's storages, a collector's batches [envs, T] need ``ndim=2``. Pass them to
+    ``extend`` as they are; items are numbered by time and environment. An episode ends where a step
+    is done, where the next one has "is_init", and where the next step's observation is not this
+    step's next observation (because the environment was reset in between). The first step that is
+    ever written begins an episode.
 
     Args:
-        max_size: Number of steps that there is room for, rounded up to whole steps of all
-            environments. Memory is taken as it is filled.
+        max_size: Maximum number of steps, rounded up to whole steps of all environments. Memory is
+            used as the storage fills up.
         num_frames: Number K of observations in a history, at least 1.
-        ndim: 1 if one environment's steps [T] are stored, 2 for those of several, [envs, T].
+        ndim: 1 for the steps of one environment, [T]; 2 for those of several, [envs, T].
         padding: The frames before the first step of an episode: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
         is_init: Whether items have "is_init"; see :class:`HistoryStorage`.
-        device: Where the steps are stored.
+        device: Device on which the steps are stored.
 
     Raises:
         TypeError: If ``num_frames`` is not an integer.
@@ -82,22 +82,22 @@ class OnlineHistoryStorage(GatheringStorage):
         self._padding: Padding = padding if num_frames > 1 else "same"
         self._is_init = is_init
         self._envs = 1
-        self._count = 0  # steps of each environment so far; a step's time is counted from 0 on
-        # In these tables, the rows of a time are next to each other, one for each environment.
-        self._steps = TensorDict()  # action and outcome, of the newest times
-        self._frames = TensorDict()  # of the same times, K - 1 older ones and the next one
-        self._starts = torch.empty(0)  # of each step: the time at which its episode begins
-        self._ends = torch.empty(0)  # of each step: the number of its end frame, or -1
+        self._count = 0  # steps per environment so far; a step's time is counted from 0
+        # In these tables, the rows of one time are adjacent, one per environment.
+        self._steps = TensorDict()  # action and outcome at the newest times
+        self._frames = TensorDict()  # at the same times, K - 1 older ones and the next one
+        self._starts = torch.empty(0)  # per step: the time at which its episode begins
+        self._ends = torch.empty(0)  # per step: the number of its end frame, or -1
         self._end_frames = EndFrames(TensorDict(batch_size=[1]))
 
     @property
     def num_written(self) -> int:
-        """Number of steps that were written so far, overwritten ones included."""
+        """Number of steps written so far, including overwritten ones."""
         return self._count * self._envs
 
     @property
     def reach(self) -> int:
-        """How many of the newest steps items are made of: all stored ones and the frames before."""
+        """Number of newest steps that items can read: all stored ones and the frames before."""
         return self.max_size + (self._num_frames - 1) * self._envs
 
     @property
@@ -109,17 +109,16 @@ class OnlineHistoryStorage(GatheringStorage):
         """Writes steps after the newest ones.
 
         Args:
-            cursor: Where TorchRL's `RoundRobinWriter` puts them, which is in the order in which
-                they come.
+            cursor: Where TorchRL's `RoundRobinWriter` puts them, which is in order.
             data: Steps [T], or [T, envs] if the storage has two dimensions, with "observation"
                 (a tensor, or a tensordict of several), "action", and under "next" "observation",
-                "reward", "terminated" and "done"; of the other entries only "truncated" and
+                "reward", "terminated" and "done"; of all other entries, only "truncated" and
                 "action_mask" are stored.
-            set_cursor: False if items are to be changed, which is refused.
+            set_cursor: False if items are to be changed, which is not supported.
 
         Raises:
             RuntimeError: If items are to be changed, or written out of order.
-            ValueError: If the steps are not those of all environments.
+            ValueError: If the steps do not cover all environments.
         """
         if not set_cursor:
             raise RuntimeError("Stored steps cannot be changed, only added.")
@@ -151,7 +150,7 @@ class OnlineHistoryStorage(GatheringStorage):
         self._finish()
 
     def _append(self, data: TensorDictBase) -> None:
-        """Writes steps [T, envs], at most as many as there is room for."""
+        """Writes steps [T, envs], at most as many as the storage holds."""
         begin, count, envs = self._count, len(data), self._envs
         frames, following = (group.select("observation") for group in (data, data["next"]))
         done = _flag(data, "done")
@@ -163,7 +162,7 @@ class OnlineHistoryStorage(GatheringStorage):
             goes_on[0] = ~_flag(self._steps[last], "done") & _equal(newest, frames[0])
         if (is_init := data.get("is_init", None)) is not None:
             goes_on &= ~is_init.reshape(count, envs)
-        if begin:  # whether they ended an episode may show only now
+        if begin:  # only the new steps show whether these ended an episode
             ended = ~goes_on[0] & (self._ends[last] < 0)
             self._ends[last[ended]] = self._push(newest[ended])
         starts = torch.arange(begin, begin + count, device=self.device).unsqueeze(-1)
@@ -173,7 +172,7 @@ class OnlineHistoryStorage(GatheringStorage):
         ends = torch.full_like(starts, -1)
         ended = torch.cat([~goes_on[1:], done[-1:]])
         rows = self._rows(begin, begin + count)
-        self._end_frames.drop(int((self._ends[rows] >= 0).sum()))  # of the steps in their place
+        self._end_frames.drop(int((self._ends[rows] >= 0).sum()))  # of the overwritten steps
         ends[ended] = self._push(following[ended])
         self._starts[rows] = starts.cummax(0).values.flatten()
         self._ends[rows] = ends.flatten()
@@ -223,7 +222,7 @@ class OnlineHistoryStorage(GatheringStorage):
         return entries
 
     def _row(self, time: Tensor, env: Tensor) -> Tensor:
-        """Rows among the frames of times and environments, int64 [...]."""
+        """Rows of frames, by time and environment; int64 [...]."""
         return time % (self._num_times + self._num_frames) * self._envs + env
 
     def _rows(self, begin: int, stop: int) -> Tensor:
@@ -240,7 +239,7 @@ class OnlineHistoryStorage(GatheringStorage):
 
     @property
     def _num_times(self) -> int:
-        """Number of steps of each environment that there is room for."""
+        """Maximum number of steps per environment."""
         return self.max_size // self._envs
 
     def state_dict(self) -> dict[str, Any]:
@@ -248,15 +247,15 @@ class OnlineHistoryStorage(GatheringStorage):
         return self.part(0)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Replaces all steps by those of a return value of `state_dict`."""
+        """Replaces all steps with those returned by `state_dict`."""
         self._empty()
         self.add_part(state_dict)
 
     def part(self, num_written: int) -> dict[str, Any]:
-        """Returns what was written since an earlier time, to be saved piece by piece.
+        """Returns the steps written since an earlier time, to be saved piece by piece.
 
-        Pieces of steps among the newest :attr:`reach` ones restore the storage; older ones have no
-        use any more.
+        The pieces with the newest :attr:`reach` steps restore the storage; older pieces are no
+        longer needed.
 
         Args:
             num_written: :attr:`num_written` at that time.
@@ -265,9 +264,10 @@ class OnlineHistoryStorage(GatheringStorage):
         if stop == since:
             return {}
         begin = max(since, stop - self._num_times)
-        # Frames before the first step are in the piece before, if that is still all there.
+        # The previous piece has the frames before the first step, unless steps since then were
+        # overwritten.
         first_frame = begin if begin == since else max(0, begin - self._num_frames + 1)
-        # Whether the newest steps of that time ended an episode may have shown later.
+        # Later steps may have shown whether the newest steps of that time ended an episode.
         first_end = max(0, begin - 1, stop - self._num_times)
         ends = self._ends[self._rows(first_end, stop)]
         first = int(torch.where(ends < 0, self._end_frames.stop, ends).min())
@@ -287,10 +287,10 @@ class OnlineHistoryStorage(GatheringStorage):
         }
 
     def add_part(self, part: dict[str, Any]) -> None:
-        """Adds what :meth:`part` returned, after the pieces before it.
+        """Adds a piece that :meth:`part` returned, after the previous pieces.
 
         Raises:
-            ValueError: If it was saved by a storage of another size, or a piece before is missing.
+            ValueError: If a storage of another size saved it, or a previous piece is missing.
         """
         if not part:
             return
@@ -335,10 +335,10 @@ class OnlineHistoryStorage(GatheringStorage):
         self._bump_mutation_revision()
 
     def _make_room(self, frames: TensorDictBase, steps: TensorDictBase) -> None:
-        """Allocates the memory, which the system provides where it is written.
+        """Allocates the memory, which the system provides as it is written.
 
         Args:
-            frames: Those of all environments at one time, [envs].
+            frames: The frames of all environments at one time, [envs].
             steps: The other entries, [envs].
         """
         self._envs = len(frames)
@@ -365,14 +365,14 @@ class OnlineHistoryStorage(GatheringStorage):
         self.initialized = True
 
     def _finish(self) -> None:
-        """Tells TorchRL how much there is, and what is the newest."""
+        """Tells TorchRL the number of steps and the position of the newest."""
         self._len = min(self._count, self._num_times) * self._envs
         self._set_last_cursor((self._count - 1) % self._num_times)
         self._bump_mutation_revision()
 
 
 def _select(steps: TensorDictBase) -> TensorDictBase:
-    """Selects what is stored, and "is_init"."""
+    """Selects the entries to store, and "is_init"."""
     groups = ((steps, (), _HERE), (steps["next"], ("next",), _NEXT))
     for group, prefix, names in groups:
         for name in names:

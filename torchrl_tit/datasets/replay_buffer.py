@@ -28,8 +28,8 @@ def make_replay_buffer(
 ) -> ReplayBuffer:
     """Makes a replay buffer that draws items uniformly, with replacement.
 
-    The buffer has a random generator of its own, which is part of its ``state_dict()``: a buffer
-    that loads it continues with the same batches. The data are not part of the state.
+    The buffer has its own random generator, which is part of its ``state_dict()``: a buffer that
+    loads the state continues with the same batches. The data are not part of the state.
 
     Args:
         storage: The data: transitions with histories
@@ -76,6 +76,6 @@ def make_sampler(slice_length: int) -> RandomSampler:
     """Makes a sampler of single items, or of slices if ``slice_length`` is not 1.
 
     Args:
-        slice_length: Number of items of a slice.
+        slice_length: Number of items in a slice.
     """
     return RandomSampler() if slice_length == 1 else ConsecutiveSampler(slice_length)

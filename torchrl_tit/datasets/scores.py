@@ -20,7 +20,7 @@ REFERENCE_RETURNS = {
 
 
 def normalized_score(returns: Returns, name: str) -> Returns:
-    """Normalizes returns to D4RL's scale: a random policy has 0, an expert 100.
+    """Normalizes returns to D4RL's scale: a random policy scores 0, an expert 100.
 
     Args:
         returns: One return or many.
@@ -48,7 +48,7 @@ def normalized_spread(spread: Returns, name: str) -> Returns:
 
     Args:
         spread: The difference of returns.
-        name: As for :func:`normalized_score`.
+        name: See :func:`normalized_score`.
 
     Returns:
         100 * spread / (expert - random), without the offset of returns.
@@ -68,7 +68,7 @@ def has_reference(name: str) -> bool:
     """Returns whether there are reference returns for a data set or task.
 
     Args:
-        name: As for :func:`normalized_score`.
+        name: See :func:`normalized_score`.
 
     Example:
         >>> has_reference("CartPole-v1")

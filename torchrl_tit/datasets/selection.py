@@ -58,7 +58,7 @@ def join_episodes(parts: Sequence[Episodes]) -> Episodes:
         The episodes of all of them.
 
     Raises:
-        ValueError: If there are none, or their fields have other shapes or dtypes.
+        ValueError: If there are none, or the shapes or dtypes of their fields differ.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays

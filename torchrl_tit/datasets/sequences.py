@@ -18,21 +18,22 @@ class SequenceStorage(EpisodeStorage):
 
     An item has "observation" [K, *obs], "action" [K, *action] (int64 if it is discrete),
     "return_to_go" [K, 1], "timestep" int64 [K] and "mask" bool [K], which is False at padding.
-    A uniformly drawn index is an episode, drawn with a probability proportional to its length, and
-    a uniformly drawn start within it.
+    A uniformly drawn index selects an episode with a probability proportional to its length, and a
+    uniformly distributed start within it.
 
     Args:
         episodes: The data.
         num_frames: Number K of steps, at least 1.
-        mean: Subtracted from observations; [*obs], as of
+        mean: Subtracted from observations; [*obs], for example from
             :meth:`~torchrl_tit.datasets.Episodes.observation_statistics`.
-        std: Observations are divided by it; [*obs].
-        return_scale: Returns-to-go are divided by it.
-        action_padding: Value of the actions at padding, where all else is 0.
+        std: Divisor of the observations; [*obs].
+        return_scale: Divisor of the returns-to-go.
+        action_padding: Value of the actions at padding, where all other entries are 0.
 
     Raises:
         ValueError: If ``num_frames`` is less than 1, ``return_scale`` is not positive, or ``mean``
-            and ``std`` are not finite, do not fit the observations, or one of them is missing.
+            and ``std`` are not finite, do not have the observations' shape, or one of them is
+            missing.
         DatasetError: If no episode is finished.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3 and its authors' code.
@@ -112,7 +113,7 @@ def _returns_to_go(episodes: Episodes) -> Tensor:
     """Sum of the rewards from each row to its episode's end; float64 [R]."""
     rewards = episodes.rows["reward"].squeeze(-1).cpu().double().numpy()
     total = np.cumsum(rewards[::-1])[::-1]
-    # The row of an episode's final observation has no reward: the sum there belongs to later
+    # The row of an episode's final observation has no reward; the sum there is that of later
     # episodes.
     later = torch.from_numpy(total.copy()).to(episodes.lengths.device)
     after = later[episodes.last_rows + 1]

@@ -44,7 +44,7 @@ def load_episodes(
         gaps: What to do where "next_observations" of an HDF5 file is not the observation of the
             next row: see the same function.
         dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
-        directory: A folder on a disk with room for the rows, where no files remain; by default the
+        directory: A folder on a disk with room for the rows; no files remain there. By default the
             system's folder for temporary files.
         cache_dir: Folder of D4RL's files: see :func:`~torchrl_tit.datasets.download_d4rl`.
 
@@ -54,7 +54,7 @@ def load_episodes(
     Raises:
         ValueError: If the source is none of these, or the task is unknown.
         FileNotFoundError: If there is no such file or data set.
-        OSError: If it cannot be downloaded, or the disk is full.
+        OSError: If the data set cannot be downloaded, or the disk is full.
         DatasetError: If the data cannot be used; the message names the file, field and row.
 
     Example:
@@ -71,7 +71,7 @@ def load_episodes(
     name = os.fspath(source)
     path = Path(source)
     if name in D4RL_DATASETS and not path.exists():
-        if spaces is not None and has_reference(name):  # such names begin with the task's
+        if spaces is not None and has_reference(name):  # such names begin with the task's name
             check_task_name(name, name.split("-")[0], spaces)
         path = download_d4rl(name, cache_dir)
     if path.is_file() or path.suffix in HDF5_SUFFIXES:

@@ -1,4 +1,4 @@
-"""A TorchRL storage that gathers samples from episodes when they are drawn."""
+"""A TorchRL storage that gathers items from episodes when they are drawn."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ class EpisodeStorage(GatheringStorage):
     """A read-only storage with one item for each step of episodes.
 
     TorchRL's samplers draw the indices; uniform sampling of indices is uniform over steps.
-    Consecutive indices are consecutive steps, the last of an episode followed by the next episode.
+    Consecutive indices are consecutive steps; the last step of an episode is followed by the next
+    episode.
 
     Args:
-        episodes: The data, on the device where items are gathered.
-        counts: Number of steps of each episode, from its first, that are items; int64 [E].
+        episodes: The data, on the device on which items are gathered.
+        counts: Number of steps of each episode, from the first, that are items; int64 [E].
 
     Raises:
         DatasetError: If no step is left.
@@ -49,7 +50,7 @@ class EpisodeStorage(GatheringStorage):
 
     @abstractmethod
     def _cut(self, row: Tensor, episode: Tensor) -> Entries:
-        """Says how to gather the items of these rows and episodes, int64 [...] each."""
+        """Returns how to gather the items of these rows and episodes, int64 [...] each."""
 
     def _take(self, name: str, rows: Tensor) -> Tensor:
         """Rows of a field."""
@@ -63,14 +64,14 @@ class EpisodeStorage(GatheringStorage):
         raise RuntimeError("A data set cannot be emptied.")
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns what identifies the data, which are not part of the state."""
+        """Returns an identification of the data, which are not part of the state."""
         return {"num_items": len(self)}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Checks that a state was saved with the same data.
 
         Args:
-            state_dict: A return value of `state_dict`.
+            state_dict: A state that `state_dict` returned.
 
         Raises:
             ValueError: If it was saved with other data.

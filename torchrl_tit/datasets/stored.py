@@ -1,4 +1,4 @@
-"""What an HDF5 file of someone else may make this process read: only what it holds itself."""
+"""Checks of untrusted HDF5 files: only data that a file itself holds are read."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import h5py
 
 from torchrl_tit.datasets.errors import DatasetError
 
-# zlib's deflate, the strongest compression of h5py's own, makes 1032 bytes of one at most.
+# zlib's deflate, h5py's strongest built-in compression, expands one byte to at most 1032.
 _MOST_BYTES_OF_ONE = 1100
-_HARMLESS_BYTES = 64 * 2**20  # which may be declared without being stored
+_HARMLESS_BYTES = 64 * 2**20  # may be declared without being stored
 _CHUNK_BYTES = 256 * 2**20  # a chunk is read as a whole, even for one of its rows
-# What h5py raises where a file is damaged.
+# Errors that h5py raises on damaged files.
 _FAILURES = (KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError)
 
 
@@ -22,11 +22,11 @@ _FAILURES = (KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueErr
 def damage_named(
     source: str, problem: str, field: str | None = None, row: int | None = None
 ) -> Iterator[None]:
-    """Turns what h5py raises on damaged files into one error that names the place.
+    """Turns h5py's errors on damaged files into one error that names the place.
 
     Args:
         source: The file.
-        problem: What could not be done.
+        problem: What is wrong, for the error message.
         field: Name of the field, if the problem is in one.
         row: Index of the row, if the problem is in one.
 
@@ -55,7 +55,7 @@ def open_hdf5(path: str | os.PathLike[str]) -> h5py.File:
         path: The file.
 
     Raises:
-        DatasetError: If it is not a whole HDF5 file.
+        DatasetError: If it is not a complete HDF5 file.
 
     Example:
         >>> import tempfile
@@ -70,13 +70,13 @@ def open_hdf5(path: str | os.PathLike[str]) -> h5py.File:
 
 
 def check_stored(source: str, field: str, dataset: h5py.Dataset) -> None:
-    """Checks that a field's values are in the file, before any of them is read.
+    """Checks that a field's values are in the file, before any are read.
 
-    HDF5 can take values from other files, whichever the file names, and believes any size that
-    it declares: a file of a few kilobytes may claim to hold terabytes.
+    HDF5 can take values from any other file that the file names, and trusts any declared size: a
+    file of a few kilobytes may claim to hold terabytes.
 
     Args:
-        source: The file, for messages.
+        source: The file, for error messages.
         field: Name of the field.
         dataset: The field.
 
@@ -114,16 +114,16 @@ def check_stored(source: str, field: str, dataset: h5py.Dataset) -> None:
 
 
 def check_size(source: str, declared: int, held: int, field: str | None = None) -> None:
-    """Checks that values fit into the bytes that a file has for them, compressed as they may be.
+    """Checks that values, possibly compressed, fit into the bytes that a file has for them.
 
     Args:
-        source: The file, for messages.
-        declared: Bytes of the values.
+        source: The file, for error messages.
+        declared: Size of the values in bytes.
         held: Bytes that the file has for them.
-        field: Name of the field, if they are of one.
+        field: Name of the field, if they belong to one.
 
     Raises:
-        DatasetError: If they do not.
+        DatasetError: If they do not fit.
 
     Example:
         >>> check_size("a.hdf5", declared=10**9, held=10**8)
@@ -138,10 +138,10 @@ def check_size(source: str, declared: int, held: int, field: str | None = None) 
 
 
 def check_group(source: str, group: h5py.Group) -> None:
-    """Checks all that a group holds as :func:`check_stored` does, before it is read.
+    """Checks all fields of a group with :func:`check_stored`, before they are read.
 
     Args:
-        source: The file, for messages.
+        source: The file, for error messages.
         group: The group.
 
     Raises:
@@ -166,12 +166,12 @@ def check_group(source: str, group: h5py.Group) -> None:
 
 
 def check_link(source: str, name: str, link: object) -> None:
-    """Checks that an entry of a group is there itself.
+    """Checks that an entry of a group is stored there, not linked from elsewhere.
 
     Args:
-        source: The file, for messages.
+        source: The file, for error messages.
         name: The entry's name.
-        link: What ``group.get(name, getlink=True)`` says of it.
+        link: The result of ``group.get(name, getlink=True)``.
 
     Raises:
         DatasetError: If it is a link to another place.

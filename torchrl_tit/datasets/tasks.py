@@ -1,4 +1,4 @@
-"""What a Gymnasium task requires of its data."""
+"""Requirements of a Gymnasium task on its data."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class TaskSpaces(NamedTuple):
     Attributes:
         observation: Gymnasium's space of one observation.
         action: Gymnasium's space of one action.
-        name: The task's name, for messages.
+        name: The task's name, for error messages.
     """
 
     observation: Space
@@ -64,14 +64,14 @@ def task_spaces(env_name: str) -> TaskSpaces:
 def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
     """Checks that the data set's recorded task is the requested one.
 
-    Tasks whose spaces have the same shapes, such as HalfCheetah and Walker2d, cannot be told apart
+    Tasks with spaces of the same shapes, such as HalfCheetah and Walker2d, cannot be told apart
     otherwise.
 
     Args:
-        source: Where the data came from, for messages.
+        source: Where the data came from, for error messages.
         recorded: The recorded name of the task; anything but a string if there is none.
-        task: The requested task. The versions may differ. Nothing is checked if its name does not
-            have Gymnasium's form.
+        task: The requested task. The versions may differ. If its name does not have Gymnasium's
+            form, nothing is checked.
 
     Raises:
         DatasetError: If it is another task.
@@ -100,14 +100,14 @@ def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
 def check_shape(
     source: str, field: str, shape: tuple[int, ...], space: Space, task: TaskSpaces
 ) -> None:
-    """Checks that observations or actions have the shape of the task's.
+    """Checks that observations or actions have the same shape as the task's.
 
     Args:
-        source: Where the data came from, for messages.
+        source: Where the data came from, for error messages.
         field: Name of the field.
         shape: Shape of one row.
         space: The space of that field.
-        task: The task, for messages.
+        task: The task, for error messages.
 
     Raises:
         DatasetError: If the shape differs.
@@ -117,7 +117,7 @@ def check_shape(
         >>> check_shape("a.hdf5", "actions", (1,), task.action, task)
     """
     expected = space.shape or ()
-    # A single number may be a column of its own.
+    # A scalar may be stored as a column.
     if shape != expected and not (expected == () and shape == (1,)):
         raise DatasetError(
             source,

@@ -1,4 +1,4 @@
-"""Transitions that are collected in parts, one file each, and joined into episodes."""
+"""Transitions that are collected in parts, one file per part, and joined into episodes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class TransitionParts:
     """A folder of numbered files of transitions, each written atomically.
 
     A part contains S streams of transitions, one from each environment of a batch, and each stream
-    continues in the next part. So an episode can span many parts, and the parts that a killed
-    process has written are not lost.
+    continues in the next part. So an episode can span many parts, and the parts written by a killed
+    process are not lost.
 
     Args:
         folder: The folder of the files, which is created if missing.
@@ -53,7 +53,7 @@ class TransitionParts:
         """Lists the parts.
 
         Args:
-            last: Number of the last part to list; all by default.
+            last: Number of the last part to list; by default all are listed.
 
         Returns:
             The numbers of the parts in ascending order.
@@ -96,7 +96,7 @@ class TransitionParts:
             return {name: file[name][:] for name in FIELDS}
 
     def drop_after(self, number: int) -> None:
-        """Removes the parts after a number, and unfinished files of a killed process.
+        """Removes the parts after a number, and unfinished files of killed processes.
 
         Args:
             number: Number of the last part to keep.
@@ -111,7 +111,7 @@ class TransitionParts:
         """Counts transitions.
 
         Args:
-            last: Number of the last part to count; all by default.
+            last: Number of the last part to count; by default all are counted.
 
         Returns:
             The number of transitions.
@@ -125,11 +125,11 @@ class TransitionParts:
     def episodes(self, last: int | None = None, **settings: Any) -> Episodes:
         """Joins the parts, one stream after the other, without reading them all at once.
 
-        An unfinished episode is truncated at the end of its stream, and where the next part begins
-        with another observation than the part before ended with.
+        An unfinished episode is truncated at the end of its stream, and where a part does not begin
+        with the observation with which the previous part ended.
 
         Args:
-            last: Number of the last part to join; all by default.
+            last: Number of the last part to join; by default all are joined.
             **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
 
         Returns:

@@ -32,7 +32,7 @@ class TransitionReader:
 
     Args:
         fields: Arrays by D4RL's names: NumPy arrays or HDF5 data sets, which are read in slices.
-        source: Name of the source, for messages.
+        source: Name of the source, for error messages.
         task: The task whose shapes and action bounds the data must have; not checked if None.
         dtype: The dtype for floats; None keeps that of each field.
 
@@ -71,7 +71,7 @@ class TransitionReader:
         row = tuple(shape[1:])
         numbers = {*FLAGS, "rewards"}
         if self.task is not None and self.task.action.shape == ():
-            numbers.add("actions")  # discrete, which may be a column of its own
+            numbers.add("actions")  # discrete, possibly stored as a column
         return () if row == (1,) and name in numbers else row
 
     def _check_sizes(self) -> None:
@@ -107,7 +107,7 @@ class TransitionReader:
                 check_shape(self.source, name, self.shapes[name], space, self.task)
 
     def torch_dtype(self, name: str) -> torch.dtype:
-        """The dtype in which a field is kept."""
+        """The dtype in which a field is stored."""
         return kept_dtype(self.source, name, np.dtype(self.fields[name].dtype), self.dtype)
 
     def row_fields(self) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:

@@ -32,13 +32,13 @@ def episodes_from_arrays(
     next_observations: ArrayLike | None = None,
     **settings: Any,
 ) -> Episodes:
-    """Builds episodes from arrays of transitions, in the order in which they happened.
+    """Builds episodes from arrays of transitions in chronological order.
 
     Args:
         observations: [N, *obs]; floats, or integers such as uint8 images, one frame each.
         actions: [N, A] floats, or [N] integers.
         rewards: [N].
-        terminals: Whether the transition led into a terminal state; bool [N].
+        terminals: Whether the transition led to a terminal state; bool [N].
         timeouts: Whether the episode was truncated after it; bool [N].
         next_observations: [N, *obs].
         **settings: As for :func:`episodes_from_transitions`, which describes how missing arrays are
@@ -90,12 +90,12 @@ def episodes_from_transitions(
     also truncated where ``next_observations`` is not the observation of the next row, and after
     ``max_episode_steps`` steps. Without ``next_observations``, final observations are unknown.
     Those of terminal states become zeros, since nothing is learned from them. The last transition
-    before a time limit then counts for returns and sequences, but is never drawn as a transition.
+    before a time limit is then used in returns and sequences, but never drawn as a transition.
 
     Args:
         fields: Arrays by D4RL's names: NumPy arrays or HDF5 data sets, which are read in slices.
             See :func:`episodes_from_arrays` for their shapes.
-        source: Name of the source, for messages.
+        source: Name of the source, for error messages.
         task: The task whose shapes and action bounds the data must have; not checked if None.
         max_episode_steps: The time limit of data without ``timeouts``.
         gaps: What to do where ``next_observations`` is not the observation of the next row within
@@ -111,7 +111,7 @@ def episodes_from_transitions(
 
     Raises:
         ValueError: If ``max_episode_steps`` is less than 1, ``gaps`` is not one of the above, or
-            ``dtype`` is not that of floats.
+            ``dtype`` is not a floating-point dtype.
         DatasetError: If a field is missing or empty, has the wrong length, shape or dtype, or
             contains NaN, infinity, or actions out of bounds; if no episode ends; or if
             ``next_observations`` is not the observation of the next row within an episode.
@@ -138,7 +138,7 @@ def episodes_from_transitions(
         last_steps = np.append(last_steps, reader.num_rows - 1)
 
     rows = memory_mapped_rows(reader.num_rows + len(last_steps), reader.row_fields(), directory)
-    # The final observation of an episode is one more row, so all later rows move by one.
+    # The final observation of an episode is an additional row, so all later rows move by one.
     row_of = np.arange(reader.num_rows)
     row_of[1:] += ends[:-1].cumsum()
     for name in ("observations", "actions", "rewards"):

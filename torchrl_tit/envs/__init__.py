@@ -1,4 +1,4 @@
-"""Gymnasium tasks, Atari games and any TorchRL environment, with the same keys and kinds."""
+"""Gymnasium tasks, Atari games and any TorchRL environment, with the same keys and spec kinds."""
 
 from torchrl_tit.envs.atari import AtariEnv
 from torchrl_tit.envs.atari_games import AtariGames

@@ -11,11 +11,11 @@ MASK = "action_mask"
 
 
 class ActionMasks:
-    """The masks of N copies of a task, in observations or in what `info` has.
+    """The masks of N copies of a task, from observations or from `info`.
 
     Args:
         num_envs: N.
-        space: The space of one task's actions.
+        space: The action space of one task.
 
     Raises:
         ValueError: If actions of that kind cannot be masked.
@@ -53,7 +53,7 @@ class ActionMasks:
     def from_info(self, info: dict[str, Any]) -> NDArray:
         """Reads the masks in a vector environment's info; bool [N, size].
 
-        Copies that report nothing, as those that are not reset, keep their last one.
+        Copies that report nothing, such as those that are not reset, keep their last mask.
         """
         masks = self._masks.copy()
         for i in np.flatnonzero(info.get(f"_{MASK}", ())):

@@ -1,4 +1,4 @@
-"""Gymnasium's spaces of actions as TorchRL's specs, and actions on their way to the tasks."""
+"""Converts Gymnasium's action spaces to TorchRL's specs, and actions to those of the tasks."""
 
 import numpy as np
 import torch
@@ -13,11 +13,12 @@ class ActionWriter:
     """Converts actions from tensordicts for a vector of Gymnasium tasks.
 
     Args:
-        space: The space of one task's actions.
-        clip: Whether continuous actions are clipped to their bounds, and their spec has none.
+        space: The action space of one task.
+        clip: Whether continuous actions are clipped to their bounds, so that their spec is
+            unbounded.
 
     Raises:
-        ValueError: If the actions are of a kind that is not supported.
+        ValueError: If actions of that kind are not supported.
 
     Example:
         >>> write = ActionWriter(Discrete(3, start=-1), clip=True)
@@ -27,13 +28,13 @@ class ActionWriter:
 
     def __init__(self, space: Space, *, clip: bool) -> None:
         self.start: int | NDArray | None = None
-        """What is added to integers; None for nothing."""
+        """Offset that is added to integers; None for no offset."""
         self.bounds: tuple[NDArray, NDArray] | None = None
-        """What actions are clipped to; None if they are not."""
+        """Bounds to which actions are clipped; None if they are not."""
         self.shape: tuple[int, ...] | None = None
-        """The shape of a task's action; None if it is that of the spec."""
+        """The shape of a task's action; None if it is the same as the spec's."""
         self.dtype: np.dtype | None = None
-        """The integers that floats are rounded to; None if they are not."""
+        """The integer dtype to which floats are rounded; None if they are not."""
         if isinstance(space, Discrete):
             self.spec: TensorSpec = Categorical(int(space.n), dtype=torch.int64)
             self.start = int(space.start) or None
@@ -58,7 +59,7 @@ class ActionWriter:
             self.shape = space.shape
 
     def __call__(self, actions: NDArray) -> NDArray:
-        """Converts actions [N, *spec] to those of the tasks, [N, *space]."""
+        """Converts actions [N, *spec] to the tasks' actions, [N, *space]."""
         if self.bounds is not None:
             actions = actions.clip(*self.bounds)
         if self.start is not None:

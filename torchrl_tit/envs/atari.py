@@ -13,8 +13,8 @@ from torchrl_tit.envs.vector import GymVectorEnv
 class AtariEnv(GymVectorEnv):
     """N copies of an Atari game as one TorchRL environment.
 
-    In addition to the entries of :class:`~torchrl_tit.envs.GymVectorEnv`, of which ``observation``
-    is uint8 [N, 84, 84], it writes
+    In addition to the entries of :class:`~torchrl_tit.envs.GymVectorEnv`, where ``observation`` is
+    uint8 [N, 84, 84], it writes
 
     ======================  ==================  ===================================================
     key                     shape               what it is

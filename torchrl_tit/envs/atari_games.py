@@ -1,4 +1,4 @@
-"""Atari games with the preprocessing of the deep Q-network, emulated side by side in C++."""
+"""Atari games with the preprocessing of the deep Q-network, emulated in parallel in C++."""
 
 import secrets
 from collections.abc import Sequence
@@ -29,9 +29,9 @@ class AtariGames(VectorEnv):
 
     ale-py's `AtariVectorEnv` emulates and scales in its own threads. There is one instance per
     game, since an instance cannot step only some of its games (those that lost a life), and its own
-    settings for lost lives either end the game or never press fire. The scaled colours are
-    converted to grey here, since the grey of the maximum of colours is not the maximum of greys.
-    `AtariWrapper` converts before it scales; the difference is one grey level of rounding.
+    options for lost lives either end the game or never press fire. The conversion from scaled
+    colours to grey is done here, since the grey of the maximum of colours is not the maximum of the
+    greys. `AtariWrapper` converts before it scales; the difference is one grey level of rounding.
 
     Games that are reset with the same seed and given the same actions repeat exactly.
 
@@ -91,7 +91,7 @@ class AtariGames(VectorEnv):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._noop_max = noop_max
-        # The second emulators, for rendering, repeat what the first do.
+        # The second emulators, for rendering, repeat the actions of the first.
         self._emulators: list[list[Any]] = [
             [
                 _emulator(game, height, width, noop_max, max_num_frames_per_episode)
@@ -113,7 +113,7 @@ class AtariGames(VectorEnv):
         self._lives = np.zeros(num_envs, int)
         self._over = np.ones(num_envs, bool)  # also before the first game
         self._truncated = np.zeros(num_envs, bool)
-        self._has_next_life = np.zeros(num_envs, bool)  # a life is lost, and the game is not over
+        self._has_next_life = np.zeros(num_envs, bool)  # a life is lost, but the game is not over
         self._returns = np.zeros(num_envs)
         self._noops = np.zeros(num_envs, int)
 
@@ -126,9 +126,9 @@ class AtariGames(VectorEnv):
         """Starts episodes, each with a new game or with the next life.
 
         Args:
-            seed: Copy i is seeded with ``seed + i``, or with entry i of a sequence.
-            options: ``"reset_mask"``, bool [N], selects the copies to reset: those that lost a life
-                continue their game. Without a mask, or with a seed, all start new games.
+            seed: Copy i gets ``seed + i``, or entry i of a sequence.
+            options: ``"reset_mask"``, bool [N], selects the copies to reset; those that lost a life
+                continue their game. Without a mask, or with a seed, all copies start new games.
 
         Returns:
             The observations, uint8 [N, 84, 84], and a dictionary: see :meth:`step`.
@@ -173,7 +173,7 @@ class AtariGames(VectorEnv):
         return images, rewards, terminated, truncated, self._info()
 
     def render(self) -> tuple[np.ndarray, ...]:
-        """Returns the screens: of each game uint8 [210, 160, 3].
+        """Returns the screen of each game, uint8 [210, 160, 3].
 
         Raises:
             ValueError: If the games were made without ``render_mode="rgb_array"``.
@@ -203,7 +203,7 @@ class AtariGames(VectorEnv):
 
     def _restart(self, i: int, seed: int | None = None) -> list[tuple[np.ndarray, dict[str, Any]]]:
         if seed is not None:
-            seed %= 2**31  # ale-py takes no larger seeds
+            seed %= 2**31  # ale-py does not support larger seeds
         return [emulator.reset(seed=seed) for emulator in self._emulators[i]]
 
     def _play(self, games: np.ndarray, actions: np.ndarray) -> np.ndarray:

@@ -46,10 +46,10 @@ def make_env(
 ) -> TransformedEnv:
     """Makes copies of a task, with histories of its observations.
 
-    A task is anything that Gymnasium makes, an Atari game, or any TorchRL environment.
+    A task is any Gymnasium environment, an Atari game, or any TorchRL environment.
 
     The environment itself (``.base_env``) writes observations only. Transforms write the rest:
-    :class:`~torchrl_tit.transforms.HideVelocities` if asked for, TorchRL's `RewardSum`, and
+    :class:`~torchrl_tit.transforms.HideVelocities` if requested, TorchRL's `RewardSum`, and
     :class:`~torchrl_tit.transforms.History`. Add further ones with ``append_transform``.
 
     ======================  ==================  ===================================================
@@ -69,37 +69,38 @@ def make_env(
 
     Args:
         name: A name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". In
-            "module:Name-v0", the module registers the name; in "module:Name", it has a class or a
-            function of that name that makes a TorchRL `EnvBase`, of which copies are made: see
+            "module:Name-v0", the module registers the name. In "module:Name", the name is that of a
+            class or function in the module that makes a TorchRL `EnvBase`: see
             :class:`~torchrl_tit.envs.torchrl_tasks.TorchRLTask`. A module is imported only if the
-            user named it on the command line, if it is loaded already, or if it is a library's.
-            Names that begin with "ALE/", such as "ALE/Pong-v5", are Atari games with the
-            preprocessing of :class:`~torchrl_tit.envs.AtariGames`.
-        num_envs: N, the number of copies; the batch size is [N], for N = 1 too.
-        seed: Copy i is seeded with ``seed + i``; without one, each differs from run to run.
+            user named it on the command line, if it is already loaded, or if it belongs to a
+            trusted library. Names that begin with "ALE/", such as "ALE/Pong-v5", are Atari games
+            with the preprocessing of :class:`~torchrl_tit.envs.AtariGames`.
+        num_envs: N, the number of copies; the batch size is [N], also for N = 1.
+        seed: Copy i is seeded with ``seed + i``; without a seed, all differ from run to run.
         num_frames: K, the number of observations in a history.
-        padding: What fills a history before an episode's first step: see
+        padding: How a history is padded before an episode's first step: see
             :class:`~torchrl_tit.transforms.History`.
-        keep_histories: Whether a step still has its histories once it was taken. If not,
-            ``step_and_maybe_reset`` removes them, from "next" too, and a collector stores
-            observations only; the tensordict that the policy acts on has its histories either way.
+        keep_histories: Whether a step keeps its histories after it is taken. If not,
+            ``step_and_maybe_reset`` removes them, also from "next", and a collector stores
+            observations only; the tensordict on which the policy acts has its histories in either
+            case.
         hide_velocities: Whether observations and histories lack the velocities: see
             :class:`~torchrl_tit.transforms.HideVelocities`.
-        clip_actions: Whether continuous actions are clipped on their way to the task: see
+        clip_actions: Whether continuous actions are clipped before they are passed to the task: see
             :class:`~torchrl_tit.envs.GymVectorEnv`.
-        observation_keys: Names of the observations to keep, of a task with several; all by default.
-            See :class:`~torchrl_tit.envs.GymVectorEnv`.
+        observation_keys: Names of the observations to keep, for a task with several; by default,
+            all. See :class:`~torchrl_tit.envs.GymVectorEnv`.
         image_layout: Where the task's images have their channels: ``"HWC"``, ``"CHW"``, or
-            ``"auto"``, which finds it out from their shape.
+            ``"auto"``, which infers it from their shape.
         mask_actions: Whether to write which actions the task allows.
         wrappers: Gymnasium wrappers and TorchRL transforms around each copy, the innermost first,
             as "module:Class" or "module:Class(argument=literal)".
         vectorization_mode: ``"sync"`` steps the copies one after the other in this process,
-            ``"async"`` side by side in one process each, with the same results, which pays off for
-            slow tasks. Atari games always run side by side, in threads.
+            ``"async"`` in parallel, in one process each, with the same results, which pays off for
+            slow tasks. Atari games always run in parallel, in threads.
         device: Device of the tensors; by default they stay on the CPU and the device is None.
-        **kwargs: Passed to `gymnasium.make`, such as ``max_episode_steps=200``, to what makes the
-            TorchRL environment, or to :class:`~torchrl_tit.envs.AtariGames`.
+        **kwargs: Passed to `gymnasium.make`, such as ``max_episode_steps=200``, to the class or
+            function of the TorchRL environment, or to :class:`~torchrl_tit.envs.AtariGames`.
 
     Returns:
         The environment. Atari games have further keys: see
@@ -108,8 +109,8 @@ def make_env(
     Raises:
         ValueError: If the name or the mode is unknown, a wrapper or a setting of the task is
             wrong, a package that the task needs is missing, ``num_envs``, ``num_frames`` or the
-            padding is invalid, observations or actions are of a kind that is not supported, Atari
-            games are to run in processes, or it is not known which observations are velocities.
+            padding is invalid, observations or actions are of an unsupported kind, ``"async"`` is
+            given for Atari games, or it is not known which observations are velocities.
 
     Example:
         >>> env = make_env("CartPole-v1", num_envs=8, seed=0, num_frames=4)
@@ -170,7 +171,7 @@ def make_env(
 
 
 def _histories(env: EnvBase, num_frames: int, padding: Padding) -> list[History]:
-    """The transforms that write histories: one for all observations of the same order."""
+    """The transforms that write histories: one for all observations with as many dimensions."""
     keys: dict[int, list[NestedKey]] = {}
     for key in keys_of(env):
         keys.setdefault(env.observation_spec[key].ndim - env.ndim, []).append(key)
@@ -206,7 +207,7 @@ def time_limit(name: str) -> int | None:
     """Returns the number of steps after which the episodes of a task are truncated.
 
     Args:
-        name: A name as :func:`make_env` takes it.
+        name: A name that :func:`make_env` accepts.
 
     Returns:
         The number of steps, or None for a task without a time limit.

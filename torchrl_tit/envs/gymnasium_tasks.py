@@ -1,4 +1,4 @@
-"""Copies of a Gymnasium task in one vector, in this process or in one process each."""
+"""Copies of a Gymnasium task in a vector environment, in this process or in one process each."""
 
 import os
 import signal
@@ -26,13 +26,13 @@ _HAS_SCREEN = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"
 def make_gymnasium_tasks(
     name: str, num_envs: int, mode: VectorizationMode, wraps: Sequence[Wrap], **kwargs: Any
 ) -> gymnasium.vector.VectorEnv:
-    """Makes a vector of a Gymnasium task, by a name that :func:`find_task` returned.
+    """Makes a vector environment of a Gymnasium task, by a name that :func:`find_task` returned.
 
     Raises:
-        ValueError: if Gymnasium cannot make it, or not in a process of its own.
+        ValueError: if Gymnasium cannot make it, or cannot make it in a separate process.
     """
     uses_mujoco = "mujoco" in str(task_spec(name).entry_point)
-    # GymVectorEnv copies what the vector environment returns, which need not copy it before.
+    # GymVectorEnv copies the returned arrays, so the vector environment need not copy them.
     settings: dict[str, Any] = {"copy": False, "autoreset_mode": AutoresetMode.DISABLED}
     copies = [partial(_task, name, tuple(wraps), os.getpid(), uses_mujoco, **kwargs)] * num_envs
     if mode == "sync":
@@ -43,7 +43,7 @@ def make_gymnasium_tasks(
         except ValueError as error:
             if not isinstance(error.__cause__, gymnasium.error.CustomSpaceError):
                 raise
-            # A task with a kind of space of its own, such as MiniGrid with its text.
+            # A task with a custom space, such as MiniGrid's text.
             return AsyncVectorEnv(copies, shared_memory=False, **settings)
     except (EOFError, ConnectionError) as error:  # a process has ended
         raise ValueError(
@@ -53,11 +53,11 @@ def make_gymnasium_tasks(
 
 
 def make_unchecked(name: str, **kwargs: Any) -> gymnasium.Env:
-    """Makes one task as Gymnasium does, but without its checker and its advice to name a newer one.
+    """Makes one task as Gymnasium does, without its checker and its advice to use a newer version.
 
-    The checker costs time in each step, and the tests check the specs instead. Who names an older
-    version means it: D4RL's data are of such. Without a screen, SDL draws pictures into memory and
-    is not asked to look for one, which it reports as an error.
+    The checker costs time in each step, and the tests check the specs instead. Older versions are
+    used on purpose: D4RL's data come from them. Without a screen, SDL is told to draw into memory,
+    because it reports an error if it looks for a screen.
     """
     if kwargs.get("render_mode") == "rgb_array" and not _HAS_SCREEN:
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -83,7 +83,7 @@ def _task(
 
 
 def _register(name: str) -> None:
-    """Imports what the user and the plugins named, which the main process had imported."""
+    """Imports the modules that the user and plugins named, as the main process did."""
     failures = load_plugins()
     if name not in gymnasium.registry:
         reason = (

@@ -8,9 +8,9 @@ _shown: set[str] = set()
 def show_mujoco_warnings_once() -> None:
     """Logs each of MuJoCo's warnings once per process, with the logger ``torchrl_tit.mujoco``.
 
-    By default MuJoCo prints a warning every time (for each environment with an outdated model, say)
-    and appends it to MUJOCO_LOG.TXT in the working directory, so both grow in a long run. A handler
-    that the user has set is kept.
+    By default MuJoCo prints a warning every time (for example, for each environment with an
+    outdated model) and appends it to MUJOCO_LOG.TXT in the working directory, so both grow in a
+    long run. A handler that the user has set is kept.
 
     Example:
         >>> import mujoco

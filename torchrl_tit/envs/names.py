@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from torchrl_tit.settings.imports import import_if_allowed, is_named
 from torchrl_tit.settings.plugins import load_plugins
 
-# The packages that register names with these beginnings; extras of these names install them.
+# The packages that register names with these prefixes; extras of the same names install them.
 _PACKAGES = {
     "BabyAI-": "minigrid",
     "MiniGrid-": "minigrid",
@@ -21,13 +21,13 @@ _PACKAGES = {
 
 
 def find_task(name: str) -> str | Callable[..., EnvBase]:
-    """Finds what a task's name stands for, and makes Gymnasium know it.
+    """Resolves a task's name, and registers it with Gymnasium if necessary.
 
     Args:
-        name: A name that Gymnasium has registered; one of a package that this library knows, such
+        name: A name that Gymnasium has registered; one from a package that this library knows, such
             as "MiniGrid-Empty-5x5-v0"; "module:Name-v0", where the module registers the name; or
-            "module:Name", a class in the module, or a function, that makes a TorchRL environment. A
-            function says so (``-> EnvBase``), unless the user named its module.
+            "module:Name", a class or function in the module that makes a TorchRL environment. A
+            function must be annotated as such (``-> EnvBase``), unless the user named its module.
 
     Returns:
         The name for `gymnasium.make`, or the class or function.
@@ -95,7 +95,7 @@ def _registered(name: str) -> str:
         ) from error
     if name not in gymnasium.registry:
         raise unknown(name)
-    return f"{package}:{name}"  # so that other processes import it, too
+    return f"{package}:{name}"  # so that other processes also import it
 
 
 def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
@@ -110,8 +110,8 @@ def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
         if issubclass(made, gymnasium.Env):
             hint = "; a Gymnasium task needs a name, with gymnasium.register in the module"
     elif callable(made):
-        # Any function of any loaded module has a name, those that start programs too: a file may
-        # name those only that say what they make.
+        # Any function of a loaded module can be named, even one that starts programs; a file may
+        # only name functions that are annotated to return an environment.
         if is_named(module.__name__) or _says_that_it_makes_an_env(made):
             return made
         found = "has a function of that name, which does not say that it makes an EnvBase"
@@ -126,6 +126,6 @@ def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
 def _says_that_it_makes_an_env(made: Any) -> bool:
     try:
         returned = get_type_hints(made).get("return")
-    except Exception:  # a builtin, or annotations that cannot be read
+    except Exception:  # a builtin, or unreadable annotations
         return False
     return isinstance(returned, type) and issubclass(returned, EnvBase)

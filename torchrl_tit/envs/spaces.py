@@ -1,4 +1,4 @@
-"""Gymnasium's spaces of observations as TorchRL's specs, and their values in these kinds."""
+"""Converts Gymnasium's observation spaces and values to TorchRL's specs."""
 
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -31,10 +31,10 @@ class Leaf:
     """One observation of a task.
 
     Args:
-        path: Keys and indices that lead to it in what the task returns.
+        path: Keys and indices that lead to it in the task's return value.
         spec: One of the kinds that :func:`observation_specs` lists, without batch dimensions.
         channels_last: Whether the task's images are (height, width, channels).
-        start: What the task's categories are counted from, an integer for each or one for all.
+        start: The integer from which the task's categories are counted, for each or one for all.
     """
 
     path: tuple[str | int, ...]
@@ -65,15 +65,15 @@ class ObservationReader:
     """Reads the observations that a vector of Gymnasium tasks returns.
 
     Args:
-        space: The space of one task's observations.
-        keys: Names of the observations to keep, or of groups of them; all if there are none.
+        space: The observation space of one task.
+        keys: Names of the observations to keep, or of groups of them; if empty, all.
         image_layout: Order of the dimensions of the task's images: ``"HWC"`` (height, width,
-            channels), ``"CHW"``, or ``"auto"``, which finds out where the channels are.
-        mask_actions: Whether an observation "action_mask" is none, but the mask of the actions.
+            channels), ``"CHW"``, or ``"auto"``, which infers it from the shape.
+        mask_actions: Whether "action_mask" is the mask of the actions instead of an observation.
 
     Raises:
-        ValueError: If no observation, or one of ``keys``, is of a kind that is supported, a key is
-            unknown, or the layout of an image cannot be found out.
+        ValueError: If no observation is of a supported kind, or one of ``keys`` is not; if a key is
+            unknown; or if the layout of an image cannot be inferred.
 
     Example:
         >>> space = Dict(camera=Box(0, 255, (84, 84, 3), np.uint8), gear=Discrete(5))
@@ -110,7 +110,7 @@ class ObservationReader:
         """Reads the observations.
 
         Args:
-            values: What the vector of N tasks returned.
+            values: The observations that the vector of N tasks returned.
 
         Returns:
             The only observation [N, *obs], or each by its name; none shares memory with ``values``.
@@ -120,12 +120,12 @@ class ObservationReader:
         return {name: leaf.read(_follow(leaf.path, values)) for name, leaf in self.leaves.items()}
 
     def masks(self, values: Any) -> list[Any]:
-        """Returns the masks of actions among the observations, [N, ...] each."""
+        """Returns the action masks among the observations, [N, ...] each."""
         return [_follow(path, values) for path in self._mask_paths]
 
 
 def observation_specs(env: EnvBase) -> TensorSpec | dict[str, TensorSpec]:
-    """Returns the specs of an environment's observations, which networks are built from.
+    """Returns the specs of an environment's observations, for building networks.
 
     Their kinds are
 
@@ -140,9 +140,9 @@ def observation_specs(env: EnvBase) -> TensorSpec | dict[str, TensorSpec]:
             under "observation".
 
     Returns:
-        The spec of the only observation; or, if there are several, of each by its name: NAME's
-        keys are ``("observation", NAME)`` and ``("history", NAME)``. All are without batch
-        dimensions.
+        The spec of the only observation; or, if there are several, the spec of each by its name:
+        the keys of NAME are ``("observation", NAME)`` and ``("history", NAME)``. The specs have no
+        batch dimensions.
 
     Example:
         >>> from torchrl_tit.envs import make_env
@@ -184,11 +184,11 @@ def categories_spec(sizes: Sequence[int]) -> MultiCategorical:
 def array_spec(
     name: str, shape: Sequence[int], dtype: torch.dtype, layout: ImageLayout
 ) -> tuple[Unbounded, bool]:
-    """The spec of an array or an image, and whether its channels come last in the task.
+    """The spec of an array or an image, and whether the task's channels come last.
 
     Raises:
-        ValueError: If it has more than three dimensions, or it cannot be found out which dimension
-            of an image is that of its channels.
+        ValueError: If it has more than three dimensions, or the channel dimension of an image
+            cannot be inferred.
     """
     if len(shape) > _MAX_ORDER:
         raise ValueError(
@@ -208,16 +208,16 @@ def choose(
     keys: Sequence[str],
     supported: Callable[[tuple[Any, Any]], Any],
 ) -> dict[str, tuple[Any, Any]]:
-    """Chooses the observations that are read.
+    """Chooses the observations to read.
 
     Args:
-        found: What the task has, by name: where it is, and its space or spec.
-        keys: Names, or the beginnings of names in front of "/"; all if there are none.
-        supported: Tells whether a value of ``found`` is of a supported kind.
+        found: The task's observations by name: the path, and the space or spec.
+        keys: Names, or prefixes of names before "/"; if empty, all.
+        supported: Returns whether a value of ``found`` is of a supported kind.
 
     Returns:
-        Those chosen, in the task's order. If there are no keys, unsupported ones are left out with
-        a warning.
+        The chosen observations, in the task's order. If there are no keys, unsupported ones are
+        left out with a warning.
 
     Raises:
         ValueError: If a key is unknown or of an unsupported kind, or nothing is left.
@@ -251,7 +251,7 @@ def choose(
 
 
 def leaf_name(keys: Iterable[str]) -> str:
-    """The name of a nested observation; modules and buffers cannot have dots in theirs."""
+    """The name of a nested observation, without dots, which names of modules cannot have."""
     return "/".join(keys).replace(".", "_")
 
 
@@ -321,6 +321,6 @@ def _belongs(name: str, key: str) -> bool:
 
 def _describe(value: Any) -> str:
     kind = value[1]
-    if isinstance(kind, TensorSpec):  # which would fill several lines
+    if isinstance(kind, TensorSpec):  # whose repr has several lines
         return f"{type(kind).__name__} {list(kind.shape)}"
     return str(kind)

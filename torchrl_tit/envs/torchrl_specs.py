@@ -1,4 +1,4 @@
-"""The specs of any TorchRL environment as those of our environments, and its values likewise."""
+"""Converts specs and values of any TorchRL environment to those of our environments."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -33,7 +33,7 @@ from torchrl_tit.envs.spaces import (
 
 Convert = Callable[[Tensor], Tensor]
 
-# What TorchRL's own transforms add to the observations.
+# Entries that TorchRL's own transforms add to the observations.
 _BOOKKEEPING = {"episode_reward", "is_init", "step_count", "traj_ids"}
 
 
@@ -42,14 +42,14 @@ class TensorReader:
 
     Args:
         specs: The specs of its observations.
-        keys: Names of the observations to keep, or of groups of them; by default all but what
-            TorchRL's transforms count.
+        keys: Names of the observations to keep, or of groups of them; by default, all except the
+            counters of TorchRL's transforms.
         image_layout: See :class:`~torchrl_tit.envs.spaces.ObservationReader`.
-        mask_actions: Whether an observation "action_mask" is none, but the mask of the actions.
+        mask_actions: Whether "action_mask" is the mask of the actions instead of an observation.
 
     Raises:
-        ValueError: If no observation, or one of ``keys``, is of a kind that is supported, a key is
-            unknown, there is no mask, or the layout of an image cannot be found out.
+        ValueError: If no observation is of a supported kind, or one of ``keys`` is not; if a key is
+            unknown; if there is no mask; or if the layout of an image cannot be inferred.
 
     Example:
         >>> from torchrl.envs import PendulumEnv
@@ -69,7 +69,7 @@ class TensorReader:
         check_layout(image_layout)
         found = {_name(key): (key, specs[key]) for key in specs.keys(True, True)}
         self.mask_key: NestedKey | None = None
-        """Key of the mask of the actions, if it is read."""
+        """Key of the action mask, if it is read."""
         if mask_actions:
             if MASK not in found:
                 raise ValueError(
@@ -98,13 +98,14 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
 
     Args:
         found: Its spec, without batch dimensions.
-        clip: Whether continuous actions are clipped to their bounds, and their spec has none.
+        clip: Whether continuous actions are clipped to their bounds, so that their spec is
+            unbounded.
 
     Returns:
-        The spec of our action, and the function that converts one to that of the environment.
+        The spec of our action, and the function that converts it to the environment's.
 
     Raises:
-        ValueError: If it is of a kind that is not supported.
+        ValueError: If the action is of an unsupported kind.
 
     Example:
         >>> spec, convert = action_spec(OneHot(3), clip=True)
@@ -144,7 +145,7 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
 
 
 def _name(key: NestedKey) -> str:
-    """The name of an observation; a group "observation" around it adds nothing."""
+    """The name of an observation; an enclosing group "observation" is left out."""
     parts = [key] if isinstance(key, str) else list(key)
     return leaf_name(parts[1:] if parts[0] == "observation" and len(parts) > 1 else parts)
 
@@ -154,7 +155,7 @@ def _is_array(spec: TensorSpec) -> bool:
 
 
 def _sizes(spec: TensorSpec) -> list[int]:
-    """The number of categories of each entry; empty if there are none, or it is not known."""
+    """The number of categories of each entry; empty if there are none or it is unknown."""
     if isinstance(spec, MultiCategorical | MultiOneHot):
         sizes = torch.as_tensor(spec.nvec).flatten().tolist()
         groups = spec.shape.numel() // (sum(sizes) if isinstance(spec, MultiOneHot) else len(sizes))

@@ -1,4 +1,4 @@
-"""Copies of any TorchRL environment, side by side, with the keys and kinds of our environments."""
+"""Copies of any TorchRL environment, with the keys and spec kinds of our environments."""
 
 import inspect
 from collections.abc import Callable, Sequence
@@ -18,23 +18,23 @@ from torchrl_tit.envs.wrappers import load_wrappers
 
 
 class TorchRLTask(EnvBase):
-    """One TorchRL environment as a task: its observations, its action and the ends of its episodes.
+    """One TorchRL environment as a task, with its observations, action and ends of episodes.
 
-    It has the keys of :class:`~torchrl_tit.envs.GymVectorEnv`. Observations of several keys are
-    nested: ("observation", NAME), where the name of a nested one joins its keys with "/". What the
-    environment itself reads from step to step stays in here.
+    It has the keys of :class:`~torchrl_tit.envs.GymVectorEnv`. Several observations are nested:
+    ("observation", NAME), where the name of a nested one joins its keys with "/". Entries that the
+    environment itself reads from step to step are kept internally.
 
     Args:
         env: The environment, without batch dimensions.
-        clip_actions: See :class:`~torchrl_tit.envs.GymVectorEnv`, as the next three.
+        clip_actions: See :class:`~torchrl_tit.envs.GymVectorEnv`, also for the next three.
         observation_keys: Names of the observations to keep; all by default.
         image_layout: Where images have their channels.
-        mask_actions: Whether an observation "action_mask" tells which actions are allowed.
+        mask_actions: Whether an observation "action_mask" marks the allowed actions.
 
     Raises:
-        ValueError: If its observations or actions are of a kind that is not supported, or it has a
-            batch size, several actions, several rewards, or ends of episodes for parts of it. See
-            also :class:`~torchrl_tit.envs.torchrl_specs.TensorReader`.
+        ValueError: If its observations or actions are of an unsupported kind, or it has a batch
+            size, several actions, several rewards, or separate done flags for parts of it. See also
+            :class:`~torchrl_tit.envs.torchrl_specs.TensorReader`.
 
     Example:
         >>> from torchrl.envs import PendulumEnv
@@ -62,7 +62,7 @@ class TorchRLTask(EnvBase):
         spec, write = action_spec(env.action_spec, clip=clip_actions)
         super().__init__(device=env.device, batch_size=torch.Size([]))
         self._env, self._read, self._write = env, read, write
-        self._carried: TensorDictBase | None = None  # what the environment reads in its next step
+        self._carried: TensorDictBase | None = None  # what the environment reads next
         entries = {"observation": read.spec}
         if read.mask_key is not None:
             mask = _mask_size(spec)
@@ -109,7 +109,7 @@ class TorchRLTask(EnvBase):
         self._env.set_seed(seed)
 
     def render(self) -> np.ndarray:
-        """Renders the task by its own ``render``, or else returns its observation "pixels".
+        """Renders the task with its own ``render``, or else returns its observation "pixels".
 
         Returns:
             uint8 [height, width, 3].
@@ -172,7 +172,7 @@ class SerialTasks(_SeededCopies, SerialEnv):
 
 
 class ParallelTasks(_SeededCopies, ParallelEnv):
-    """Copies of a task that are stepped side by side, in one process each."""
+    """Copies of a task that are stepped in parallel, in one process each."""
 
 
 def make_torchrl_tasks(
@@ -189,15 +189,15 @@ def make_torchrl_tasks(
     """Makes copies of a TorchRL environment, as an environment of batch size [N].
 
     Args:
-        make: A class, or a function, that makes an environment without batch dimensions.
+        make: A class or function that makes an environment without batch dimensions.
         num_envs: N.
-        name: The task's name, for messages.
-        wrappers: TorchRL transforms around each copy, as
-            :func:`~torchrl_tit.envs.wrappers.load_wrappers` takes them.
+        name: The task's name, for error messages.
+        wrappers: TorchRL transforms around each copy, in the format of
+            :func:`~torchrl_tit.envs.wrappers.load_wrappers`.
         vectorization_mode: ``"sync"`` steps the copies in this process (`SerialEnv`), ``"async"``
             in one process each (`ParallelEnv`).
         device: Device of the tensors.
-        task_settings: Passed to ``make``. If it takes no ``max_episode_steps``, TorchRL's
+        task_settings: Passed to ``make``. If ``make`` has no ``max_episode_steps``, TorchRL's
             `StepCounter` truncates the episodes.
         **reading: See :class:`TorchRLTask`.
 
@@ -205,7 +205,7 @@ def make_torchrl_tasks(
         The environment.
 
     Raises:
-        ValueError: See :class:`TorchRLTask`; or a setting or a wrapper is wrong.
+        ValueError: See :class:`TorchRLTask`; or if a setting or a wrapper is invalid.
 
     Example:
         >>> from torchrl.envs import PendulumEnv
@@ -214,7 +214,7 @@ def make_torchrl_tasks(
         torch.Size([2, 3])
     """
     copy = partial(_copy, make, name, tuple(wrappers), task_settings, reading)
-    copy().close()  # so that errors are those of a copy, not of its processes
+    copy().close()  # so that errors are raised here, not in other processes
     kind = SerialTasks if vectorization_mode == "sync" else ParallelTasks
     return kind(num_envs, copy, device=device)
 
@@ -238,11 +238,11 @@ def _copy(
     if "max_episode_steps" not in parameters:
         limit = settings.get("max_episode_steps")
         settings = {key: value for key, value in settings.items() if key != "max_episode_steps"}
-    if "render_mode" not in parameters:  # it renders as it does
+    if "render_mode" not in parameters:  # it renders in its own way
         settings = {key: value for key, value in settings.items() if key != "render_mode"}
     try:
         env = make(**settings)
-    except Exception as error:  # each checks its settings in its own way
+    except Exception as error:  # an environment can raise anything
         raise ValueError(
             f"Task {name!r} cannot be made: {type(error).__name__}: {error}"
         ) from error
@@ -284,7 +284,7 @@ def _check(env: EnvBase) -> None:
 
 
 def _mask_size(spec: Any) -> int:
-    """The number of entries of a mask of actions."""
+    """The number of entries of an action mask."""
     if type(spec) is Categorical:
         return int(spec.space.n)
     if hasattr(spec, "nvec"):

@@ -13,12 +13,12 @@ from torchrl_tit.envs.action_masks import MASK
 class TransformedVectorEnv(TransformedEnv):
     """A `TransformedEnv` around :class:`~torchrl_tit.envs.GymVectorEnv` with faster steps.
 
-    It behaves like TorchRL's. Most of the time of TorchRL's step goes into copying the
-    tensordict for inverse transforms and into checking what the environment wrote. Where no
-    transform has an inverse, neither is needed: the environment reads only the action and writes
-    every entry in the shape of its spec. A step of eight CartPoles then takes about a fifth less
-    time. Everything else takes TorchRL's code path: a transform with an inverse (of actions, say),
-    or a tensordict with entries under "next" or on another device.
+    It behaves like TorchRL's. TorchRL's step spends most of its time on copying the tensordict for
+    inverse transforms and on checking what the environment wrote. If no transform has an inverse,
+    neither is needed: the environment only reads the action, and writes every entry in the shape of
+    its spec. A step of eight CartPoles then takes about a fifth less time. All other cases take
+    TorchRL's code path: a transform with an inverse (of actions, for example), or a tensordict with
+    entries under "next" or on another device.
 
     Add transforms with ``append_transform``; a second `TransformedEnv` around this one works, but
     takes TorchRL's code path.
@@ -26,9 +26,9 @@ class TransformedVectorEnv(TransformedEnv):
     Args:
         base_env: The environment.
         transform: As in `TransformedEnv`.
-        transient_keys: Entries that only the policy reads, such as histories: a step that was taken
-            lacks them, at its root and under "next". The tensordict to act on next has them, so a
-            collector works as usual and does not store them.
+        transient_keys: Entries that only the policy reads, such as histories. They are removed from
+            a step after it is taken, at its root and under "next". The tensordict to act on next
+            has them, so a collector works as usual but does not store them.
         **settings: As in `TransformedEnv`.
 
     Example:
@@ -50,7 +50,7 @@ class TransformedVectorEnv(TransformedEnv):
     ) -> None:
         super().__init__(base_env, transform, **settings)
         self.transient_keys = tuple(transient_keys)
-        """Entries that a step lacks once it was taken."""
+        """Entries that are removed from a step after it is taken."""
 
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
@@ -83,12 +83,13 @@ class TransformedVectorEnv(TransformedEnv):
         return taken, following
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        """Draws an action, one that is allowed if the tensordict has an "action_mask".
+        """Draws an action; an allowed one, if the tensordict has an "action_mask".
 
-        TorchRL's `ActionMask` would do it, but keeps the mask in the spec, which no checkpoint has.
+        TorchRL's `ActionMask` could do this, but keeps the mask in the spec, which checkpoints
+        lack.
 
         Args:
-            tensordict: What the environment wrote; [N].
+            tensordict: The environment's output; [N].
 
         Returns:
             The tensordict with the action.
@@ -101,8 +102,8 @@ class TransformedVectorEnv(TransformedEnv):
 
 
 def _only_writes(transform: Transform) -> bool:
-    """Returns whether transforms only add to what the environment wrote."""
-    # Checked in every step, since transforms can be added at any time; it takes microseconds.
+    """Returns whether transforms only add to the environment's output."""
+    # Checked in every step, since transforms can be added at any time; this takes microseconds.
     return type(transform) is Compose and all(
         not part.in_keys_inv
         and all(getattr(type(part), hook) is getattr(Transform, hook) for hook in _HOOKS)
@@ -111,4 +112,4 @@ def _only_writes(transform: Transform) -> bool:
 
 
 _HOOKS = ("_inv_call", "inv", "_post_step_mdp_hooks", "transform_env_device")
-"""What a transform can do in a step besides `_step` and `_call`."""
+"""Methods that a transform can run in a step besides `_step` and `_call`."""

@@ -1,4 +1,4 @@
-"""A Gymnasium vector environment as a TorchRL environment that adds little time to a step."""
+"""A Gymnasium vector environment as a TorchRL environment with little overhead per step."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,9 +20,9 @@ from torchrl_tit.envs.spaces import ImageLayout, ObservationReader
 class GymVectorEnv(EnvBase):
     """N copies of a Gymnasium task as one TorchRL environment.
 
-    It writes what TorchRL's `GymWrapper` under the transform `DoubleToFloat` writes, several times
-    as fast: a step of a small task costs less than the bookkeeping around it, which is a few lines
-    here. Histories, returns and the like are transforms on top: see
+    It writes the same entries as TorchRL's `GymWrapper` with the transform `DoubleToFloat`, several
+    times faster: a step of a small task costs less than the bookkeeping around it, which is kept
+    minimal here. Histories, returns and the like are written by transforms: see
     :func:`~torchrl_tit.envs.make_env`.
 
     ======================  ==================  ===================================================
@@ -41,11 +41,11 @@ class GymVectorEnv(EnvBase):
     Several observations (Dict, Tuple) are nested: ``("observation", NAME)``, where the name of an
     observation in a nested Dict joins the keys with "/" (and dots in them become "_"), and those
     of a Tuple are "0", "1", ...
-    Images are written with their channels first. Text and other unsupported kinds beside supported
-    ones are left out with a warning.
+    Images are written with their channels first. Text and other unsupported observations are left
+    out with a warning if there are supported ones.
 
-    Continuous actions are clipped to the task's bounds only on their way to the task: the
-    tensordict keeps the sampled action, which its log-probability belongs to.
+    Continuous actions are clipped to the task's bounds only when they are passed to the task: the
+    tensordict keeps the sampled action, to which its log-probability belongs.
 
     Args:
         env: The vector environment, made with ``autoreset_mode=AutoresetMode.DISABLED``. Its
@@ -55,15 +55,16 @@ class GymVectorEnv(EnvBase):
             they are passed on unchanged, and the spec has the task's bounds.
         observation_keys: Names of the observations to keep; all by default.
         image_layout: Where images have their channels: ``"HWC"``, ``"CHW"``, or ``"auto"``, which
-            finds it out from their shape.
-        mask_actions: Whether to write which actions are allowed: an observation "action_mask" of
-            the task (which is no observation then), or what its ``info`` has under that name.
+            infers it from their shape.
+        mask_actions: Whether to write which actions are allowed: the task's observation
+            "action_mask" (then not written as an observation), or the entry of that name in its
+            ``info``.
         device: Device of the tensors; by default they stay on the CPU and the device is None.
 
     Raises:
         ValueError: If the vector environment resets itself, observations or actions are of another
-            kind, there is no observation of that name, the layout of an image cannot be found out,
-            or the task has no mask of its actions.
+            kind, there is no observation of that name, the layout of an image cannot be inferred,
+            or the task has no action mask.
 
     Example:
         >>> from gymnasium.vector import SyncVectorEnv
@@ -151,7 +152,7 @@ class GymVectorEnv(EnvBase):
         )
 
     def _observed(self, observations: Any, info: dict[str, Any]) -> dict[str, Any]:
-        """The observation, or several in a tensordict, and the mask of the actions."""
+        """The observation, or several in a tensordict, and the action mask."""
         values = self._read(observations)
         if not isinstance(values, dict):
             entries = {"observation": self._tensor(values)}
@@ -166,8 +167,8 @@ class GymVectorEnv(EnvBase):
         return entries
 
     def _check_shapes(self) -> None:
-        """Raises ValueError if a task returns other shapes than its observation space has."""
-        for env in getattr(self._env, "envs", ()):  # which tasks in other processes lack
+        """Raises ValueError if observations do not have the shape of their space."""
+        for env in getattr(self._env, "envs", ()):  # missing for tasks in other processes
             observation, _ = env.reset()
             shape, declared = np.shape(observation), env.observation_space.shape
             if declared is not None and shape != declared:
@@ -177,7 +178,7 @@ class GymVectorEnv(EnvBase):
                 )
 
     def _check_masks(self) -> None:
-        """Raises ValueError if the task has no masks of its actions."""
+        """Raises ValueError if the task has no action masks."""
         observations, info = self._env.reset()
         if not self._read.masks(observations) and MASK not in info:
             raise ValueError(
@@ -192,7 +193,7 @@ class GymVectorEnv(EnvBase):
 
     @property
     def action_writer(self) -> ActionWriter:
-        """What brings actions of the tensordict to the tasks."""
+        """The object that converts the tensordict's actions to those of the tasks."""
         return self._write
 
     @property
@@ -204,7 +205,7 @@ class GymVectorEnv(EnvBase):
         """Renders the tasks, which must be made with ``render_mode="rgb_array"``.
 
         Returns:
-            One image of each task; uint8 [N, height, width, 3].
+            One image per task; uint8 [N, height, width, 3].
 
         Raises:
             ValueError: If the tasks cannot be rendered.
@@ -220,7 +221,7 @@ class GymVectorEnv(EnvBase):
         self._env.reset(seed=seed)
 
     def _seed_spaces(self, seed: int | None) -> None:
-        """Seeds what spaces draw, which resets leave to chance; copies in processes keep theirs."""
+        """Seeds the spaces, which resets do not; those in other processes are unchanged."""
         if seed is None:
             return
         copies = getattr(self._env.unwrapped, "envs", ())

@@ -1,4 +1,4 @@
-"""Wrappers and transforms around a task, by name."""
+"""Finds wrappers and transforms of a task by name."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -14,18 +14,18 @@ Wrap = Callable[[gymnasium.Env], gymnasium.Env]
 
 
 def load_wrappers(names: Sequence[str]) -> tuple[list[Wrap], list[Transform]]:
-    """Finds what to put around a task.
+    """Finds the wrappers and transforms to apply to a task.
 
     Args:
         names: Gymnasium wrappers, then TorchRL transforms, as "module:Class" or
             "module:Class(argument=literal)"; the innermost first.
 
     Returns:
-        What puts a Gymnasium wrapper around a task, and the transforms.
+        Functions that apply the Gymnasium wrappers to a task, and the transforms.
 
     Raises:
-        ValueError: If there is no such class, it is of another kind, its arguments are wrong, or a
-            wrapper stands after a transform.
+        ValueError: If there is no such class, it is of another kind, its arguments are invalid, or
+            a wrapper comes after a transform.
 
     Example:
         >>> wraps, transforms = load_wrappers(
@@ -66,7 +66,7 @@ def _wrapped(kind: Any, name: str, arguments: dict[str, Any], env: gymnasium.Env
 def _called(kind: Any, name: str, *values: Any, **arguments: Any) -> Any:
     try:
         return kind(*values, **arguments)
-    except Exception as error:  # each checks its arguments and its task in its own way
+    except Exception as error:  # a wrapper can raise anything
         raise ValueError(
             f"Wrapper {name!r} cannot be made: {type(error).__name__}: {error}"
         ) from error

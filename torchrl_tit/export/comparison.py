@@ -1,4 +1,4 @@
-"""Whether an exported policy acts as the live one."""
+"""Checks that an exported policy acts like the live one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl_tit.export.observed import Untouched
 from torchrl_tit.export.program import NOISE, Program, Step
 
 TOLERANCE = 1e-5
-"""Largest difference, relative to the largest entry where that is above 1."""
+"""Largest difference, relative to the largest entry if that is above 1."""
 OBSERVATIONS = 100
 """Number of observations on which policies are compared."""
 COPIES = 4
@@ -25,7 +25,7 @@ _EPISODE = 10
 
 
 class NotTheSameError(ValueError):
-    """An exported policy does something else than the live one."""
+    """An exported policy acts differently from the live one."""
 
 
 @torch.no_grad()
@@ -39,19 +39,19 @@ def compare(
 ) -> float:
     """Compares an exported policy with the live one, step by step, in the live one's episodes.
 
-    Compared are the action and what it was chosen by. Of discrete actions, it is the choice that is
-    compared, given the exported logits or values: where two are equally good but for rounding, both
-    choices are right. If actions are drawn, the noise is random.
+    Compares the action and the outputs from which it was chosen. For discrete actions, the choice
+    is compared given the exported logits or values: if two actions are equally good up to rounding,
+    both are correct. If actions are sampled, the noise is random.
 
     Args:
         run: the exported policy.
-        program: what it was made of.
+        program: the program that was exported.
         policy: the live policy.
         env: environment to act in; a transform is added to it.
         observations: number of observations.
 
     Returns:
-        The largest difference, relative to the largest entry where that is above 1.
+        The largest difference, relative to the largest entry if that is above 1.
 
     Raises:
         NotTheSameError: if a difference is above ``TOLERANCE``.
@@ -75,7 +75,7 @@ def compare(
             name: live[key] for name, key in program.parts.further.items()
         }
         for name in program.state:
-            # What is carried into an episode does not matter.
+            # The state carried into an episode does not matter.
             entry = program.inputs[name]
             given[name] = state.get(name, torch.ones_like(entry.zeros(len(flat))))
         if program.noise is not None:
@@ -100,10 +100,10 @@ def compare(
 
 
 def _keep_untouched(program: Program, env: EnvBase) -> list[NestedKey]:
-    """Makes an environment write each observation as it was before its transforms."""
+    """Makes an environment also write each observation from before its transforms."""
     observed = program.parts.observed
     keys = [seen.key for seen in observed]
-    # From the outside in, so that places stay what they are.
+    # From the outside in, so that places remain valid.
     for index in sorted(range(len(observed)), key=lambda i: -observed[i].place):
         seen = observed[index]
         if len(seen.layers):

@@ -20,16 +20,16 @@ from torch import Tensor, nn
 from torchrl_tit.export.program import Program
 
 FACTS = "torchrl_tit.json"
-"""Under this name a .pt2 file holds the facts about its policy."""
+"""Name under which a .pt2 file stores the facts about its policy."""
 METADATA = "torchrl_tit"
-"""Under this name an ONNX file holds them."""
+"""Name under which an ONNX file stores them."""
 
 Run = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
-"""From inputs by name to outputs by name."""
+"""Maps inputs by name to outputs by name."""
 
 
 class Format(ABC):
-    """A kind of files."""
+    """A file format."""
 
     suffix: ClassVar[str]
 
@@ -41,7 +41,7 @@ class Format(ABC):
 
         Args:
             program: the program.
-            facts: what to say about it; their "inputs" and "outputs" name its tensors in order.
+            facts: metadata of the policy; "inputs" and "outputs" list its tensors in order.
             path: the file.
 
         Raises:
@@ -53,12 +53,12 @@ class Format(ABC):
         """Reads a file; returns the function from inputs to outputs by name."""
 
     def check_installed(self) -> None:
-        """Raises ValueError if a package that it needs is missing."""
+        """Raises ValueError if a required package is missing."""
         return
 
 
 class PT2(Format):
-    """PyTorch's own: `torch.export.load` reads it, into any device and AOTInductor."""
+    """PyTorch's own format, which `torch.export.load` reads, for any device and AOTInductor."""
 
     suffix = ".pt2"
 
@@ -77,7 +77,7 @@ class PT2(Format):
 
 
 class ONNX(Format):
-    """ONNX, by PyTorch's exporter of exported programs; any ONNX runtime reads it."""
+    """ONNX, written by PyTorch's exporter for exported programs; any ONNX runtime reads it."""
 
     suffix = ".onnx"
 
@@ -142,7 +142,7 @@ def trace(program: Program) -> torch.export.ExportedProgram:
     """Traces a policy with a free batch size.
 
     Raises:
-        ValueError: if `torch.export` cannot follow it.
+        ValueError: if `torch.export` cannot trace it.
     """
     batch = torch.export.Dim("batch")
     examples = program.examples(2)
@@ -154,10 +154,10 @@ def trace(program: Program) -> torch.export.ExportedProgram:
                 examples,
                 dynamic_shapes={name: {0: batch} for name in examples},
             )
-    except Exception as error:  # each of torch.export's layers has its own
+    except Exception as error:  # each layer of torch.export has its own errors
         raise ValueError(f"torch.export cannot trace this policy: {_first_line(error)}") from error
     exported.example_inputs = None
-    for node in exported.graph.nodes:  # half of a small file, with the paths of this machine
+    for node in exported.graph.nodes:  # half of a small file, with paths of this machine
         for note in ("nn_module_stack", "source_fn_stack", "stack_trace", "torch_fn"):
             node.meta.pop(note, None)
     return exported
@@ -181,7 +181,7 @@ class _Named(nn.Module):
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Hides what the exporters tell about themselves."""
+    """Hides the exporters' own messages."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript")]
     levels = [logger.level for logger in loggers]
     try:
@@ -196,7 +196,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _missing_operator(error: BaseException) -> str:
-    """Says what of a program ONNX lacks, as far as the exporter tells."""
+    """Returns which operator ONNX lacks, if the exporter's error says so."""
     messages: list[str] = []
     cause: BaseException | None = error
     while cause is not None:

@@ -1,4 +1,4 @@
-"""What stands between a policy's features and its action, in plain tensors."""
+"""The layers between a policy's features and its action, on plain tensors."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from torchrl_tit.modules.distributions import IndependentBernoulli
 
 
 class Head(nn.Module):
-    """The modules of a policy that turn features into an action, and no others.
+    """The modules of a policy that map features to an action, and no others.
 
-    Actions are the most likely ones. A sample is the most likely action once noise was added to the
-    parameters of the distribution: to logits a Gumbel variable, or for switches a logistic one, and
-    to a mean a standard normal one times the standard deviation. So a sampling policy is a function
-    too, which draws the same in every runtime, and with noise of zeros acts deterministically.
-    (Maddison et al., "A* Sampling", arXiv 1411.0030, section 2, has the first; the others are
-    inverse distribution functions.)
+    By default, it takes the most likely action. A sample is the most likely action after noise was
+    added to the parameters of the distribution: a Gumbel variable to logits (a logistic one for
+    binary actions), or a standard normal one times the standard deviation to a mean. So a sampling
+    policy is also a pure function, which gives the same samples in every runtime, and acts
+    deterministically with zero noise. (Maddison et al., "A* Sampling", arXiv 1411.0030, section 2,
+    describe the first; the others are inverse distribution functions.)
 
     Args:
-        modules: all modules of a policy behind its backbone, in their order.
+        modules: all modules of a policy after its backbone, in order.
         action_key: key of the action.
 
     Raises:
@@ -45,7 +45,7 @@ class Head(nn.Module):
         self.action_key = unravel_key(action_key)
         needed = {self.action_key}
         used: list[TensorDictModuleBase] = []
-        for module in reversed(modules):  # a critic, say, is left out
+        for module in reversed(modules):  # a critic, for example, is left out
             writes = {unravel_key(key) for key in module.out_keys}
             if writes & needed:
                 used.insert(0, module)
@@ -53,16 +53,17 @@ class Head(nn.Module):
         if not used:
             raise ValueError(f"the policy writes no {action_key!r} behind its backbone")
         self.reads: set[NestedKey] = needed
-        """Keys of what the modules read: features, masks."""
+        """Keys that the modules read: features, masks."""
         *layers, last = used
         chooses = isinstance(last, ProbabilisticTensorDictModule | QValueModule)
         self.layers = nn.ModuleList(layers if chooses else used)
         self.choice = last if chooses else None
-        """What turns the parameters of a distribution, or the values of actions, into an action."""
+        """The module that maps a distribution's parameters, or the values of actions, to an
+        action."""
 
     @property
     def noise(self) -> str | None:
-        """The noise of a sample, by the name of NumPy's generator; None if nothing is drawn."""
+        """The kind of noise, by the name of NumPy's generator; None if actions are not sampled."""
         if not isinstance(self.choice, ProbabilisticTensorDictModule):
             return None
         if self.choice.distribution_class is IndependentBernoulli:
@@ -71,7 +72,7 @@ class Head(nn.Module):
 
     @property
     def parameter_keys(self) -> list[str]:
-        """Keys of what the choice depends on: "logits", "loc" and "scale", or "action_value"."""
+        """Keys on which the choice depends: "logits", "loc" and "scale", or "action_value"."""
         if self.choice is None:
             return []
         known = ("logits", "loc", "scale", "action_value")
@@ -83,11 +84,11 @@ class Head(nn.Module):
         """Maps features to actions.
 
         Args:
-            entries: what ``reads`` names, [N, ...] each.
-            noise: of the shape of the logits or the mean; None for the most likely action.
+            entries: the entries that ``reads`` lists, [N, ...] each.
+            noise: noise with the shape of the logits or the mean; None for the most likely action.
 
         Returns:
-            The action [N, ...], and what ``parameter_keys`` names.
+            The action [N, ...], and the entries that ``parameter_keys`` lists.
         """
         tensordict: TensorDictBase = TensorDict(dict(entries))
         for layer in self.layers:
@@ -109,7 +110,7 @@ class Head(nn.Module):
 
 
 def split_policy(policy: nn.Module) -> tuple[Backbone, list[TensorDictModuleBase]]:
-    """Splits a policy into its backbone and the modules behind it.
+    """Splits a policy into its backbone and the modules after it.
 
     Args:
         policy: a sequence of TensorDict modules, nested or not.

@@ -1,4 +1,4 @@
-"""Observations as an environment writes them, and how they become what a network reads."""
+"""Observations as an environment writes them, and their conversion to a network's inputs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Entry:
 
 
 class Select(nn.Module):
-    """Reads some entries of the last dimension.
+    """Selects some entries of the last dimension.
 
     Args:
         entries: their indices.
@@ -54,8 +54,8 @@ class Standardize(nn.Module):
     """Subtracts a mean and divides by a standard deviation.
 
     Args:
-        mean: of the shape of an observation.
-        std: likewise.
+        mean: the mean, with the shape of an observation.
+        std: the standard deviation, with the same shape.
     """
 
     mean: Tensor
@@ -73,28 +73,28 @@ class Standardize(nn.Module):
 
 @dataclass(frozen=True)
 class Observed:
-    """An observation of a task, before it is normalised and velocities are hidden."""
+    """An observation of a task, before normalisation and before velocities are hidden."""
 
     name: str
-    """Its name among several; empty if it is the only one."""
+    """Its name, if there are several; empty if it is the only one."""
     key: NestedKey
-    """Where the environment writes it."""
+    """The key under which the environment writes it."""
     entry: Entry
-    """What one observation is."""
+    """Shape and dtype of one observation."""
     layers: nn.Sequential
-    """What the environment does with it before the network reads it."""
+    """The environment's operations on it before the network reads it."""
     place: int
     """Number of the environment's transforms before the first of these."""
     padding: Padding | None
-    """What precedes an episode; None if that is masked."""
+    """Padding before an episode; None if it is masked."""
 
 
 class Untouched(ObservationTransform):
-    """Keeps an observation as it is at this place among the transforms of an environment.
+    """Copies an observation as it is at this place among the transforms of an environment.
 
     Args:
-        in_keys: its key.
-        out_keys: another key.
+        in_keys: key of the observation.
+        out_keys: key of the copy.
     """
 
     def _apply_transform(self, observation: Tensor) -> Tensor:
@@ -119,12 +119,12 @@ def transforms_of(env: EnvBase) -> list[Transform]:
 
 
 def trace(env: EnvBase, history_key: NestedKey, name: str = "") -> Observed:
-    """Finds out where a history comes from.
+    """Finds the observation from which a history is made.
 
     Args:
         env: the environment that writes it.
         history_key: its key.
-        name: name of the observation among several.
+        name: name of the observation, if there are several.
 
     Raises:
         ValueError: if no :class:`~torchrl_tit.transforms.History` writes it.
@@ -161,7 +161,7 @@ def trace(env: EnvBase, history_key: NestedKey, name: str = "") -> Observed:
         elif isinstance(transform, ObservationNorm) and transform.standard_normal:
             layers.append(Standardize(transform.loc, transform.scale))
         else:
-            break  # the observation is what this one writes
+            break  # this one writes the observation
         key, place = source, index
     if not stacked:
         raise ValueError(
@@ -177,7 +177,7 @@ def trace(env: EnvBase, history_key: NestedKey, name: str = "") -> Observed:
 
 
 def identifiers(names: Sequence[str]) -> list[str]:
-    """Returns names as those of arguments, which are unique.
+    """Turns names into unique argument names.
 
     Example:
         >>> identifiers(["arm/left", "arm.left", "image"])

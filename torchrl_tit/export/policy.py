@@ -1,4 +1,4 @@
-"""Writes a policy to a file that acts without this library, and checks that it does."""
+"""Writes a policy to a file that acts without this library, and checks the file."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from torchrl_tit.export.sequences import SequenceSteps, SequenceWindows
 from torchrl_tit.files import whole_or_not_at_all
 
 VERSION = 1
-"""Of the facts in a file."""
+"""Version of the facts in a file."""
 
 
 def export_policy(
@@ -44,34 +44,35 @@ def export_policy(
 
     The file holds everything between the task's observation and its action: normalisation, hidden
     velocities, the network, the choice of an action and its clipping. The batch size is free, and
-    weights are float32, on a CPU. Of a policy that reads K > 1 observations there are two forms:
+    weights are float32, on a CPU. A policy that reads K > 1 observations can have two forms:
 
-    - by default it reads the last K observations, ``history`` [N, K, *obs], and carries nothing;
-    - ``step_by_step`` it reads the newest ``observation`` [N, *obs], whether an episode begins
-      (``is_init`` bool [N]) and the tokens of the K - 1 frames before it, and writes the tokens to
-      pass on. So each frame is encoded once.
+    - by default, it reads the last K observations, ``history`` [N, K, *obs], and carries no state;
+    - with ``step_by_step``, it reads the newest ``observation`` [N, *obs], whether an episode
+      begins (``is_init`` bool [N]) and the tokens of the previous K - 1 frames, and writes the
+      tokens to pass on. So each frame is encoded once.
 
-    A recurrent policy is always the second, with its state instead of tokens. A policy of one
-    observation reads that, in both forms.
+    A recurrent policy always has the second form, with its state instead of tokens. A policy that
+    reads one observation takes just that in both forms.
 
     After writing, the file is read again and compared with the live policy on 100 observations of
-    episodes that it plays.
+    the live policy's episodes.
 
     Args:
-        policy: a :class:`~torchrl_tit.modules.Backbone` and the modules behind it, in evaluation
+        policy: a :class:`~torchrl_tit.modules.Backbone` and the modules after it, in evaluation
             mode and on a CPU.
-        make_env: makes the environment that the policy acts in, given the number of copies.
+        make_env: makes the environment in which the policy acts, given the number of copies.
         path: the file to write, which must not exist yet.
-        format: "pt2" (`torch.export`) or "onnx"; by default what the file's name ends with.
-        step_by_step: whether each frame is to be encoded once.
-        sample: whether actions are drawn, from an input "noise", instead of being the most likely.
-        facts: further entries of the facts that the file holds.
+        format: "pt2" (`torch.export`) or "onnx"; by default, given by the file's suffix.
+        step_by_step: whether each frame is encoded only once.
+        sample: whether actions are sampled, from an input "noise", instead of being the most likely
+            ones.
+        facts: further entries of the facts in the file.
 
     Returns:
         The facts: "inputs" and "outputs" by name with "shape" (without the batch) and "dtype",
-        "state" (the inputs to be passed on, whose new values are the outputs "next_NAME"), "noise"
-        (what to draw it with, by the name of NumPy's generator), "num_frames", and the "difference"
-        that was found.
+        "state" (the inputs to carry over, whose new values are the outputs "next_NAME"), "noise"
+        (the name of NumPy's generator that draws it), "num_frames", and the "difference" that was
+        found.
 
     Raises:
         FileExistsError: if the file exists already.
@@ -108,7 +109,7 @@ def export_policy(
         precision, parts.backbone.autocast = parts.backbone.autocast, None
         try:
             program = make_program(parts, step_by_step=step_by_step, sample=sample)
-            # A copy: tracing touches the weights of some layers, such as nn.LSTM's.
+            # A copy, because tracing modifies the weights of some layers, such as nn.LSTM.
             exported = trace(copy.deepcopy(program))
             said = {**describe(program, env), **(facts or {})}
             kind.write(exported, said, hidden)
@@ -124,7 +125,7 @@ def find_format(path: Path, format: str | None = None) -> Format:
 
     Args:
         path: the file.
-        format: its name; by default, the file's suffix tells.
+        format: its name; by default, it follows from the file's suffix.
 
     Raises:
         ValueError: if it is unknown.
@@ -147,15 +148,15 @@ def find_format(path: Path, format: str | None = None) -> Format:
 
 
 def make_program(parts: Parts, *, step_by_step: bool = False, sample: bool = False) -> Program:
-    """Makes a policy a function of plain tensors.
+    """Turns a policy into a function of plain tensors.
 
     Args:
         parts: the policy.
-        step_by_step: whether each frame is to be encoded once.
-        sample: whether actions are drawn.
+        step_by_step: whether each frame is encoded only once.
+        sample: whether actions are sampled.
 
     Raises:
-        ValueError: if its history encoder reads what is not known, or there is nothing to draw.
+        ValueError: if its history encoder has unknown inputs, or there is nothing to sample.
     """
     trunk = parts.trunk
     program: Program
@@ -178,7 +179,7 @@ def make_program(parts: Parts, *, step_by_step: bool = False, sample: bool = Fal
 
 
 def describe(program: Program, env: EnvBase) -> dict[str, Any]:
-    """Says what a program reads and writes, as JSON can hold it."""
+    """Describes a program's inputs and outputs in a form suitable for JSON."""
     examples = program.examples(1)
     with torch.no_grad():
         outputs = program(examples)

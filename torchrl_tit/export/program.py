@@ -1,4 +1,4 @@
-"""Policies as functions of plain tensors, of which `torch.export` makes programs."""
+"""Policies as functions of plain tensors, which `torch.export` can trace."""
 
 from __future__ import annotations
 
@@ -22,50 +22,50 @@ from torchrl_tit.transforms import SequenceHistory
 from torchrl_tit.windows import Padding
 
 FIRST = "is_init"
-"""Name of the input that tells that an episode begins, bool [N]."""
+"""Name of the input that marks the beginning of an episode, bool [N]."""
 NOISE = "noise"
-"""Name of the input from which actions are drawn."""
+"""Name of the input from which actions are sampled."""
 
 
 @dataclass(frozen=True)
 class Parts:
-    """What a policy consists of, and what it reads in an environment."""
+    """The parts of a policy, and its inputs in an environment."""
 
     backbone: Backbone
     trunk: HistoryNetwork
-    """The network of the action; a second one of the value is left out."""
+    """The network of the action; a separate network of the value is left out."""
     features_key: NestedKey
     head: Head
     observed: Sequence[Observed]
     """The observations, in the order of the network."""
     further: Mapping[str, NestedKey]
-    """Keys of what else the head reads in the environment, such as masks, by name of the input."""
+    """Keys of the head's other inputs from the environment, such as masks, by name of the input."""
     entries: Mapping[str, Entry]
-    """What these are."""
+    """Shapes and dtypes of these."""
     to_task: nn.Module
-    """Brings actions to the task."""
+    """Converts actions to those of the task."""
     action: Entry
     """An action of the policy."""
     sequence: SequenceHistory | None
-    """What writes the windows of a Decision Transformer."""
+    """The transform that writes the windows of a Decision Transformer."""
 
     @property
     def names(self) -> list[str]:
-        """Names of the observations as parts of arguments: "" of a single one, or "_NAME"."""
+        """Suffixes of argument names for the observations: "" for a single one, or "_NAME"."""
         if len(self.observed) == 1:
             return [""]
         return [f"_{name}" for name in identifiers([seen.name for seen in self.observed])]
 
 
 def read_parts(policy: nn.Module, env: EnvBase) -> Parts:
-    """Takes a policy apart.
+    """Splits a policy into its parts.
 
     Args:
-        policy: a backbone around a network of this library, and the modules behind it.
-        env: the environment that it acts in.
+        policy: a backbone around a network of this library, and the modules after it.
+        env: the environment in which it acts.
 
     Raises:
-        ValueError: if it is not such a policy, or reads something that is not known.
+        ValueError: if it is not such a policy, or has unknown inputs.
     """
     backbone, modules = split_policy(policy)
     trunks = list(trunks_of(backbone.module).values())
@@ -116,29 +116,29 @@ def read_parts(policy: nn.Module, env: EnvBase) -> Parts:
 
 @dataclass(frozen=True)
 class Step:
-    """What a step of an episode holds that a program may read."""
+    """The data of one step of an episode that a program may read."""
 
     observations: Sequence[Tensor]
-    """Of each observation, [N, *obs], before anything is hidden or normalised."""
+    """The value of each observation, [N, *obs], before anything is hidden or normalised."""
     tensordict: TensorDictBase
-    """What the live policy read and wrote, [N]."""
+    """The live policy's inputs and outputs, [N]."""
     reward: Tensor
-    """The reward of the step before it, float [N]; zeros at an episode's first step."""
+    """The reward of the previous step, float [N]; zeros at an episode's first step."""
 
 
 class Program(nn.Module, ABC):
     """A policy as a function from tensors by name to tensors by name.
 
-    It writes "action", as the task takes it, and what the action was chosen by: "logits", "loc" and
-    "scale", or "action_value". What it carries from step to step it reads as NAME and writes as
-    "next_NAME".
+    It writes "action", in the task's format, and the values from which the action was chosen:
+    "logits", "loc" and "scale", or "action_value". State that is carried from step to step is read
+    as NAME and written as "next_NAME".
 
     Args:
         parts: the policy.
-        sample: whether actions are drawn, from an input "noise".
+        sample: whether actions are sampled, from an input "noise".
 
     Raises:
-        ValueError: if there is nothing to draw from.
+        ValueError: if there is no distribution to sample from.
     """
 
     def __init__(self, parts: Parts, *, sample: bool) -> None:
@@ -154,30 +154,31 @@ class Program(nn.Module, ABC):
         self.to_task = parts.to_task
         self.preparations = nn.ModuleList(seen.layers for seen in parts.observed)
         self.noise = parts.head.noise if sample else None
-        """What "noise" holds, by the name of NumPy's generator; None if actions are not drawn."""
+        """The kind of "noise", by the name of NumPy's generator; None if actions are not
+        sampled."""
         self.inputs: dict[str, Entry] = {}
         """The inputs by name."""
         self.state: list[str] = []
-        """Names of the inputs that carry something from step to step."""
+        """Names of the inputs that carry state from step to step."""
 
     @abstractmethod
     def read(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Returns the features, float [N, F], and what is carried on, by name."""
+        """Returns the features, float [N, F], and the state to carry on, by name."""
 
     @abstractmethod
     def feed(self, episode: Sequence[Step]) -> dict[str, Tensor]:
-        """Returns the inputs at the last step of an episode, but for state, noise and masks.
+        """Returns the inputs at the last step of an episode, except state, noise and masks.
 
         Args:
             episode: its steps so far.
         """
 
     def act(self, carried: dict[str, Tensor], action: Tensor) -> dict[str, Tensor]:
-        """Returns what is carried on, once the action is known; by default the same."""
+        """Returns the state to carry on, once the action is known; by default the same."""
         return carried
 
     def windows(self, inputs: Mapping[str, Tensor]) -> dict[NestedKey, Tensor]:
-        """Returns what the head reads of the windows, by key; by default nothing."""
+        """Returns the entries of the windows that the head reads, by key; by default none."""
         return {}
 
     def forward(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -195,7 +196,7 @@ class Program(nn.Module, ABC):
         """Adds the inputs that all programs share; returns itself."""
         self.inputs |= self.parts.entries
         if self.noise is not None:
-            # Zeros would allow no action; noise has the shape of the parameters.
+            # A mask of zeros would allow no action; noise has the shape of the parameters.
             self.inputs[NOISE] = Entry(tuple(self._parameter().shape[1:]), torch.float32)
         return self
 
@@ -212,13 +213,13 @@ class Program(nn.Module, ABC):
 
 
 class Windows(Program):
-    """Reads the last K observations; with K = 1 the observation itself.
+    """Reads the last K observations or, if K = 1, the observation itself.
 
         history [N, K, *obs]  ->  action
 
     Args:
         parts: the policy.
-        sample: whether actions are drawn.
+        sample: whether actions are sampled.
     """
 
     def __init__(self, parts: Parts, *, sample: bool = False) -> None:
@@ -231,7 +232,7 @@ class Windows(Program):
             self.inputs[name] = Entry((*leading, *seen.entry.shape), seen.entry.dtype)
 
     def read(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """See :meth:`Program.read`; nothing is carried on."""
+        """See :meth:`Program.read`; no state is carried on."""
         frames = [inputs[name] if self.stacks else inputs[name].unsqueeze(1) for name in self.names]
         prepared = [prepare(x) for prepare, x in zip(self.preparations, frames, strict=True)]
         return self.trunk(*prepared), {}
@@ -249,11 +250,11 @@ class Windows(Program):
 
 
 class Steps(Program):
-    """Reads the newest observation, and what it carries from step to step.
+    """Reads the newest observation, and state that it carries from step to step.
 
     Args:
         parts: the policy.
-        sample: whether actions are drawn.
+        sample: whether actions are sampled.
     """
 
     def __init__(self, parts: Parts, *, sample: bool = False) -> None:
@@ -276,7 +277,7 @@ class Steps(Program):
         return given
 
     def carry(self, state: Mapping[str, Entry]) -> None:
-        """Adds what is carried from step to step to the inputs."""
+        """Adds the state that is carried from step to step to the inputs."""
         self.inputs |= state
         self.state = list(state)
 
@@ -288,7 +289,7 @@ class TokenSteps(Steps):
 
     Args:
         parts: the policy.
-        sample: whether actions are drawn.
+        sample: whether actions are sampled.
     """
 
     padding: Tensor | None
@@ -303,7 +304,7 @@ class TokenSteps(Steps):
         entry = Entry((parts.trunk.num_frames - 1, *tokens.shape[2:]), tokens.dtype)
         self.carry({"tokens": entry})
         zeros = "constant" in {seen.padding for seen in parts.observed}
-        # What precedes an episode: the tokens of zeros, or those of its first observation.
+        # Padding before an episode: the tokens of zeros, or those of its first observation.
         self.register_buffer("padding", tokens if zeros else None)
 
     def encode(self, frames: Sequence[Tensor]) -> Tensor:
@@ -331,7 +332,7 @@ class RecurrentSteps(Steps):
 
     Args:
         parts: the policy.
-        sample: whether actions are drawn.
+        sample: whether actions are sampled.
     """
 
     def __init__(self, parts: Parts, *, sample: bool = False) -> None:
@@ -357,9 +358,9 @@ def stack(frames: Sequence[Tensor], num_frames: int, padding: Padding | None) ->
     """Stacks the last K of an episode's frames, [N, ...] each -> [N, K, ...].
 
     Args:
-        frames: all of the episode so far.
+        frames: all frames of the episode so far.
         num_frames: number K.
-        padding: what precedes the first: itself ("same"), or zeros.
+        padding: padding before the first frame: that frame ("same"), or zeros.
 
     Example:
         >>> stack([torch.tensor([1]), torch.tensor([2])], 4, "same")

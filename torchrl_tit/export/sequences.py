@@ -19,12 +19,12 @@ class SequenceWindows(Program):
         observation [N, K, *obs], actions [N, K, *action], return_to_go [N, K, 1],
         timestep int64 [N, K], mask bool [N, K]  ->  action
 
-    Returns are those of the task, and steps before an episode are masked. As in
+    Returns are unscaled, and steps before an episode are masked. As in
     :class:`~torchrl_tit.transforms.SequenceHistory`, the last action is not read.
 
     Args:
         parts: the policy.
-        sample: whether actions are drawn.
+        sample: whether actions are sampled.
     """
 
     def __init__(self, parts: Parts, *, sample: bool = False) -> None:
@@ -46,7 +46,7 @@ class SequenceWindows(Program):
         return {action_key(self.parts): inputs["actions"]}
 
     def read(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """See :meth:`Program.read`; nothing is carried on."""
+        """See :meth:`Program.read`; no state is carried on."""
         (prepare,) = self.preparations
         features = self.trunk(
             prepare(inputs["observation"]),
@@ -78,12 +78,11 @@ class SequenceSteps(TokenSteps):
 
         observation [N, *obs], is_init [N], reward [N], target_return [N], state  ->  action, next_
 
-    The return to go is the target less the rewards since the episode's first step, where the
-    target is read.
+    The return to go is the target, read at the episode's first step, minus the rewards since then.
 
     Args:
         parts: the policy.
-        sample: whether actions are drawn.
+        sample: whether actions are sampled.
     """
 
     def __init__(self, parts: Parts, *, sample: bool = False) -> None:
@@ -134,7 +133,7 @@ class SequenceSteps(TokenSteps):
         return features, carried
 
     def act(self, carried: dict[str, Tensor], action: Tensor) -> dict[str, Tensor]:
-        """Adds the action to those that are carried on."""
+        """Adds the action to the actions that are carried on."""
         actions = torch.cat([carried["actions"][:, :-1], action.unsqueeze(1)], dim=1)
         return {**carried, "actions": actions}
 

@@ -1,4 +1,4 @@
-"""Actions as the task takes them."""
+"""Converts actions to those of the task."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from torchrl_tit.envs.actions import ActionWriter
 
 
 class TaskAction(nn.Module):
-    """Clips, shifts, rounds and shapes actions as :class:`~torchrl_tit.envs.GymVectorEnv` does.
+    """Clips, shifts, rounds and reshapes actions like :class:`~torchrl_tit.envs.GymVectorEnv`.
 
     Args:
-        writer: that of the environment.
+        writer: the environment's action writer.
 
     Example:
         >>> from gymnasium.spaces import Box

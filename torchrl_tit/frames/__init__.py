@@ -1,4 +1,4 @@
-"""Frame encoders: one observation to tokens, the same way at every step."""
+"""Frame encoders, which map one observation to tokens, in the same way at every step."""
 
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.normalized import NormalizedFrames

@@ -1,4 +1,4 @@
-"""Convolutional frame encoders: one image to one token."""
+"""Convolutional frame encoders, which map one image to one token."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from torchrl_tit.layers.torsos import TORSOS
 class CNNFrameEncoder(FrameEncoder):
     """Maps one image to one token: convolutions and a linear layer.
 
-    With the residual network of arXiv 2212.14538, the frame encoder of Catformer and CoBERL.
+    With the residual network of arXiv 2212.14538, this is the frame encoder of Catformer and
+    CoBERL.
 
     Args:
         settings: which convolutions, and the width of the token.
-        observation_shape: (H, W) or (C, H, W), at least 8 pixels a side (NatureCNN: 36).
+        observation_shape: (H, W) or (C, H, W), at least 8 pixels per side (NatureCNN: 36).
 
     Raises:
         ValueError: if observations are not images of that size.

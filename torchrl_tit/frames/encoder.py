@@ -11,19 +11,19 @@ from torchrl_tit.frames.observation import Kind, check_observation_shape
 
 
 class FrameEncoder(nn.Module):
-    """Turns one observation into tokens, the same way at every step.
+    """Maps one observation to tokens, in the same way at every step.
 
     A frame's tokens depend on that frame alone. So while acting, and in training on consecutive
-    steps, each frame is encoded once, however many histories it is part of.
+    steps, each frame is encoded once, however many histories contain it.
 
     A subclass is built as ``Encoder(settings, observation_shape)``, calls ``super().__init__`` with
-    the shapes of its input and output, and implements ``forward``. One that reads categories names
-    them in ``kinds``, and is built as ``Encoder(settings, observation_shape, categories=counts)``
-    for these, with the number of values of each entry.
+    the shapes of its input and output, and implements ``forward``. An encoder that reads categories
+    lists "categories" in ``kinds``, and gets the number of values of each entry as the keyword
+    argument ``categories``.
 
     Args:
         observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
-        num_tokens: number L of tokens that an observation becomes.
+        num_tokens: number L of tokens per observation.
         width: width D of a token.
 
     Raises:
@@ -45,9 +45,9 @@ class FrameEncoder(nn.Module):
     """
 
     kinds: ClassVar[tuple[Kind, ...]] = ("array", "image")
-    """Kinds of observations that it reads: of "array", "image" and "categories"."""
+    """Kinds of observations that it reads: any of "array", "image" and "categories"."""
     num_tokens: int
-    """Number L of tokens of an observation."""
+    """Number L of tokens per observation."""
     width: int
     """Width D of a token."""
 
@@ -61,7 +61,7 @@ class FrameEncoder(nn.Module):
         """Encodes observations.
 
         Args:
-            observation: [..., *observation_shape], float, or uint8, which is scaled to 0..1; of
+            observation: [..., *observation_shape], float, or uint8, which is scaled to 0..1; for
                 categories, integers [..., D] from 0 to the number of values - 1.
 
         Returns:
@@ -78,7 +78,7 @@ def check_image_shape(shape: Sequence[int], smallest: int) -> tuple[int, ...]:
     """Returns the shape of an image as a tuple.
 
     Raises:
-        ValueError: if it is the shape of an array, or has fewer than ``smallest`` pixels a side.
+        ValueError: if it is the shape of an array, or has fewer than ``smallest`` pixels per side.
     """
     shape = check_observation_shape(shape)
     if len(shape) == 1:

@@ -22,7 +22,7 @@ class Flat(FrameEncoder):
     Args:
         settings: the settings, which have no fields.
         observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
-        categories: of categories, the number of values of each entry.
+        categories: for categories, the number of values of each entry.
 
     Example:
         >>> import torch
@@ -56,7 +56,7 @@ class Flat(FrameEncoder):
             observation: [..., *observation_shape] of any dtype.
 
         Returns:
-            [..., 1, entries] of the same dtype; bool of categories.
+            [..., 1, entries] of the same dtype; bool for categories.
         """
         if self.index is not None:
             return self.index.one_hot(observation).unsqueeze(-2)

@@ -1,4 +1,4 @@
-"""The inner transformer: the patches of one observation to class tokens."""
+"""The inner transformer, which maps the patches of one observation to class tokens."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from torchrl_tit.layers.patches import find_patch_size, make_patch_embedding
 class InnerTransformer(FrameEncoder):
     """Reads the patches of one observation (arXiv 2212.14538, section "The Inner Transformer").
 
-    Class token and patch tokens, plus position encodings, go through L blocks. The outputs are
-    the class token: after every block (Enhanced_TIT) or after the last one (Vanilla_TIT). The last
-    block computes only the class token, because nothing else is read.
+    Class token and patch tokens, plus position encodings, go through L blocks. The output is the
+    class token after every block (Enhanced_TIT) or after the last one (Vanilla_TIT). The last block
+    computes only the class token, because nothing else is read.
 
     Args:
         settings: patch size, width, blocks and outputs.
         observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
-        num_frames: number of observations that are stacked as channels; not of categories.
-        categories: of categories, the number of values of each entry. Each entry has an embedding,
-            and a patch is the sum of those of its entries.
+        num_frames: number of observations that are stacked as channels; not for categories.
+        categories: for categories, the number of values of each entry. Each entry has an embedding,
+            and a patch is the sum of its entries' embeddings.
 
     Raises:
         ValueError: if the patch does not fit the observation, or the heads do not divide the width.
@@ -91,9 +91,9 @@ class InnerTransformer(FrameEncoder):
         """Encodes observations.
 
         Args:
-            observation: [..., *observation_shape], or [..., num_frames, *observation_shape] where
-                frames are stacked as channels; float, or uint8 which is divided by 255; integers
-                of categories.
+            observation: [..., *observation_shape], or [..., num_frames, *observation_shape] if
+                frames are stacked as channels; float, or uint8, which is divided by 255; integers
+                for categories.
 
         Returns:
             Class tokens, float [..., L, D], or [..., 1, D] of the last block only.

@@ -18,15 +18,15 @@ from torchrl_tit.layers.patches import embed
 
 
 class LinearFrameEncoder(FrameEncoder):
-    """Maps a whole observation to one token with a linear layer; categories as one-hot vectors.
+    """Maps an observation to one token with a linear layer; categories become one-hot vectors.
 
-    The observation embedding of the ablation without inner blocks (arXiv 2212.14538, appendix
-    "Ablation Study"); with a bias, that of Decision Transformer.
+    This is the observation embedding of the ablation without inner blocks (arXiv 2212.14538,
+    appendix "Ablation Study"); with a bias, it is that of Decision Transformer.
 
     Args:
         settings: width, bias and activation.
         observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
-        categories: of categories, the number of values of each entry.
+        categories: for categories, the number of values of each entry.
 
     Example:
         >>> import torch
@@ -61,7 +61,7 @@ class LinearFrameEncoder(FrameEncoder):
         if self.index is None:
             x = observation.flatten(-len(self.observation_shape)).unsqueeze(-2)  # [..., 1, entries]
             token = embed(x, self.linear.weight)
-        else:  # of one-hot vectors, all other products are zeros
+        else:  # for one-hot vectors, all other products are zero
             weights = F.embedding(self.index(observation), self.linear.weight.t())
             token = weights.sum(-2, keepdim=True)
         return self.activation(token if self.linear.bias is None else token + self.linear.bias)

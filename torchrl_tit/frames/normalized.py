@@ -1,4 +1,4 @@
-"""Observations with the running mean 0 and standard deviation 1, in front of a frame encoder."""
+"""Normalises observations by their running mean and standard deviation for a frame encoder."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.layers.images import bytes_to_floats
 
 _IMAGES = 256
-"""Images that become floats at a time, which take four times the memory of bytes."""
+"""Images converted to floats at a time; floats take four times the memory of bytes."""
 
 
 class NormalizedFrames(FrameEncoder):
-    """A frame encoder that reads observations divided by their running standard deviation.
+    """A frame encoder that reads observations normalised by running statistics.
 
-    Each entry of an array has a mean and a standard deviation of its own, as in `VecNormalize` of
-    Stable-Baselines3, and so has each channel of an image, whose bytes become 0..1 before: of
-    pixels that are all positive, a network sees first what all images have in common. Results
-    beyond +-``limit`` are clipped.
+    Each entry of an array has its own mean and standard deviation, as in `VecNormalize` of
+    Stable-Baselines3. So has each channel of an image, whose bytes are first scaled to 0..1: if all
+    pixels are positive, a network first sees what all images have in common. Results beyond
+    +-``limit`` are clipped.
 
     The statistics are buffers of the network, so checkpoints, evaluation, copies and exports have
     them, and a frame's tokens stay the same while a batch is collected. TorchRL's `VecNormV2` is a
-    transform of the environment: its statistics change with each step, so that a history would hold
-    frames of several scales, and a network without that environment would read observations of a
-    scale that it does not know.
+    transform of the environment: its statistics change with each step, so a history would hold
+    frames of several scales, and without that environment, a network would read observations of an
+    unknown scale.
 
     Args:
         encoder: the frame encoder.
-        limit: what normalised entries are clipped to.
+        limit: bound to which normalised entries are clipped.
 
     Example:
         >>> from torchrl_tit import settings

@@ -1,4 +1,4 @@
-"""What networks know of the observations that they read: shapes, and numbers of categories."""
+"""Descriptions of the observations that networks read: shapes, and numbers of categories."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class Observation:
     shape: tuple[int, ...]
     """(D,) for arrays and categories, (H, W) or (C, H, W) for images."""
     categories: tuple[int, ...] | None = None
-    """Of categories, the number of values of each of the D entries."""
+    """For categories, the number of values of each of the D entries."""
     dtype: torch.dtype | None = None
-    """The dtype, if a spec tells."""
+    """The dtype, if known from a spec."""
 
     def __post_init__(self) -> None:
         check_observation_shape(self.shape)
@@ -51,23 +51,23 @@ class Observation:
 
     @property
     def kind(self) -> Kind:
-        """What kind of observation it is."""
+        """The kind of observation."""
         if self.categories is not None:
             return "categories"
         return "array" if len(self.shape) == 1 else "image"
 
     @property
     def entries(self) -> int:
-        """Number of entries; of categories, of all their one-hot vectors."""
+        """Number of entries; for categories, of all their one-hot vectors."""
         return math.prod(self.shape) if self.categories is None else sum(self.categories)
 
     def zeros(self, *leading: int) -> torch.Tensor:
-        """Returns observations of zeros, [*leading, *shape], of a dtype that networks read."""
+        """Returns observations of zeros, [*leading, *shape], with a dtype that networks read."""
         dtype = torch.int64 if self.categories is not None else self.dtype
         return torch.zeros(*leading, *self.shape, dtype=dtype)
 
     def __str__(self) -> str:
-        """Describes it for messages, such as "an image of shape (3, 7, 7)"."""
+        """Describes it for error messages, such as "an image of shape (3, 7, 7)"."""
         if self.categories is not None:
             counts = ", ".join(map(str, self.categories))
             return f"a row of categories ({counts} values)"
@@ -78,7 +78,7 @@ def read_observation(observation: ObservationLike) -> Observation:
     """Describes one observation.
 
     Args:
-        observation: its shape, or its spec without batch dimensions. Of categories, the spec is
+        observation: its shape, or its spec without batch dimensions. For categories, the spec is
             TorchRL's `MultiCategorical` [D], or a `Categorical` or `Binary` of that shape.
 
     Raises:
@@ -108,8 +108,8 @@ def read_observations(observations: Observations) -> dict[str, Observation]:
     """Describes observations by name; a single one is called "observation".
 
     Args:
-        observations: one, or several by name; of a `Composite` spec, the leaves, whose names are
-            joined by "/".
+        observations: one, or several by name; from a `Composite` spec, the leaves are taken, whose
+            names are joined by "/".
 
     Raises:
         ValueError: if there are none, or networks cannot read one; the message names it.
@@ -159,9 +159,9 @@ def check_observation_shape(shape: Sequence[int]) -> tuple[int, ...]:
 
 
 def _categories(spec: TensorSpec) -> tuple[int, ...] | None:
-    """Numbers of values of a row of categories; None of other specs."""
+    """Numbers of values of a row of categories; None for other specs."""
     if not isinstance(spec, Categorical) or spec.ndim != 1:
         return None
     if isinstance(spec, MultiCategorical):
         return tuple(spec.nvec.tolist())
-    return (int(spec.n),) * spec.shape[0]  # Binary is a Categorical too
+    return (int(spec.n),) * spec.shape[0]  # Binary is also a Categorical

@@ -1,4 +1,4 @@
-"""History encoders: the tokens of K frames to one vector."""
+"""History encoders, which map the tokens of K frames to one vector."""
 
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken, RecurrentEncoder
 

@@ -18,9 +18,9 @@ class CatformerAttention(nn.Module):
     Args:
         in_dim: width of the concatenation of all earlier layers' outputs.
         width: width D of the output.
-        settings: heads, the width at which attention works, and temporal positions.
+        settings: heads, width inside attention, and temporal positions.
         num_frames: number K of frames.
-        project: whether there is a projection; without it ``in_dim`` is the attention's width.
+        project: whether there is a projection; without one, ``in_dim`` is the attention's width.
 
     Raises:
         ValueError: if the heads do not divide the attention's width.
@@ -58,17 +58,17 @@ class CatformerAttention(nn.Module):
 
 
 class Catformer(HistoryEncoder):
-    """Catformer's layers over one token a frame, read at the newest frame.
+    """Catformer's layers over one token per frame, read at the newest frame.
 
     Davis et al., "Catformer: Designing Stable Transformers via Sensitivity Analysis", ICML 2021, as
-    built for the baseline of arXiv 2212.14538. Attention and FFN take turns, without residuals:
-    each layer after the first reads the concatenation of the outputs of all layers before it (not
-    of the tokens themselves). The weights have PyTorch's default initialisation. If frames have
-    several tokens, a linear layer merges them into one.
+    built for the baseline of arXiv 2212.14538. Attention and FFN layers alternate, without
+    residuals: each layer after the first reads the concatenated outputs of all previous layers
+    (without the tokens themselves). The weights have PyTorch's default initialisation. If frames
+    have several tokens, a linear layer merges them into one.
 
     Args:
         settings: blocks, heads, expansions and temporal positions.
-        shape: what it reads.
+        shape: shape of the input.
 
     Raises:
         ValueError: if the heads do not divide the attention's width.

@@ -13,17 +13,17 @@ from torchrl_tit.layers.gated_block import GRUGate
 
 
 class CoBERL(GatedTransformerEncoder):
-    """Gated transformer over one token a frame, a gate that mixes its input in, an LSTM.
+    """Gated transformer over one token per frame, a gate that mixes in its input, and an LSTM.
 
     Banino et al., "CoBERL: Contrastive BERT for Reinforcement Learning", arXiv 2107.05431, figure
     1; a baseline of arXiv 2212.14538. The gate lets the LSTM read the tokens themselves until the
-    transformer is worth reading. The LSTM starts each history with a state of zeros. The weights
-    have PyTorch's default initialisation. If frames have several tokens, a linear layer merges them
-    into one.
+    transformer's output is useful. The LSTM's state is zero at the start of each history. The
+    weights have PyTorch's default initialisation. If frames have several tokens, a linear layer
+    merges them into one.
 
     Args:
         settings: blocks, heads, gates and the size of the LSTM's state.
-        shape: what it reads.
+        shape: shape of the input.
 
     Raises:
         ValueError: if the heads do not divide the width.
@@ -39,7 +39,7 @@ class CoBERL(GatedTransformerEncoder):
         super().__init__(settings, shape, out_features=settings.hidden_dim)
         self.mask_token = nn.Parameter(torch.empty(shape.width))
         self.gate = GRUGate(shape.width, settings.gate_bias)
-        # TorchRL's LSTM, not PyTorch's: it works under vmap and in a compiled graph.
+        # TorchRL's LSTM, which unlike PyTorch's works under vmap and in a compiled graph.
         self.lstm = LSTM(shape.width, settings.hidden_dim, batch_first=True)
         self.reset_parameters()
 

@@ -25,21 +25,21 @@ class DecisionTransformer(HistoryEncoder):
           LayerNorm                   on the state tokens: the features of that step
 
     Chen et al., "Decision Transformer: Reinforcement Learning via Sequence Modeling", arXiv
-    2106.01345, section 3. With linear frames it is DT; with an inner transformer it is DT_TIT of
-    arXiv 2212.14538. The original's predictions of states and returns, which are never trained, are
-    left out. GPT-2 blocks are initialised as in GPT-2, all other layers as in PyTorch.
+    2106.01345, section 3. With a linear frame encoder it is DT; with an inner transformer it is
+    DT_TIT of arXiv 2212.14538. The original's predictions of states and returns, which are never
+    trained, are left out. GPT-2 blocks are initialised as in GPT-2, all other layers as in PyTorch.
 
-    Only the state tokens of the last block are read, so only these are computed. No state sees the
+    The last block computes only the state tokens, because only these are read. No state sees the
     action of the last step, so that action is not read.
 
     Args:
         settings: blocks, heads, FFN, dropout and time steps.
-        shape: what it reads; its ``action_dim`` is required.
+        shape: shape of the input; its ``action_dim`` is required.
 
     Raises:
         ValueError: if ``action_dim`` is missing or below 1, the heads do not divide the width, or
-            ``forward`` is given inputs that do not fit, such as time steps beyond ``max_ep_len``
-            (on a CPU).
+            ``forward`` gets invalid inputs, such as time steps beyond ``max_ep_len`` (checked only
+            on a CPU).
 
     Example:
         >>> shape = HistoryShape(num_frames=20, num_tokens=1, width=128, action_dim=3)
@@ -97,10 +97,10 @@ class DecisionTransformer(HistoryEncoder):
         timestep: Tensor,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """Encodes the newest step of a window, which is what acting needs.
+        """Encodes the newest step of a window, for acting.
 
         Args:
-            tokens: of the states, float [..., K, L, D], for any K.
+            tokens: tokens of the states, float [..., K, L, D], for any K.
             action: float [..., K, A]; discrete actions are integers [..., K], negative at padding,
                 or one-hot [..., K, A]. The action of the last step is not read.
             return_to_go: float [..., K, 1].
@@ -123,7 +123,7 @@ class DecisionTransformer(HistoryEncoder):
         timestep: Tensor,
         mask: Tensor | None = None,
     ) -> Tensor:
-        """Encodes every step of a window from what came before it, for training.
+        """Encodes every step of a window from the steps up to it, for training.
 
         Args:
             tokens: as in ``forward``.
@@ -133,7 +133,7 @@ class DecisionTransformer(HistoryEncoder):
             mask: as in ``forward``.
 
         Returns:
-            float [..., K, D]; finite, but meaningless, at padding.
+            float [..., K, D]; finite but meaningless at padding.
         """
         return self._encode(tokens, action, return_to_go, timestep, mask, read=_STATES)
 
@@ -145,9 +145,9 @@ class DecisionTransformer(HistoryEncoder):
         timestep: Tensor,
         mask: Tensor | None = None,
     ) -> list[Tensor]:
-        """Returns what each step's state reads of each step, float [..., heads, K, K].
+        """Returns how much each step's state attends to each step, float [..., heads, K, K].
 
-        A step counts with its return to go, its state and its action together.
+        The weights of a step's return to go, state and action are added.
 
         Args:
             tokens: as in ``forward``.
@@ -192,7 +192,7 @@ class DecisionTransformer(HistoryEncoder):
         timestep: Tensor,
         mask: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        """The tokens of the blocks, float [N, 3K - 1, D], and which see which, bool [...]."""
+        """The tokens of the blocks, float [N, 3K - 1, D], and the attention mask, bool [...]."""
         state = self.one_token(tokens)  # [..., K, D]
         *leading, steps, width = state.shape
         action = self._as_vectors(action, (*leading, steps)).to(state.dtype)

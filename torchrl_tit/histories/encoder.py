@@ -16,12 +16,12 @@ class HistoryShape:
     num_frames: int
     """Number K of frames."""
     num_tokens: int
-    """Number L of tokens of a frame."""
+    """Number L of tokens per frame."""
     width: int
     """Width D of a token."""
     frame_shape: tuple[int, ...] | None = None
-    """The observation's shape, if a token is the observation itself; of categories, that of their
-    one-hot vectors."""
+    """The observation's shape, if the token is the observation itself; for categories, the shape of
+    their one-hot vectors."""
     action_dim: int | None = None
     """Entries of a continuous action, or number of discrete ones, if the task is known."""
 
@@ -49,20 +49,20 @@ class HistoryEncoder(nn.Module):
     its output, and implements ``forward``.
 
     Args:
-        shape: what it reads.
+        shape: shape of the input.
         out_features: size E of the output.
 
     Raises:
-        ValueError: if it reads the frames themselves, but is given tokens.
+        ValueError: if the encoder reads the frames themselves, but gets tokens.
     """
 
     reads_frames: ClassVar[bool] = False
-    """Whether it needs the frames themselves (see :class:`~torchrl_tit.frames.flat.Flat`), and
-    reads uint8 directly."""
+    """Whether it reads the frames themselves (see :class:`~torchrl_tit.frames.flat.Flat`), also as
+    uint8."""
     context: ClassVar[tuple[str, ...]] = ()
     """Names of its inputs besides the tokens, one argument of ``forward`` each."""
     reads_any_length: ClassVar[bool] = False
-    """Whether it takes histories of any length, not only of ``num_frames``."""
+    """Whether it accepts histories of any length, not only ``num_frames``."""
     encodes_every_frame: ClassVar[bool] = False
     """Whether ``every_frame`` is implemented."""
     is_recurrent: ClassVar[bool] = False
@@ -106,7 +106,8 @@ class RecurrentEncoder(HistoryEncoder):
     """A history encoder with a state.
 
     If it reads one frame (K = 1), :class:`~torchrl_tit.modules.Backbone` carries the state from
-    step to step in the tensordict. If it reads several, each history starts with a state of zeros.
+    step to step in the tensordict. If it reads several, the state is zero at the start of each
+    history.
     """
 
     is_recurrent = True
@@ -132,7 +133,7 @@ class RecurrentEncoder(HistoryEncoder):
     def single_step(
         self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """As :meth:`step` of single steps, for `torch.export`, which cannot follow every step."""
+        """Like :meth:`step` on single steps, in a form that `torch.export` can trace."""
         return self.step(tokens, state, is_init)
 
 
@@ -140,7 +141,7 @@ class OneToken(nn.Module):
     """Merges the L tokens of a frame into one with a linear layer; does nothing if L = 1.
 
     Args:
-        shape: what the history encoder reads.
+        shape: input shape of the history encoder.
 
     Example:
         >>> shape = HistoryShape(num_frames=4, num_tokens=2, width=32)

@@ -12,13 +12,13 @@ from torchrl_tit.layers.gated_block import GatedTransformerBlock
 
 
 class GatedTransformerEncoder(HistoryEncoder):
-    """The base of GTrXL and CoBERL: gated blocks with relative positions over one token a frame.
+    """The base of GTrXL and CoBERL: gated blocks with relative positions, one token per frame.
 
     If frames have several tokens, a linear layer merges them into one.
 
     Args:
         settings: blocks, heads and gates.
-        shape: what it reads.
+        shape: shape of the input.
         out_features: size of the output.
     """
 
@@ -60,26 +60,26 @@ class GatedTransformerEncoder(HistoryEncoder):
 
 
 class GTrXL(GatedTransformerEncoder):
-    """GTrXL's blocks over one token a frame, read at the newest frame.
+    """GTrXL's blocks over one token per frame, read at the newest frame.
 
         x = gate(x, relu(attention(LN(x))))    causal, relative positions of Transformer-XL
         x = gate(x, relu(FFN(LN(x))))          gates as in a GRU; their bias starts at 2
 
     Parisotto et al., "Stabilizing Transformers for Reinforcement Learning", arXiv 1910.06764,
-    section 3. LayerNorm stands on the branches only and the gates start near the identity, so a new
-    network hands the newest frame through.
+    section 3. LayerNorm is on the branches only and the gates start near the identity, so a new
+    network passes the newest frame through.
 
-    The paper's blocks also attend to a memory: outputs that they had for earlier steps, computed
-    with older weights and never trained through, so that what is seen reaches back further with
-    each block. Here a block sees the K frames of the window and nothing before, computed afresh
-    and trained through. What is read depends on these K frames alone, as for every encoder.
+    The paper's blocks also attend to a memory: the outputs of earlier steps, computed with older
+    weights and without gradients, so that the context grows with each block. Here a block sees only
+    the K frames of the window, computed with the current weights and with gradients. The output
+    depends on these K frames alone, as for every encoder.
 
-    Only the newest frame of the last block is read, so only this is computed. The weights have
+    The last block computes only the newest frame, because only this is read. The weights have
     PyTorch's default initialisation.
 
     Args:
         settings: blocks, heads and gates.
-        shape: what it reads.
+        shape: shape of the input.
 
     Raises:
         ValueError: if the heads do not divide the width.

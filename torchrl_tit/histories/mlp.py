@@ -19,7 +19,7 @@ class MLP(HistoryEncoder):
 
     Args:
         settings: width, layers and activation.
-        shape: what it reads.
+        shape: shape of the input.
 
     Example:
         >>> mlp = MLP(settings.MLP(), HistoryShape(num_frames=8, num_tokens=1, width=4))
@@ -44,11 +44,11 @@ class MLP(HistoryEncoder):
 
 
 class OFENet(HistoryEncoder):
-    """Linear layers that each read the input and the outputs of all layers before.
+    """Linear layers that each read the input and the outputs of all previous layers.
 
     Args:
         settings: width, layers and activation.
-        shape: what it reads.
+        shape: shape of the input.
 
     Example:
         >>> ofenet = OFENet(settings.OFENet(), HistoryShape(num_frames=1, num_tokens=1, width=11))
@@ -72,11 +72,11 @@ class OFENet(HistoryEncoder):
 
 
 class D2RL(HistoryEncoder):
-    """Linear layers that each read the input and the output of the layer before.
+    """Linear layers that each read the input and the output of the previous layer.
 
     Args:
         settings: width, layers and activation.
-        shape: what it reads.
+        shape: shape of the input.
 
     Example:
         >>> d2rl = D2RL(settings.D2RL(), HistoryShape(num_frames=1, num_tokens=1, width=11))

@@ -1,4 +1,4 @@
-"""The outer transformers of TIT: the tokens of K frames to one vector."""
+"""The outer transformers of TIT, which map the tokens of K frames to one vector."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class OuterTransformer(HistoryEncoder):
     """The base of the outer transformers: causal blocks over the frames, read at the newest one.
 
     The paper gives the outer transformer no position encoding: the newest frame then sees the past
-    as a set. Temporal positions are an option that tells the frames apart. Learned ones are added
-    to the tokens; a bias for each distance, or rotations, act within attention. Distances are those
-    within the window of K frames.
+    as a set. Optional temporal positions tell the frames apart. Learned encodings are added to the
+    tokens; a bias for each distance, or rotations, act within attention. Distances are within the
+    window of K frames.
 
     Args:
         settings: heads, FFN, dropout and temporal positions.
-        shape: what it reads.
+        shape: shape of the input.
         num_blocks: number of blocks.
         out_features: size of the output.
     """
@@ -74,13 +74,13 @@ class OuterTransformer(HistoryEncoder):
 class PairedOuterTransformer(OuterTransformer):
     """The outer blocks of Enhanced_TIT (arXiv 2212.14538, section "Enhanced_TIT").
 
-    Outer block l reads token l of the K frames, the output of inner block l, never the
-    outer block before it. The newest frame's outputs of all blocks are concatenated (the dense
+    Outer block l reads token l of the K frames, which is the output of inner block l, but never the
+    previous outer block. The newest frame's outputs of all blocks are concatenated (the dense
     connection). Without the dense connection only the last pair matters, so frames have one token.
 
     Args:
         settings: heads, FFN, dropout and temporal positions.
-        shape: what it reads.
+        shape: shape of the input.
 
     Example:
         >>> shape = HistoryShape(num_frames=4, num_tokens=2, width=32)
@@ -113,24 +113,24 @@ class PairedOuterTransformer(OuterTransformer):
 
 
 class ChainedOuterTransformer(PairedOuterTransformer):
-    """The outer blocks of Enhanced_TIT, each also on the output of the one before it.
+    """The outer blocks of Enhanced_TIT, each also reading the output of the previous one.
 
     Outer block l reads, at all K frames, the sum of token l (the output of inner block l) and the
     output of outer block l - 1. The newest frame's outputs of all blocks are concatenated, as in
-    Enhanced_TIT. So perception and decision take turns, as in the successor of TIT by its authors:
-    Mao et al., "PDiT: Interleaving Perception and Decision-making Transformers for Deep
+    Enhanced_TIT. So perception and decision alternate, as in the successor of TIT by the same
+    authors: Mao et al., "PDiT: Interleaving Perception and Decision-making Transformers for Deep
     Reinforcement Learning", arXiv 2312.15863.
 
-    Unlike in a network that interleaves both ways, nothing flows from the history back to the
-    frames: inner block l + 1 does not see what outer block l found. The tokens of a frame still
-    depend on that frame alone, so each frame is encoded once.
+    Unlike in a network that interleaves in both directions, nothing flows from the history back to
+    the frames: inner block l + 1 does not see the output of outer block l. The tokens of a frame
+    still depend on that frame alone, so each frame is encoded once.
 
-    All blocks but the last compute all K frames, where those of
-    :class:`PairedOuterTransformer` compute the newest only.
+    All blocks but the last compute all K frames, whereas those of :class:`PairedOuterTransformer`
+    compute only the newest.
 
     Args:
         settings: heads, FFN, dropout and temporal positions.
-        shape: what it reads.
+        shape: shape of the input.
 
     Example:
         >>> shape = HistoryShape(num_frames=4, num_tokens=2, width=32)
@@ -165,14 +165,13 @@ class ChainedOuterTransformer(PairedOuterTransformer):
 class StackedOuterTransformer(OuterTransformer):
     """The outer transformer of Vanilla_TIT (arXiv 2212.14538, section "The Outer Transformer").
 
-    Causal blocks, each on the output of the one before, over one token a frame. The output is the
-    last block's output for the newest frame or, with dense connections (the ablation without inner
-    blocks), the outputs of all blocks. If frames have several tokens, a linear layer merges them
-    into one.
+    A stack of causal blocks over one token per frame. The output is the last block's output for the
+    newest frame or, with dense connections (the ablation without inner blocks), the outputs of all
+    blocks. If frames have several tokens, a linear layer merges them into one.
 
     Args:
         settings: blocks, heads, FFN, dropout and temporal positions.
-        shape: what it reads.
+        shape: shape of the input.
 
     Example:
         >>> shape = HistoryShape(num_frames=4, num_tokens=1, width=32)

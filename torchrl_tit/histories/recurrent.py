@@ -14,20 +14,20 @@ from torchrl_tit.histories.encoder import HistoryShape, OneToken, RecurrentEncod
 
 
 class _TorchRLEncoder(RecurrentEncoder):
-    """A recurrent module of TorchRL over frames.
+    """One of TorchRL's recurrent modules, over frames.
 
-    With one frame (K = 1) the state is its memory, which :class:`~torchrl_tit.modules.Backbone`
-    carries through an episode. With more, it reads them from a state of zeros.
+    With one frame (K = 1), its state is its memory, which :class:`~torchrl_tit.modules.Backbone`
+    carries through an episode. With several, the state is zero before the first frame.
 
     Args:
         settings: size of the state.
-        shape: what it reads.
+        shape: shape of the input.
     """
 
     memory_class: ClassVar[type[Any]]
     """TorchRL's module, which reads single steps and whole sequences."""
     layer_name: ClassVar[str]
-    """Where that module has its layers."""
+    """Attribute of that module that holds the layers."""
     state: ClassVar[tuple[str, ...]]
     """Keys of the state."""
 
@@ -69,7 +69,7 @@ class _TorchRLEncoder(RecurrentEncoder):
     def single_step(
         self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """As :meth:`step` of single steps; TorchRL's module branches on values and batch sizes."""
+        """Like :meth:`step` on single steps, without branches on values and batch sizes."""
         x = self.one_token(tokens)  # [*B, D]
         first = is_init.reshape(-1, 1, 1)
         before = [state[key].reshape(-1, 1, self.out_features) for key in self.state]
@@ -93,12 +93,12 @@ class _TorchRLEncoder(RecurrentEncoder):
 class LSTM(_TorchRLEncoder):
     """An LSTM over frames: TorchRL's `LSTMModule`.
 
-    With one frame (K = 1) the state is its memory, which :class:`~torchrl_tit.modules.Backbone`
-    carries through an episode. With more, it reads them from a state of zeros.
+    With one frame (K = 1), its state is its memory, which :class:`~torchrl_tit.modules.Backbone`
+    carries through an episode. With several, the state is zero before the first frame.
 
     Args:
         settings: size of the state.
-        shape: what it reads.
+        shape: shape of the input.
 
     Example:
         >>> lstm = LSTM(settings.LSTM(), HistoryShape(num_frames=4, num_tokens=1, width=32))
@@ -115,12 +115,12 @@ class GRU(_TorchRLEncoder):
     """A GRU over frames: TorchRL's `GRUModule`.
 
     Cho et al., "Learning Phrase Representations using RNN Encoder-Decoder for Statistical Machine
-    Translation", arXiv 1406.1078, in PyTorch's variant. Its state is handled as that of
-    :class:`LSTM`; it has three quarters of its weights.
+    Translation", arXiv 1406.1078, in PyTorch's variant. Its state is handled like that of
+    :class:`LSTM`; it has three quarters of the weights.
 
     Args:
         settings: size of the state.
-        shape: what it reads.
+        shape: shape of the input.
 
     Example:
         >>> gru = GRU(settings.GRU(), HistoryShape(num_frames=4, num_tokens=1, width=32))

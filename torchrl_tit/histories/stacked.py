@@ -13,15 +13,15 @@ from torchrl_tit.layers.torsos import TORSOS
 
 
 class StackedInnerTransformer(HistoryEncoder):
-    """Inner blocks over K frames that are stacked as channels: the ablation "w/o Outer".
+    """Inner blocks over K frames stacked as channels: the ablation "w/o Outer".
 
     Args:
         settings: patch size, width, blocks and outputs.
-        shape: what it reads: flat frames.
+        shape: shape of the input, which must be flat frames.
 
     Raises:
-        ValueError: if it is given tokens instead, the patch does not fit the observation, or the
-            heads do not divide the width.
+        ValueError: if it gets tokens instead, the patch does not fit the observation, or the heads
+            do not divide the width.
 
     Example:
         >>> import torch
@@ -53,14 +53,15 @@ class StackedInnerTransformer(HistoryEncoder):
 
 
 class StackedCNN(HistoryEncoder):
-    """A convolutional network on K images that are stacked as channels.
+    """A convolutional network on K images stacked as channels.
 
     Args:
         settings: which convolutions.
-        shape: what it reads: flat frames of at least 36 pixels a side (resnet: 8).
+        shape: shape of the input, which must be flat frames of at least 36 pixels per side (resnet:
+            8).
 
     Raises:
-        ValueError: if it is given tokens instead, or frames are not images of that size.
+        ValueError: if it gets tokens instead, or frames are not images of that size.
 
     Example:
         >>> import torch

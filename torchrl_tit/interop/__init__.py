@@ -1,4 +1,4 @@
-"""Networks and weights of the authors' release."""
+"""Loads networks and weights of the authors' release."""
 
 from torchrl_tit.interop.official import from_official
 

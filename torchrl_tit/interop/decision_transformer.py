@@ -16,10 +16,10 @@ from torchrl_tit.networks import DTTIT, DecisionTransformer, HistoryNetwork
 
 
 class ActionPredictor(nn.Module):
-    """Decision Transformer and its head, called as the authors' network is.
+    """Decision Transformer and its head, with the interface of the authors' network.
 
     Args:
-        network: predicts features.
+        network: computes features.
         head: maps features to actions.
     """
 
@@ -36,7 +36,7 @@ class ActionPredictor(nn.Module):
         timesteps: Tensor,
         attention_mask: Tensor | None = None,
     ) -> Tensor:
-        """Predicts the action of every step from what came before it.
+        """Predicts the action of every step from the past.
 
         Args:
             states: float [..., K, S].
@@ -84,13 +84,13 @@ _INNER = [
     (r"inner_blocks\.(\d+)\.ln(\d)\.(.*)", rf"{_FRAME}.blocks.\1.norm\2.\3"),
     (r"inner_blocks\.(\d+)\.(.*)", rf"{_FRAME}.blocks.\1.\2"),
 ]
-# Weights of the authors' network that it does not use: predictions of states and returns that are
-# not trained, token and position embeddings of GPT-2, and causal masks.
+# Weights that the authors' network does not use: untrained predictions of states and returns, token
+# and position embeddings of GPT-2, and causal masks.
 _UNUSED = re.compile(
     r"predict_(state|return)\..*|transformer\.w[tp]e\..*|.*\.attn\.(masked_)?bias|.*mask.*"
 )
 _CONV1D = re.compile(r".*\.(c_attn|c_proj|c_fc)\.weight")
-# The activations' names in GPT-2 configurations that differ from ours.
+# Names of activations in GPT-2 configurations that differ from ours.
 _ACTIVATIONS = {"gelu_new": "gelu_tanh", "gelu_pytorch_tanh": "gelu_tanh", "swish": "silu"}
 
 
@@ -147,7 +147,7 @@ def _build(
 
 
 def _prepare(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Drops prefix and unused parameters, and turns GPT-2's weights [in, out] to [out, in]."""
+    """Drops prefix and unused parameters, and transposes GPT-2's weights [in, out]."""
     params = strip_prefix(params, "embed_ln.weight")
     used = {name: value for name, value in params.items() if not _UNUSED.fullmatch(name)}
     prepared = {n: value.T if _CONV1D.fullmatch(n) else value for n, value in used.items()}

@@ -56,7 +56,7 @@ def catformer_from_official(config: Mapping[str, Any], params: Mapping[str, Tens
             ffn_expansion=hidden_dim // embed_dim,
         ),
         observation_shape=shape,
-        num_frames=num_frames,  # the authors' may read one frame, which our recipes refuse
+        num_frames=num_frames,  # the authors' may read one frame, which our recipes do not allow
         head=settings.Head(features_dim=features_dim, activation="relu"),
     )
     layers = []

@@ -26,7 +26,7 @@ _BUILDERS: dict[str, Callable[[Mapping[str, Any], Mapping[str, Tensor]], nn.Modu
 def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Module:
     """Builds a network of this library from one of the authors' release.
 
-    For the same input, its output equals that of the authors' network, to float precision.
+    For the same input, its output equals that of the authors' network, up to float precision.
 
     Args:
         config: describes the network. Its entry ``kind`` is one of
@@ -58,8 +58,8 @@ def from_official(config: dict[str, Any], params: dict[str, Tensor]) -> nn.Modul
         timesteps and attention_mask, and return the actions.
 
     Raises:
-        ValueError: if the kind is not known, an entry is missing, or parameters are missing, left
-            over or of another shape.
+        ValueError: if the kind is unknown, an entry is missing, or parameters are missing,
+            unexpected or of another shape.
 
     Example:
         >>> import torch

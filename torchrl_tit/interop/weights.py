@@ -21,7 +21,7 @@ def load_renamed(network: nn.Module, params: Mapping[str, Tensor], renaming: Ren
         renaming: the first expression that matches a whole old name gives the new one.
 
     Raises:
-        ValueError: if a name is not known, or names or shapes do not fit the network.
+        ValueError: if a name is unknown, or names or shapes do not match the network.
 
     Example:
         >>> import torch

@@ -16,8 +16,8 @@ from torchrl_tit.layers.patches import ArrayPatchEmbedding, ImagePatchEmbedding
 from torchrl_tit.layers.positions import RelativeBias, Rotary
 from torchrl_tit.layers.relative_attention import RelativeSelfAttention
 
-# TorchRL's losses call two critics as one by torch.vmap. PyTorch's attention kernel for CPUs then
-# runs once for each of them, as it does without, and so does dropout; PyTorch warns of it.
+# TorchRL's losses call two critics with torch.vmap. PyTorch's attention kernel for CPUs, and
+# dropout, then run once per critic, as without vmap; PyTorch warns about this.
 warnings.filterwarnings("ignore", "There is a performance drop", module=r"torchrl_tit\.layers\.")
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Activation functions by the names that the configurations use."""
+"""Activation functions by the names that settings use."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def make_activation(name: Activation) -> nn.Module:
         A parameterless module, elementwise on any shape.
 
     Raises:
-        ValueError: if the name is not known.
+        ValueError: if the name is unknown.
 
     Example:
         >>> make_activation("relu")

@@ -28,7 +28,7 @@ READ_SLICES: dict[Read, slice] = {
 class SelfAttention(nn.Module):
     """Multi-head scaled dot-product self-attention (arXiv 2212.14538, section "Inner Transformer").
 
-    Same parameters, names and results as :class:`torch.nn.MultiheadAttention` with
+    Has the same parameters, names and results as :class:`torch.nn.MultiheadAttention` with
     ``batch_first=True``, so that state dicts can be exchanged. Unlike there, queries are computed
     only for the positions that are read.
 
@@ -37,10 +37,10 @@ class SelfAttention(nn.Module):
         num_heads: number of heads; must divide ``embed_dim``.
         causal: whether a position sees only itself and earlier ones.
         dropout: probability of dropping an attention weight while training.
-        out_dim: width of the output; by default that of the input.
-        positions: whether attention sees the distance between positions: "relative" (only of
-            causal attention) or "rotary". "learned" ones were added to the tokens, so here they are
-            as "none".
+        out_dim: width of the output; by default the input's.
+        positions: whether attention sees the distance between positions: "relative" (causal
+            attention only) or "rotary". "learned" positions were added to the tokens, so here they
+            are the same as "none".
         num_frames: number K of positions of the longest sequence, for "relative" and "rotary".
 
     Raises:
@@ -79,7 +79,7 @@ class SelfAttention(nn.Module):
         self.in_proj_weight = nn.Parameter(torch.empty(3 * embed_dim, embed_dim))
         self.in_proj_bias = nn.Parameter(torch.empty(3 * embed_dim))
         self.out_proj = nn.Linear(embed_dim, out_dim or embed_dim)
-        # A module, not a number: TorchRL's losses look for nn.Dropout to set vmap's randomness.
+        # A module, because TorchRL's losses look for nn.Dropout to set vmap's randomness.
         self.dropout = Dropout(dropout)
         self.relative = RelativeBias(num_heads, num_frames) if positions == "relative" else None
         self.rotary = Rotary(embed_dim // num_heads, num_frames) if positions == "rotary" else None
@@ -100,13 +100,13 @@ class SelfAttention(nn.Module):
             read: which positions to return, by name or as a slice of S.
             mask: bool [..., S, S], to be broadcast to [N, heads, S, S]: True where a position (row)
                 sees another (column). Each must see at least one. Replaces the causal mask, if any;
-                "relative" positions keep it, as they know no future.
+                "relative" positions keep it, as they have no bias for the future.
 
         Returns:
             float [N, positions read, D].
         """
         positions = READ_SLICES[read] if isinstance(read, str) else read
-        # The last position sees everything before it, so for it no mask is needed.
+        # The last position sees all others, so it needs no mask.
         causal = self.causal and mask is None and read != "last"
         if x.shape[1] == 1:
             mixed = self._attend_itself(x)
@@ -115,7 +115,7 @@ class SelfAttention(nn.Module):
             and read != "all"
             and mask is None
             and not causal
-            and self.rotary is None  # turns each key by another angle
+            and self.rotary is None  # rotates each key by a different angle
         ):
             mixed = self._attend_one(x, positions)
         else:
@@ -125,7 +125,7 @@ class SelfAttention(nn.Module):
     def read_first(self, first: Tensor, rest: Tensor) -> Tensor:
         """Reads the first position, which must be the same in all sequences: it is projected once.
 
-        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")`` of
+        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")`` with
         attention that is not causal.
 
         Args:
@@ -137,8 +137,8 @@ class SelfAttention(nn.Module):
         """
         count, width = rest.shape[0], first.shape[-1]
         # All sequences share one query, so it is projected instead of the keys:
-        # q (K x) = (q K) x. The keys' bias adds the same to all scores of a head, so the softmax
-        # ignores it.
+        # q (K x) = (q K) x. The keys' bias adds the same constant to all scores of a head, so the
+        # softmax ignores it.
         query = self._project(first, 0, 1).reshape(self.num_heads, 1, -1)
         keys = self.in_proj_weight[width : 2 * width].unflatten(0, (self.num_heads, -1))
         probe = (query @ keys).squeeze(1).t() / math.sqrt(keys.shape[1])  # [D, heads]
@@ -161,7 +161,7 @@ class SelfAttention(nn.Module):
         return self._weights(query, key, self._mask(x, mask, self.causal and mask is None))
 
     def extra_repr(self) -> str:
-        """Shows what the parameters' shapes do not."""
+        """Shows the settings that the parameters' shapes do not."""
         return f"num_heads={self.num_heads}, causal={self.causal}"
 
     def _project(self, x: Tensor, start: int, stop: int) -> Tensor:
@@ -178,7 +178,7 @@ class SelfAttention(nn.Module):
             mask = self._mask(x, mask, causal)
         if mask is not None:
             mask = mask[..., positions, :]
-        # PyTorch's kernel for CPUs has no gradient for what is added to the scores.
+        # PyTorch's kernel for CPUs has no gradient for a bias added to the scores.
         if self._drops or self.relative is not None:
             mixed = self.dropout(self._weights(query, key, mask)) @ value
         else:
@@ -186,7 +186,7 @@ class SelfAttention(nn.Module):
         return mixed.transpose(1, 2).flatten(2)
 
     def _attend_itself(self, x: Tensor) -> Tensor:
-        """As ``_attend``, for one position: a softmax over one is 1, so only the value is left."""
+        """Like ``_attend``, for a sequence of one: its softmax is 1, so only the value is left."""
         value = self._project(x, 2, 3)  # [N, 1, D]
         if not self._drops:
             return value
@@ -194,16 +194,16 @@ class SelfAttention(nn.Module):
         return (self.dropout(ones) * value.unflatten(-1, (self.num_heads, -1))).flatten(2)
 
     def _attend_one(self, x: Tensor, position: slice) -> Tensor:
-        """As ``_attend``, for one position that sees all others, float [N, 1, D].
+        """Like ``_attend``, for one position that sees all others, float [N, 1, D].
 
         No keys or values are computed, because projections are linear:
 
             q . (W x_i + b) = (W^T q) . x_i + q . b,  and the softmax ignores what all i share,
             sum_i a_i (W x_i + b) = W (sum_i a_i x_i) + b,  as the a_i sum to 1.
 
-        So keys' and values' weights are applied once to each head, not to each of the S tokens.
+        So the weights of keys and values are applied once per head, not to each of the S tokens.
         """
-        if self._drops:  # weights that were dropped do not sum to 1
+        if self._drops:  # with dropout, the weights do not sum to 1
             return self._attend(x, position, None, causal=False)
         weights = self.in_proj_weight.unflatten(0, (3, self.num_heads, -1))
         query_weight, key_weight, value_weight = weights.unbind()  # [heads, D / heads, D] each
@@ -246,9 +246,9 @@ class SelfAttention(nn.Module):
         return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 
     def _mask(self, x: Tensor, mask: Tensor | None, causal: bool) -> Tensor | None:
-        """What is added to the scores, float [..., S, S], or which of them count, bool [..., S, S].
+        """The bias added to the scores, float [..., S, S], or their mask, bool [..., S, S].
 
-        None if all scores are taken as they are.
+        None if all scores are used unchanged.
         """
         if self.relative is None:
             return self._past(x) if causal else mask

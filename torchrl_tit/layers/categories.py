@@ -15,7 +15,7 @@ from torchrl_tit.settings.numbers import Size, Width
 
 
 class CategoryIndex(nn.Module):
-    """Numbers the values of all entries of a row: entry i's value 0 follows entry i - 1's last one.
+    """Numbers the values of all entries of a row consecutively, from the first entry to the last.
 
     Args:
         counts: number of values of each entry.
@@ -45,14 +45,14 @@ class CategoryIndex(nn.Module):
 
 
 class CategoryPatchEmbedding(nn.Module):
-    """Embeds P neighbouring categories as one token: the sum of an embedding for each.
+    """Embeds P neighbouring categories as one token: the sum of their embeddings.
 
-    That is a linear layer on the one-hot vectors of the patch, without a bias. The last patch may
+    This is a linear layer on the one-hot vectors of the patch, without a bias. The last patch may
     have fewer entries.
 
     Args:
         counts: number of values of each of the D entries.
-        patch_size: entries P of a patch.
+        patch_size: number P of entries per patch.
         embed_dim: width of a token.
 
     Example:

@@ -1,4 +1,4 @@
-"""Dropout that draws its mask quickly on a CPU."""
+"""Dropout that draws its mask faster on a CPU."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ class Dropout(nn.Dropout):
     """Dropout (Srivastava et al. 2014), with the distribution of :class:`torch.nn.Dropout`.
 
     On a CPU, ``nn.Dropout`` draws a number for each entry, one after another, which took a sixth of
-    a training step of Decision Transformer. This draws one 64-bit number for every four entries, in
-    a fifth of that time. Elsewhere this is ``nn.Dropout``, whose kernels are fused.
+    a training step of Decision Transformer. This module draws one 64-bit number for every four
+    entries, in a fifth of that time. On other devices it is ``nn.Dropout``, whose kernels are
+    fused.
 
     Args:
-        p: probability of a zero; on a CPU to the nearest 1/65536, by which the rest is scaled too.
+        p: probability of a zero; on a CPU rounded to the nearest 1/65536, also for the scale.
 
     Example:
         >>> dropout = Dropout(0.25)
@@ -44,6 +45,6 @@ class Dropout(nn.Dropout):
         dropped = min(round(self.p * _LEVELS), _LEVELS - 1)
         draws = torch.randint(_INT64.min, _INT64.max, (math.ceil(input.numel() / 4),))
         bits = draws.view(torch.int16)[: input.numel()].view(input.shape)  # from -2^15 on
-        # Floats throughout: comparing integers, and turning booleans into numbers, takes longer.
+        # Floats throughout: comparing integers and converting booleans to numbers takes longer.
         scale = bits.float().ge_(dropped - _LEVELS // 2).mul_(_LEVELS / (_LEVELS - dropped))
         return input * scale.to(input.dtype)  # 0 or 1 / (1 - p)

@@ -23,7 +23,7 @@ class GRUGate(nn.Module):
 
     Args:
         embed_dim: width D of x and y.
-        bias: start value of every entry of b, which is learned.
+        bias: initial value of every entry of b, which is learned.
 
     Example:
         >>> gate, x = GRUGate(32, bias=100.0), torch.randn(8, 5, 32)
@@ -40,7 +40,7 @@ class GRUGate(nn.Module):
         self.update_x = nn.Linear(embed_dim, embed_dim, bias=False)
         self.candidate_y = nn.Linear(embed_dim, embed_dim, bias=False)
         self.candidate_x = nn.Linear(embed_dim, embed_dim, bias=False)
-        # Not a linear layer's bias: initialisations that zero those must leave this one.
+        # Not a linear layer's bias, because initialisations set those to zero.
         self.bias = nn.Parameter(torch.full((embed_dim,), float(bias)))
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
@@ -61,7 +61,7 @@ class GatedTransformerBlock(nn.Module):
         num_heads: attention heads; must divide ``embed_dim``.
         num_frames: number K of tokens, one for each frame.
         ffn_expansion: hidden width of the FFN as a multiple of ``embed_dim``.
-        gate_bias: start value of the gates' bias; 2 starts near the identity.
+        gate_bias: initial value of the gates' bias; 2 starts near the identity.
 
     Example:
         >>> block = GatedTransformerBlock(32, num_heads=4, num_frames=5)

@@ -14,8 +14,8 @@ class GaussianHead(nn.Module):
     """Mean and standard deviation of each entry of an action, before a tanh squashes it.
 
     Zheng et al., "Online Decision Transformer", arXiv 2202.05607, and its authors' code: two linear
-    layers, orthogonal at the start; a tanh keeps the logarithm of the standard deviation within -5
-    and 2.
+    layers with orthogonal initialisation; a tanh keeps the logarithm of the standard deviation
+    between -5 and 2.
 
     Args:
         in_features: size F of the features.
@@ -36,7 +36,7 @@ class GaussianHead(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises orthogonally, with biases 0."""
+        """Initialises the weights orthogonally and the biases with zeros."""
         for layer in (self.mean, self.log_std):
             nn.init.orthogonal_(layer.weight)
             nn.init.zeros_(layer.bias)

@@ -15,8 +15,8 @@ from torchrl_tit.settings.numbers import Count, Probability, Width
 class GPT2Block(nn.Module):
     """Pre-LayerNorm block with dropout on both residuals, with the caller's mask.
 
-    Radford et al., "Language Models are Unsupervised Multitask Learners" (2019). Weights start
-    normal with a standard deviation of 0.02 and biases 0, as there.
+    Radford et al., "Language Models are Unsupervised Multitask Learners" (2019). As there, the
+    initial weights are normal with a standard deviation of 0.02, and the biases are zero.
 
     Args:
         embed_dim: width D of a token.

@@ -1,4 +1,4 @@
-"""Shared by the convolutional networks: uint8 input, and frames as a batch or as channels."""
+"""Helpers of the convolutional networks: uint8 inputs, and frames as a batch or as channels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 
 def bytes_to_floats(x: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Converts bytes (uint8) to floats of 0 to 1, and leaves floats as they are.
+    """Converts bytes (uint8) to floats from 0 to 1, and leaves floats unchanged.
 
     Example:
         >>> bytes_to_floats(torch.tensor([0, 51, 255], dtype=torch.uint8))
@@ -20,9 +20,9 @@ def bytes_to_floats(x: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 class ImageConv2d(nn.Conv2d):
-    """2-d convolution that reads floats as they are and divides bytes (uint8) by 255.
+    """2-d convolution that reads floats unchanged and divides bytes (uint8) by 255.
 
-    The division is done on the weights, which are few.
+    The division is applied to the weights, which are fewer.
 
     Example:
         >>> conv = ImageConv2d(4, 32, kernel_size=8, stride=4)
@@ -71,7 +71,7 @@ def stacked_shape(
 
 
 def convolved_size(size: int, kernels: Sequence[tuple[int, int]]) -> int:
-    """Returns the side length left of ``size`` pixels after (kernel, stride) convolutions.
+    """Returns the side length that ``size`` pixels have after (kernel, stride) convolutions.
 
     Example:
         >>> convolved_size(84, [(8, 4), (4, 2), (3, 1)])

@@ -12,7 +12,7 @@ from torchrl_tit.settings.numbers import Weight
 
 @checked_arguments
 def init_normal_(module: nn.Module, std: Weight = 0.02) -> None:
-    """Initialises as the authors' networks do: linear and embedding weights normal, biases 0.
+    """Initialises like the authors' networks: linear and embedding weights normal, biases 0.
 
     LayerNorms become 1 and 0. Convolutions, patch embeddings and the input projections of
     attention keep PyTorch's defaults; class tokens and position encodings are initialised by their
@@ -39,11 +39,12 @@ def init_normal_(module: nn.Module, std: Weight = 0.02) -> None:
 
 @checked_arguments
 def init_orthogonal_(module: nn.Module, gain: Weight = 2**0.5) -> None:
-    """Initialises as Stable-Baselines3 does, which trained the paper's online networks.
+    """Initialises like Stable-Baselines3, which trained the paper's online networks.
 
-    Every linear layer (output projections of attention included) and 2-d convolution (image patch
-    embeddings included) becomes orthogonal, its bias 0. The array patch embedding, a 1-d
-    convolution there, and the input projections of attention are left unchanged.
+    The weights of every linear layer (including output projections of attention) and 2-d
+    convolution (including image patch embeddings) become orthogonal, their biases 0. The array
+    patch embedding, a 1-d convolution there, and the input projections of attention are left
+    unchanged.
 
     Args:
         module: the network, changed in place.

@@ -1,4 +1,4 @@
-"""Patch embeddings: one observation to a sequence of tokens."""
+"""Patch embeddings, which map one observation to a sequence of tokens."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Size, Width
 
 _MOST_CATEGORY_PATCHES = 16
-_IMAGE_PATCHES = 49  # of the paper's Atari games: 84 pixels in patches of 12
+_IMAGE_PATCHES = 49  # as in the paper's Atari games: 84 pixels in patches of 12
 _MOST_IMAGE_PATCHES = 1024
 
 
 class ArrayPatchEmbedding(nn.Module):
     """Embeds windows of P entries of an array observation, without a bias.
 
-    Where P does not divide the size D, the array is zero-padded at both ends by
+    If P does not divide the size D, the array is zero-padded at both ends by
     ``ceil((ceil(D / P) * P - D) / 2)``, as in the authors' code, which gives ``ceil(D / P)``
     patches. The same as a 1-d convolution with kernel and stride P.
 
@@ -30,8 +30,9 @@ class ArrayPatchEmbedding(nn.Module):
         size: entries D of an observation.
         patch_size: entries P of a patch.
         embed_dim: width of a token.
-        channels: arrays that are stacked in one observation (frames, say); 1 for a plain one.
-        own_weights: whether each patch has weights of its own, and a bias.
+        channels: arrays that are stacked in one observation (for example, frames); 1 for a plain
+            one.
+        own_weights: whether each patch has its own weights and bias.
 
     Raises:
         ValueError: if the patch is larger than the array.
@@ -66,7 +67,7 @@ class ArrayPatchEmbedding(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises as ``nn.Conv1d`` does, and a bias like the token of an entry of size 1."""
+        """Initialises like ``nn.Conv1d``, and a bias like the token of an entry of size 1."""
         bound = 1 / math.sqrt(self.weight.shape[-2:].numel())
         nn.init.uniform_(self.weight, -bound, bound)
         if self.bias is not None:
@@ -91,9 +92,8 @@ class ArrayPatchEmbedding(nn.Module):
 class ImagePatchEmbedding(nn.Module):
     """Embeds non-overlapping P x P patches of an image, without a bias.
 
-    Rows first: patch ``i * W / P + j`` is the one in row i and column j of the grid. The same as
-    a 2-d convolution with kernel and stride P (arXiv 2212.14538, steps 1 and 2 of the inner
-    transformer).
+    Row by row: patch ``i * W / P + j`` is in row i and column j of the grid. The same as a 2-d
+    convolution with kernel and stride P (arXiv 2212.14538, steps 1 and 2 of the inner transformer).
 
     Args:
         channels: channels C of the image.
@@ -133,7 +133,7 @@ class ImagePatchEmbedding(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises as ``nn.Conv2d`` does."""
+        """Initialises like ``nn.Conv2d``."""
         nn.init.kaiming_uniform_(self.weight, a=math.sqrt(5))
 
     def extra_repr(self) -> str:
@@ -144,14 +144,14 @@ class ImagePatchEmbedding(nn.Module):
         """[N, C, H, W], float or uint8 -> tokens [N, H / P * W / P, embed_dim]."""
         rows, columns = self.grid
         x = x.unflatten(-1, (columns, self.patch_size)).unflatten(-3, (rows, self.patch_size))
-        # [N, C, rows, P, columns, P] -> [N, rows, columns, C, P, P]; bytes are moved, not floats
+        # [N, C, rows, P, columns, P] -> [N, rows, columns, C, P, P]; moves bytes instead of floats
         return embed(x.permute(0, 2, 4, 1, 3, 5).flatten(3).flatten(1, 2), self.weight)
 
 
 def embed(patches: Tensor, weight: Tensor) -> Tensor:
     """Maps patches [N, patches, entries] to tokens with a weight [width, ...] over their entries.
 
-    Bytes become 0..1: the division by 255 is done on the weights, which are few.
+    Bytes are scaled to 0..1: the division by 255 is applied to the weights, which are fewer.
     """
     weight = weight.flatten(1)
     if patches.dtype == torch.uint8:
@@ -169,15 +169,15 @@ def find_patch_size(
 
     Args:
         observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
-        patch_size: a number, which is returned; None for the whole observation; or "auto". Of
-            arrays that is the whole observation. Of categories it is 1 for up to 16 entries, else
-            the smallest divisor of the entries that leaves at most 16 patches. Of images it is the
-            side of the square patch that divides them into the number of patches nearest to 49, the
-            paper's for Atari games.
+        patch_size: a number, which is returned; None for the whole observation; or "auto". For
+            arrays, that is the whole observation. For categories, it is 1 for up to 16 entries,
+            else the smallest divisor of the number of entries that gives at most 16 patches. For
+            images, it is the side of the square patch that divides them into the number of patches
+            nearest to 49, as in the paper's Atari games.
         categories: whether the entries count categories.
 
     Raises:
-        ValueError: if no patch divides an image into fewer than 1025.
+        ValueError: if no patch divides an image into fewer than 1025 patches.
 
     Example:
         >>> [find_patch_size(shape, "auto") for shape in [(4,), (27,), (3, 84, 84), (7, 7)]]
@@ -221,15 +221,15 @@ def make_patch_embedding(
     categories: Sequence[int] | None = None,
     own_weights: bool = False,
 ) -> ArrayPatchEmbedding | ImagePatchEmbedding | CategoryPatchEmbedding:
-    """Builds the patch embedding that fits an observation.
+    """Builds the patch embedding of an observation.
 
     Args:
         observation_shape: (D,) for arrays and categories, (H, W) or (C, H, W) for images.
-        patch_size: entries, or pixels along a side, of a patch.
+        patch_size: entries of a patch, or pixels along its side.
         embed_dim: width of a token.
-        num_frames: observations stacked as channels; 1 of categories.
-        categories: of categories, the number of values of each entry.
-        own_weights: whether each patch of an array has weights of its own.
+        num_frames: observations stacked as channels; 1 for categories.
+        categories: for categories, the number of values of each entry.
+        own_weights: whether each patch of an array has its own weights.
 
     Example:
         >>> make_patch_embedding((84, 84), patch_size=12, embed_dim=64, num_frames=4).weight.shape

@@ -1,4 +1,4 @@
-"""Positions of steps that attention sees as distances: a learned bias, or rotations."""
+"""Positions that attention sees as distances between steps: a learned bias, or rotations."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from torchrl_tit.settings.numbers import Count, Frames, Width
 class RelativeBias(nn.Module):
     """Adds a learned number to the attention score of two steps, for each head and distance.
 
-    As in T5 (Raffel et al., arXiv 1910.10683, section 2.1), with a bias of its own for every
-    distance up to K - 1. The biases start at zero, so attention starts without positions.
+    As in T5 (Raffel et al., arXiv 1910.10683, section 2.1), with a separate bias for every distance
+    up to K - 1. The biases start at zero, so attention starts without positions.
 
     Args:
         num_heads: number of attention heads.
@@ -38,7 +38,7 @@ class RelativeBias(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises the biases: zeros."""
+        """Initialises the biases with zeros."""
         nn.init.zeros_(self.bias)
 
     def forward(self, length: int) -> Tensor:
@@ -71,7 +71,7 @@ class RelativeBias(nn.Module):
 class Rotary(nn.Module):
     """Rotates queries and keys by angles that grow with the step (RoPE).
 
-    The score of two steps then depends on the distance between them, besides what they hold: with
+    The score of two steps then depends on their contents and on the distance between them: with
     rotations R, (R_i q) . (R_j k) = q . (R_{j-i} k). Su et al., "RoFormer: Enhanced Transformer
     with Rotary Position Embedding", arXiv 2104.09864, section 3.2. Entry e is paired with entry
     e + d/2 of a head.
@@ -112,7 +112,7 @@ class Rotary(nn.Module):
         Args:
             x: float [..., steps read, d].
             length: number S <= K of steps of the sequence.
-            read: which of these steps ``x`` holds.
+            read: the steps that ``x`` holds.
 
         Returns:
             float [..., steps read, d].

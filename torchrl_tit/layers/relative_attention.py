@@ -1,4 +1,4 @@
-"""Self-attention of Transformer-XL: positions enter as distances between steps."""
+"""Self-attention of Transformer-XL, where positions are distances between steps."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class RelativeSelfAttention(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises u and v: zeros. The linear layers have their own."""
+        """Initialises u and v with zeros. The linear layers initialise themselves."""
         nn.init.zeros_(self.content_bias)
         nn.init.zeros_(self.distance_bias)
 

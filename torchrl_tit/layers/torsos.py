@@ -23,7 +23,7 @@ class NatureCNNTorso(nn.Module):
     """
 
     smallest_image = 36
-    """Pixels a side that leave one position after the last convolution."""
+    """Pixels per side that leave one position after the last convolution."""
 
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
         super().__init__()
@@ -77,7 +77,7 @@ class ResNetTorso(nn.Module):
     """
 
     smallest_image = 8
-    """Pixels a side that the first convolution needs."""
+    """Pixels per side that the first convolution needs."""
 
     def __init__(self, channels: int, size: tuple[int, int]) -> None:
         super().__init__()

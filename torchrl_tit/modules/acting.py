@@ -16,10 +16,10 @@ class HasActingMode(Protocol):
     """A module that can reuse what it computed a step ago, such as a backbone."""
 
     def acting(self) -> AbstractContextManager[None]:
-        """Returns the context within which it does so."""
+        """Returns the context in which it does so."""
 
     def clear_cache(self) -> None:
-        """Discards what it keeps."""
+        """Discards what it has kept."""
 
 
 @contextmanager
@@ -49,10 +49,10 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
 
 
 def clear_caches(policy: Callable[..., Any]) -> None:
-    """Discards what the backbones of a policy keep, after a change of weights within ``acting``.
+    """Clears the caches of a policy's backbones, after its weights change within ``acting``.
 
     Args:
-        policy: as that of :func:`acting`.
+        policy: see :func:`acting`.
     """
     for module in _within(policy):
         module.clear_cache()
@@ -66,8 +66,9 @@ def _within(policy: Callable[..., Any]) -> list[HasActingMode]:
 def while_acting(policy: Callable[..., Any], batches: Iterable[T]) -> Iterator[T]:
     """Iterates over a collector, with its policy in acting mode only while it collects.
 
-    Between two batches, when the policy is trained and saved, no tokens are kept. Policies of other
-    processes are not reached: give their collector ``collector_class=ActingCollector``.
+    Between two batches, when the policy is trained and saved, no tokens are kept. This does not
+    reach policies in other processes: for those, pass ``collector_class=ActingCollector`` to the
+    collector.
 
     Args:
         policy: the collector's policy, or a module that contains its backbones.

@@ -14,8 +14,8 @@ class ActingCollector(Collector):
     """TorchRL's collector, with its policy in acting mode while it collects a batch.
 
     For collectors in other processes, whose policies :func:`~torchrl_tit.modules.while_acting` does
-    not reach. New weights are used for all frames: each batch starts without kept tokens, and
-    weights that arrive meanwhile, in a ``MultiAsyncCollector`` for example, discard them.
+    not reach. New weights apply to all frames: each batch starts with an empty cache, and weights
+    that arrive during a batch, in a ``MultiAsyncCollector`` for example, clear it.
 
     The arguments are those of ``torchrl.collectors.Collector``.
 
@@ -33,9 +33,9 @@ class ActingCollector(Collector):
     """
 
     def __bool__(self) -> bool:
-        """True: Ray asks when a method failed, and TorchRL's collectors would raise for a length.
+        """Returns True. Ray asks for it when a method fails.
 
-        The error that made it fail would then be lost.
+        TorchRL's collectors have no length and would raise, which would hide the original error.
         """
         return True
 

@@ -1,4 +1,4 @@
-"""A network that is called at every step of an environment, and encodes the newest frames only."""
+"""A network that is called at every step of an environment, and only encodes the newest frames."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ActingNetwork:
     def compile(self, **options: Any) -> None:
         """Compiles the encoding of the newest frames, and everything after the frame encoders.
 
-        Which tokens can be reused is decided in between, in plain Python.
+        Between the two, plain Python decides which tokens can be reused.
 
         Args:
             **options: passed to ``torch.compile``.
@@ -57,7 +57,7 @@ class ActingNetwork:
     def clear(self) -> None:
         """Discards the tokens, so that the next histories are encoded like the first ones.
 
-        Can be called from another thread: what a call then still computes is not kept.
+        Can be called from another thread: tokens that a running call still computes are not kept.
         """
         self._caches = [
             FrameCache(encoder, len(encoder.observation_shape), encode_newest)

@@ -1,4 +1,4 @@
-"""What specs tell about an action: its shape, and the options of its components."""
+"""Reads specs of actions: the shape of an action, and the options of its components."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ def action_shape(spec: TensorSpec, batch_dims: int | None) -> torch.Size:
 
     Args:
         spec: the action's spec.
-        batch_dims: number of its batch dimensions; None if the kind of the spec is to tell.
+        batch_dims: number of its batch dimensions; None to infer it from the kind of the spec.
 
     Raises:
-        ValueError: if it is of a kind without a policy head, or does not tell.
+        ValueError: if there is no policy head for this kind of spec, or the number cannot be
+            inferred.
 
     Example:
         >>> action_shape(OneHot(3, shape=(8, 3)), None)
@@ -68,8 +69,8 @@ def numbers_of_options(spec: Categorical | OneHot, shape: torch.Size) -> list[in
         shape: the shape of one action.
 
     Raises:
-        ValueError: if it is not the same for all actions of a batched spec, or the action consists
-            of several rows of one-hot vectors.
+        ValueError: if the number differs between the actions of a batched spec, or the action
+            consists of several rows of one-hot vectors.
 
     Example:
         >>> numbers_of_options(MultiCategorical([2, 3]), torch.Size([2]))

@@ -23,8 +23,8 @@ from torchrl_tit.windows import Padding, Windows
 class Backbone(TensorDictModule):
     """Reads histories and writes features, for any TorchRL head, loss or collector.
 
-    Put one backbone in front of all heads. They read its features, so the network runs once a step
-    in collection and once a minibatch in training, however many heads and losses there are.
+    Put one backbone in front of all heads. They read its features, so the network runs once per
+    step in collection and once per minibatch in training, however many heads and losses there are.
 
     The histories of consecutive steps share K - 1 frames. Within :meth:`acting`, only the newest
     frame is encoded at each step, and the features are the same.
@@ -49,9 +49,9 @@ class Backbone(TensorDictModule):
     **Sequences.** By default a backbone reads single steps. Within TorchRL's recurrent mode
     (``torchrl.modules.set_recurrent_mode(True)``, which TorchRL's losses switch on) it reads
     sequences, if the tensordict has ``is_init``: the last batch dimension is time, and each frame
-    is encoded once, not once for each of the K windows that it is part of. The features are those
-    of single steps. A recurrent network reads its state at the first step of each sequence only;
-    any other reads:
+    is encoded once, not once for each of the K windows that contain it. The features are the same
+    as those of single steps. A recurrent network reads its state only at the first step of each
+    sequence; any other network reads:
 
     ==================  =====================  =====================================================
     key                 shape                  what it is
@@ -68,38 +68,38 @@ class Backbone(TensorDictModule):
                                                episode, whose windows would begin before it
     ==================  =====================  =====================================================
 
-    Shuffled single steps are no sequences: leave ``is_init`` out of those, or call the backbone
+    Shuffled single steps are not sequences: leave out their ``is_init``, or call the backbone
     within ``set_recurrent_mode(False)``. `SliceSampler` sets ``is_init`` at the beginning of each
-    slice, which is right with histories; without them, give it ``init_key=None``. Dropout in the
-    frame encoder is drawn once a frame.
+    slice, which is right with histories; without them, pass ``init_key=None`` to it. Dropout in the
+    frame encoder is drawn once per frame.
 
     Args:
         network: a :class:`~torchrl_tit.networks.HistoryNetwork`, which maps histories to features
             [..., F]; a :class:`~torchrl_tit.networks.TwoTrunks` of two such networks; or any other
             module that maps one tensor for each of ``in_keys`` to one for each of ``out_keys``.
         in_keys: keys, nested or not, of the history of each observation (see
-            :class:`~torchrl_tit.transforms.History`), in the order of the network, then of the
-            history encoder's further inputs. A single key can be given as a string. Of several
-            observations, :func:`~torchrl_tit.modules.history_keys` names them.
+            :class:`~torchrl_tit.transforms.History`), in the network's order, followed by those of
+            the history encoder's further inputs. A single key can be given as a string. For several
+            observations, :func:`~torchrl_tit.modules.history_keys` lists the keys.
         out_keys: keys of the features: one, or one for the policy and one for the value. A single
             key can be given as a string.
         autocast: dtype of matrix products, such as ``torch.bfloat16``; weights and features keep
             their dtype. None disables autocast.
         every_frame: write the features of all K frames, [..., K, F], for losses on whole windows,
-            instead of those of the newest one. Two backbones, one to train and one to act, can
-            share a network.
+            instead of those of the newest frame only. Two backbones, one for training and one for
+            acting, can share a network.
         padding: what precedes an ``is_init`` in a sequence, as in
             :class:`~torchrl_tit.transforms.History`: its observation ("same") or zeros
-            ("constant"). Then only the histories at t = 0 are read, all shapes are static (for
+            ("constant"). If given, only the histories at t = 0 are read, all shapes are static (for
             ``torch.compile`` and ``vmap``), and padding is encoded once. If None, the histories at
             the starts of sequences are read; without histories, "same" is used.
         observation_keys: keys of the observations, one for each history; by default a history's
-            key with "history" replaced by "observation". If these or ``padding`` are given, they
-            and ``is_init`` are among the ``in_keys``, for losses that select these.
+            key with "history" replaced by "observation". If these or ``padding`` are given, the
+            ``in_keys`` include them and ``is_init``, for losses that select the ``in_keys``.
 
     Raises:
         ValueError: if the number of keys does not match the network's inputs and outputs,
-            ``every_frame`` is set for a history encoder that encodes the newest frame only, or the
+            ``every_frame`` is set for a history encoder that only encodes the newest frame, or the
             padding is unknown.
         KeyError: in ``forward``, if the tensordict lacks one of the entries.
 
@@ -144,9 +144,9 @@ class Backbone(TensorDictModule):
             in_keys=[*step_keys, *(key for key in declared if key not in step_keys)],
             out_keys=[*out_keys, *(("next", key) for key in state_shapes)],
         )
-        self._step_keys = step_keys  # what a single step is read from
+        self._step_keys = step_keys  # keys that a single step reads
         self.sequence_keys = sequence_keys
-        """Keys of what is read of sequences."""
+        """Keys of the entries read from sequences."""
         self.history_keys = in_keys
         """Keys of the histories, and of the history encoder's further inputs."""
         self.features_keys = out_keys
@@ -155,8 +155,8 @@ class Backbone(TensorDictModule):
         """Shape of each entry of the recurrent state without batch dimensions, by key."""
         self.autocast = autocast
         self.every_frame = every_frame
-        self._acting: list[ActingNetwork] | None = None  # one for each trunk, in acting mode
-        self._compiled: list[ActingNetwork] | None = None  # what acting mode runs, if any
+        self._acting: list[ActingNetwork] | None = None  # one per trunk, in acting mode
+        self._compiled: list[ActingNetwork] | None = None  # what acting mode runs, if compiled
 
     def forward(
         self, tensordict: TensorDictBase, *args: object, **kwargs: object
@@ -169,7 +169,7 @@ class Backbone(TensorDictModule):
         # A recurrent network reads sequences itself.
         if not self.is_recurrent and self.sequence_keys.in_sequence(tensordict):
             return self._read_sequences(tensordict)
-        # Skips the 0.1 ms overhead of TensorDictModule, which matters at each step of acting.
+        # Skips the 0.1 ms overhead of TensorDictModule, which matters when acting step by step.
         self._check_entries(tensordict)
         outputs = self._call_module([tensordict.get(key) for key in self._step_keys])
         outputs = (outputs,) if isinstance(outputs, Tensor) else outputs
@@ -211,22 +211,21 @@ class Backbone(TensorDictModule):
     def acting(self) -> Iterator[None]:
         """Keeps the tokens of the last frames, so that only the newest is encoded at each step.
 
-        For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses. The
-        histories can be any: after a reset, or with another batch, whatever is new is encoded (see
-        :class:`~torchrl_tit.modules.FrameCache`). Has no effect while gradients are enabled, and on
+        For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses. Any
+        histories are allowed: after a reset, or with another batch, all new frames are encoded (see
+        :class:`~torchrl_tit.modules.FrameCache`). Has no effect while gradients are enabled, or on
         networks that encode no frames or read a single one.
 
         **The network must not change within the context**: its weights are not compared. Optimizers
-        step between two collections, each of which enters the context anew, as
-        :func:`~torchrl_tit.modules.while_acting` and
-        :class:`~torchrl_tit.modules.ActingCollector` do. If you change weights within it, call
-        :meth:`clear_cache` afterwards; otherwise, the frames of the next K - 1 steps that were seen
-        before the change keep the tokens of the old weights.
+        step between two collections, each of which enters a new context, as with
+        :func:`~torchrl_tit.modules.while_acting` and :class:`~torchrl_tit.modules.ActingCollector`.
+        If you change weights within the context, call :meth:`clear_cache` afterwards; otherwise,
+        for the next K - 1 steps, frames seen before the change keep the tokens of the old weights.
 
-        The cache (copies of one batch of histories and of its tokens) is empty at the beginning and
-        discarded at the end, and whenever a state dict of the backbone or of a module around it is
-        taken or loaded, and these are moved or cast. So a run continues exactly like one that is
-        resumed from its state dict. Copies and pickles are not in acting mode.
+        The cache (copies of one batch of histories and of its tokens) starts empty. It is discarded
+        at the end, and whenever the backbone or a module that contains it is moved or cast, or its
+        state dict is taken or loaded. So a run continues exactly like one that is resumed from its
+        state dict. Copies and pickles are not in acting mode.
 
         Example:
             >>> from tensordict import TensorDict
@@ -248,8 +247,8 @@ class Backbone(TensorDictModule):
     def compile_parts(self, **options: Any) -> None:
         """Compiles what acting mode runs: the encoding of the newest frames, and all later layers.
 
-        Which tokens can be reused is decided between the two, in plain Python. Do not compile the
-        whole policy instead: a compiled backbone keeps no tokens. Copies of the backbone are not
+        Between the two, plain Python decides which tokens can be reused. Do not compile the whole
+        policy instead: a compiled backbone keeps no tokens. Copies of the backbone are not
         compiled.
 
         Args:
@@ -271,7 +270,7 @@ class Backbone(TensorDictModule):
         return super().state_dict(*args, **kwargs)
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        self.clear_cache()  # called for modules around this one, too
+        self.clear_cache()  # also called when a containing module is loaded
         super()._load_from_state_dict(*args, **kwargs)
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
@@ -287,16 +286,16 @@ class Backbone(TensorDictModule):
     def _make_acting(self) -> list[ActingNetwork] | None:
         if not self.keeps_frames:
             return None
-        # Within `acting` of its own, a compiled network starts anew.
+        # A compiled network clears its cache when it enters `acting`.
         return self._compiled or list(map(ActingNetwork, trunks_of(self.module).values()))
 
     def encode_windows(
         self, frames: Sequence[Tensor], windows: Windows, *context: Tensor
     ) -> tuple[Tensor, ...]:
-        """Maps windows on a table of frames to features; each frame is encoded once.
+        """Maps windows on a table of frames to features, encoding each frame once.
 
         Args:
-            frames: of each observation, [R, *observation_shape].
+            frames: the table of each observation, [R, *observation_shape].
             windows: the rows of each window, [..., K].
             *context: further inputs of the history encoder, [..., K, *entry] each.
 
@@ -330,7 +329,7 @@ class Backbone(TensorDictModule):
         return tensordict
 
     def _call_module(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
-        """Calls the network; overrides the method of TensorDictModule that does."""
+        """Calls the network; overrides TensorDictModule's method."""
         tensors = tensors[: len(self._step_keys)]
         if self.autocast is None:
             return self._encode(tensors, **kwargs)
@@ -380,7 +379,7 @@ class Backbone(TensorDictModule):
                 )
 
     def __getstate__(self) -> dict[str, Any]:
-        # Compiled code cannot be copied, and nobody clears what a copy keeps.
+        # Compiled code cannot be copied, and nothing would clear a copy's cache.
         return {**super().__getstate__(), "_compiled": None, "_acting": None}
 
 
@@ -403,7 +402,7 @@ def _sequence_keys(
     observation_keys: Sequence[NestedKey] | str | None,
     padding: Padding | None,
 ) -> SequenceKeys:
-    """Keys of what a backbone reads of sequences."""
+    """Keys of the entries that a backbone reads from sequences."""
     count = max((len(trunk.frames) for trunk in trunks.values()), default=len(in_keys))
     histories, context = in_keys[:count], in_keys[count:]
     keys = default_observation_keys(histories) if observation_keys is None else observation_keys

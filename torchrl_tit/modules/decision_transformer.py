@@ -30,9 +30,8 @@ class DTHead(nn.Module):
     Args:
         features_dim: size F of the features.
         action_dim: entries A of a continuous action, or number A of discrete actions.
-        action_space: "continuous" actions are predicted within -1..1 by a tanh; "gaussian" ones
-            are drawn from a Gaussian that a tanh squashes, as in Online DT; "discrete" ones have
-            logits.
+        action_space: "continuous" predicts actions in -1..1 with a tanh; "gaussian" predicts a
+            tanh-squashed Gaussian, as in Online DT; "discrete" predicts logits.
 
     Raises:
         ValueError: if there is no such ``action_space``.
@@ -67,11 +66,11 @@ class DTHead(nn.Module):
 
         Args:
             features: float [..., F].
-            action: the actions that the network read, to check that they are of this head's kind;
-                not checked if None.
+            action: the actions that the network read, to check that they suit this head; not
+                checked if None.
 
         Returns:
-            float [..., A]: actions, or logits; of a Gaussian, its mean and standard deviation.
+            float [..., A]: actions or logits; for a Gaussian, its mean and standard deviation.
         """
         if action is not None:
             discrete = not action.is_floating_point()
@@ -92,9 +91,10 @@ def make_dt_backbone(
     Args:
         network: a Decision Transformer of one observation.
         group: the key under which "observation", "action", "return_to_go", "timestep" and "mask"
-            are, as in :class:`~torchrl_tit.transforms.SequenceHistory`; None for the top level, as
-            in batches of :class:`~torchrl_tit.datasets.SequenceStorage`.
-        every_frame: write the features of all steps, [..., K, F], not of the newest one, [..., F].
+            are stored, as in :class:`~torchrl_tit.transforms.SequenceHistory`; None for the top
+            level, as in batches of :class:`~torchrl_tit.datasets.SequenceStorage`.
+        every_frame: write the features of all steps, [..., K, F], instead of the newest one's,
+            [..., F].
 
     Example:
         >>> from torchrl_tit.networks import DecisionTransformer
@@ -154,7 +154,7 @@ def make_dt_actor(
         network: a Decision Transformer; its weights are shared with other modules, not copied.
         head: its head.
         group: the key under which :class:`~torchrl_tit.transforms.SequenceHistory` writes.
-        action_key: where the action goes.
+        action_key: key under which the action is written.
         one_hot: whether the environment's discrete actions are one-hot.
         every_frame: write the actions of all steps, for losses on distributions such as TorchRL's
             `OnlineDTLoss`; usually with ``group=None``.
@@ -162,8 +162,8 @@ def make_dt_actor(
     Returns:
         A policy for any TorchRL collector. A continuous head's actions, float [..., A], are written
         as predicted; gaussian ones and discrete ones, int64 [...] or one-hot [..., A], are the most
-        likely ones or drawn, as TorchRL's exploration type says. With ``every_frame``, shapes are
-        [..., K, A] or [..., K].
+        likely actions or samples, according to TorchRL's exploration type. With ``every_frame``,
+        shapes are [..., K, A] or [..., K].
 
     Example:
         >>> from torchrl.collectors import Collector

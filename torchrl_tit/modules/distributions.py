@@ -1,8 +1,8 @@
 """Distributions of actions with several discrete components: one log-probability for all of them.
 
-They stand on PyTorch's `Independent`, as TorchRL's `IndependentNormal` does, and write actions in
-the form of a spec. TorchRL's `OneHotCategorical` writes int64 where a `OneHot` spec is bool, and
-its mode has several ones where logits are equal.
+They build on PyTorch's `Independent`, as TorchRL's `IndependentNormal` does, and write actions in
+the format of a spec. TorchRL's `OneHotCategorical` writes int64 where a `OneHot` spec is bool, and
+its mode has several ones if logits are equal.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class IndependentCategorical(distributions.Independent):
         base: distributions.Categorical
         if mask is None:
             base = distributions.Categorical(logits=logits, validate_args=False)
-        else:  # its cross-entropy takes no samples of samples
+        else:  # its cross-entropy does not support several samples at once
             base = MaskedCategorical(logits=logits, mask=mask, use_cross_entropy=False)
         super().__init__(base, event_dim, validate_args=False)
         self._dtype = dtype
@@ -54,12 +54,12 @@ class IndependentCategorical(distributions.Independent):
 
     @property
     def mode(self) -> Tensor:
-        """The most likely action; the first of several."""
+        """The most likely action; if there are several, the first."""
         return self._encode(self.base_dist.mode)
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """The mode, under the name by which TorchRL asks for it."""
+        """The mode, under the name that TorchRL uses."""
         return self.mode
 
     def log_prob(self, value: Tensor) -> Tensor:
@@ -105,7 +105,7 @@ class IndependentOneHotCategorical(IndependentCategorical):
         return torch.cat([one_hot(choice, size) for choice, size in components], -1).to(self._dtype)
 
     def _decode(self, value: Tensor) -> Tensor:
-        components = value.byte().split(self._sizes, -1)  # argmax takes no bools
+        components = value.byte().split(self._sizes, -1)  # argmax does not support bool
         return torch.stack([component.argmax(-1) for component in components], -1)
 
 
@@ -113,7 +113,7 @@ class IndependentBernoulli(distributions.Independent):
     """Several switches, each on or off: the actions of a `Binary` spec.
 
     Args:
-        logits: of on, [*batch, *switches].
+        logits: logits of "on", [*batch, *switches].
         event_dim: number of dimensions of ``switches``.
         dtype: dtype of the actions.
 
@@ -138,12 +138,12 @@ class IndependentBernoulli(distributions.Independent):
 
     @property
     def mode(self) -> Tensor:
-        """The most likely action; PyTorch's is NaN where both are equally likely, ours is off."""
+        """The most likely action; off if both are equally likely, where PyTorch returns NaN."""
         return (self.base_dist.logits > 0).to(self._dtype)
 
     @property
     def deterministic_sample(self) -> Tensor:
-        """The mode, under the name by which TorchRL asks for it."""
+        """The mode, under the name that TorchRL uses."""
         return self.mode
 
     def log_prob(self, value: Tensor) -> Tensor:

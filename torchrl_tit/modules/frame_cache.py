@@ -30,25 +30,25 @@ class _Kept:
 class FrameCache:
     """Encodes windows of K frames, and reuses the tokens of the frames of the previous call.
 
-    A frame's tokens depend on that frame alone. While acting, the window of a step is that of the
-    step before, moved by one frame, so K - 1 of its frames have been encoded already.
+    A frame's tokens depend on that frame alone. While acting, each step's window is the previous
+    step's window, moved by one frame, so K - 1 of its frames have already been encoded.
 
-    The windows can be any. Tokens are reused only if the frame has the same bytes as the one they
-    were computed from, which was in the same row of the batch, one place later in the window.
-    Everything else is encoded, a frame that occurs several times once. So the first window of an
+    Any windows are allowed. Tokens are reused only if the frame has the same bytes as the one they
+    were computed from, in the same row of the batch, one place later in the window. All other
+    frames are encoded; a frame that occurs several times is encoded once. So the first window of an
     episode, padded with copies of one observation or with zeros, costs one or two frames. The
-    output is that of the encoder, within rounding: a frame encoded alone and in a batch may differ
-    in the last bits.
+    output is that of the encoder, up to rounding: the last bits may differ between a frame encoded
+    alone and in a batch.
 
     The encoder must not change between two calls. After a change of its weights or modules, call
-    :meth:`clear`, or the tokens of the previous frames remain those of the old weights.
+    :meth:`clear`; otherwise, the previous frames keep the tokens of the old weights.
 
     Nothing is kept or reused while gradients are enabled, dropout or batch normalisation is active
     in the encoder, under ``vmap`` and the other transforms of ``torch.func``, or while
     ``torch.compile``, ``torch.export`` or a CUDA graph is recording.
 
     Args:
-        encoder: maps observations [..., *observation_shape] to tokens [..., *token_shape], each one
+        encoder: maps observations [..., *observation_shape] to tokens [..., *token_shape], each
             independently of the others; its only randomness is ``nn.Dropout``.
         observation_ndim: number of dimensions of an observation.
         encode_newest: encodes the newest frame of each window; the encoder itself by default, or
@@ -73,7 +73,7 @@ class FrameCache:
         """Maps observations to tokens."""
         self._observation_ndim = observation_ndim
         self._encode_newest = encoder if encode_newest is None else encode_newest
-        # All that behaves differently in training mode.
+        # All modules that behave differently in training mode.
         self._mode_dependent = [
             module
             for module in encoder.modules()
@@ -145,7 +145,7 @@ class FrameCache:
             or any(module.training for module in self._mode_dependent)
             or torch.compiler.is_compiling()
             or torch.jit.is_tracing()
-            or type(window) is not Tensor  # a fake tensor, while something is traced
+            or type(window) is not Tensor  # a fake tensor, during tracing
             or window.is_meta
             or forward_ad._current_level >= 0
             or torch._C._functorch.peek_interpreter_stack() is not None  # vmap, jvp, ...

@@ -1,4 +1,4 @@
-"""Sequences of consecutive steps as a table in which each frame stands once."""
+"""Sequences of consecutive steps as a table that holds each frame once."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class FrameTable(NamedTuple):
     """The frames of sequences, and the window of each step.
 
     Attributes:
-        frames: of each observation, [R, *observation_shape].
-        windows: of each step, [N, T, K].
+        frames: the table of each observation, [R, *observation_shape].
+        windows: the window of each step, [N, T, K].
         valid: bool [N, T], False where the window would begin before the sequence does; None if
             the histories at the starts are known.
     """
@@ -57,7 +57,7 @@ def table_of_stored(
 def table_of_first(
     first: Sequence[Tensor], observations: Sequence[Tensor], is_init: Tensor, padding: Padding
 ) -> FrameTable:
-    """Reads the stored history at the first step only, and fills what precedes later episodes.
+    """Reads only the first step's stored history, and pads before later episodes.
 
     All shapes are static.
 
@@ -86,7 +86,7 @@ def table_without_histories(
     num_frames: int,
     padding: Padding,
 ) -> FrameTable:
-    """Fills what precedes a sequence, and says which windows are those that acting would see.
+    """Pads before sequences, and marks the windows that are the same as in acting.
 
     All shapes are static.
 
@@ -107,7 +107,7 @@ def table_without_histories(
 
 
 def find_starts(is_init: Tensor, ends: Sequence[Tensor]) -> Tensor:
-    """Finds where sequences begin: at the first step, at episodes, and after a step that is done.
+    """Finds where sequences begin: at the first step, at episode starts, and after done steps.
 
     TorchRL's `SliceSampler` marks the last step of each slice as done, so this also finds the
     slices of a flat batch.

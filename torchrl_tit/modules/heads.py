@@ -65,23 +65,25 @@ def make_actor(
         action_spec: spec of the action, such as ``env.action_spec_unbatched``.
         in_key: key of the features [..., F].
         action_key: key of the action.
-        mask_key: key of the action mask, bool, True where an action is allowed; the components of
-            an action one after the other. Others have probability 0. None allows all.
-        batch_dims: number of batch dimensions of ``action_spec``, whose others are those of an
-            action. By default, those before the last dimension of ``OneHot``, ``MultiOneHot`` and
-            ``MultiCategorical`` specs, all of a ``Categorical`` spec, none of others.
-        gain: of the initial weights. Small ones start with almost the same probabilities in all
-            states (arXiv 2006.05990 recommends that); 1 starts with a policy that differs by state.
+        mask_key: key of the action mask, bool, True where an action is allowed; the masks of an
+            action's components are concatenated. Masked actions have probability 0. None allows
+            all.
+        batch_dims: number of batch dimensions of ``action_spec``; the others are an action's. By
+            default, all but the last dimension of ``OneHot``, ``MultiOneHot`` and
+            ``MultiCategorical`` specs, all of a ``Categorical`` spec, none of other specs.
+        gain: gain of the initial weights. With a small gain, the initial policy has almost the same
+            probabilities in all states (recommended by arXiv 2006.05990); with 1, it differs by
+            state.
 
     Returns:
         A :class:`~torchrl.modules.ProbabilisticActor` that writes the action and its
-        log-probability [...] and follows TorchRL's exploration type: random, or the most likely
-        action under ``ExplorationType.DETERMINISTIC``. With a mask, it raises ValueError where
+        log-probability [...] and follows TorchRL's exploration type: it samples, or takes the most
+        likely action under ``ExplorationType.DETERMINISTIC``. With a mask, it raises ValueError if
         no action is allowed.
 
     Raises:
-        ValueError: for any other action space; if it is not clear which dimensions are batch; or
-            if actions that have no mask are to be masked.
+        ValueError: for any other action space; if the batch dimensions are ambiguous; or if a mask
+            is given for actions that cannot be masked.
 
     Example:
         >>> from tensordict import TensorDict
@@ -143,11 +145,11 @@ def make_value(features_dim: Size, *, in_key: NestedKey = "features") -> ValueOp
 
 
 class _Parts(NamedTuple):
-    """What an actor consists of."""
+    """The parts of an actor."""
 
     network: nn.Module
     parameters: dict[str, str]
-    """Keys of what the network writes, by the distribution's name for it."""
+    """Keys that the network writes, by the name of the distribution's parameter."""
     distribution: type[distributions.Distribution]
     settings: dict[str, Any]
 
@@ -155,7 +157,7 @@ class _Parts(NamedTuple):
 def _choices(
     features_dim: int, spec: Categorical | OneHot, shape: torch.Size, mask_key: NestedKey | None
 ) -> _Parts:
-    """Parts for actions of which each component is one of several options."""
+    """Parts for actions whose components each are one of several options."""
     distribution: type[distributions.Distribution]
     settings: dict[str, Any]
     sizes = numbers_of_options(spec, shape)
@@ -169,7 +171,7 @@ def _choices(
         distribution = IndependentCategorical
         settings = {"event_dim": len(shape), "dtype": spec.dtype}
     elif mask_key is not None:
-        # Its cross-entropy takes no samples of samples, which compiled losses draw.
+        # Its cross-entropy does not support several samples at once, which compiled losses draw.
         distribution, settings = MaskedCategorical, {"use_cross_entropy": False}
     else:
         # Validating logits and samples takes a third of the head's time at each step.
@@ -180,7 +182,7 @@ def _choices(
 
 
 def _switches(features_dim: int, spec: Binary, shape: torch.Size) -> _Parts:
-    """Parts for actions of which each component is on or off."""
+    """Parts for actions whose components each are on or off."""
     layer = nn.Linear(features_dim, math.prod(shape))
     network = layer if len(shape) == 1 else nn.Sequential(layer, _Fit(shape))
     settings = {"event_dim": len(shape), "dtype": spec.dtype}
@@ -208,7 +210,7 @@ class _Fit(nn.Module):
         self.dtype = dtype
 
     def forward(self, tensors: Tensor | tuple[Tensor, ...]) -> Tensor | tuple[Tensor, ...]:
-        """[..., entries] -> [..., *shape], of one tensor or of each."""
+        """[..., entries] -> [..., *shape], for one tensor or each of several."""
         if isinstance(tensors, Tensor):
             dtype = tensors.dtype if self.dtype is None else self.dtype
             return tensors.reshape((*tensors.shape[:-1], *self.shape)).to(dtype)
@@ -222,7 +224,7 @@ class _ChoicesHead(nn.Module):
         features_dim: size of the features.
         sizes: number of options of each component.
         shape: the components' shape.
-        mask_key: key of the action mask, for messages; None if there is none.
+        mask_key: key of the action mask, for error messages; None if there is none.
     """
 
     def __init__(
@@ -231,7 +233,7 @@ class _ChoicesHead(nn.Module):
         super().__init__()
         self.linear = nn.Linear(features_dim, sum(sizes))
         self.mask_key = mask_key
-        # Which logit belongs to each option of each component; the one behind the last to none.
+        # The logit of each option of each component; the index after the last stands for none.
         columns = torch.full((len(sizes), max(sizes)), sum(sizes))
         for row, numbers in zip(columns, torch.arange(sum(sizes)).split(sizes), strict=True):
             row[: len(numbers)] = numbers
@@ -258,7 +260,7 @@ class _ChoicesHead(nn.Module):
     def _check_allowed(self, allowed: Tensor) -> None:
         transformed = torch._C._functorch.peek_interpreter_stack() is not None
         if torch.compiler.is_compiling() or transformed:
-            return  # neither can depend on values
+            return  # neither supports control flow that depends on values
         possible = allowed.any(-1)
         if not possible.all():
             where = (~possible).nonzero()[0].tolist()

@@ -10,8 +10,8 @@ class ManyActions(TensorDictModuleBase):
     """Makes a Q network evaluate several actions in each state.
 
     In a sequence of modules, those before the first one that reads the action (a backbone, for
-    example) run once a state, and their outputs are expanded over the actions. TorchRL's losses
-    repeat the state instead, and run the whole network once an action.
+    example) run once per state, and their outputs are expanded over the actions. TorchRL's losses
+    repeat the state instead, and run the whole network once per action.
 
     Args:
         qvalue_network: reads entries of the state [*batch, ...] and an action [*batch, A], and
@@ -60,8 +60,8 @@ class ManyActions(TensorDictModuleBase):
         later = [key for module in modules[first:] for key in module.in_keys]
         states = states.select(*later, strict=False)  # expanding copies, and histories are large
         shape = (*tensordict.shape, action.shape[-2])
-        # One batch dimension: linear layers return views of flat products for several, and autograd
-        # copies a view that is written in place, as by an in-place ReLU.
+        # One batch dimension: for several, linear layers return views of flat products, and
+        # autograd copies a view that is modified in place, for example by an in-place ReLU.
         each = states.unsqueeze(-1).expand(shape).reshape(-1)
         each.set(self.action_key, action.flatten(0, -2))
         for module in modules[first:]:

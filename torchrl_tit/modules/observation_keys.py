@@ -12,12 +12,12 @@ def history_keys(observation: object) -> list[NestedKey]:
     """Names the histories of a task's observations: the ``in_keys`` of a backbone.
 
     Args:
-        observation: what a network is built from: the shape or the spec of the only observation,
+        observation: the argument that builds a network: the shape or spec of the only observation,
             or those of several by name (a mapping or a ``Composite``), as
             :func:`~torchrl_tit.envs.observation_specs` returns them.
 
     Returns:
-        ``"history"`` of the only observation, or ``("history", NAME)`` of each.
+        ``"history"`` for the only observation, or ``("history", NAME)`` for each.
 
     Example:
         >>> history_keys((4,)), history_keys({"image": (3, 84, 84), "state": (4,)})

@@ -12,7 +12,7 @@ def as_words(frames: Tensor) -> Tensor:
     """Views the bytes of frames as the widest integers that fit.
 
     Two frames are equal as integers if and only if they have the same bytes: NaN equals itself, and
-    0.0 differs from -0.0. This compares images several times as fast as byte by byte.
+    0.0 differs from -0.0. This compares images several times faster than byte by byte.
 
     Args:
         frames: [..., entries] of any dtype; copied only if not contiguous or not aligned.
@@ -37,10 +37,10 @@ def as_words(frames: Tensor) -> Tensor:
 def all_same(tensor: Tensor, other: Tensor) -> bool:
     """Returns whether two tensors of the same shape and dtype have the same values.
 
-    On a CPU, NumPy compares strided arrays several times as fast as ``torch.equal``.
+    On a CPU, NumPy compares strided arrays several times faster than ``torch.equal``.
 
     Args:
-        tensor: of any shape, and a dtype that NumPy has too.
+        tensor: of any shape, with a dtype that NumPy also has.
         other: of the same shape and dtype.
 
     Example:

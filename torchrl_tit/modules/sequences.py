@@ -25,10 +25,10 @@ from torchrl_tit.windows import Padding
 
 @dataclass(frozen=True)
 class SequenceKeys:
-    """Where a backbone finds what it reads of sequences.
+    """The keys that a backbone reads from sequences.
 
     Raises:
-        ValueError: if there is not one observation for each history, or the padding is unknown.
+        ValueError: if the numbers of observations and histories differ, or the padding is unknown.
     """
 
     histories: list[NestedKey]
@@ -38,7 +38,7 @@ class SequenceKeys:
     context: list[NestedKey]
     """Keys of the history encoder's further inputs."""
     padding: Padding | None
-    """What precedes an episode; None if the stored histories tell."""
+    """Padding before an episode; None to read the stored histories instead."""
 
     def __post_init__(self) -> None:
         if len(self.observations) != len(self.histories):
@@ -64,7 +64,7 @@ class SequenceKeys:
 
         Args:
             tensordict: the sequences.
-            trunks: the networks that read them; empty if these are other modules.
+            trunks: the networks that read them; empty for other modules.
 
         Returns:
             The table, with windows [N, T, K], and the further inputs, [N, T, K, *entry] each.

@@ -1,4 +1,4 @@
-"""Keeps the last entries of a sequence by writing one entry a step."""
+"""Keeps the last entries of a sequence by writing one entry per step."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class SlidingWindow:
 
     def __init__(self, entries: Tensor) -> None:
         self._count = entries.shape[1]
-        # Room for 2 M entries: they move to the front only when the end is reached.
+        # Room for 2 M entries, so that they move to the front only when the end is reached.
         self._room = entries.new_empty(len(entries), 2 * self._count, *entries.shape[2:])
         self._room[:, : self._count] = entries
         self._start = 0

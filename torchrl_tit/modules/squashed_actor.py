@@ -37,8 +37,8 @@ def make_squashed_actor(
         A :class:`~torchrl.modules.ProbabilisticActor` that follows TorchRL's exploration type.
 
     Raises:
-        ValueError: if the actions are not continuous and bounded, or there is nothing between the
-            bounds.
+        ValueError: if the actions are not continuous and bounded, or the bounds enclose no
+            interval.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""TensorDict's modules without the search for pandas that they make for each output."""
+"""TensorDict's modules, without their search for pandas at each output."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from torchrl.modules import ValueOperator
 class TensorModule(TensorDictModule):
     """A :class:`~tensordict.nn.TensorDictModule` that writes tensors as they are.
 
-    TensorDict 0.14 asks of each output whether it is a data frame, and for that whether pandas is
-    installed: a search of all folders of packages, 0.1 ms, at every call of a module that is not
-    compiled (docs/upstream/tensordict.md).
+    TensorDict 0.14 checks whether each output is a data frame, and therefore whether pandas is
+    installed. This searches all package folders, which takes 0.1 ms, at every call of a module that
+    is not compiled (docs/upstream/tensordict.md).
 
     Example:
         >>> import torch
@@ -45,4 +45,4 @@ class TensorModule(TensorDictModule):
 
 
 class TensorValue(TensorModule, ValueOperator):
-    """A :class:`~torchrl.modules.ValueOperator`, likewise."""
+    """A :class:`~torchrl.modules.ValueOperator` that writes tensors as they are."""

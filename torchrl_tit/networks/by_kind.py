@@ -25,23 +25,23 @@ def frames_by_kind(
 ) -> dict[str, FrameSettings]:
     """Chooses the settings of the frame encoder of each observation.
 
-    ``network.frames`` names those of some observations. A single other observation has
-    ``network.frame``. Of several, each has the first of these that can read it, all of the same
-    width:
+    ``network.frames`` gives those of some observations. If one other observation is left, it gets
+    ``network.frame``. If several are left, each gets the first of these that can read it, all of
+    the same width:
 
     1. ``network.frame``, unless it is flat: flat frames are as wide as their observations, so they
-       cannot stand side by side;
+       cannot be concatenated;
     2. the same with the patch size "auto";
-    3. of arrays and categories, a linear layer; of images, NatureCNN, or an inner transformer if
-       they have less than 36 pixels a side.
+    3. for arrays and categories, a linear layer; for images, NatureCNN, or an inner transformer if
+       they have fewer than 36 pixels per side.
 
     Args:
         network: settings of the network.
         observation: shape or spec of an observation, or of each by name if there are several.
 
     Raises:
-        ValueError: if ``network.frames`` names an observation that there is not, or nothing can
-            read an observation; the message names it and its kind.
+        ValueError: if ``network.frames`` names an observation that does not exist, or no encoder
+            can read an observation; the message names it and its kind.
 
     Example:
         >>> from torchrl.data import MultiCategorical
@@ -147,7 +147,7 @@ def _candidates(
 
 
 def _too_many_patches(patch_size: object, observation: Observation) -> bool:
-    """Whether a patch that is meant for other observations splits an image too finely."""
+    """Whether a patch size meant for other observations splits an image too finely."""
     if observation.kind != "image" or not isinstance(patch_size, int):
         return False
     height, width = observation.shape[-2:]
@@ -155,16 +155,16 @@ def _too_many_patches(patch_size: object, observation: Observation) -> bool:
 
 
 def _try(frame: FrameSettings, observation: Observation) -> FrameEncoder | ValueError:
-    """Builds an encoder, or returns what it says if it cannot read the observation.
+    """Builds an encoder, or returns its error if it cannot read the observation.
 
     Raises:
-        BrokenEncoderError: if it is not that, but an encoder that cannot be built.
+        BrokenEncoderError: if the encoder cannot be built for any observation.
     """
     try:
         try:
             with torch.device("meta"):
                 return build_frame(frame, observation)
-        except (NotImplementedError, RuntimeError):  # needs numbers, as one does that loads weights
+        except (NotImplementedError, RuntimeError):  # needs real tensors, to load weights
             with torch.random.fork_rng(devices=[]):
                 return build_frame(frame, observation)
     except BrokenEncoderError:

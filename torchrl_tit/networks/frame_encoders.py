@@ -1,4 +1,4 @@
-"""Builds the frame encoders of a network, and finds out early if one does not keep its contract."""
+"""Builds the frame encoders of a network, and detects early if one breaks its contract."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def build_frames(
 
     Raises:
         ValueError: if an observation has no frame encoder, or one that cannot read it, or one that
-            does not write the tokens that it promises.
+            does not output the tokens that it promises.
     """
     frames = frame if isinstance(frame, Mapping) else dict.fromkeys(observations, frame)
     if frames.keys() != observations.keys():
@@ -60,7 +60,7 @@ def build_frame(frame: settings.FrameSettings, observation: Observation) -> Fram
     if observation.categories is None:
         encoder = build_part(frame, observation.shape)
     else:
-        # A function that builds encoders says nothing of kinds.
+        # A function that builds encoders does not declare kinds.
         _check_kind(getattr(settings.resolve(frame.builds), "kinds", ()), frame, observation)
         encoder = build_part(frame, observation.shape, categories=observation.categories)
     if is_own(encoder):
@@ -72,7 +72,7 @@ def build_frame(frame: settings.FrameSettings, observation: Observation) -> Fram
 
 
 def module_names(names: Iterable[str]) -> list[str]:
-    """Returns names of observations as those of modules, which are unique and have no dots.
+    """Turns names of observations into names of modules, which are unique and have no dots.
 
     Example:
         >>> module_names(["arm/left", "arm.left", "arm_left", "values"])

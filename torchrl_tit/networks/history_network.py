@@ -1,4 +1,4 @@
-"""The one idea of this library: a frame encoder, then a history encoder, then a head."""
+"""The core of this library: a frame encoder, then a history encoder, then a head."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class HistoryNetwork(nn.Module):
                 )
         self.num_frames = num_frames
         self.observations = read_observations(observation_shape)
-        """What the network reads, by name."""
+        """The observations that the network reads, by name."""
         encoders = build_frames(frame, self.observations)
         self.frame_settings = (
             dict(frame) if isinstance(frame, Mapping) else dict.fromkeys(encoders, frame)
@@ -162,14 +162,14 @@ class HistoryNetwork(nn.Module):
         *context: Tensor,
         every_frame: bool = False,
     ) -> Tensor:
-        """Maps windows on a table of frames to features, and encodes each frame of it once.
+        """Maps windows on a table of frames to features, encoding each frame once.
 
         The features and gradients are those of ``forward(*(windows.gather(x) for x in frames))``,
         up to rounding, at a cost that hardly grows with K. Dropout in the frame encoder is drawn
-        once a frame, not once for each window that the frame is part of.
+        once per frame, not once for each window that contains it.
 
         Args:
-            frames: of each observation, [R, *observation_shape].
+            frames: the table of each observation, [R, *observation_shape].
             windows: the rows of each window, [..., K].
             *context: further inputs of the history encoder, [..., K, *entry] each.
             every_frame: return the features of every frame of a window (see ``every_frame``).
@@ -187,7 +187,7 @@ class HistoryNetwork(nn.Module):
             torch.Size([32, 64])
         """
         self.check_frames(*frames)
-        if windows.missing is not None:  # what stands for a missing frame is encoded like any other
+        if windows.missing is not None:  # the padding frame is encoded like any other
             last = frames[0].shape[0]
             frames = [torch.cat([x, torch.zeros_like(x[:1])]) for x in frames]
             windows = Windows(windows.rows.masked_fill(windows.missing, last), None)
@@ -216,11 +216,11 @@ class HistoryNetwork(nn.Module):
     def step(
         self, histories: Sequence[Tensor], state: dict[str, Tensor], is_init: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Reads the newest frame and the state before it, if the network is recurrent.
+        """Reads the newest frame and the previous state; only for recurrent networks.
 
         Args:
             histories: [*B, 1, *observation_shape] each.
-            state: of the history encoder, before the step.
+            state: the history encoder's state before the step.
             is_init: bool [*B, 1], True where an episode begins.
 
         Returns:
@@ -242,7 +242,8 @@ class HistoryNetwork(nn.Module):
     def attention_maps(self, *inputs: Tensor) -> AttentionMaps:
         """Returns the attention weights of every inner and outer block.
 
-        This is a separate pass, because the usual one does not compute all attention weights.
+        This is a separate forward pass, because the usual one does not compute all attention
+        weights.
 
         Args:
             *inputs: as in ``forward``.
@@ -289,13 +290,13 @@ class HistoryNetwork(nn.Module):
 
     @property
     def keeps_frames(self) -> bool:
-        """Whether keeping tokens saves work: frames are encoded, and histories have several."""
+        """Whether caching tokens saves work: frames are encoded, and histories have several."""
         encodes = not all(isinstance(encoder, Flat) for encoder in self.frames)
         return encodes and self.num_frames > 1
 
     @property
     def carries_state(self) -> bool:
-        """Whether a state is carried from step to step instead of reading several frames."""
+        """Whether the network carries a state between steps instead of reading several frames."""
         return self.history_encoder.is_recurrent and self.num_frames == 1
 
     @property
@@ -342,8 +343,8 @@ def build_network(
         network: the settings.
         observation: shape or spec of an observation, or of each by name if there are several.
         action_dim: entries of an action, for history encoders that read actions.
-        trunks: "shared" builds one network even if the settings say two: for an actor with separate
-            critics, say.
+        trunks: "shared" builds one network even if the settings ask for two, for example for an
+            actor with separate critics.
 
     Raises:
         ValueError: if the two encoders do not fit each other or the observation (see
@@ -465,7 +466,7 @@ def _history_shape(
 
 
 def _build_history(history: settings.HistorySettings, shape: HistoryShape) -> HistoryEncoder:
-    """Builds the history encoder; raises ValueError if it does not keep its contract."""
+    """Builds the history encoder; raises ValueError if it breaks its contract."""
     encoder = build_part(history, shape)
     if is_own(encoder):
         check_contract(encoder, HistoryEncoder, ("shape", "out_features"), history)

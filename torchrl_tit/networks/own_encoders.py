@@ -1,4 +1,4 @@
-"""Finds out early if an encoder from outside this library does not keep its contract."""
+"""Detects early if an encoder from outside this library breaks its contract."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape
 
 
 class BrokenEncoderError(ValueError):
-    """An encoder that cannot be built, whatever it is to read."""
+    """An encoder that cannot be built, whatever the observation."""
 
 
 def build_part(part: settings.Part, *args: Any, **kwargs: Any) -> Any:
-    """Builds what settings describe.
+    """Builds the encoder that settings describe.
 
     Raises:
         BrokenEncoderError: if it cannot be built, with the reason in one line.
@@ -40,7 +40,7 @@ def build_part(part: settings.Part, *args: Any, **kwargs: Any) -> Any:
         raise
     except Exception as error:  # a user's constructor can raise anything
         if torch.empty(0).is_meta and isinstance(error, (NotImplementedError, RuntimeError)):
-            raise  # it may need numbers
+            raise  # it may need real tensors
         hint = ": call super().__init__ first" if "before Module.__init__()" in str(error) else ""
         raise BrokenEncoderError(f"{called} cannot be built: {_reason(error)}{hint}") from error
 
@@ -53,7 +53,7 @@ def is_own(encoder: object) -> bool:
 def check_contract(
     encoder: Any, base: type[nn.Module], attributes: Sequence[str], part: settings.Part
 ) -> None:
-    """Raises BrokenEncoderError without a base class, its constructor or a ``forward``."""
+    """Raises BrokenEncoderError without the base class, its ``__init__`` call or a ``forward``."""
     cls: Any = type(encoder)
     if not isinstance(encoder, base):
         raise BrokenEncoderError(
@@ -75,7 +75,7 @@ def check_contract(
 
 
 def check_tokens(encoder: FrameEncoder, observation: Observation) -> None:
-    """Encodes zeros once, and raises ValueError if these do not become the promised tokens."""
+    """Encodes zeros once, and raises ValueError if the outputs are not the promised tokens."""
     cls = type(encoder).__name__
     if encoder.observation_shape != observation.shape:
         raise ValueError(
@@ -92,7 +92,7 @@ def check_tokens(encoder: FrameEncoder, observation: Observation) -> None:
 
 
 def check_features(encoder: HistoryEncoder, shape: HistoryShape) -> None:
-    """Encodes zeros once, and raises ValueError if these do not become the promised vector."""
+    """Encodes zeros once, and raises ValueError if the output is not the promised vector."""
     if encoder.context or (encoder.is_recurrent and shape.num_frames == 1):
         return  # it reads more than tokens
     _check_output(
@@ -131,7 +131,7 @@ def _reason(error: Exception) -> str:
 
 @contextmanager
 def _evaluating(module: nn.Module) -> Iterator[None]:
-    """Switches dropout off and leaves batch statistics and the random numbers as they are."""
+    """Switches dropout off, and leaves batch statistics and random generators unchanged."""
     modes = {child: child.training for child in module.modules()}
     module.eval()
     try:

@@ -31,7 +31,7 @@ class System(HistoryNetwork):
     """
 
     system: ClassVar[Callable[..., settings.Network]]
-    """The function."""
+    """The function that describes the network."""
 
     def __init__(
         self,

@@ -18,13 +18,13 @@ class LikelihoodBCLoss(BCLoss):
 
         loss_bc  -log pi(a | s)
 
-    `BCLoss` of TorchRL 0.14.1 passes the action that a policy has drawn to a cross-entropy if
-    actions are integers, where the logits belong, and runs a stochastic policy twice if they are
-    not. This loss asks the policy for its distribution, in one pass.
+    `BCLoss` of TorchRL 0.14.1 passes the sampled action, instead of the logits, to the
+    cross-entropy if actions are integers; if they are not, it runs a stochastic policy twice. This
+    loss gets the policy's distribution in one pass.
 
     Args:
         actor_network: a policy with ``get_dist``, such as a `ProbabilisticActor`.
-        reduction: of the losses of a batch.
+        reduction: how to reduce the losses of a batch.
 
     Raises:
         ValueError: if there is no such ``reduction``, or the policy has no ``get_dist``.

@@ -38,7 +38,7 @@ def contrastive_prediction_loss(
         The mean over the masked steps, float []; 0 if none is masked.
 
     Raises:
-        ValueError: if shapes do not fit, or the temperature is not positive.
+        ValueError: if shapes do not match, or the temperature is not positive.
 
     Example:
         >>> encodings, mask = torch.eye(6).view(2, 3, 6), torch.tensor([[True, False, False]] * 2)
@@ -63,5 +63,5 @@ def contrastive_prediction_loss(
     agreement = F.kl_div(log_p_x, log_p_y.detach(), reduction="none", log_target=True).sum(-1)
     loss = agreement - log_p_x.diagonal() - log_p_y.diagonal()  # [N * K]
     masked = mask.flatten()
-    # Selecting rows would make a shape depend on data, which cannot be compiled.
+    # Selecting rows would make shapes depend on the data, which cannot be compiled.
     return torch.where(masked, loss, 0).sum() / masked.sum().clamp(min=1)

@@ -42,32 +42,32 @@ class ContinuousCQLLoss(CQLLoss):
     `CQLLoss` of TorchRL 0.14.1 takes a separate logsumexp over 3 values for each of the m samples,
     evaluates the actions sampled at s' in s' instead of in s, samples the action of the target,
     requires that critics read the same entries as the actor, and runs the actor on m copies of each
-    state. Here the actor runs once a state, its distribution is sampled m times, and the modules of
-    a critic that do not read the action run once a state.
+    state. Here the actor runs once per state, its distribution is sampled m times, and the modules
+    of a critic that do not read the action run once per state.
 
     A batch is single transitions [B], or slices [N, T] of consecutive ones with "is_init", as
     :class:`~torchrl_tit.datasets.HistoryStorage` makes them: the loss is the same mean over
-    transitions, and backbones encode each frame of a slice once. The actor encodes the frames that
-    s and s' share once in any case, see :func:`~torchrl_tit.objectives.encode_pairs`.
+    transitions, and backbones encode each frame of a slice once. In either case, the actor encodes
+    the frames that s and s' share once, see :func:`~torchrl_tit.objectives.encode_pairs`.
 
-    The terms are meant to be optimized one after the other, in this order, on the samples of one
-    pass: :meth:`alpha_loss`, :meth:`critic_losses`, :meth:`actor_loss`. Each then sees the weights
-    that the optimizers before it have updated. ``forward`` computes all terms at once.
+    Optimize the terms one after the other, in this order, on the samples of one pass:
+    :meth:`alpha_loss`, :meth:`critic_losses`, :meth:`actor_loss`. Each then sees the weights that
+    the previous optimizers have updated. ``forward`` computes all terms at once.
 
     Args:
         actor_network: policy whose distribution has a ``deterministic_sample``, such as that of
             :func:`~torchrl_tit.modules.make_squashed_actor`.
         qvalue_network: reads any keys (those under "next" for the target) and the action, and
             writes "state_action_value", float [..., 1]. Either two critics, which keep their
-            initial weights, or one, which TorchRL duplicates and initialises anew.
+            initial weights, or one, which TorchRL duplicates and reinitialises.
         action_spec: bounds of an action, a ``Bounded`` spec of shape [A].
         min_q_weight: weight w of the conservative term.
         num_random: number m of samples of each kind.
         over_critics: whether the conservative term is the mean over the critics, as in d3rlpy
             1.1.1, or their sum, as in d3rlpy since 2.5.
         alpha_init: initial temperature.
-        target_entropy: target of the temperature; "auto" is minus the number of entries of an
-            action.
+        target_entropy: entropy that the temperature aims for; "auto" is minus the number of entries
+            of an action.
         loss_function: distance to the target; "l2" is the square.
         deactivate_vmap: whether to run the critics one after the other, for networks that vmap
             does not support.
@@ -215,9 +215,9 @@ class ContinuousCQLLoss(CQLLoss):
 
         Args:
             tensordict: a batch [*B].
-            samples: of :meth:`sample_policy`.
-            chunk_size: states at a time, each with its 3m + 1 actions; whole slices of them if the
-                batch is [N, T].
+            samples: from :meth:`sample_policy`.
+            chunk_size: number of states at a time, each with its 3m + 1 actions; whole slices of
+                states if the batch is [N, T].
 
         Returns:
             The values of :meth:`critic_losses`, detached.
@@ -308,7 +308,7 @@ class ContinuousCQLLoss(CQLLoss):
         """The two losses over some states of a batch, for one critic or all of them.
 
         Args:
-            values: of the actions, float [*b, 3m + 1] or [critics, *b, 3m + 1].
+            values: the actions' values, float [*b, 3m + 1] or [critics, *b, 3m + 1].
             batch: these states, [*b].
             num_states: number of states of the whole batch.
         """

@@ -11,7 +11,7 @@ from torch import Tensor
 
 
 class PolicySamples(NamedTuple):
-    """What all terms of the loss share: one pass of the actor over a batch, at s and at s'.
+    """Samples that all terms of the loss share: one pass of the actor over a batch, at s and s'.
 
     States [*B], m samples of each distribution, A entries of an action.
     """
@@ -30,10 +30,10 @@ class PolicySamples(NamedTuple):
 
 @dataclass(frozen=True)
 class CriticBatch:
-    """What the critics evaluate: in states [*B] 3m sampled actions each, and the action taken."""
+    """The critics' inputs: states [*B] with 3m sampled actions each, and the action taken."""
 
     inputs: TensorDictBase
-    """What the critics read; the actions are float [*B, 3m + 1, A], the action taken last."""
+    """The critics' input entries; the actions are float [*B, 3m + 1, A], the action taken last."""
     log_density: Tensor
     """Log densities of the sampled actions; float [*B, 3m]."""
     target: Tensor

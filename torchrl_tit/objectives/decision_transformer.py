@@ -14,10 +14,10 @@ from torchrl_tit.settings.arguments import checked_arguments
 
 
 class MaskedDTLoss(DTLoss):
-    """TorchRL's `DTLoss` over the steps that are not padding.
+    """TorchRL's `DTLoss`, restricted to the steps that are not padding.
 
-    `DTLoss` counts padding unless its ``loss_mask_key`` is set, as it is here, and has no loss for
-    discrete actions, which ``loss_function="cross_entropy"`` adds. The mean is taken over all
+    `DTLoss` includes padding unless its ``loss_mask_key`` is set, as it is here. It has no loss for
+    discrete actions; this class adds ``loss_function="cross_entropy"``. The mean is taken over all
     entries of all unmasked actions.
 
     Args:
@@ -26,14 +26,14 @@ class MaskedDTLoss(DTLoss):
         loss_function: "l2", "l1" or "smooth_l1" between continuous actions [..., K, A], or
             "cross_entropy" between logits and discrete ones, integers [..., K] or one-hot.
         mask_key: Key of the mask, bool [..., K], False at padding.
-        reduction: Of the losses of the steps.
+        reduction: How to reduce the losses of the steps.
 
     Returns:
         In ``forward``, a tensordict with "loss", float [].
 
     Raises:
         ValueError: if there is no such ``loss_function`` or ``reduction``.
-        TypeError: in ``forward``, if it does not fit the actions of the batch.
+        TypeError: in ``forward``, if the loss function does not suit the actions of the batch.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3.
 
@@ -85,7 +85,7 @@ class MaskedDTLoss(DTLoss):
             logits = self.actor_network(tensordict).get(self.tensor_keys.action_pred)
         if target.ndim == logits.ndim:  # one-hot
             target = target.to(torch.int8).argmax(-1)
-        # Padding is negative, which is not a class; whatever replaces it is masked below.
+        # Padding is negative, which is not a valid class; its replacement is masked below.
         classes = target.long().clamp(min=0)
         loss = F.cross_entropy(logits.flatten(0, -2), classes.flatten(), reduction="none")
         loss = self._reduce_loss(loss.view_as(classes), tensordict=tensordict)

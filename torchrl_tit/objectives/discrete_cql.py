@@ -25,15 +25,15 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
     estimator as ``params``, which the estimator ignores, so its target is computed with Q. In
     addition to what `DiscreteCQLLoss` writes into the batch, this loss writes the value at s'.
 
-    A batch is single transitions [B], or slices [N, T] of consecutive ones with "is_init", of which
-    a backbone encodes each frame once. In single ones s and s' share no work: they are evaluated
-    with different weights.
+    A batch is single transitions [B], or slices [N, T] of consecutive ones with "is_init", where a
+    backbone encodes each frame once. In single transitions, s and s' share no work, because they
+    are evaluated with different weights.
 
     Args:
         value_network: writes "action_value", float [..., n], and "chosen_action_value", float
             [..., 1].
         loss_function: distance to the target; "l2" is the square.
-        reduction: of the losses of a batch.
+        reduction: how to reduce the losses of a batch.
         **settings: passed to `DiscreteCQLLoss`: ``action_space``.
 
     Raises:
@@ -83,7 +83,7 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Chooses how targets are computed; see TorchRL's `LossModule.make_value_estimator`."""
         super().make_value_estimator(value_type, **hyperparams)
-        self.value_estimator.value_network = None  # which would use the trained weights
+        self.value_estimator.value_network = None  # it would use the trained weights
 
     def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The squared error of a batch [*B], float [], and mean values to log."""

@@ -20,15 +20,15 @@ class NextFrameLoss(nn.Module):
     A token's loss is one minus the cosine of prediction and target, as in SPR (Schwarzer et al.,
     arXiv 2007.05929) with one step and without augmentation. The targets come from a slowly moving
     copy of the frame encoders, :math:`\bar\theta \leftarrow d\,\bar\theta + (1 - d)\,\theta`: with
-    the encoders themselves, tokens that are all the same would be a solution. The TIT paper names
-    such losses as future work (arXiv 2212.14538, appendix).
+    the encoders themselves, identical tokens would be a trivial solution. The TIT paper names such
+    losses as future work (arXiv 2212.14538, appendix).
 
     Args:
         frames: the frame encoder of each observation; their tokens have one width.
         features_dim: size F of the features.
         action_dim: entries A of an action; categories are one-hot.
         hidden_dim: width of the predictor's hidden layer.
-        decay: share d of the copy's weights that :meth:`update_target` keeps.
+        decay: fraction d of the copy's weights that :meth:`update_target` keeps.
 
     Example:
         >>> from torchrl_tit import EnhancedTIT
@@ -58,12 +58,12 @@ class NextFrameLoss(nn.Module):
     def forward(
         self, features: Tensor, actions: Tensor, observations: Sequence[Tensor], is_init: Tensor
     ) -> Tensor:
-        """Compares predictions with the next step's tokens, except across episodes.
+        """Compares predictions with the next step's tokens, within episodes only.
 
         Args:
             features: float [N, T, F].
             actions: float [N, T, A].
-            observations: of each frame encoder, [N, T, *observation_shape].
+            observations: one tensor per frame encoder, [N, T, *observation_shape].
             is_init: bool [N, T], True where an episode begins.
 
         Returns:
@@ -95,7 +95,7 @@ class NextFrameLoss(nn.Module):
 class ReconstructionLoss(nn.Module):
     """Reconstructs the current observation from the features.
 
-    Autoencoders of observations beside RL: Lange and Riedmiller, IJCNN 2010; Yarats et al., arXiv
+    Autoencoders of observations in RL: Lange and Riedmiller, IJCNN 2010; Yarats et al., arXiv
     1910.01741.
 
     Args:

@@ -1,4 +1,4 @@
-"""Features at s and at s', which share all frames of their windows but one."""
+"""Features at s and at s', whose windows share all frames but one."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from torchrl_tit.windows import Windows
 def encode_pairs(
     network: TensorDictModuleBase, tensordict: TensorDictBase
 ) -> tuple[TensorDictBase, TensorDictBase]:
-    """Runs a network's backbones at s and, without gradient, at s', and encodes each frame once.
+    """Runs a network's backbones at s and, without gradient, at s', encoding each frame once.
 
-    The window at s' is that at s, moved by one observation. So of s' only the newest frame is
+    The window at s' is the one at s, moved by one observation. So only the newest frame of s' is
     encoded, without storing activations; the other tokens are those of s, detached. Features and
     gradients are those of two separate calls, up to rounding. Dropout in a frame encoder is drawn
-    once a frame, so s and s' see the same noise on the frames that they share.
+    once per frame, so s and s' see the same noise on the frames that they share.
 
     Run the network on the results within ``tensordict.nn.set_skip_existing(True)``, which skips the
     backbones, or get its distribution with :func:`get_dist`. Backbones without a frame encoder, and
-    those that carry a state, have nothing to share and are left to that call.
+    those that carry a state, have nothing to share and run in that call.
 
     Args:
         network: reads entries of a state; its weights can be functional (``params.to_module``).
@@ -41,7 +41,7 @@ def encode_pairs(
             Then "is_init", bool [*B, T, 1], is True where an episode begins.
 
     Returns:
-        What the network reads at s and at s', with the backbones' features.
+        The network's inputs at s and at s', with the backbones' features.
 
     Example:
         >>> from tensordict import TensorDict
@@ -73,13 +73,14 @@ def encode_pairs(
 
 
 def get_dist(policy: ProbabilisticTensorDictSequential, tensordict: TensorDictBase) -> Any:
-    """Gets the distribution of a policy, without the backbones whose features are there already.
+    """Gets a policy's distribution, skipping backbones whose features are already computed.
 
-    As ``policy.get_dist`` within ``set_skip_existing(True)``, which ``torch.compile`` cannot trace.
+    Like ``policy.get_dist`` within ``set_skip_existing(True)``, which ``torch.compile`` cannot
+    trace.
 
     Args:
         policy: modules in a sequence, the last of which makes the distribution.
-        tensordict: what it reads, or what :func:`encode_pairs` returns.
+        tensordict: the policy's inputs, or a result of :func:`encode_pairs`.
     """
     *modules, last = _in_sequence(policy)
     for module in modules:
@@ -91,23 +92,23 @@ def get_dist(policy: ProbabilisticTensorDictSequential, tensordict: TensorDictBa
 
 
 def _in_sequence(module: TensorDictModuleBase) -> list[Any]:
-    """Lists the modules of sequences of sequences."""
+    """Lists the modules of nested sequences."""
     if not isinstance(module, TensorDictSequential):
         return [module]
     return [inner for outer in module.module for inner in _in_sequence(outer)]
 
 
 class _Pairs(NamedTuple):
-    """The frames of the windows at s and at s', and where they are."""
+    """The frames of the windows at s and at s', and their rows."""
 
     frames: list[Tensor]
-    """Of each observation, those in windows at s; [R, *observation_shape]."""
+    """For each observation, the frames in windows at s; [R, *observation_shape]."""
     extra: list[Tensor]
-    """The other ones, which only s' sees; [E, *observation_shape]."""
+    """The other frames, which only s' sees; [E, *observation_shape]."""
     rows: Tensor
-    """Of each window at s, among the frames; int64 [..., K]."""
+    """Rows of each window at s, in ``frames``; int64 [..., K]."""
     next_rows: Tensor
-    """Of each window at s', among the frames with the extra ones behind; int64 [..., K]."""
+    """Rows of each window at s', in ``frames`` followed by ``extra``; int64 [..., K]."""
 
 
 def _lay_out(backbone: Backbone, trunk: HistoryNetwork, tensordict: TensorDictBase) -> _Pairs:
@@ -131,7 +132,7 @@ def _groups(tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]
 
 
 def _lay_out_single(histories: Sequence[Tensor], newest: Sequence[Tensor]) -> _Pairs:
-    """Lays out single transitions, in static shapes.
+    """Lays out single transitions, with static shapes.
 
     Args:
         histories: at s, [N, K, *observation_shape] each.
@@ -147,7 +148,7 @@ def _lay_out_single(histories: Sequence[Tensor], newest: Sequence[Tensor]) -> _P
 def _lay_out_slices(
     histories: Sequence[Tensor], newest: Sequence[Tensor], starts: Tensor
 ) -> _Pairs:
-    """Lays out slices: s' is mostly the s of the next step, whose newest frame is there already.
+    """Lays out slices: s' is mostly the s of the next step, whose newest frame is already there.
 
     Args:
         histories: at s, [N, T, K, *observation_shape] each.

@@ -1,4 +1,4 @@
-"""Arguments of public calls are checked as fields of settings are: by their annotations."""
+"""Checks arguments of public calls by their annotations, like the fields of settings."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ _PLAIN = (bool, float, int, str, NoneType)
 
 
 def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
-    """Makes a call fail at once, in one line, where an argument cannot mean anything.
+    """Makes a function check its arguments first, with an error message of one line.
 
-    Arguments are checked whose annotation is a number, a text, a choice (``Literal``) or several of
-    these; with the bounds that stand in it (:mod:`torchrl_tit.settings.numbers`). Others are left
-    to the function.
+    Arguments annotated as numbers, strings, choices (``Literal``) or unions of these are checked,
+    including the bounds in the annotation (:mod:`torchrl_tit.settings.numbers`). Others are left to
+    the function.
 
     Args:
-        function: what to check the arguments of; of a class, ``__init__``.
+        function: the function whose arguments to check; for a class, its ``__init__``.
 
     Raises:
-        ValueError: when it is called, if an argument is of another type, not finite or out of
-            bounds.
+        ValueError: when the function is called, if an argument has the wrong type, is not finite or
+            is out of bounds.
 
     Example:
         >>> from torchrl_tit.settings.numbers import Width
@@ -63,11 +63,11 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
         try:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:
-            return function(*args, **kwargs)  # which says it better
+            return function(*args, **kwargs)  # raises Python's own error
         for name, kind in kinds().items():
             if name in given:
                 value: Any = given[name]
-                # NumPy's numbers are as good as Python's.
+                # NumPy's numbers are accepted like Python's.
                 checked(name, value.item() if hasattr(value, "item") else value, kind)
         return function(*args, **kwargs)
 
@@ -75,7 +75,7 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def _is_plain(kind: Any) -> bool:
-    """Whether values of a type can be checked: numbers, texts, choices and unions of them."""
+    """Whether values of a type can be checked: numbers, strings, choices and unions of them."""
     if get_origin(kind) is Literal:
         return True
     if get_origin(kind) is Annotated:

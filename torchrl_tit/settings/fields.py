@@ -1,7 +1,7 @@
-"""The one check of settings: each field has its type, and lies within the bounds beside it.
+"""Checks that each field of the settings has its declared type and lies within its bounds.
 
-Bounds stand in the types of the fields (:mod:`torchrl_tit.settings.numbers`), so that settings say
-in one place what they accept. Every number is finite.
+Bounds are part of the fields' types (:mod:`torchrl_tit.settings.numbers`), so that each field
+declares in one place what it accepts. Every number must be finite.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ def check_fields(settings: object) -> None:
     """Checks the type and the bounds of each field.
 
     Args:
-        settings: a dataclass; nested ones have checked themselves.
+        settings: a dataclass; nested dataclasses have already checked themselves.
 
     Raises:
-        ValueError: if a field has another type, or lies out of its bounds.
+        ValueError: if a field has the wrong type or is out of bounds.
 
     Example:
         >>> from torchrl_tit.settings import Inner
@@ -43,7 +43,7 @@ def check_fields(settings: object) -> None:
                     f"field {name!r} must be settings of type {kind.__name__}, not "
                     f"{type(value).__name__}"
                 )
-        elif get_origin(kind) is not Mapping:  # PerKey has checked what it holds
+        elif get_origin(kind) is not Mapping:  # PerKey has already checked its values
             checked(name, value, kind)
 
 
@@ -62,12 +62,12 @@ def checked(name: str, value: object, kind: Any) -> Any:
     """Returns a value converted to a type.
 
     Args:
-        name: the field's full name, for messages.
+        name: the field's full name, for error messages.
         value: the value.
-        kind: the type, with bounds or not.
+        kind: the type, with or without bounds.
 
     Raises:
-        ValueError: if it is of another type, is no finite number, or lies out of its bounds.
+        ValueError: if the value has the wrong type, is not finite or is out of bounds.
 
     Example:
         >>> from torchrl_tit.settings.numbers import Fraction

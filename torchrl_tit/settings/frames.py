@@ -56,15 +56,15 @@ class PatchTransformerSettings(TransformerSettings):
     """Settings of a transformer on the patches of observations."""
 
     patch_size: Width | Literal["auto"] | None = 1
-    """Entries of an array's patch, or pixels along a side of an image's; the whole observation
-    (of an image, which must be square) if not given. "auto" takes an array as one patch, makes at
-    most 16 patches of categories, and about 49 of an image."""
+    """Entries per patch of an array, or pixels per side of an image patch. If not given, the patch
+    is the whole observation (images must then be square). "auto" uses one patch for an array, at
+    most 16 patches for categories, and about 49 for an image."""
     embed_dim: Width = 32
     """Width D of a token."""
     patch_weights: Literal["shared", "own"] = "shared"
-    """Whether all patches of an array share the weights of their embedding, which has no bias, or
-    each has weights and a bias of its own, of one size (the feature tokenizer of arXiv 2106.11959).
-    A shared patch of one entry reaches the attention as little more than the entry's sign."""
+    """Whether all patches of an array share one embedding, which has no bias, or each patch has its
+    own weights and bias, all of the same size (the feature tokenizer of arXiv 2106.11959). With
+    shared weights and patches of one entry, attention sees little more than each entry's sign."""
     num_blocks: Count = 2
     """Number of blocks."""
     position_encoding: bool = True
@@ -80,12 +80,12 @@ class Inner(
     name="inner",
     builds="torchrl_tit.frames.inner:InnerTransformer",
 ):
-    """The inner transformer of TIT (arXiv 2212.14538): class tokens after its blocks."""
+    """The inner transformer of TIT (arXiv 2212.14538), which outputs its class tokens."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ResNetFrames(FrameSettings, name="resnet", builds="torchrl_tit.frames.cnn:CNNFrameEncoder"):
-    """One token of an image: the residual network of the baselines and a linear layer."""
+    """One token per image: the baselines' residual network followed by a linear layer."""
 
     embed_dim: Width = 256
     """Width D of the token."""
@@ -95,7 +95,7 @@ class ResNetFrames(FrameSettings, name="resnet", builds="torchrl_tit.frames.cnn:
 class NatureCNNFrames(
     FrameSettings, name="nature-cnn", builds="torchrl_tit.frames.cnn:CNNFrameEncoder"
 ):
-    """One token of an image: the convolutions of NatureCNN and a linear layer."""
+    """One token per image: NatureCNN's convolutions followed by a linear layer."""
 
     embed_dim: Width = 256
     """Width D of the token."""

@@ -10,8 +10,8 @@ from torchrl_tit.settings.numbers import Count, Probability, Real, Steps, Width
 from torchrl_tit.settings.parts import Part
 
 TemporalPositions = Literal["none", "learned", "relative", "rotary"]
-"""How attention over K frames tells them apart: not at all, by a learned encoding that is added to
-the tokens, by a learned bias for each distance and head, or by rotated queries and keys."""
+"""How attention tells the K frames apart: not at all, by a learned encoding that is added to the
+tokens, by a learned bias for each distance and head, or by rotated queries and keys."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,7 +45,7 @@ class OuterSettings(TransformerSettings, HistorySettings):
 
     @classmethod
     def from_older(cls, fields: dict[str, Any]) -> dict[str, Any]:
-        """Reads the switch of learned positions, before there were others."""
+        """Converts the boolean field of older versions, which had learned positions only."""
         learned = fields.pop("temporal_position_encoding", None)
         if isinstance(learned, bool):
             fields["temporal_positions"] = "learned" if learned else "none"
@@ -60,7 +60,7 @@ class Outer(
     name="outer",
     builds="torchrl_tit.histories.outer:StackedOuterTransformer",
 ):
-    """The outer transformer of Vanilla_TIT: stacked causal blocks over one token a frame."""
+    """The outer transformer of Vanilla_TIT: stacked causal blocks over one token per frame."""
 
     num_blocks: Count = 2
     """Number of blocks."""
@@ -83,7 +83,7 @@ class ChainedOuter(
     name="chained-outer",
     builds="torchrl_tit.histories.outer:ChainedOuterTransformer",
 ):
-    """The outer blocks of Enhanced_TIT, each also on the one before it, as in PDiT."""
+    """The outer blocks of Enhanced_TIT, each also reading the block before it, as in PDiT."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,7 @@ class StackedCNN(
     """A convolutional network on K images that are stacked as channels."""
 
     torso: Literal["nature-cnn", "resnet"] = "nature-cnn"
-    """The convolutions: those of the deep Q-network, or the residual ones of the baselines."""
+    """The convolutions: those of the deep Q-network, or the residual network of the baselines."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,19 +127,19 @@ class MLP(LayersSettings, HistorySettings, name="mlp", builds="torchrl_tit.histo
 class OFENet(
     LayersSettings, HistorySettings, name="ofenet", builds="torchrl_tit.histories.mlp:OFENet"
 ):
-    """Fully connected layers that each read the input and the outputs of all layers before."""
+    """Fully connected layers that each read the input and the outputs of all previous layers."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class D2RL(LayersSettings, HistorySettings, name="d2rl", builds="torchrl_tit.histories.mlp:D2RL"):
-    """Fully connected layers that each read the input and the output of the layer before."""
+    """Fully connected layers that each read the input and the output of the previous layer."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Catformer(
     HistorySettings, name="catformer", builds="torchrl_tit.histories.catformer:Catformer"
 ):
-    """Catformer: a transformer whose layers are concatenated, by default as in arXiv 2212.14538."""
+    """Catformer: a transformer that concatenates its layers, by default as in arXiv 2212.14538."""
 
     num_blocks: Count = 2
     """Number of pairs of an attention layer and an FFN layer."""
@@ -169,7 +169,7 @@ class GatedTransformerSettings(HistorySettings):
     ffn_expansion: Count = 4
     """Hidden width of an FFN as a multiple of the width."""
     gate_bias: Real = 0.0
-    """Start value of the bias of all gates; 2 starts them near the identity, as its paper does."""
+    """Initial bias of all gates; 2 starts them near the identity, as in GTrXL's paper."""
 
     def check_num_frames(self, num_frames: int) -> None:
         """Raises ValueError if there is only one frame."""
@@ -181,7 +181,7 @@ class GTrXL(GatedTransformerSettings, name="gtrxl", builds="torchrl_tit.historie
     """GTrXL: a transformer whose residuals are gated. Its paper has 12 blocks."""
 
     gate_bias: Real = 2.0
-    """Start value of the bias of all gates: 2, as in its paper, starts them near the identity."""
+    """Initial bias of all gates: 2, as in the paper, starts them near the identity."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +196,7 @@ class CoBERL(GatedTransformerSettings, name="coberl", builds="torchrl_tit.histor
 class RecurrentSettings(HistorySettings):
     """Settings of recurrent networks.
 
-    They carry their state through the episode if they read one frame, else it starts at 0.
+    If they read one frame, they carry their state through the episode; otherwise it starts at 0.
     """
 
     is_recurrent = True

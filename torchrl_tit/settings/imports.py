@@ -1,4 +1,4 @@
-"""What may be imported by its name: modules that the user named, not those that a file names."""
+"""Imports by name: only of modules that the user named, never of those that a file names."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ TRUSTED = frozenset(
 )
 """Packages whose modules any recipe may name."""
 
-# An environment variable, so that processes that this one starts may import the same.
+# An environment variable, so that child processes may import the same modules.
 _VARIABLE = "TORCHRL_TIT_IMPORTS"
 
 
 def allow(module: str) -> None:
-    """Allows a module and its submodules to be imported by name, because the user typed it.
+    """Allows a module that the user named, and its submodules, to be imported by name.
 
-    The module's folder becomes importable: that of a Python file, and otherwise the current
-    directory, as with ``python -m``.
+    Adds a folder to ``sys.path``: that of a Python file, otherwise the current directory, as
+    ``python -m`` does.
 
     Args:
         module: a module's name, or the path of a Python file (ending in ".py").
@@ -46,27 +46,28 @@ def allow(module: str) -> None:
 
 
 def allowed_modules() -> list[str]:
-    """Returns what the user named, as typed and in that order, for processes that start later."""
+    """Returns the modules that the user named, as typed and in order, for child processes."""
     return list(filter(None, os.environ.get(_VARIABLE, "").split(os.pathsep)))
 
 
 def is_named(module: str) -> bool:
-    """Returns whether the user named a module, or a package around it (:func:`allow`)."""
+    """Returns whether the user named a module or a parent package (:func:`allow`)."""
     return any(f"{module}.".startswith(f"{_module_name(name)}.") for name in allowed_modules())
 
 
 def import_options() -> list[str]:
-    """Returns the same as options of the command line: ``--import MODULE`` for each."""
+    """Returns the allowed modules as command-line options, ``--import MODULE`` for each."""
     return [word for module in allowed_modules() for word in ("--import", module)]
 
 
 def import_allowed(module: str) -> ModuleType:
-    """Imports a module, or a Python file, that the user named, and allows it.
+    """Imports a module or Python file that the user named, and allows it (:func:`allow`).
 
     Raises:
-        ImportError: if there is no such module, or it raises, with the reason in one line.
-        ValueError: if it is neither the name of a module nor a Python file, or a module of the
-            file's name is loaded already.
+        ImportError: if the module does not exist or raises an error; the message gives the reason
+            in one line.
+        ValueError: if it is neither the name of a module nor a Python file, or if another module
+            with the file's name is already loaded.
     """
     allow(module)
     if not module.endswith(".py"):
@@ -82,14 +83,14 @@ def import_allowed(module: str) -> ModuleType:
 
 
 def import_named(target: str) -> Any:
-    """Imports what "module:attribute" names, if the module may be imported.
+    """Imports the object that "module:attribute" names, if the module may be imported.
 
-    It may if the user named it or a package around it (:func:`allow`), if it is loaded already, or
-    if it belongs to a trusted package. Callers check what the object is before they call it.
+    It may if the user named it or a parent package (:func:`allow`), if it is already loaded, or if
+    it belongs to a trusted package. Callers check the object before they call it.
 
     Raises:
-        ValueError: if the form is another, or the module may not be imported.
-        ImportError: if there is no such module, it raises, or it lacks the attribute.
+        ValueError: if the target has another form, or the module may not be imported.
+        ImportError: if the module does not exist, raises an error, or lacks the attribute.
 
     Example:
         >>> import_named("this:zen")
@@ -113,7 +114,7 @@ def import_if_allowed(module: str, target: str) -> ModuleType:
 
     Raises:
         ValueError: if the module may not be imported.
-        ImportError: if there is no such module, or it raises.
+        ImportError: if the module does not exist or raises an error.
     """
     if not _is_allowed(module):
         raise ValueError(
@@ -124,10 +125,11 @@ def import_if_allowed(module: str, target: str) -> ModuleType:
 
 
 def import_module(name: str) -> ModuleType:
-    """Imports a module; the caller has made sure that it may be.
+    """Imports a module; the caller has checked that this is allowed.
 
     Raises:
-        ImportError: if there is no such module, or it raises, with the reason in one line.
+        ImportError: if the module does not exist or raises an error; the message gives the reason
+            in one line.
     """
     try:
         return importlib.import_module(name)

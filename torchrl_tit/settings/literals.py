@@ -1,4 +1,4 @@
-"""Values and calls as they are typed: Python literals, never code that runs."""
+"""Parses values and calls that users type: Python literals only, so no code is run."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     """Reads settings such as "is_slippery=False" or "map_name=8x8".
 
     Args:
-        assignments: Each a name, "=" and a Python literal; what is no literal is text.
+        assignments: Strings "name=value", with a Python literal as the value; anything else is kept
+            as text.
 
     Returns:
         The values by name.
 
     Raises:
-        ValueError: If one has another form, or a name stands twice.
+        ValueError: If an assignment has another form, or a name occurs twice.
 
     Example:
         >>> parse_assignments(["is_slippery=False", "map_name=8x8", "sizes=(3, 4)"])
@@ -33,7 +34,7 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
             raise ValueError(f"{name} is set twice, the second time by {assignment!r}")
         try:
             values[name] = ast.literal_eval(text.strip())
-        except (SyntaxError, ValueError, MemoryError, RecursionError):  # too deep is no literal
+        except (SyntaxError, ValueError, MemoryError, RecursionError):  # or nested too deeply
             values[name] = text.strip()
     return values
 
@@ -45,7 +46,7 @@ def parse_call(text: str) -> tuple[str, dict[str, Any]]:
         "module:Name", and the arguments.
 
     Raises:
-        ValueError: If it has another form, or an argument is no literal.
+        ValueError: If it has another form, or an argument is not a literal.
 
     Example:
         >>> parse_call("minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)")

@@ -1,4 +1,4 @@
-"""Tables of what users choose by name, to which packages of their own add."""
+"""Tables of things that users choose by name; other packages can add to them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ T = TypeVar("T")
 
 
 class Names(dict[str, T]):
-    """Things by name. A name belongs to one thing, and unknown names are looked for in plugins.
+    """Things by name. Each name belongs to one thing; unknown names are looked up in plugins.
 
     Args:
-        kind: what they are, for messages.
+        kind: what the things are, for error messages.
 
     Example:
         >>> colours = Names("colour")
@@ -34,15 +34,15 @@ class Names(dict[str, T]):
         self._clashes: dict[str, str] = {}
 
     def add(self, name: str, thing: T, home: str) -> None:
-        """Adds a thing. If it comes from the same place as before, it replaces the one before.
+        """Adds a thing. It replaces an earlier one with the same name and home.
 
         Args:
             name: its name.
             thing: the thing.
-            home: where it is defined, for messages.
+            home: where it is defined, for error messages.
 
         Raises:
-            ValueError: if the name belongs to a thing from elsewhere.
+            ValueError: if the name already belongs to a thing from elsewhere.
         """
         if self._homes.setdefault(name, home) != home:
             self._clashes[name] = (
@@ -53,11 +53,11 @@ class Names(dict[str, T]):
         self[name] = thing
 
     def find(self, name: str) -> T:
-        """Looks a name up, in plugins too if it is unknown.
+        """Looks up a name, also in plugins if it is unknown.
 
         Raises:
-            ValueError: if nothing, or more than one thing, has that name. The message suggests
-                similar names, and says which plugins could not be imported.
+            ValueError: if no thing, or more than one, has that name. The message suggests similar
+                names, and says which plugins could not be imported.
         """
         failures = load_plugins() if str(name) not in self else []
         if str(name) in self._clashes:

@@ -41,13 +41,13 @@ class Head:
     """The layers between the history encoder and the features."""
 
     features_dim: Width | None = 64
-    """Size F of the features; if not given, the history encoder's output is the features."""
+    """Size F of the features; if not given, the features are the history encoder's output."""
     activation: Activation = "tanh"
     """Activation after the linear layer."""
     norm: bool = True
     """Whether to add a LayerNorm before the linear layer and another one after the activation."""
     final_norm: bool = True
-    """Whether that second LayerNorm is there."""
+    """Whether to add that second LayerNorm."""
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -55,22 +55,22 @@ class Head:
 
 @dataclass(frozen=True, kw_only=True)
 class Network:
-    """A frame encoder followed by a history encoder and a head: any pair that makes sense."""
+    """A frame encoder followed by a history encoder and a head, in any valid combination."""
 
     frame: FrameSettings
-    """What turns one observation into tokens. If a task has several observations, this is for those
-    that it can read and that ``frames`` leaves out; the others get an encoder of the same width by
-    their kind."""
+    """The frame encoder, which turns one observation into tokens. If a task has several
+    observations, it encodes those that it can read and that ``frames`` does not name; the others
+    get an encoder of the same width, chosen by their kind."""
     frames: Mapping[str, FrameSettings] = field(default_factory=lambda: PerKey({}))
-    """What turns an observation into tokens, by its name, if a task has several."""
+    """Frame encoders by the name of their observation, for tasks with several observations."""
     history: HistorySettings
-    """What turns the tokens of the last K frames into one vector."""
+    """The history encoder, which turns the tokens of the last K frames into one vector."""
     head: Head = field(default_factory=Head)
-    """What turns that into features."""
+    """The head, which turns that vector into features."""
     num_frames: Frames = 1
     """Number K of observations that the network reads."""
     trunks: Literal["shared", "separate"] = "shared"
-    """Whether policy and value share the network, or have one each."""
+    """Whether policy and value share one network or have one each."""
     initialization: Literal["normal", "default"] = "default"
     """Initialisation of the weights: normal with a standard deviation of 0.02, as in the authors'
     code, or the default of each layer."""
@@ -82,7 +82,7 @@ class Network:
 
     @property
     def carries_state(self) -> bool:
-        """Whether a state is carried from step to step instead of reading several frames."""
+        """Whether the network carries a state between steps instead of reading several frames."""
         return self.history.is_recurrent and self.num_frames == 1
 
 
@@ -115,8 +115,8 @@ def vanilla_tit(
 
     Args:
         num_frames: number K of observations.
-        patch_size: entries of an array's patch, or pixels along a side of an image's; the whole
-            observation if None; "auto" chooses (see
+        patch_size: entries per patch of an array, or pixels per side of an image patch; if None,
+            the whole observation; "auto" chooses (see
             :func:`~torchrl_tit.layers.patches.find_patch_size`).
         patch_weights: whether all patches of an array share their weights, or each has its "own"
             weights and bias.
@@ -184,13 +184,13 @@ def enhanced_tit(
 
     Args:
         num_frames: number K of observations.
-        dense: off is the paper's "w/o Dense": only the last outer block is read.
-        inner: off is "w/o Inner": outer blocks, each on the one before, on a linear embedding.
-        outer: off is "w/o Outer": frames stacked as channels, and inner blocks only.
+        dense: False is the paper's "w/o Dense": only the last outer block is read.
+        inner: False is "w/o Inner": a linear embedding, then outer blocks in sequence.
+        outer: False is "w/o Outer": frames stacked as channels, and inner blocks only.
         **hyperparameters: those of :func:`vanilla_tit`.
 
     Raises:
-        ValueError: if ``inner`` and ``outer`` are both off, or a hyperparameter is invalid.
+        ValueError: if ``inner`` and ``outer`` are both False, or a hyperparameter is invalid.
 
     Example:
         >>> enhanced_tit(4, inner=False).frame
@@ -264,8 +264,8 @@ def gtrxl(
     """GTrXL: a residual network on each frame, then a gated transformer over the frames.
 
     Parisotto et al., "Stabilizing Transformers for Reinforcement Learning", arXiv 1910.06764. It is
-    no baseline of arXiv 2212.14538; frames and head are those of :func:`catformer`. For arrays,
-    replace the frame encoder, by :class:`Linear` say.
+    not a baseline of arXiv 2212.14538; frame encoder and head are those of :func:`catformer`. For
+    arrays, replace the frame encoder, for example with :class:`Linear`.
 
     Args:
         num_frames: number K of observations.
@@ -366,7 +366,7 @@ def lstm(
 def gru(
     num_frames: int = 1, *, embed_dim: int = 64, hidden_dim: int = 64, features_dim: int = 64
 ) -> Network:
-    """GRU: as :func:`lstm`, with TorchRL's GRU.
+    """GRU: like :func:`lstm`, with TorchRL's GRU.
 
     Args:
         num_frames: if 1, the state is carried through the episode; if more, it starts at 0.
@@ -413,7 +413,7 @@ def dt_tit(
     position_encoding: bool = False,
     **hyperparameters: Any,
 ) -> Network:
-    """DT_TIT: Decision Transformer whose states are read by an inner transformer.
+    """DT_TIT: a Decision Transformer whose states are read by an inner transformer.
 
     arXiv 2212.14538, section on offline supervised learning.
 

@@ -1,7 +1,7 @@
-"""The kinds of numbers in settings, each with the bounds beyond which it is nonsense.
+"""The kinds of numbers in settings, each with the bounds of sensible values.
 
-:func:`~torchrl_tit.settings.fields.check_fields` enforces them, and refuses what is not finite in
-any field.
+:func:`~torchrl_tit.settings.fields.check_fields` enforces the bounds, and rejects numbers that are
+not finite in any field.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import Annotated
 from msgspec import Meta
 
 MAX_SEED = 2**31
-"""NumPy takes 32 bits, and environments are seeded with a run's seed and those that follow."""
+"""NumPy takes 32 bits, and environments are seeded with a run's seed and the numbers after it."""
 
 Width = Annotated[int, Meta(ge=1, le=65_536)]
 """Entries of a token, a layer or a state."""
 Size = Annotated[int, Meta(ge=1, le=10**9)]
-"""Entries of what comes from a task: features, observations, actions."""
+"""Sizes that depend on a task: of features, observations, actions."""
 Widths = Annotated[
     tuple[Width, ...],
     Meta(min_length=1, description="at least one width of at least 1 and at most 65536"),
@@ -29,22 +29,22 @@ Frames = Annotated[int, Meta(ge=1, le=10_000)]
 Steps = Annotated[int, Meta(ge=1, le=10**12)]
 """Steps or updates of a run, and intervals of them."""
 StepsOrNone = Annotated[int, Meta(ge=0, le=10**12)]
-"""Steps or updates that there need not be."""
+"""Steps or updates, possibly none."""
 Batch = Annotated[int, Meta(ge=1, le=10**9)]
 """Steps, transitions or windows that are held at once."""
 Copies = Annotated[int, Meta(ge=1, le=10_000)]
-"""Environments, processes or episodes side by side."""
+"""Environments, processes or episodes in parallel."""
 Episodes = Annotated[int, Meta(ge=1, le=100_000)]
 """Episodes of an evaluation."""
 Threads = Annotated[int, Meta(ge=1, le=1024)]
 """Threads of a processor."""
 Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
-"""What random generators start from."""
+"""Seeds of random number generators."""
 
 Rate = Annotated[float, Meta(ge=0, le=10)]
 """Learning rates."""
 Weight = Annotated[float, Meta(ge=0, le=1e9)]
-"""Weights of terms and other factors, which can switch something off."""
+"""Weights of loss terms, and other factors that may be 0."""
 Positive = Annotated[float, Meta(gt=0, le=1e9)]
 """Factors that cannot be 0."""
 Real = Annotated[float, Meta(ge=-1e9, le=1e9)]
@@ -52,8 +52,8 @@ Real = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Reals = Annotated[tuple[Real, ...], Meta(min_length=1, description="at least one finite number")]
 """Several of these."""
 Fraction = Annotated[float, Meta(ge=0, le=1)]
-"""Shares, discounts and steps between two networks."""
+"""Fractions, discounts, and update rates of target networks."""
 Probability = Annotated[float, Meta(ge=0, lt=1, description="a probability in [0, 1)")]
-"""Probabilities of what must not always happen, such as dropout."""
+"""Probabilities below 1, such as dropout."""
 Inside = Annotated[float, Meta(gt=0, lt=1, description="a probability in (0, 1)")]
-"""Probabilities of what happens sometimes."""
+"""Probabilities above 0 and below 1."""

@@ -60,7 +60,7 @@ class Part:
 
     @classmethod
     def from_older(cls, fields: dict[str, Any]) -> dict[str, Any]:
-        """Renames fields of JSON that an older version of the part wrote; by default, none.
+        """Renames fields in JSON from older versions of the part; by default, renames none.
 
         Args:
             fields: the fields by name, which may be changed in place.
@@ -73,7 +73,7 @@ class Part:
 
 
 def resolve(target: str) -> Any:
-    """Imports what "module:attribute" names.
+    """Imports the object that "module:attribute" names.
 
     Raises:
         ImportError: if there is no such module, or it lacks the attribute.

@@ -1,4 +1,4 @@
-"""Settings by the name of an observation."""
+"""Settings by the name of their observation."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torchrl_tit.settings.frames import FrameSettings
 class PerKey(Mapping[str, FrameSettings]):
     """Frame encoders by the name of the observation that they read, in any order.
 
-    A mapping that does not change and has a hash, as recipes have.
+    The mapping is immutable and hashable, like recipes.
 
     Args:
         frames: the frame encoders by name.
 
     Raises:
-        ValueError: if one is something else.
+        ValueError: if a value is not a frame encoder's settings.
 
     Example:
         >>> from torchrl_tit.settings import Inner

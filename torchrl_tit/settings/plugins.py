@@ -15,8 +15,8 @@ _failures: dict[str, str] | None = None
 def load_plugins() -> list[str]:
     """Imports the modules that installed packages and the user have named, once.
 
-    It is called where a name is unknown without them, so that other commands neither wait for a
-    package nor fail with it.
+    It is called only for names that are otherwise unknown, so that other commands neither wait for
+    a plugin nor fail because of it.
 
     Returns:
         For each module that cannot be imported, a line that names its package and entry point.

@@ -1,4 +1,4 @@
-"""Tasks whose solution needs a past, registered with Gymnasium, and what reads MiniGrid's."""
+"""Tasks that require memory, registered with Gymnasium, and a wrapper for MiniGrid's tasks."""
 
 import gymnasium
 

@@ -1,4 +1,4 @@
-"""The first actions of a task only."""
+"""Restricts a task to its first actions."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from gymnasium import spaces
 
 
 class FirstActions(gymnasium.ActionWrapper[Any, Any, Any]):
-    """Leaves the first ``count`` actions of a Discrete task, since the others have no use.
+    """Keeps the first ``count`` actions of a Discrete task whose other actions are useless.
 
     MiniGrid gives every task the same seven actions. MiniGrid-Memory needs three: left, right and
     forward.
 
     Args:
         env: a task with Discrete actions.
-        count: how many actions to leave.
+        count: number of actions to keep.
 
     Raises:
         ValueError: if the task's actions are of another kind or fewer than ``count``.
@@ -37,5 +37,5 @@ class FirstActions(gymnasium.ActionWrapper[Any, Any, Any]):
         self.action_space = spaces.Discrete(count, start=space.start)
 
     def action(self, action: Any) -> Any:
-        """Returns the action as it is."""
+        """Returns the action unchanged."""
         return action

@@ -12,12 +12,12 @@ _MOVES = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)])  # right, up, left, down
 
 
 class TMaze(gymnasium.Env[np.ndarray, np.int64]):
-    """Remembers a cue while walking down a corridor, and turns to its side at the end.
+    """A corridor where the agent must remember a cue and turn to its side at the end.
 
     The agent starts at one end of a corridor, where it sees on which side the goal is: up or down.
-    At the other end, the junction, it turns. An episode is as long as the shortest way to a goal,
-    so that nothing but memory decides between a return of 1 and one of 0: whoever walks straight on
-    and guesses gets 0.5. A step that falls behind the shortest way costs ``1 / corridor_length``.
+    At the other end, the junction, it turns. An episode is as long as the shortest path to a goal,
+    so only memory decides between a return of 1 and one of 0: walking straight on and guessing
+    gives 0.5 on average. A step that falls behind the shortest path costs ``1 / corridor_length``.
 
     Ni et al., "When Do Transformers Shine in RL? Decoupling Memory from Credit Assignment", arXiv
     2307.03864, section 5.1, after Bakker, "Reinforcement Learning with Long Short-Term Memory",
@@ -67,14 +67,14 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
         return self._observe(), {}
 
     def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Moves, unless there is a wall; the last step is rewarded at the goal."""
+        """Moves, unless a wall is in the way; the last step is rewarded at the goal."""
         right, up = _MOVES[action]
         self._steps += 1
         at_junction = self._x == self.corridor_length
         if right:
             self._x = min(max(self._x + int(right), 0), self.corridor_length)
         elif up and at_junction:
-            self._y = int(up)  # at the last step: the way to the junction takes all others
+            self._y = int(up)  # at the last step: all others are needed to reach the junction
         over = self._steps > self.corridor_length
         if over:
             reward = float(self._y == self._goal)

@@ -31,8 +31,8 @@ class HideEntries(ObservationTransform):
             [..., D - len(hidden)].
 
     Raises:
-        ValueError: If ``hidden`` names an entry twice, or, when the specs of an environment with
-            the transform are read, an entry that does not exist, or all of them.
+        ValueError: If ``hidden`` names an entry twice; or, when the specs of an environment with
+            the transform are read, if it names an entry that does not exist, or all entries.
 
     Example:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -95,16 +95,16 @@ class HideEntries(ObservationTransform):
 class HideVelocities(HideEntries):
     """Removes the velocities from a task's observations, so that one alone is not enough to act on.
 
-    The velocities follow from the observations of several steps, so a history makes up for them.
+    The velocities can be inferred from several observations, so a history makes up for them.
 
     Args:
         task: Name of the task, with or without its version, such as "CartPole-v1" or "Hopper".
         in_keys: See :class:`HideEntries`.
 
     Raises:
-        ValueError: If it is not known which entries are velocities in this task, or, when the specs
-            of an environment with the transform are read, a setting of the task has added entries;
-            use :class:`HideEntries` instead.
+        ValueError: If the velocities of this task are unknown, or if, when the specs of an
+            environment with the transform are read, a setting of the task has added entries; use
+            :class:`HideEntries` instead.
 
     Example:
         >>> from torchrl.envs import GymEnv, TransformedEnv

@@ -24,9 +24,9 @@ class History(CatFrames):
     ends, ``("next", history)`` holds the terminal observation, and the next episode starts with a
     fresh history. With K = 1 nothing is stored.
 
-    `CatFrames` alone concatenates along an axis that exists, so it needs an `UnsqueezeTransform`
-    before it, and its step rolls and copies the whole buffer. This class writes the same in about
-    60% of the time for small observations. The buffers are in the environment's ``state_dict``.
+    `CatFrames` alone concatenates along an existing axis, so it needs an `UnsqueezeTransform`
+    before it, and its step rolls and copies the whole buffer. For small observations, this class
+    writes the same in about 60% of the time. The buffers are in the environment's ``state_dict``.
 
     As a transform of a replay buffer it makes the histories of sampled slices, see
     :meth:`unfolding` and :meth:`make_rb_transform_and_sampler`.
@@ -37,7 +37,7 @@ class History(CatFrames):
         out_keys: Keys of the histories, one for each of ``in_keys`` and different from all of them.
         observation_ndim: Number of dimensions of one observation: 1 for arrays [D], 2 for grey
             images [H, W], 3 for images [C, H, W].
-        padding: What fills the steps before an episode's first: ``"same"`` repeats the first
+        padding: How to pad before an episode's first step: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
 
     Raises:
@@ -81,22 +81,22 @@ class History(CatFrames):
             padding=padding,
         )
         self._observation_ndim = observation_ndim
-        self._buffers.clear()  # CatFrames makes them in the first step; here the specs tell earlier
+        self._buffers.clear()  # made from the specs instead of in the first step
 
-    _inv_call = Transform._inv_call  # none, which TransformedVectorEnv relies on
+    _inv_call = Transform._inv_call  # does nothing, which TransformedVectorEnv relies on
 
     def set_container(self, container: Transform | EnvBase) -> None:
         """Joins an environment or a composition of transforms, and makes the buffers.
 
         Args:
-            container: What the transform becomes a part of.
+            container: The environment or composition that the transform joins.
 
         Raises:
             KeyError: If the environment has no such observation.
             ValueError: If an observation does not have ``observation_ndim`` dimensions.
         """
         super().set_container(container)
-        if self.parent is None:  # a composition that is in no environment yet
+        if self.parent is None:  # a composition without an environment yet
             return
         specs = self.parent.full_observation_spec  # before this transform
         for key in self.in_keys:
@@ -126,8 +126,8 @@ class History(CatFrames):
         Args:
             buffer: The last histories, [..., K, *obs].
             newest: [..., 1, *obs].
-            reset: Where an episode begins, bool [...]; the other histories stay unchanged. None
-                in a step.
+            reset: True where an episode begins, bool [...]; the other histories stay unchanged.
+                None in a step.
 
         Returns:
             The histories, [..., K, *obs].
@@ -169,18 +169,18 @@ class History(CatFrames):
     def unfolding(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Makes the histories of stored steps, and of the next steps if these are stored.
 
-        A history begins at the latest where its slice does: at t = 0, at "is_init", after a step
-        that is done, and where an observation is not the next observation of the step before. What
-        came before a slice is not known: padding takes its place.
+        A history begins at the latest where its slice does: at t = 0, at "is_init", after a done
+        step, and where an observation differs from the previous step's next observation. Frames
+        before a slice are unknown and replaced by padding.
 
         Args:
-            tensordict: [..., T], the last dimension (or the one that is named "time") time.
+            tensordict: [..., T]; the last dimension, or the one named "time", is time.
 
         Returns:
             The same tensordict with the histories [..., T, K, *obs].
 
         Raises:
-            ValueError: If the steps are no slices, or nothing tells where slices begin.
+            ValueError: If the steps are not slices, or the starts of slices cannot be found.
         """
         time = tensordict.ndim - 1
         named = [axis for axis, name in enumerate(tensordict.names) if name == "time"]
@@ -202,15 +202,15 @@ class History(CatFrames):
     def make_rb_transform_and_sampler(
         self, batch_size: int, **sampler_kwargs: Any
     ) -> tuple[Transform, SliceSampler]:
-        """Builds what a TorchRL storage needs to store observations once and sample histories.
+        """Builds the transform and sampler to store each observation once and sample histories.
 
-        As `CatFrames.make_rb_transform_and_sampler`: histories, and those under "next", are left
-        out when steps are stored. To sample a step, the K - 1 steps before it are read too. So an
-        episode's first K - 1 steps are never drawn;
+        Like `CatFrames.make_rb_transform_and_sampler`, leaves out histories, also those under
+        "next", when steps are stored. To sample a step, the K - 1 steps before it are also read. So
+        an episode's first K - 1 steps are never drawn;
         :class:`~torchrl_tit.datasets.OnlineHistoryStorage` draws every step and reads less.
 
         Args:
-            batch_size: Not read; it is that of the buffer.
+            batch_size: Ignored; the buffer's batch size is used.
             **sampler_kwargs: Passed to `SliceSampler`, which finds the episodes.
 
         Returns:
@@ -263,7 +263,8 @@ class History(CatFrames):
                 f"History found no observation {key!r} in the environment, which has "
                 f"{sorted(map(str, specs.keys(True, True)))}; name one of these in in_keys."
             )
-        # The dimensions of the observation's own group are batch; the rest is the observation.
+        # The dimensions of the observation's group are batch dimensions; the rest are the
+        # observation's.
         group = specs if isinstance(key, str) else specs[key[:-1]]
         shape = specs[key].shape[group.ndim :]
         if len(shape) != self._observation_ndim:

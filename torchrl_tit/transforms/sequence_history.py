@@ -15,18 +15,18 @@ class SequenceHistory(Transform):
     Under ``out_key`` it writes the entries of an item of
     :class:`~torchrl_tit.datasets.SequenceStorage`: "observation" [..., K, *obs], "action"
     [..., K, *action], "return_to_go" [..., K, 1], "timestep" int64 [..., K] and "mask" bool
-    [..., K]. The newest step comes last, with zeros for its action; steps before the first of an
-    episode are padding, zeros that are masked. The transform itself holds no state: the tensordict
-    holds it all, so environments can be reset in any way.
+    [..., K]. The newest step comes last, with zeros for its action; steps before an episode's first
+    are padding: masked zeros. The transform itself holds no state: it is all in the tensordict, so
+    environments can be reset in any way.
 
     Put TorchRL's `TargetReturn` before it, which writes the return that is still to be reached.
 
-    TorchRL's `CatFrames` stacks one entry and knows neither time steps nor a mask, and at an
-    action's key it would stack the action of a step with the observation that follows it.
+    TorchRL's `CatFrames` stacks one entry, without time steps or a mask, and would stack the action
+    of a step with the observation that follows it.
 
     Args:
         num_frames: Number K of steps, at least 1.
-        return_scale: Returns-to-go are divided by it.
+        return_scale: Divisor of the returns-to-go.
         observation_key: Key of the observation [..., *obs].
         action_key: Key under which the policy writes the action [..., *action].
         target_return_key: Key of the return that is still to be reached [..., 1].
@@ -113,7 +113,7 @@ class SequenceHistory(Transform):
         return next_tensordict.set(out_key, sequence)
 
     def _newest(self, tensordict: TensorDictBase, axis: int) -> dict[str, Tensor]:
-        """What the environment wrote in its newest step; [..., 1, ...] each."""
+        """The entries of the environment's newest step; [..., 1, ...] each."""
         observation_key, target_return_key = self.in_keys
         to_go = tensordict.get(target_return_key).unsqueeze(axis) / self.return_scale
         return {
@@ -123,7 +123,7 @@ class SequenceHistory(Transform):
         }
 
     def _first(self, tensordict: TensorDictBase) -> TensorDict:
-        """The sequence at an episode's first step, after padding."""
+        """The sequence at an episode's first step: padding, then this step."""
         self._check_keys(tensordict)
         axis = tensordict.ndim
         step = self._newest(tensordict, axis)

@@ -14,22 +14,22 @@ from torchrl_tit.windows import Padding, Windows, find_windows
 def find_histories(
     steps: TensorDictBase, keys: Sequence[NestedKey], num_frames: int, padding: Padding
 ) -> Windows:
-    """Finds the windows of steps that a replay buffer drew, none of which leaves its slice.
+    """Finds the windows of steps drawn from a replay buffer; each stays within its slice.
 
-    A window ends where its episode or its slice begins: at t = 0, at "is_init", after a step that
-    is done, and where an observation is not the next observation of the step before.
+    A window reaches back at most to the start of its episode or slice: t = 0, "is_init", a step
+    after a done step, or one whose observation differs from the previous step's next observation.
 
     Args:
-        steps: [*B, T], the last dimension time; flat batches [slices * steps] are fine.
+        steps: [*B, T], where the last dimension is time; flat batches [slices * steps] also work.
         keys: Keys of the observations.
         num_frames: Number K of frames in a window.
-        padding: What takes the place of frames before a window's first.
+        padding: What replaces frames before a window's first valid one.
 
     Returns:
         Windows [*B, T, K] on the steps in order.
 
     Raises:
-        ValueError: If the steps are single ones, or nothing tells.
+        ValueError: If the steps are single ones, or the starts cannot be found.
 
     Example:
         >>> from tensordict import TensorDict
