@@ -1,4 +1,4 @@
-"""GTrXL: a transformer whose residuals are gated."""
+"""The gated block of GTrXL: gates take the place of residual connections."""
 
 from __future__ import annotations
 

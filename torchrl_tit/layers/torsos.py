@@ -8,7 +8,7 @@ from torchrl_tit.layers.images import ImageConv2d, convolved_size
 
 
 class NatureCNNTorso(nn.Module):
-    """Three convolutions with relu: 32 of 8x8 stride 4, 64 of 4x4 stride 2, 64 of 3x3.
+    """Three convolutions with relu: 32 filters of 8x8, stride 4; 64 of 4x4, stride 2; 64 of 3x3.
 
     Mnih et al., "Human-level control through deep reinforcement learning", Nature 518 (2015).
 
@@ -62,7 +62,7 @@ class ResidualBlock(nn.Module):
 
 
 class ResNetTorso(nn.Module):
-    """64 convolutions of 8x8 stride 4 with relu, two residual blocks, flattened.
+    """A convolution with 64 filters of 8x8 and stride 4, relu, two residual blocks, flattened.
 
     As the authors of arXiv 2212.14538 built it for ResNet and Catformer.
 
