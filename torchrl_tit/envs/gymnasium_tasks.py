@@ -56,11 +56,12 @@ def make_unchecked(name: str, **kwargs: Any) -> gymnasium.Env:
     """Makes one task as Gymnasium does, without its checker and its advice to use a newer version.
 
     The checker costs time in each step, and the tests check the specs instead. Older versions are
-    used on purpose: D4RL's data come from them. Without a screen, SDL is told to draw into memory,
-    because it reports an error if it looks for a screen.
+    used on purpose: D4RL's data come from them. Without a screen, SDL is told to draw into memory
+    and to play no sound, because it reports an error if it looks for a screen or a sound card.
     """
     if kwargs.get("render_mode") == "rgb_array" and not _HAS_SCREEN:
-        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        for driver in ("SDL_VIDEODRIVER", "SDL_AUDIODRIVER"):
+            os.environ.setdefault(driver, "dummy")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".* is out of date", DeprecationWarning)
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
