@@ -31,8 +31,8 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
 
     Returns:
         The cells, in the paper's order, and a note for each run that is left out, was evaluated
-        over a different number of episodes than its recipe says, or was trained further with
-        schedules that follow its length.
+        over a different number of episodes than its recipe says, or changed its length
+        while schedules followed it.
 
     Raises:
         ValueError: if there is no evaluated run, or two runs of the same settings have the same
@@ -58,7 +58,7 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         if (episodes := evaluation.get("episodes", asked)) != asked:  # `evaluate --episodes`
             notes.append(f"{run.folder} was evaluated over {episodes} episodes, not {asked}")
         if lengths := run.earlier_lengths():
-            notes.append(_trained_further(run, lengths))
+            notes.append(_earlier_lengths(run, lengths))
         evaluations[run.folder] = evaluation
         runs.append(run)
     if not runs:
@@ -123,10 +123,10 @@ def _measure(recipe: Recipe, evaluation: dict) -> str:
     return "normalized score" if "score" in evaluation and has_reference(recipe.env) else "return"
 
 
-def _trained_further(run: Run, lengths: Sequence[tuple[int, int]]) -> str:
+def _earlier_lengths(run: Run, lengths: Sequence[tuple[int, int]]) -> str:
     field, schedules = run.recipe.length, ", ".join(run.recipe.schedules)
     before = ", ".join(f"{length} until step {step}" for step, length in lengths)
-    return f"{run.folder} was trained further: for {schedules}, {field} was {before}"
+    return f"{run.folder} changed its length: for {schedules}, {field} was {before}"
 
 
 def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:

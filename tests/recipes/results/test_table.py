@@ -231,7 +231,7 @@ def test_runs_whose_schedules_followed_other_lengths_are_named(tmp_path):
     evaluation = json.loads((folder / "evaluation.json").read_text())
     (folder / "evaluation.json").write_text(json.dumps(evaluation | {"steps": 4096}))
     assert make_table([tmp_path])[1] == [
-        f"{folder} was trained further: for decay_learning_rate, total_steps was "
+        f"{folder} changed its length: for decay_learning_rate, total_steps was "
         "2048 until step 1024, 3072 until step 3072"
     ]
 
