@@ -139,7 +139,8 @@ def _huge_number(file: h5py.File, folder: Path) -> None:
 
 
 def _nested(metadata: dict[str, Any]) -> dict[str, Any]:
-    deep = '{"type": "Tuple", "subspaces": [' * 900 + "]}" * 900
+    depth = 100_000  # Python 3.13 still reads a thousand
+    deep = '{"type": "Tuple", "subspaces": [' * depth + "]}" * depth
     return metadata | {"action_space": deep}
 
 
@@ -160,10 +161,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
         lambda f: _minari(f, _endless_space),
         "a space of 10000000000 entries lists bounds of fewer",
     ),
-    "spaces in spaces": (  # Python 3.11 refuses the depth, 3.13 reads on
-        lambda f: _minari(f, _nested),
-        "is not a whole Minari data set|its actions are a Tuple space",
-    ),
+    "spaces in spaces": (lambda f: _minari(f, _nested), "is not a whole Minari data set"),
     "metadata of a list": (lambda f: _minari(f, lambda m: [m]), "Expected `object`, got `array`"),
     "metadata of other kinds": (
         lambda f: _minari(f, lambda m: m | {"author": 5}),
