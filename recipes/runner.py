@@ -28,6 +28,7 @@ from .algorithm import (
 )
 from .best import EPISODES, Best
 from .callback import Callback
+from .free_memory import return_free_memory
 from .interrupt import Interrupt
 from .outcomes import Outcome, summarize
 from .recipe import Recipe
@@ -336,6 +337,7 @@ def _naming(step: int, saved_step: int) -> Iterator[None]:
 def _save(run: Run, step: int, parts: Mapping[str, Stateful]) -> None:
     state = {name: part.state_dict() for name, part in parts.items()}
     run.save(step, {**state, "rng": global_rng_state()})
+    return_free_memory()
 
 
 def _load(run: Run, parts: Mapping[str, Stateful]) -> None:

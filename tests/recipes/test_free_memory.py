@@ -1,0 +1,55 @@
+"""Freed memory is returned to the system."""
+
+import ctypes
+import platform
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from recipes import runner
+from recipes.free_memory import return_free_memory
+from recipes.registry import get_recipe
+from recipes.run import Run
+
+BLOCK, COUNT = 100_000, 1_000  # bytes; smaller than what glibc takes from the system piece by piece
+
+
+def own_memory():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    fields = dict(line.split(":", 1) for line in lines)
+    return int(fields["RssAnon"].split()[0]) * 1024
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has malloc_trim")
+def test_memory_between_blocks_in_use_is_returned():
+    libc = ctypes.CDLL(None)
+    libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+    libc.free.argtypes = [ctypes.c_void_p]
+    blocks = [libc.malloc(BLOCK) for _ in range(COUNT)]
+    for block in blocks:
+        ctypes.memset(block, 1, BLOCK)
+    last = blocks.pop()  # in use: what lies before it cannot be given back from the end
+    for block in blocks:
+        libc.free(block)
+    kept = own_memory()
+    return_free_memory()
+    returned = kept - own_memory()
+    libc.free(last)
+    assert returned > 0.8 * BLOCK * COUNT
+
+
+def test_checkpoints_return_it(tmp_path, monkeypatch):
+    calls = []
+    monkeypatch.setattr(runner, "return_free_memory", lambda: calls.append(None))
+    recipe = replace(
+        get_recipe("ppo/cartpole/mlp"),
+        total_steps=64,
+        steps_per_batch=32,
+        minibatch_size=32,
+        checkpoint_interval=32,
+        epochs=1,
+    )
+    with Run.create(tmp_path / "run", recipe) as run:
+        runner.train(recipe, run)
+    assert len(calls) == 2
