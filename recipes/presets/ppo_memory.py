@@ -1,8 +1,9 @@
 """The named recipes of tasks that require memory, for four kinds of memory.
 
 All networks have the same frame encoder and about the same number of weights, and train with the
-same PPO settings. They differ in how they remember: the last four observations side by side, a
-recurrent state, a gated transformer over the last K observations, and TIT's outer blocks.
+same PPO settings on all tasks. They differ in how they remember: the last four observations side by
+side, a recurrent state, a gated transformer over the last K observations, and TIT's outer blocks.
+docs/results/memory.md describes how the settings were found, and the results.
 """
 
 from __future__ import annotations
@@ -14,6 +15,18 @@ from torchrl_tit.settings import LSTM, MLP, GTrXL, Inner, Network
 
 from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
+
+MEMORY_SETTINGS: dict[str, Any] = PPO_SETTINGS | {
+    # More of the past in a batch, and sequences longer than most networks look back.
+    "num_envs": 16,
+    "steps_per_batch": 2048,
+    "sequence_length": 64,
+    "epochs": 8,
+    # An agent that is in a hurry, or too sure too early, never finds out what there is to remember.
+    "gamma": 0.995,
+    "entropy_coeff": 0.01,
+}
+"""The settings of all PPO recipes on arrays, with six fields changed."""
 
 _T_MAZES = {10: 50_000, 50: 200_000}
 """The number of steps by the corridor's length. At the junction, K frames just reach the cue."""
@@ -54,20 +67,22 @@ MEMORY_RECIPES: dict[str, PPO] = {
         env_settings=(f"corridor_length={length}",),
         total_steps=total_steps,
         backbone=backbone,
-        **PPO_SETTINGS,
+        **MEMORY_SETTINGS,
     )
     for length, total_steps in _T_MAZES.items()
     for network, backbone in memory_networks(length + 1).items()
 } | {
-    # As in arXiv 2505.15040: a view of 3 x 3 tiles, 96 steps. A patch is a tile.
+    # As in arXiv 2505.15040: a view of 3 x 3 tiles, and episodes are truncated after 96 steps.
+    # `max_steps=96` would truncate them too, but a step would then cost 0.9 / 96 of the reward
+    # instead of 0.9 / 245 on S7, and looking at the cue would not pay. A patch is a tile.
     f"ppo/memory-s{size}/{network}": PPO(
         name=f"ppo/memory-s{size}/{network}",
         env=f"MiniGrid-MemoryS{size}-v0",
-        env_settings=("agent_view_size=3", "max_steps=96"),
+        env_settings=("agent_view_size=3", "max_episode_steps=96"),
         wrappers=_VIEW,
         total_steps=total_steps,
         backbone=backbone,
-        **PPO_SETTINGS,
+        **MEMORY_SETTINGS,
     )
     for size, total_steps in _MINIGRIDS.items()
     for network, backbone in memory_networks(32, patch_size=8).items()

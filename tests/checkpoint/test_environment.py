@@ -25,6 +25,7 @@ from torchrl.envs import (
     VecNormV2,
 )
 
+import torchrl_tit.tasks  # noqa: F401  # registers TMaze-v0
 from torchrl_tit.checkpoint import (
     can_save_env,
     env_state,
@@ -141,6 +142,19 @@ def test_classic_control_vector(tmp_path: Path, name: str, reset_first: bool) ->
     steps = check_continues(tmp_path, make, before=50, after=60, reset_first=reset_first)
     assert steps["next", "done"].sum() >= 6  # new episodes were drawn on the way
     assert steps["next", "truncated"].any()
+
+
+@pytest.mark.parametrize("reset_first", [False, True], ids=["new", "used"])
+def test_t_maze_vector(tmp_path: Path, reset_first: bool) -> None:
+    # So short that random actions reach the goal: its side is part of the state.
+    steps = check_continues(
+        tmp_path,
+        lambda: make_vector("TMaze-v0", 8, corridor_length=1),
+        before=51,
+        after=60,
+        reset_first=reset_first,
+    )
+    assert (steps["next", "reward"] == 1).any()
 
 
 @pytest.mark.parametrize("name", MUJOCO)

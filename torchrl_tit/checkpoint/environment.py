@@ -18,10 +18,10 @@ from torchrl_tit.envs import GymVectorEnv
 def can_save_env(env: EnvBase) -> bool:
     """Return whether an environment can be saved and resumed.
 
-    All layers must be known: Gymnasium's classic control, toy text and MuJoCo tasks (v4, v5) with
-    the wrappers that `gymnasium.make` adds and a few more, single or in a `SyncVectorEnv`, inside
-    `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`. Other environments, such as
-    Atari, MiniGrid and TorchRL's own, must be reset at each checkpoint.
+    All layers must be known: Gymnasium's classic control, toy text and MuJoCo tasks (v4, v5) and
+    the T-Maze, with the wrappers that `gymnasium.make` adds and a few more, single or in a
+    `SyncVectorEnv`, inside `GymVectorEnv`, `GymWrapper` or `GymEnv` and any `TransformedEnv`. Other
+    environments, such as Atari, MiniGrid and TorchRL's own, must be reset at each checkpoint.
 
     Args:
         env: A TorchRL environment.

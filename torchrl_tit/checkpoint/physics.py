@@ -25,6 +25,7 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
     f"{_TOY}.cliffwalking.CliffWalkingEnv": ("s", "lastaction"),
     f"{_TOY}.frozen_lake.FrozenLakeEnv": ("s", "lastaction"),
     f"{_TOY}.taxi.TaxiEnv": ("s", "lastaction", "fickle_step", "taxi_orientation"),
+    "torchrl_tit.tasks.t_maze.TMaze": ("_x", "_y", "_goal", "_steps"),
     # All state of a MuJoCo environment is in its mjData, see mujoco_state.
     **{
         f"{_MUJOCO}.{module}_{version}.{name}": ()

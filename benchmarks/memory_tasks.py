@@ -1,0 +1,146 @@
+"""Success on tasks that need a past: ``python -m benchmarks.memory_tasks RECIPE ... --out FOLDER``.
+
+Each recipe is trained with each seed in a run folder. A run that was stopped goes on when the
+command is repeated. Training ends early once 98 % of the last 500 episodes were successful: had a
+return above ``--threshold``, which fits MiniGrid-Memory and the T-Maze. Then the final weights are
+evaluated. There is
+
+- a row in ``runs.csv`` for each run; runs that have one are not repeated;
+- ``successes.csv`` in each run's folder: episodes and successes of each batch.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from recipes import runner
+from recipes.callback import Callback
+from recipes.outcomes import Outcome
+from recipes.recipe import Recipe
+from recipes.registry import get_recipe
+from recipes.run import Run
+from torchrl_tit.checkpoint import checkpoint_steps
+from torchrl_tit.evaluation import finished_returns
+from torchrl_tit.files import write_text_atomic
+
+SOLVED, EPISODES = 0.98, 500
+REACHED, WINDOW = 0.9, 100
+"""``steps_to_0.9`` is where the share of successes first is this high over so many episodes."""
+COLUMNS = ["recipe", "seed", "weights", "steps", "steps_to_0.9", "success", "return"]
+
+
+class Successes(Callback):
+    """Counts successful episodes, and ends training when nearly all are.
+
+    Args:
+        path: CSV of the batches so far. Rows after the step are dropped: they are repeated.
+        step: the step from which the run goes on.
+        threshold: the return that a successful episode exceeds.
+    """
+
+    def __init__(self, path: Path, step: int, threshold: float) -> None:
+        self.path = path
+        self.threshold = threshold
+        self.batches: list[tuple[int, int, int]] = []
+        """Step, episodes and successes of each batch."""
+        self.returns: list[float] = []
+        """Returns of the evaluation."""
+        self._last: deque[bool] = deque(maxlen=EPISODES)
+        if step:
+            with path.open(newline="", encoding="utf-8") as file:
+                rows = [[int(cell) for cell in row] for row in [*csv.reader(file)][1:]]
+            for at, count, right in rows:
+                if at <= step:
+                    self._add(at, count, right)
+
+    def collected(self, step: int, batch: Any) -> None:
+        """Counts the episodes that ended in a batch."""
+        returns = finished_returns(batch)
+        self._add(step, returns.numel(), int((returns > self.threshold).sum()))
+
+    def updated(self, step: int, policy: Any) -> bool:
+        """Returns whether the task is solved."""
+        return len(self._last) == EPISODES and fmean(self._last) >= SOLVED
+
+    def evaluated(self, step: int, outcomes: Sequence[Outcome]) -> None:
+        """Keeps the returns."""
+        [outcome] = outcomes
+        self.returns = outcome.returns
+
+    def saving(self, step: int) -> None:
+        """Writes the batches, before the checkpoint that they belong to."""
+        rows = [["step", "episodes", "successes"], *self.batches]
+        write_text_atomic(self.path, "".join(",".join(map(str, row)) + "\n" for row in rows))
+
+    def reached(self) -> int | None:
+        """Returns the first step with 90 % of successes in the last 100 or more episodes."""
+        window: deque[tuple[int, int]] = deque()
+        for step, episodes, right in self.batches:
+            window.append((episodes, right))
+            while sum(count for count, _ in window) - window[0][0] >= WINDOW:
+                window.popleft()
+            count, successes = map(sum, zip(*window, strict=True))
+            if count >= WINDOW and successes >= REACHED * count:
+                return step
+        return None
+
+    def _add(self, step: int, episodes: int, right: int) -> None:
+        self.batches.append((step, episodes, right))
+        # The order within a batch does not matter.
+        self._last += [True] * right + [False] * (episodes - right)
+
+
+def measure(recipe: Recipe, folder: Path, threshold: float) -> list[object]:
+    """Trains and evaluates in a run folder, from its newest checkpoint; returns the row."""
+    started = (folder / "recipe.json").exists()
+    with Run.open(folder) if started else Run.create(folder, recipe) as run:
+        step = max(checkpoint_steps(run.checkpoints), default=0)
+        successes = Successes(folder / "successes.csv", step, threshold)
+        if not successes.updated(step, None):
+            runner.train(run.recipe, run, [successes])
+        evaluation = runner.evaluate(run, callbacks=[successes])
+        run.save_evaluation(evaluation)
+        step, algorithm, _ = runner.load_trained(run)
+    returns = successes.returns
+    weights = sum(weight.numel() for weight in algorithm.policy.parameters())
+    success = fmean(value > threshold for value in returns)
+    reached = successes.reached()
+    return [recipe.name, recipe.seed, weights, step, reached, success, round(fmean(returns), 4)]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Trains all recipes with all seeds that have no row yet."""
+    parser = argparse.ArgumentParser("python -m benchmarks.memory_tasks")
+    parser.add_argument("recipes", nargs="+", metavar="RECIPE", help="names of recipes")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--threshold", type=float, default=0.0, help="successes return more")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the runs and runs.csv")
+    options = parser.parse_args(arguments)
+    table = options.out / "runs.csv"
+    done = set()
+    if table.exists():
+        with table.open(newline="", encoding="utf-8") as file:
+            done = {(row["recipe"], row["seed"]) for row in csv.DictReader(file)}
+    else:
+        options.out.mkdir(parents=True, exist_ok=True)
+        table.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
+    for seed in options.seeds:
+        for name in options.recipes:
+            if (name, str(seed)) in done:
+                continue
+            folder = options.out / name / f"seed-{seed}"
+            row = measure(replace(get_recipe(name), seed=seed), folder, options.threshold)
+            with table.open("a", newline="", encoding="utf-8") as file:
+                csv.writer(file, lineterminator="\n").writerow(row)
+            print(*row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

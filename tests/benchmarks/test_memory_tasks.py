@@ -1,0 +1,86 @@
+"""Runs on memory tasks end early where they are solved, and go on where they were stopped."""
+
+import csv
+from dataclasses import replace
+
+import pytest
+
+from benchmarks import memory_tasks
+from benchmarks.memory_tasks import EPISODES, Successes
+from recipes import runner
+from recipes.registry import get_recipe
+from recipes.run import Run
+
+NAME = "ppo/tmaze-10/frames-4"
+SHORT = {
+    "total_steps": 512,
+    "num_envs": 2,
+    "steps_per_batch": 128,
+    "minibatch_size": 64,
+    "sequence_length": None,
+    "epochs": 1,
+    "checkpoint_interval": 128,
+    "evaluation_episodes": 3,
+}
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setattr(memory_tasks, "get_recipe", lambda name: replace(get_recipe(name), **SHORT))
+
+
+def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
+    words = [NAME, "--seeds", "0", "--out", str(tmp_path)]
+    memory_tasks.main(words)
+    [row] = rows_of(tmp_path / "runs.csv")
+    assert (row["recipe"], row["seed"], row["steps"]) == (NAME, "0", "512")
+    assert float(row["success"]) in (0, 1 / 3, 2 / 3, 1)
+    batches = rows_of(tmp_path / NAME / "seed-0" / "successes.csv")
+    assert [int(batch["step"]) for batch in batches] == [128, 256, 384, 512]
+    assert sum(int(batch["episodes"]) for batch in batches) >= 44  # of 11 steps
+    assert capsys.readouterr().out.startswith(f"{NAME} 0 ")
+    monkeypatch.setattr(memory_tasks, "measure", lambda *_: pytest.fail("measured again"))
+    memory_tasks.main(words)
+
+
+def test_training_ends_where_the_task_is_solved(short, tmp_path, monkeypatch):
+    monkeypatch.setattr(memory_tasks, "EPISODES", 20)
+    words = [NAME, "--seeds", "0", "--threshold", "-2", "--out", str(tmp_path)]
+    memory_tasks.main(words)  # all returns are at least -1
+    [row] = rows_of(tmp_path / "runs.csv")
+    assert (row["steps"], row["success"]) == ("256", "1.0")
+    assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
+
+
+def test_a_stopped_run_goes_on(short, tmp_path):
+    recipe = memory_tasks.get_recipe(NAME)
+
+    class Stopped(Exception):
+        pass
+
+    class Stop(Successes):
+        def saved(self, step):
+            if step == 256:
+                raise Stopped
+
+    with Run.create(tmp_path / "run", recipe) as run, pytest.raises(Stopped):
+        runner.train(recipe, run, [Stop(run.folder / "successes.csv", 0, 0.0)])
+    memory_tasks.measure(recipe, tmp_path / "run", 0.0)
+    memory_tasks.measure(recipe, tmp_path / "whole", 0.0)
+    texts = [(tmp_path / name / "successes.csv").read_text() for name in ("run", "whole")]
+    assert texts[0] == texts[1]
+
+
+def test_when_nine_in_ten_are_reached(tmp_path):
+    successes = Successes(tmp_path / "successes.csv", 0, 0.0)
+    # Over the last three batches: 70, 80, 89 and 90 %.
+    successes.batches = [(1, 40, 20), (2, 40, 30), (3, 40, 34), (4, 40, 32), (5, 40, 41 - 1)]
+    assert successes.reached() is None
+    successes.batches.append((6, 40, 36))
+    assert successes.reached() == 6
+    assert EPISODES == 500
