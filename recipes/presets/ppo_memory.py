@@ -17,16 +17,17 @@ from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
 
 MEMORY_SETTINGS: dict[str, Any] = PPO_SETTINGS | {
-    # More of the past in a batch, and sequences longer than most networks look back.
     "num_envs": 16,
     "steps_per_batch": 2048,
-    "sequence_length": 64,
+    "sequence_length": 64,  # by default 16; K - 1 frames more are encoded for each sequence
     "epochs": 8,
-    # An agent that is in a hurry, or too sure too early, never finds out what there is to remember.
+    # Less noise in the advantage of the one step where memory decides.
+    "gae_lambda": 0.8,
+    # An agent in a hurry, or sure too early, does not find out what there is to remember.
     "gamma": 0.995,
     "entropy_coeff": 0.01,
 }
-"""The settings of all PPO recipes on arrays, with six fields changed."""
+"""The settings of all PPO recipes on arrays, but for these fields."""
 
 _T_MAZES = {10: 50_000, 50: 200_000}
 """The number of steps by the corridor's length. At the junction, K frames just reach the cue."""
@@ -49,7 +50,8 @@ def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[s
         patch_size: pixels along a side of an image's patch; an array is one patch.
     """
     patch: dict[str, Any] = {"patch_size": patch_size or "auto", "patch_weights": "own"}
-    tit = reliable_tit("enhanced-tit", num_frames, **patch)
+    # Rotary positions find a frame by its distance sooner than learned ones.
+    tit = reliable_tit("enhanced-tit", num_frames, temporal_positions="rotary", **patch)
     # TIT's inner transformer; the other networks read only the class token of its last block.
     last = Inner(every_block=False, **patch)
     return {

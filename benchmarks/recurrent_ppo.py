@@ -1,0 +1,181 @@
+"""sb3-contrib's RecurrentPPO on MiniGrid-Memory: ``python -m benchmarks.recurrent_ppo --out FILE``.
+
+The environments are those of the recipes ``ppo/memory-s7/...``, and success is defined as in
+``benchmarks.memory_tasks``: training ends early once 98 % of the last 500 episodes were successful.
+Steps per second are those of collecting and updating together. A row is added to --out as soon as a
+run ends; runs that have a row are not repeated.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import time
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import gymnasium
+import torch
+from minigrid.wrappers import ImgObsWrapper, RGBImgPartialObsWrapper
+from sb3_contrib import RecurrentPPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from torchrl_tit.tasks import FirstActions
+
+from .memory_tasks import Successes
+from .sb3_returns import EVALUATION_SEED
+
+COLUMNS = [
+    "size",
+    "seed",
+    "total_steps",
+    "weights",
+    "steps_to_0.9",
+    "success",
+    "return",
+    "steps_per_second",
+    "processor_steps_per_second",
+    "sb3_contrib",
+]
+THRESHOLD = 0.0
+"""Successful episodes return more."""
+NUM_ENVS = 16
+"""As in the recipes. With the default of 128 steps in each, a batch has 2,048 steps, as there."""
+
+
+class Tiles(BaseFeaturesExtractor):
+    """A convolution over the tiles, another over their 3 x 3 neighbourhood, and a linear layer.
+
+    The default, NatureCNN, takes images of 36 x 36 pixels or more, and these have 24 x 24. Like
+    NatureCNN, it ends with a ReLU.
+
+    Args:
+        observation_space: that of images of 3 x 3 tiles, channels first.
+        features_dim: number of features.
+    """
+
+    def __init__(self, observation_space: gymnasium.spaces.Box, features_dim: int = 64) -> None:
+        super().__init__(observation_space, features_dim)
+        self.layers = nn.Sequential(
+            nn.Conv2d(observation_space.shape[0], 32, kernel_size=8, stride=8),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, kernel_size=3),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Linear(64, features_dim),
+            nn.ReLU(),
+        )
+
+    def forward(self, observations: Tensor) -> Tensor:
+        return self.layers(observations)
+
+
+SETTINGS: dict[str, Any] = {
+    "n_epochs": 4,  # instead of 10
+    "policy_kwargs": {
+        "features_extractor_class": Tiles,
+        "lstm_hidden_size": 64,  # instead of 256; as in the recipe with an LSTM
+    },
+}
+"""All other settings are the library's defaults: the actor and the critic have an LSTM each."""
+
+
+class Progress(BaseCallback):
+    """Counts successful episodes, batch by batch, and ends training when nearly all are."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.successes = Successes(Path(), step=0, threshold=THRESHOLD)  # is not saved
+        self._returns: list[float] = []
+        self._solved = False
+
+    def _on_rollout_start(self) -> None:
+        self._solved = self.successes.updated(self.num_timesteps, None)
+
+    def _on_step(self) -> bool:
+        infos = self.locals["infos"]
+        self._returns += [info["episode"]["r"] for info in infos if "episode" in info]
+        return not self._solved
+
+    def _on_rollout_end(self) -> None:
+        returns = torch.tensor(self._returns)
+        ends = {"done": torch.ones_like(returns, dtype=torch.bool), "episode_reward": returns}
+        self.successes.collected(self.num_timesteps, TensorDict({"next": ends}))
+        self._returns.clear()
+
+
+def make_env(size: int) -> gymnasium.Env[Any, Any]:
+    """Returns the environment of the recipes: partial views as images, and the first 3 actions."""
+    env: gymnasium.Env[Any, Any] = gymnasium.make(
+        f"MiniGrid-MemoryS{size}-v0", agent_view_size=3, max_episode_steps=96
+    )
+    return FirstActions(ImgObsWrapper(RGBImgPartialObsWrapper(env, tile_size=8)), count=3)
+
+
+def measure(size: int, seed: int, total_steps: int, episodes: int) -> list[object]:
+    """Trains once and evaluates the last weights with their most likely actions; returns a row."""
+    make = partial(make_env, size)
+    envs = make_vec_env(make, NUM_ENVS, seed=seed)
+    agent = RecurrentPPO("CnnLstmPolicy", envs, seed=seed, device="cpu", **SETTINGS)
+    progress = Progress()
+    start, processor_start = time.perf_counter(), time.process_time()
+    agent.learn(total_steps, callback=progress)
+    seconds, processor = time.perf_counter() - start, time.process_time() - processor_start
+    returns, _ = evaluate_policy(
+        agent,
+        make_vec_env(make, NUM_ENVS, seed=EVALUATION_SEED),
+        n_eval_episodes=episodes,
+        return_episode_rewards=True,
+    )
+    assert isinstance(returns, list)
+    return [
+        size,
+        seed,
+        total_steps,
+        sum(weight.numel() for weight in agent.policy.parameters()),
+        progress.successes.reached(),
+        fmean(value > THRESHOLD for value in returns),
+        round(fmean(returns), 4),
+        round(agent.num_timesteps / seconds, 1),
+        round(agent.num_timesteps / processor, 1),
+        version("sb3-contrib"),
+    ]
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Trains with all seeds that have no row yet."""
+    parser = argparse.ArgumentParser("python -m benchmarks.recurrent_ppo")
+    parser.add_argument("--size", type=int, default=7, help="of MiniGrid-MemoryS{size}-v0")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
+    parser.add_argument("--total-steps", type=int, default=1_000_000)
+    parser.add_argument("--episodes", type=int, default=100, help="episodes of the evaluation")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--out", type=Path, required=True, help="CSV that rows are added to")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(options.threads)
+    done = set()
+    if options.out.exists():
+        with options.out.open(newline="", encoding="utf-8") as file:
+            done = {(row["size"], row["seed"], row["total_steps"]) for row in csv.DictReader(file)}
+    else:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
+    for seed in options.seeds:
+        if (str(options.size), str(seed), str(options.total_steps)) in done:
+            continue
+        row = measure(options.size, seed, options.total_steps, options.episodes)
+        with options.out.open("a", newline="", encoding="utf-8") as file:
+            csv.writer(file, lineterminator="\n").writerow(row)
+        print(*row, flush=True)
+
+
+if __name__ == "__main__":
+    main()

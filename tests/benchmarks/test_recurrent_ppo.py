@@ -1,0 +1,69 @@
+"""What RecurrentPPO reaches on MiniGrid-Memory is written as each run ends, and not run twice."""
+
+import csv
+
+import pytest
+from gymnasium.spaces import Discrete
+
+pytest.importorskip("minigrid")
+
+from benchmarks import memory_tasks, recurrent_ppo
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture
+def short(monkeypatch):
+    monkeypatch.setitem(recurrent_ppo.SETTINGS, "n_steps", 8)  # 128 steps in a batch
+    monkeypatch.setitem(recurrent_ppo.SETTINGS, "n_epochs", 1)
+
+
+def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "new" / "recurrent.csv"
+    words = ["--total-steps", "256", "--episodes", "2", "--out", str(out), "--seeds", "0"]
+    recurrent_ppo.main(words)
+    [row] = rows_of(out)
+    assert list(row) == recurrent_ppo.COLUMNS
+    assert (row["size"], row["seed"], row["total_steps"]) == ("7", "0", "256")
+    assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
+    assert float(row["success"]) in (0, 1 / 2, 1)
+    assert 0 <= float(row["return"]) <= 1
+    assert float(row["steps_per_second"]) > 0
+    assert float(row["processor_steps_per_second"]) > 0
+    assert capsys.readouterr().out.startswith("7 0 256 ")
+    monkeypatch.setattr(recurrent_ppo, "measure", lambda *_: pytest.fail("measured again"))
+    recurrent_ppo.main(words)
+
+
+def test_training_ends_where_the_task_is_solved(short, monkeypatch):
+    monkeypatch.setattr(memory_tasks, "EPISODES", 4)
+    monkeypatch.setattr(memory_tasks, "WINDOW", 4)
+    monkeypatch.setattr(recurrent_ppo, "THRESHOLD", -1.0)  # all returns are at least 0
+    batches = []
+
+    class Progress(recurrent_ppo.Progress):
+        def _on_training_end(self):
+            batches.extend(self.successes.batches)
+
+    monkeypatch.setattr(recurrent_ppo, "Progress", Progress)
+    row = recurrent_ppo.measure(7, 0, 5_000, 2)
+    cells = dict(zip(recurrent_ppo.COLUMNS, row, strict=True))
+    assert [step for step, _, _ in batches] == [128 * (i + 1) for i in range(len(batches))]
+    assert batches[-1][0] < 5_000
+    # The batch in which the fourth episode ends is the last.
+    assert sum(episodes for _, episodes, _ in batches[:-1]) < 4
+    assert cells["steps_to_0.9"] == batches[-1][0]
+    assert cells["success"] == 1
+
+
+def test_the_environment_is_that_of_the_recipes():
+    env = recurrent_ppo.make_env(7)
+    assert env.observation_space.shape == (24, 24, 3)
+    assert env.action_space == Discrete(3)
+    env.reset(seed=0)
+    for _ in range(95):
+        assert not any(env.step(0)[2:4])  # it turns
+    assert env.step(0)[2:4] == (False, True)
