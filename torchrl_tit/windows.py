@@ -31,6 +31,9 @@ class Windows(NamedTuple):
     """int64 [..., K], oldest frame first; a missing frame has the row of the oldest valid one."""
     missing: Tensor | None
     """bool [..., K], True where zeros replace a missing frame; None if they replace none."""
+    span: int | None = None
+    """If the windows are those of N sequences, [N, T, K], the rows of each sequence: those of
+    sequence n are n * span to (n + 1) * span - 1, in the order of time. None otherwise."""
 
     def used(self) -> tuple[Tensor, Windows]:
         """Finds the rows that are used, so that only those are encoded.
@@ -45,6 +48,19 @@ class Windows(NamedTuple):
         """
         rows, renumbered = self.rows.unique(return_inverse=True)
         return rows, Windows(renumbered, self.missing)
+
+    def padded(self) -> Tensor:
+        """Finds where padding repeats a row, instead of one row following another.
+
+        Returns:
+            bool [..., K].
+
+        Example:
+            >>> Windows(torch.tensor([[2, 2, 3], [3, 4, 5]]), None).padded().tolist()
+            [[True, False, False], [False, False, False]]
+        """
+        steps = torch.arange(1 - self.rows.shape[-1], 1, device=self.rows.device)
+        return self.rows != self.rows[..., -1:] + steps
 
     def gather(self, frames: Tensor) -> Tensor:
         """Gathers frames.

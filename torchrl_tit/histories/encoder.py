@@ -8,6 +8,8 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from torchrl_tit.windows import Windows
+
 
 @dataclass(frozen=True)
 class HistoryShape:
@@ -94,6 +96,22 @@ class HistoryEncoder(nn.Module):
 
         Returns:
             float [..., K, E].
+        """
+        raise NotImplementedError
+
+    def reads_tables(self, windows: Windows) -> bool:
+        """Whether ``read_table`` is implemented, and faster for these windows than ``forward``."""
+        return False
+
+    def read_table(self, tokens: Tensor, windows: Windows) -> Tensor:
+        """Encodes windows on a table of frames, without a copy of each window.
+
+        Args:
+            tokens: float [R, L, D], of each frame.
+            windows: rows of the frames, [N, T, K], none missing.
+
+        Returns:
+            float [N, T, E]: that of ``forward(windows.gather(tokens))``.
         """
         raise NotImplementedError
 

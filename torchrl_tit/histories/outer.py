@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
 from torchrl_tit.layers.block import TransformerBlock
+from torchrl_tit.layers.window_attention import worth_a_table
+from torchrl_tit.windows import Windows
 
 
 class OuterTransformer(HistoryEncoder):
@@ -105,6 +107,20 @@ class PairedOuterTransformer(OuterTransformer):
         newest = [self._block(i)(x[:, :, i], read="last") for i in range(self.num_blocks)]
         return torch.cat(newest, dim=-1).reshape(*leading, self.out_features)
 
+    def reads_tables(self, windows: Windows) -> bool:
+        """Whether each block can project the tokens of a frame once for all windows.
+
+        Learned positions are added to the tokens, so these differ from window to window.
+        """
+        return self.positions is None and worth_a_table(windows)
+
+    def read_table(self, tokens: Tensor, windows: Windows) -> Tensor:
+        """Tokens of a table of frames, float [R, L, D] -> float [N, T, L * D]."""
+        newest = [
+            self._block(i).read_windows(tokens[:, i], windows) for i in range(self.num_blocks)
+        ]
+        return torch.cat(newest, dim=-1)
+
     def attention_maps(self, tokens: Tensor) -> list[Tensor]:
         """Returns the attention weights of each block, L x float [..., heads, K, K]."""
         x, leading = self._steps(tokens)
@@ -138,6 +154,10 @@ class ChainedOuterTransformer(PairedOuterTransformer):
         >>> outer(torch.randn(8, 4, 2, 32)).shape
         torch.Size([8, 64])
     """
+
+    def reads_tables(self, windows: Windows) -> bool:
+        """No: what a block passes on at a frame depends on where the window begins."""
+        return False
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., L * D]."""

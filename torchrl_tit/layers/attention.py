@@ -139,13 +139,13 @@ class SelfAttention(nn.Module):
         # All sequences share one query, so it is projected instead of the keys:
         # q (K x) = (q K) x. The keys' bias adds the same constant to all scores of a head, so the
         # softmax ignores it.
-        query = self._project(first, 0, 1).reshape(self.num_heads, 1, -1)
+        query = self.project(first, 0, 1).reshape(self.num_heads, 1, -1)
         keys = self.in_proj_weight[width : 2 * width].unflatten(0, (self.num_heads, -1))
         probe = (query @ keys).squeeze(1).t() / math.sqrt(keys.shape[1])  # [D, heads]
         scores = torch.cat([(first @ probe).expand(count, -1, -1), rest @ probe], dim=1)
         weights = self.dropout(scores.softmax(dim=1)).unsqueeze(-1)  # [N, S, heads, 1]
         own, other = (
-            self._project(x, 2, 3).unflatten(-1, (self.num_heads, -1)) for x in (first, rest)
+            self.project(x, 2, 3).unflatten(-1, (self.num_heads, -1)) for x in (first, rest)
         )  # values, [1, 1, heads, D / heads] and [N, S - 1, heads, D / heads]
         mixed = weights[:, :1] * own + (weights[:, 1:] * other).sum(dim=1, keepdim=True)
         return self.out_proj(mixed.flatten(2))
@@ -164,7 +164,7 @@ class SelfAttention(nn.Module):
         """Shows the settings that the parameters' shapes do not."""
         return f"num_heads={self.num_heads}, causal={self.causal}"
 
-    def _project(self, x: Tensor, start: int, stop: int) -> Tensor:
+    def project(self, x: Tensor, start: int, stop: int) -> Tensor:
         """Applies the projections from ``start`` to ``stop`` of (query, key, value) at once."""
         rows = slice(start * x.shape[-1], stop * x.shape[-1])
         return F.linear(x, self.in_proj_weight[rows], self.in_proj_bias[rows])
@@ -187,7 +187,7 @@ class SelfAttention(nn.Module):
 
     def _attend_itself(self, x: Tensor) -> Tensor:
         """Like ``_attend``, for a sequence of one: its softmax is 1, so only the value is left."""
-        value = self._project(x, 2, 3)  # [N, 1, D]
+        value = self.project(x, 2, 3)  # [N, 1, D]
         if not self._drops:
             return value
         ones = x.new_ones(x.shape[0], 1, self.num_heads, 1)
@@ -231,10 +231,10 @@ class SelfAttention(nn.Module):
     def _heads(self, x: Tensor, positions: slice) -> tuple[Tensor, Tensor, Tensor]:
         """Queries of the positions, keys and values of all, [N, heads, ..., D / heads] each."""
         if positions == READ_SLICES["all"]:
-            query, key, value = self._project(x, 0, 3).chunk(3, dim=-1)
+            query, key, value = self.project(x, 0, 3).chunk(3, dim=-1)
         else:
-            query = self._project(x[:, positions], 0, 1)
-            key, value = self._project(x, 1, 3).chunk(2, dim=-1)
+            query = self.project(x[:, positions], 0, 1)
+            key, value = self.project(x, 1, 3).chunk(2, dim=-1)
         query, key, value = self._split(query), self._split(key), self._split(value)
         if self.rotary is None:
             return query, key, value

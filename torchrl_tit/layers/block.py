@@ -6,10 +6,12 @@ from torch import Tensor, nn
 
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.attention import READ_SLICES, Read, SelfAttention
+from torchrl_tit.layers.window_attention import attend_windows
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.frames import Activation, TransformerSettings
 from torchrl_tit.settings.histories import TemporalPositions
 from torchrl_tit.settings.numbers import Count, Probability, Width
+from torchrl_tit.windows import Windows
 
 
 class TransformerBlock(nn.Module):
@@ -126,6 +128,22 @@ class TransformerBlock(nn.Module):
             float [N, 1, D].
         """
         x = first + self.attention.read_first(self.norm1(first), self.norm1(rest))
+        return x + self.ffn(self.norm2(x))
+
+    def read_windows(self, x: Tensor, windows: Windows) -> Tensor:
+        """Reads the newest token of windows on a table; tokens are projected once.
+
+        Args:
+            x: tokens of the table, float [R, D].
+            windows: windows of sequences, [N, T, K].
+
+        Returns:
+            float [N, T, D]: that of ``forward(windows.gather(x), "last")``.
+        """
+        newest = x.index_select(0, windows.rows[..., -1].flatten()).view(
+            *windows.rows.shape[:2], -1
+        )
+        x = newest + attend_windows(self.attention, self.norm1(x), windows)
         return x + self.ffn(self.norm2(x))
 
     def attention_weights(self, x: Tensor) -> Tensor:

@@ -125,6 +125,33 @@ class Rotary(nn.Module):
         cos, sin = (table[:length][read].to(x.dtype) for table in (self.cos, self.sin))
         return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
 
+    def at(self, x: Tensor, steps: Tensor) -> Tensor:
+        """Rotates queries or keys of any steps.
+
+        Args:
+            x: float [..., d].
+            steps: int64, broadcastable to [...].
+        """
+        angles = sinusoids(steps.flatten(), x.shape[-1]).view(*steps.shape, -1).to(x.dtype)
+        sin, cos = angles.chunk(2, dim=-1)
+        first, second = x.chunk(2, dim=-1)
+        return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
+
+    def at_each_distance(self, query: Tensor, key: Tensor) -> Tensor:
+        """The products of queries and keys, were the key 0 to K - 1 steps back.
+
+        Args:
+            query: float [..., d].
+            key: float [..., d].
+
+        Returns:
+            float [..., K], the largest distance first.
+        """
+        # With pairs of entries as complex numbers: the real part of conj(q) k exp(-i angle).
+        (q1, q2), (k1, k2) = query.chunk(2, dim=-1), key.chunk(2, dim=-1)
+        cos, sin = (table.flip(0).mT.to(query.dtype) for table in (self.cos, self.sin))
+        return (q1 * k1 + q2 * k2) @ cos + (q1 * k2 - q2 * k1) @ sin
+
     def extra_repr(self) -> str:
         """Shows the number of entries and of steps."""
         return f"{2 * self.cos.shape[-1]}, {self.num_frames}"

@@ -75,8 +75,10 @@ def table_of_first(
     start = _last_start(_after_first(is_init, False))
     oldest = torch.where(start == 0, 0, start + num_frames - 1)
     newest = torch.arange(steps, device=start.device) + num_frames - 1
-    offset = _offsets(count, steps + num_frames - 1, start)
-    return FrameTable(frames, find_windows(offset + newest, offset + oldest, num_frames, padding))
+    span = steps + num_frames - 1
+    offset = _offsets(count, span, start)
+    windows = find_windows(offset + newest, offset + oldest, num_frames, padding)
+    return FrameTable(frames, windows._replace(span=span))
 
 
 def table_without_histories(
@@ -103,7 +105,8 @@ def table_without_histories(
     valid = (newest - start >= num_frames - 1) | is_init.gather(1, start)
     offset = _offsets(count, steps, start)
     windows = find_windows(offset + newest, offset + start, num_frames, padding)
-    return FrameTable([x.flatten(0, 1) for x in observations], windows, valid)
+    frames = [x.flatten(0, 1) for x in observations]
+    return FrameTable(frames, windows._replace(span=steps), valid)
 
 
 def find_starts(is_init: Tensor, ends: Sequence[Tensor]) -> Tensor:

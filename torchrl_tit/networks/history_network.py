@@ -190,9 +190,13 @@ class HistoryNetwork(nn.Module):
         if windows.missing is not None:  # the padding frame is encoded like any other
             last = frames[0].shape[0]
             frames = [torch.cat([x, torch.zeros_like(x[:1])]) for x in frames]
-            windows = Windows(windows.rows.masked_fill(windows.missing, last), None)
+            rows = windows.rows.masked_fill(windows.missing, last)
+            windows = windows._replace(rows=rows, missing=None)
         tokens = [encoder(x) for encoder, x in zip(self.frames, frames, strict=True)]
-        gathered = windows.gather(self.join_tokens(tokens))
+        table = self.join_tokens(tokens)
+        if not every_frame and self.history_encoder.reads_tables(windows):
+            return self.head(self.history_encoder.read_table(self.as_floats(table), windows))
+        gathered = windows.gather(table)
         if every_frame:
             encoded = self.history_encoder.every_frame(self.as_floats(gathered), *context)
             return self.head(encoded)

@@ -1,0 +1,107 @@
+"""Windows on a table read as copies of them do, in values and gradients."""
+
+import pytest
+import torch
+
+from torchrl_tit.layers.attention import SelfAttention
+from torchrl_tit.layers.window_attention import attend_windows, worth_a_table
+from torchrl_tit.modules.frame_tables import find_starts, table_of_first, table_without_histories
+from torchrl_tit.networks import build_network
+from torchrl_tit.settings.networks import enhanced_tit
+from torchrl_tit.windows import Windows, find_windows
+
+SEQUENCES, STEPS, K, WIDTH = 3, 9, 5, 8
+POSITIONS = ["none", "relative", "rotary"]
+TOLERANCES = {
+    **dict.fromkeys(["none", "relative", "learned"], {"rtol": 1e-10, "atol": 1e-10}),
+    "rotary": {"rtol": 1e-5, "atol": 1e-5},  # angles are float32
+}
+
+
+def make_attention(positions, **settings):
+    torch.manual_seed(0)
+    attention = SelfAttention(
+        WIDTH, 2, causal=True, positions=positions, num_frames=K, **settings
+    ).double()
+    for parameter in attention.parameters():
+        torch.nn.init.normal_(parameter, std=0.5)
+    return attention
+
+
+def make_table(padding, stored=True, width=(WIDTH,)):
+    """A table of sequences, the second of which has two starts and the third one every step."""
+    torch.manual_seed(1)
+    is_init = torch.zeros(SEQUENCES, STEPS, dtype=torch.bool)
+    is_init[1, [0, 2, 6]] = True
+    is_init[2] = True
+    observations = [torch.randn(SEQUENCES, STEPS, *width, dtype=torch.float64)]
+    if not stored:
+        starts = find_starts(is_init, [])
+        return table_without_histories(observations, is_init, starts, K, padding)
+    first = [torch.randn(SEQUENCES, K, *width, dtype=torch.float64)]
+    return table_of_first(first, observations, is_init, padding)
+
+
+@pytest.mark.parametrize("stored", [True, False], ids=["stored", "padded"])
+@pytest.mark.parametrize("positions", POSITIONS)
+def test_attention_equals_that_on_copies(positions, stored):
+    attention, table = make_attention(positions), make_table("same", stored)
+    assert table.windows.span == (STEPS + K - 1 if stored else STEPS)
+    assert table.windows.padded().any()
+    assert not table.windows.padded().all()
+    results = []
+    for read in (
+        lambda x: attend_windows(attention, x, table.windows),
+        lambda x: attention(table.windows.gather(x).flatten(0, 1), "last").view(
+            SEQUENCES, STEPS, WIDTH
+        ),
+    ):
+        x = table.frames[0].clone().requires_grad_()
+        output = read(x)
+        weights = [p for p in attention.parameters()]
+        gradients = torch.autograd.grad((output * output.detach().cos()).sum(), [x, *weights])
+        results.append([output, *gradients])
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, **TOLERANCES[positions])
+
+
+def test_dropout_drops_weights_of_single_frames():
+    attention, table = make_attention("none", dropout=0.5), make_table("same")
+    torch.nn.init.zeros_(attention.out_proj.bias)
+    attention.train()
+    draws = torch.stack(
+        [attend_windows(attention, table.frames[0], table.windows) for _ in range(4000)]
+    )
+    expected = attention.eval()(table.windows.gather(table.frames[0]).flatten(0, 1), "last")
+    error = draws.std(0) / len(draws) ** 0.5
+    assert ((draws.mean(0).flatten(0, 1) - expected[:, 0]).abs() < 6 * error.flatten(0, 1)).all()
+    # All K frames of an episode's first window are the same. Dropped one by one, 0 to K of them are
+    # left for each of the two heads; if padding were dropped as a whole, there were 4 ways each.
+    kept = draws[:, 2, 1, 0].mul(1e6).round().unique()
+    assert 4**2 < len(kept) <= (K + 1) ** 2
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("positions", [*POSITIONS, "learned"])
+def test_the_network_reads_sequences_as_histories(positions, padding, monkeypatch):
+    torch.manual_seed(0)
+    network = build_network(enhanced_tit(K, temporal_positions=positions), (4,)).double()
+    for parameter in network.parameters():
+        torch.nn.init.normal_(parameter, std=0.3)
+    table = make_table(padding, width=(4,))
+    calls = []
+    encoder = network.history_encoder
+    read = encoder.read_table
+    monkeypatch.setattr(encoder, "read_table", lambda *x: calls.append(1) or read(*x))
+    features = network.encode_windows(table.frames, table.windows)
+    expected = network(table.windows.gather(table.frames[0]))
+    torch.testing.assert_close(features, expected, **TOLERANCES[positions])
+    assert len(calls) == (positions != "learned")
+
+
+def test_when_a_table_is_worth_it():
+    newest = torch.arange(40)
+    windows = find_windows(newest, newest.clamp(max=0), 2, "same")
+    assert not worth_a_table(windows)  # nothing is known of sequences
+    assert worth_a_table(Windows(windows.rows[None], None, span=32))
+    assert not worth_a_table(Windows(windows.rows[None], None, span=33))
