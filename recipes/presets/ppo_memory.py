@@ -29,8 +29,11 @@ MEMORY_SETTINGS: dict[str, Any] = PPO_SETTINGS | {
 }
 """The settings of all PPO recipes on arrays, but for these fields."""
 
-_T_MAZES = {10: 50_000, 50: 200_000}
+_T_MAZES = {10: 100_000, 50: 400_000, 250: 1_000_000, 500: 2_000_000}
 """The number of steps by the corridor's length. At the junction, K frames just reach the cue."""
+
+_REPEATS = {"easy": 500_000, "medium": 500_000}
+"""The number of steps of POPGym's RepeatPrevious by difficulty: 4 or 32 steps back."""
 
 _MINIGRIDS = {7: 1_000_000, 9: 2_000_000, 11: 4_000_000}
 """The number of steps by the size of the maze."""
@@ -40,6 +43,13 @@ _VIEW = (
     "minigrid.wrappers:ImgObsWrapper",
     "torchrl_tit.tasks:FirstActions(count=3)",  # left, right, forward
 )
+
+
+def _t_maze_settings(length: int) -> dict[str, Any]:
+    """Sequences as long as an episode, so that an LSTM's gradient reaches the cue."""
+    steps = max(128, 2 ** length.bit_length())
+    batch = {"steps_per_batch": 16 * steps, "minibatch_size": 2 * steps}
+    return MEMORY_SETTINGS | {**batch, "sequence_length": steps if steps > 128 else 64}
 
 
 def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[str, Network]:
@@ -62,31 +72,45 @@ def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[s
     }
 
 
-MEMORY_RECIPES: dict[str, PPO] = {
-    f"ppo/tmaze-{length}/{network}": PPO(
-        name=f"ppo/tmaze-{length}/{network}",
-        env="TMaze-v0",
-        env_settings=(f"corridor_length={length}",),
-        total_steps=total_steps,
-        backbone=backbone,
-        **MEMORY_SETTINGS,
-    )
-    for length, total_steps in _T_MAZES.items()
-    for network, backbone in memory_networks(length + 1).items()
-} | {
-    # As in arXiv 2505.15040: a view of 3 x 3 tiles, and episodes are truncated after 96 steps.
-    # `max_steps=96` would truncate them too, but a step would then cost 0.9 / 96 of the reward
-    # instead of 0.9 / 245 on S7, and looking at the cue would not pay. A patch is a tile.
-    f"ppo/memory-s{size}/{network}": PPO(
-        name=f"ppo/memory-s{size}/{network}",
-        env=f"MiniGrid-MemoryS{size}-v0",
-        env_settings=("agent_view_size=3", "max_episode_steps=96"),
-        wrappers=_VIEW,
-        total_steps=total_steps,
-        backbone=backbone,
-        **MEMORY_SETTINGS,
-    )
-    for size, total_steps in _MINIGRIDS.items()
-    for network, backbone in memory_networks(32, patch_size=8).items()
-}
+MEMORY_RECIPES: dict[str, PPO] = (
+    {
+        f"ppo/tmaze-{length}/{network}": PPO(
+            name=f"ppo/tmaze-{length}/{network}",
+            env="TMaze-v0",
+            env_settings=(f"corridor_length={length}",),
+            total_steps=total_steps,
+            backbone=backbone,
+            **_t_maze_settings(length),
+        )
+        for length, total_steps in _T_MAZES.items()
+        for network, backbone in memory_networks(length + 1).items()
+    }
+    | {
+        f"ppo/repeat-previous-{difficulty}/{network}": PPO(
+            name=f"ppo/repeat-previous-{difficulty}/{network}",
+            env=f"popgym-RepeatPrevious{difficulty.title()}-v0",
+            total_steps=total_steps,
+            backbone=backbone,
+            **MEMORY_SETTINGS,
+        )
+        for difficulty, total_steps in _REPEATS.items()
+        for network, backbone in memory_networks(32).items()
+    }
+    | {
+        # As in arXiv 2505.15040: a view of 3 x 3 tiles, and episodes are truncated after 96 steps.
+        # `max_steps=96` would truncate them too, but a step would then cost 0.9 / 96 of the reward
+        # instead of 0.9 / 245 on S7, and looking at the cue would not pay. A patch is a tile.
+        f"ppo/memory-s{size}/{network}": PPO(
+            name=f"ppo/memory-s{size}/{network}",
+            env=f"MiniGrid-MemoryS{size}-v0",
+            env_settings=("agent_view_size=3", "max_episode_steps=96"),
+            wrappers=_VIEW,
+            total_steps=total_steps,
+            backbone=backbone,
+            **MEMORY_SETTINGS,
+        )
+        for size, total_steps in _MINIGRIDS.items()
+        for network, backbone in memory_networks(32, patch_size=8).items()
+    }
+)
 """The recipes by name."""
