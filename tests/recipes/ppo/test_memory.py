@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 pytest.importorskip("minigrid")
+pytest.importorskip("popgym")
 
 from recipes.algorithm import make_algorithm
 from recipes.presets.ppo_memory import MEMORY_RECIPES
@@ -12,12 +13,15 @@ from recipes.registry import RECIPES
 from torchrl_tit.settings import Inner
 
 TASKS = sorted({name.rpartition("/")[0] for name in MEMORY_RECIPES})
+SHAPES = {"tmaze": (2,), "repeat": (1,), "memory-s": (3, 24, 24)}
 T_MAZES = [task for task in TASKS if "tmaze" in task]
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_only_the_memory_differs(task):
-    recipes = {name: recipe for name, recipe in MEMORY_RECIPES.items() if name.startswith(task)}
+    recipes = {
+        name: recipe for name, recipe in MEMORY_RECIPES.items() if name.startswith(f"{task}/")
+    }
     frames = set()
     for recipe in recipes.values():
         assert isinstance(recipe.backbone.frame, Inner)
@@ -32,7 +36,7 @@ def test_only_the_memory_differs(task):
         algorithm = make_algorithm(recipe)
         algorithm.check()
         history = algorithm.make_env(1, seed=0).reset()["history"]
-        shape = (2,) if task in T_MAZES else (3, 24, 24)
+        [shape] = [shape for word, shape in SHAPES.items() if word in task]
         assert history.shape == (1, recipe.backbone.num_frames, *shape)
         sizes.append(sum(weights.numel() for weights in algorithm.policy.parameters()))
     assert max(sizes) < 1.1 * min(sizes), "about the same number of weights"
@@ -45,6 +49,8 @@ def test_the_cue_is_within_reach_of_those_that_should_solve_it(task):
         if name.startswith(f"{task}/"):
             reaches = recipe.backbone.num_frames > length or recipe.backbone.carries_state
             assert reaches == ("frames" not in name)
+            # So does an LSTM's gradient.
+            assert recipe.steps_per_sequence > length
 
 
 @pytest.mark.parametrize("name", [name for name in MEMORY_RECIPES if "memory-s" in name])
