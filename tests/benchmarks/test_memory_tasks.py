@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -12,7 +13,7 @@ from recipes.registry import get_recipe
 from recipes.run import Run
 
 NAME = "ppo/tmaze-10/frames-4"
-SHORT = {
+SHORT: dict[str, Any] = {
     "total_steps": 512,
     "num_envs": 2,
     "steps_per_batch": 128,

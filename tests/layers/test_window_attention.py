@@ -3,19 +3,17 @@
 import pytest
 import torch
 
+from torchrl_tit.histories.outer import PairedOuterTransformer
 from torchrl_tit.layers.attention import SelfAttention
 from torchrl_tit.layers.window_attention import attend_windows, worth_a_table
 from torchrl_tit.modules.frame_tables import find_starts, table_of_first, table_without_histories
-from torchrl_tit.networks import build_network
-from torchrl_tit.settings.networks import enhanced_tit
+from torchrl_tit.networks import EnhancedTIT
 from torchrl_tit.windows import Windows, find_windows
 
 SEQUENCES, STEPS, K, WIDTH = 3, 9, 5, 8
 POSITIONS = ["none", "relative", "rotary"]
-TOLERANCES = {
-    **dict.fromkeys(["none", "relative", "learned"], {"rtol": 1e-10, "atol": 1e-10}),
-    "rotary": {"rtol": 1e-5, "atol": 1e-5},  # angles are float32
-}
+TOLERANCES = dict.fromkeys(POSITIONS, 1e-10) | {"learned": 1e-10, "rotary": 1e-5}
+"""Angles are float32."""
 
 
 def make_attention(positions, **settings):
@@ -62,7 +60,8 @@ def test_attention_equals_that_on_copies(positions, stored):
         gradients = torch.autograd.grad((output * output.detach().cos()).sum(), [x, *weights])
         results.append([output, *gradients])
     for ours, theirs in zip(*results, strict=True):
-        torch.testing.assert_close(ours, theirs, **TOLERANCES[positions])
+        tolerance = TOLERANCES[positions]
+        torch.testing.assert_close(ours, theirs, rtol=tolerance, atol=tolerance)
 
 
 def test_dropout_drops_weights_of_single_frames():
@@ -85,17 +84,22 @@ def test_dropout_drops_weights_of_single_frames():
 @pytest.mark.parametrize("positions", [*POSITIONS, "learned"])
 def test_the_network_reads_sequences_as_histories(positions, padding, monkeypatch):
     torch.manual_seed(0)
-    network = build_network(enhanced_tit(K, temporal_positions=positions), (4,)).double()
+    network = EnhancedTIT((4,), K, temporal_positions=positions).double()
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     table = make_table(padding, width=(4,))
     calls = []
-    encoder = network.history_encoder
-    read = encoder.read_table
-    monkeypatch.setattr(encoder, "read_table", lambda *x: calls.append(1) or read(*x))
+    read_table = PairedOuterTransformer.read_table
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return read_table(*arguments)
+
+    monkeypatch.setattr(PairedOuterTransformer, "read_table", counted)
     features = network.encode_windows(table.frames, table.windows)
     expected = network(table.windows.gather(table.frames[0]))
-    torch.testing.assert_close(features, expected, **TOLERANCES[positions])
+    tolerance = TOLERANCES[positions]
+    torch.testing.assert_close(features, expected, rtol=tolerance, atol=tolerance)
     assert len(calls) == (positions != "learned")
 
 

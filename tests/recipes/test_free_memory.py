@@ -2,15 +2,15 @@
 
 import ctypes
 import platform
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from recipes import runner
 from recipes.free_memory import return_free_memory
-from recipes.registry import get_recipe
+from recipes.ppo import PPO
 from recipes.run import Run
+from torchrl_tit.settings.networks import mlp
 
 BLOCK, COUNT = 100_000, 1_000  # bytes; smaller than what glibc takes from the system piece by piece
 
@@ -40,10 +40,12 @@ def test_memory_between_blocks_in_use_is_returned():
 
 
 def test_checkpoints_return_it(tmp_path, monkeypatch):
-    calls = []
+    calls: list[None] = []
     monkeypatch.setattr(runner, "return_free_memory", lambda: calls.append(None))
-    recipe = replace(
-        get_recipe("ppo/cartpole/mlp"),
+    recipe = PPO(
+        name="ppo/cartpole/mlp",
+        env="CartPole-v1",
+        backbone=mlp(),
         total_steps=64,
         steps_per_batch=32,
         minibatch_size=32,
