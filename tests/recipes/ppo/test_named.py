@@ -8,6 +8,7 @@ import pytest
 
 from recipes.algorithm import make_algorithm
 from recipes.ppo import PPO
+from recipes.presets.ppo_memory import MEMORY_RECIPES, MEMORY_SETTINGS
 from recipes.presets.ppo_settings import PPO_SETTINGS
 from recipes.registry import RECIPES
 from torchrl_tit.settings.networks import d2rl, enhanced_tit, mlp, ofenet, vanilla_tit
@@ -81,8 +82,22 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings():
         for name, recipe in RECIPES.items()
         if isinstance(recipe, PPO) and not name.endswith("-protocol") and "ALE" not in recipe.env
     ]
-    assert len({recipe.env for recipe in recipes}) == 11  # the paper's and those of memory
-    one = PPO(env="one", backbone=mlp(), **PPO_SETTINGS)
+    memory = [recipe for recipe in recipes if recipe.name in MEMORY_RECIPES]
+    others = [recipe for recipe in recipes if recipe.name not in MEMORY_RECIPES]
+    assert len({recipe.env for recipe in others}) == 7  # the paper's
+    assert len({recipe.env for recipe in memory}) == 6
+    _check_one_set(others, PPO_SETTINGS)
+    # Sequences are as long as the corridor, and batches grow with them.
+    long = [recipe for recipe in memory if recipe.steps_per_sequence > 64]
+    assert {recipe.name.split("/")[1] for recipe in long} == {"tmaze-250", "tmaze-500"}
+    batch = {name: MEMORY_SETTINGS[name] for name in ("steps_per_batch", "minibatch_size")}
+    batch["sequence_length"] = 64
+    memory = [replace(recipe, **batch) if recipe in long else recipe for recipe in memory]
+    _check_one_set(memory, MEMORY_SETTINGS)
+
+
+def _check_one_set(recipes, settings):
+    one = PPO(env="one", backbone=mlp(), **settings)
     same: dict[str, Any] = {
         "env": "one",
         "env_settings": (),
