@@ -35,7 +35,7 @@ help:  ## List the targets
 demo: $(VENV)/installed-run  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 5 minutes) into runs/
 	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit --out $(OUT) $(ARGS)
 
-demo-memory: $(VENV)/installed-run  ## Train four frames and TIT on a maze that only memory solves (about 10 minutes)
+demo-memory: $(VENV)/installed-run  ## Train four frames and TIT on a maze that only memory solves (about 3 minutes)
 	$(BIN)/python -m recipes sweep ppo/tmaze-10/frames-4 ppo/tmaze-10/enhanced-tit \
 	  --workers 2 --out $(OUT) $(ARGS)
 	$(BIN)/python -m recipes compare $(OUT)/ppo/tmaze-10/*/seed-* --out $(OUT)/memory.png
