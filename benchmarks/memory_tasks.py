@@ -30,6 +30,8 @@ from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.evaluation import finished_returns
 from torchrl_tit.files import write_text_atomic
 
+from .rows import add_missing_rows
+
 SOLVED, EPISODES = 0.98, 500
 REACHED, WINDOW = 0.9, 100
 """``steps_to_0.9`` is where the share of successes first is this high over so many episodes."""
@@ -58,12 +60,12 @@ class Successes(Callback):
                 rows = [[int(cell) for cell in row] for row in [*csv.reader(file)][1:]]
             for at, count, right in rows:
                 if at <= step:
-                    self._add(at, count, right)
+                    self.add(at, count, right)
 
     def collected(self, step: int, batch: Any) -> None:
         """Counts the episodes that ended in a batch."""
         returns = finished_returns(batch)
-        self._add(step, returns.numel(), int((returns > self.threshold).sum()))
+        self.add(step, returns.numel(), int((returns > self.threshold).sum()))
 
     def updated(self, step: int, policy: Any) -> bool:
         """Returns whether the task is solved."""
@@ -91,7 +93,8 @@ class Successes(Callback):
                 return step
         return None
 
-    def _add(self, step: int, episodes: int, right: int) -> None:
+    def add(self, step: int, episodes: int, right: int) -> None:
+        """Adds a batch: the step at its end, episodes that ended in it, and successes."""
         self.batches.append((step, episodes, right))
         # The order within a batch does not matter.
         self._last += [True] * right + [False] * (episodes - right)
@@ -123,23 +126,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--threshold", type=float, default=0.0, help="successes return more")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs and runs.csv")
     options = parser.parse_args(arguments)
-    table = options.out / "runs.csv"
-    done = set()
-    if table.exists():
-        with table.open(newline="", encoding="utf-8") as file:
-            done = {(row["recipe"], row["seed"]) for row in csv.DictReader(file)}
-    else:
-        options.out.mkdir(parents=True, exist_ok=True)
-        table.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
-    for seed in options.seeds:
-        for name in options.recipes:
-            if (name, str(seed)) in done:
-                continue
-            folder = options.out / name / f"seed-{seed}"
-            row = measure(replace(get_recipe(name), seed=seed), folder, options.threshold)
-            with table.open("a", newline="", encoding="utf-8") as file:
-                csv.writer(file, lineterminator="\n").writerow(row)
-            print(*row, flush=True)
+
+    def measure_run(name: str, seed: int) -> list[object]:
+        recipe = replace(get_recipe(name), seed=seed)
+        return measure(recipe, options.out / name / f"seed-{seed}", options.threshold)
+
+    runs = [(name, seed) for seed in options.seeds for name in options.recipes]
+    add_missing_rows(options.out / "runs.csv", COLUMNS, runs, measure_run)
 
 
 if __name__ == "__main__":

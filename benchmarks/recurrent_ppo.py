@@ -9,7 +9,6 @@ run ends; runs that have a row are not repeated.
 from __future__ import annotations
 
 import argparse
-import csv
 import time
 from functools import partial
 from importlib.metadata import version
@@ -25,12 +24,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_tit.tasks import FirstActions
 
 from .memory_tasks import Successes
+from .rows import add_missing_rows
 from .sb3_returns import EVALUATION_SEED
 
 COLUMNS = [
@@ -106,9 +105,8 @@ class Progress(BaseCallback):
         return not self._solved
 
     def _on_rollout_end(self) -> None:
-        returns = torch.tensor(self._returns)
-        ends = {"done": torch.ones_like(returns, dtype=torch.bool), "episode_reward": returns}
-        self.successes.collected(self.num_timesteps, TensorDict({"next": ends}))
+        right = sum(value > THRESHOLD for value in self._returns)
+        self.successes.add(self.num_timesteps, len(self._returns), right)
         self._returns.clear()
 
 
@@ -161,20 +159,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="CSV that rows are added to")
     options = parser.parse_args(arguments)
     torch.set_num_threads(options.threads)
-    done = set()
-    if options.out.exists():
-        with options.out.open(newline="", encoding="utf-8") as file:
-            done = {(row["size"], row["seed"], row["total_steps"]) for row in csv.DictReader(file)}
-    else:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
-    for seed in options.seeds:
-        if (str(options.size), str(seed), str(options.total_steps)) in done:
-            continue
-        row = measure(options.size, seed, options.total_steps, options.episodes)
-        with options.out.open("a", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerow(row)
-        print(*row, flush=True)
+    runs = [(options.size, seed, options.total_steps) for seed in options.seeds]
+    measure_run = partial(measure, episodes=options.episodes)
+    add_missing_rows(options.out, COLUMNS, runs, measure_run)
 
 
 if __name__ == "__main__":

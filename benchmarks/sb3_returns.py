@@ -6,7 +6,7 @@ A row is added to --out as soon as a run ends; runs that have a row are not repe
 from __future__ import annotations
 
 import argparse
-import csv
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
@@ -17,6 +17,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
+
+from .rows import add_missing_rows
 
 COLUMNS = [
     "env",
@@ -76,21 +78,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="CSV that rows are added to")
     options = parser.parse_args(arguments)
     torch.set_num_threads(options.threads)
-    done = set()
-    if options.out.exists():
-        with options.out.open(newline="", encoding="utf-8") as file:
-            done = {(row["env"], row["seed"], row["total_steps"]) for row in csv.DictReader(file)}
-    else:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(",".join(COLUMNS) + "\n", encoding="utf-8")
-    for seed in options.seeds:
-        for env in options.envs:
-            if (env, str(seed), str(options.total_steps)) in done:
-                continue
-            row = measure(env, seed, options.total_steps, options.episodes)
-            with options.out.open("a", newline="", encoding="utf-8") as file:
-                csv.writer(file, lineterminator="\n").writerow(row)
-            print(*row, flush=True)
+    runs = [(env, seed, options.total_steps) for seed in options.seeds for env in options.envs]
+    measure_run = partial(measure, episodes=options.episodes)
+    add_missing_rows(options.out, COLUMNS, runs, measure_run)
 
 
 if __name__ == "__main__":

@@ -235,13 +235,13 @@ class SelfAttention(nn.Module):
         else:
             query = self.project(x[:, positions], 0, 1)
             key, value = self.project(x, 1, 3).chunk(2, dim=-1)
-        query, key, value = self._split(query), self._split(key), self._split(value)
+        query, key, value = self.split_heads(query), self.split_heads(key), self.split_heads(value)
         if self.rotary is None:
             return query, key, value
         length = x.shape[1]
         return self.rotary(query, length, positions), self.rotary(key, length), value
 
-    def _split(self, x: Tensor) -> Tensor:
+    def split_heads(self, x: Tensor) -> Tensor:
         """[N, S, D] -> [N, heads, S, D / heads]."""
         return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 

@@ -140,9 +140,7 @@ class TransformerBlock(nn.Module):
         Returns:
             float [N, T, D]: that of ``forward(windows.gather(x), "last")``.
         """
-        newest = x.index_select(0, windows.rows[..., -1].flatten()).view(
-            *windows.rows.shape[:2], -1
-        )
+        newest = Windows(windows.rows[..., -1], None).gather(x)
         x = newest + attend_windows(self.attention, self.norm1(x), windows)
         return x + self.ffn(self.norm2(x))
 

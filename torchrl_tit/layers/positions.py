@@ -121,9 +121,8 @@ class Rotary(nn.Module):
             ValueError: if there are more than K steps.
         """
         check_length(length, self.num_frames)
-        first, second = x.chunk(2, dim=-1)
         cos, sin = (table[:length][read].to(x.dtype) for table in (self.cos, self.sin))
-        return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
+        return _rotate(x, cos, sin)
 
     def at(self, x: Tensor, steps: Tensor) -> Tensor:
         """Rotates queries or keys of any steps.
@@ -134,8 +133,7 @@ class Rotary(nn.Module):
         """
         angles = sinusoids(steps.flatten(), x.shape[-1]).view(*steps.shape, -1).to(x.dtype)
         sin, cos = angles.chunk(2, dim=-1)
-        first, second = x.chunk(2, dim=-1)
-        return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
+        return _rotate(x, cos, sin)
 
     def at_each_distance(self, query: Tensor, key: Tensor) -> Tensor:
         """The products of queries and keys, were the key 0 to K - 1 steps back.
@@ -155,6 +153,12 @@ class Rotary(nn.Module):
     def extra_repr(self) -> str:
         """Shows the number of entries and of steps."""
         return f"{2 * self.cos.shape[-1]}, {self.num_frames}"
+
+
+def _rotate(x: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
+    """Rotates pairs of entries, float [..., d], by angles with these cosines and sines."""
+    first, second = x.chunk(2, dim=-1)
+    return torch.cat([first * cos - second * sin, first * sin + second * cos], dim=-1)
 
 
 def check_length(length: int, num_frames: int) -> None:

@@ -42,17 +42,12 @@ def attend_windows(attention: SelfAttention, x: Tensor, windows: Windows) -> Ten
     back = windows.rows[..., -1:] - rows  # how many steps, [N, T, span]
     within = (back >= 0) & (back < num_frames - padded.sum(-1, keepdim=True))
 
-    def per_head(entries: Tensor) -> Tensor:  # [N, S, D] -> [N, heads, S, D / heads]
-        return entries.unflatten(-1, (heads, -1)).transpose(1, 2)
-
-    def of_windows(table: Tensor, frame: int) -> Tensor:  # [R, D] -> [N, T, D]
-        numbers = windows.rows[..., frame]
-        return table.index_select(0, numbers.flatten()).view(*numbers.shape, -1)
-
+    per_head = attention.split_heads  # [N, S, D] -> [N, heads, S, D / heads]
+    oldest, newest = (Windows(windows.rows[..., frame], None) for frame in (0, -1))
     keys, values = attention.project(x, 1, 3).chunk(2, dim=-1)  # [R, D]
-    oldest_key, oldest_value = (per_head(of_windows(table, 0)) for table in (keys, values))
+    oldest_key, oldest_value = (per_head(oldest.gather(table)) for table in (keys, values))
     key, value = (per_head(table[: count * span].view(count, span, -1)) for table in (keys, values))
-    query = per_head(attention.project(of_windows(x, -1), 0, 1))  # [N, heads, T, D / heads]
+    query = per_head(attention.project(newest.gather(x), 0, 1))  # [N, heads, T, D / heads]
     query = query / math.sqrt(query.shape[-1])
     if attention.rotary is None:
         scores = query @ key.mT  # [N, heads, T, span]
