@@ -38,6 +38,8 @@ MEASURES = {
 _BLOCKS = 12
 """Blocks of time whose means are fitted: neighbouring samples are not independent."""
 _FOREVER = "1000000000"
+_ENDLESS_CQL = ("--total-updates", _FOREVER, "--checkpoint-interval", "100")
+"""Checkpoints as often as the other runs write them, by time: each returns free memory."""
 
 _TASKS = {
     "PPO": ["ppo/cartpole/enhanced-tit", "--num-envs", "8", "--total-steps", _FOREVER],
@@ -96,7 +98,7 @@ def soak(folder: Path, out: Path, minutes: float, interval: float) -> None:
     for name, words in _TASKS.items():
         run = folder / name
         words = [word.format(data=folder / "data") for word in words]
-        more = ["--total-updates", _FOREVER] if name == "CQL" else []
+        more = _ENDLESS_CQL if name == "CQL" else ()
         command = [*_PROGRAM, "train", *words, *more, "--compile", "off", "--out", str(run)]
         with (folder / f"{run.name}.log").open("wb") as log:
             process = subprocess.Popen(command, stdout=log, stderr=log)
