@@ -8,7 +8,6 @@ and update together, without the first batch, in which libraries warm up and com
 
 from __future__ import annotations
 
-import io
 import os
 import statistics
 import tempfile
@@ -41,9 +40,9 @@ from recipes.ppo import algorithm
 from recipes.ppo.algorithm import PPOAlgorithm
 from recipes.recipe import Compile
 from recipes.registry import get_recipe
+from recipes.results.plot import save_figure
 from recipes.run import Run
 from torchrl_tit.envs import TransformedVectorEnv
-from torchrl_tit.files import write_bytes_atomic
 from torchrl_tit.modules import Backbone
 
 from .report import publish, spread, table
@@ -258,9 +257,7 @@ def draw(shares: dict[str, dict[str, float]], picture: Path) -> None:
         start = [left + width for left, width in zip(start, widths, strict=True)]
     axes.set(xlabel="% of the time of a PPO step", xlim=(0, 100))
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=3, frameon=False)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    write_bytes_atomic(picture, buffer.getvalue())
+    save_figure(figure, picture)
 
 
 def main(out: Path | None) -> None:

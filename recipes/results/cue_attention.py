@@ -1,12 +1,17 @@
-"""How much attention a trained agent pays to the observation that tells it what to do."""
+"""How much attention a trained agent pays to the observations that tell it what to do."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from statistics import mean
 
+import numpy as np
+from gymnasium.vector import SyncVectorEnv
+from matplotlib.figure import Figure
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_tit.analysis import outer_attention
 from torchrl_tit.analysis.targets import find_network, histories_of
@@ -22,19 +27,32 @@ class Decision:
 
     right: bool
     """Whether the episode's return is positive."""
-    shares: list[float]
-    """Attention of each outer block to the frames that show the cue, mean over heads."""
-    even: float
-    """These frames' share of all K."""
+    attention: list[list[float]]
+    """Attention of each outer block to each of the K frames, the oldest first; mean over heads."""
+    cue: list[bool]
+    """Which of the K frames show the cue."""
+
+    @property
+    def shares(self) -> list[float]:
+        """Attention of each outer block to the frames that show the cue."""
+        return [float(np.array(block)[self.cue].sum()) for block in self.attention]
+
+    @property
+    def even(self) -> float:
+        """These frames' share of all K."""
+        return sum(self.cue) / len(self.cue)
 
 
 def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None) -> list[Decision]:
-    """Plays episodes whose first observation is the cue, and measures attention in their last step.
+    """Plays episodes and measures what the agent reads of the cue in their last step.
 
-    The frames before an episode's first observation are copies of it, and count as the cue.
+    In MiniGrid-Memory the cue is the object in the room where the agent starts, whenever it is in
+    view; in other tasks it is the first observation. The frames before an episode's first
+    observation are copies of it, and show what it shows.
 
     Args:
-        run: a run on a task whose first observation is the cue, such as TMaze-v0.
+        run: a run on MiniGrid-Memory, or on a task whose first observation is the cue, such as
+            TMaze-v0.
         episodes: number of episodes.
         seed: seed of the first episode; by default the evaluation's.
 
@@ -53,22 +71,26 @@ def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None)
     first = run.recipe.evaluation_seed if seed is None else seed
     found = []
     with closing(algorithm.make_env(1)) as env:
+        shows_cue = _cue_of(run.recipe.env, env)
         for number in range(episodes):
             states: list[TensorDictBase] = []
+            shown: list[bool] = []
 
             def acted(
-                tensordict: TensorDictBase, states: list[TensorDictBase] = states
+                tensordict: TensorDictBase,
+                states: list[TensorDictBase] = states,
+                shown: list[bool] = shown,
             ) -> TensorDictBase:
+                shown.append(shows_cue(len(shown)))
                 outputs = policy(tensordict)
                 states.append(outputs.clone())
                 return outputs
 
             outcome = evaluate(env, acted, 1, seed=first + number)
             attention = outer_attention(network, *histories_of(policy, states[-1]))
-            read = attention[0].mean(1)  # [blocks, K]
-            cue = max(network.num_frames - len(states) + 1, 0)  # the first of the K frames
-            shares = read[:, :cue].sum(-1).tolist()
-            found.append(Decision(outcome.item() > 0, shares, cue / network.num_frames))
+            copies = max(network.num_frames - len(shown), 0)
+            cue = [shown[0]] * copies + shown[-network.num_frames :]
+            found.append(Decision(outcome.item() > 0, attention[0].mean(1).tolist(), cue))
     return found
 
 
@@ -92,3 +114,44 @@ def to_markdown(groups: dict[str, list[Decision]]) -> str:
             ]
             lines.append(f"| {name} | {word} | {len(chosen)} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def plot_decisions(groups: dict[str, list[Decision]]) -> Figure:
+    """Draws a panel for each run: a row an episode, a column a frame, dots on those with the cue.
+
+    Attention is that of the block that reads most of the cue. Wrong decisions are the rows below
+    the line.
+    """
+    figure = Figure(figsize=(7.5, 3.6 * len(groups)), layout="constrained")
+    panels = figure.subplots(len(groups), squeeze=False)[:, 0]
+    for axes, (name, decisions) in zip(panels, groups.items(), strict=True):
+        rows = sorted(decisions, key=lambda decision: (not decision.right, decision.cue[::-1]))
+        read = np.array([row.attention[int(np.argmax(row.shares))] for row in rows])
+        num_frames = read.shape[1]
+        cue = np.array([row.cue for row in rows])
+        extent = (0.5 - num_frames, 0.5, len(rows), 0)
+        image = axes.imshow(read, cmap="viridis", vmin=0, vmax=1, aspect="auto", extent=extent)
+        episode, frame = cue.nonzero()
+        axes.scatter(frame - num_frames + 1, episode + 0.5, s=2, c="C3")
+        right = sum(row.right for row in rows)
+        if 0 < right < len(rows):
+            axes.axhline(right, c="white", lw=1)
+        axes.set(title=name, xlabel="step, 0 is the decision", ylabel="episode")
+        figure.colorbar(image, ax=axes, label="attention")
+    return figure
+
+
+def _cue_of(name: str, env: EnvBase) -> Callable[[int], bool]:
+    """Returns what says, given the number of steps, whether the observation shows the cue."""
+    if not name.startswith("MiniGrid-Memory"):
+        return lambda steps: steps == 0
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    tasks: SyncVectorEnv = env._env
+
+    def in_view(_: int) -> bool:
+        [height] = tasks.get_attr("height")
+        [seen] = tasks.call("agent_sees", 1, height // 2 - 1)
+        return bool(seen)
+
+    return in_view

@@ -161,7 +161,7 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     for axes in panels[len(tasks) :]:
         axes.set_visible(False)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    _save(figure, picture)
+    save_figure(figure, picture)
 
 
 def _curve(metrics: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -199,10 +199,11 @@ def _write(figure: Figure, picture: Path) -> None:
         figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
     else:
         axes.legend(frameon=False)
-    _save(figure, picture)
+    save_figure(figure, picture)
 
 
-def _save(figure: Figure, picture: Path) -> None:
+def save_figure(figure: Figure, picture: Path) -> None:
+    """Writes a figure as PNG, whole or not at all."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight")
     write_bytes_atomic(picture, buffer.getvalue())

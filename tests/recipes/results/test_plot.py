@@ -59,7 +59,9 @@ def test_what_was_changed_has_room_beside_its_panel(tmp_path, monkeypatch):
         for text in ("", changes)
     ]
     figures = []
-    monkeypatch.setattr("recipes.results.plot._save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr(
+        "recipes.results.plot.save_figure", lambda figure, path: figures.append(figure)
+    )
     plot_table(cells, tmp_path / "table.png")
     (figure,) = figures
     figure.canvas.draw()
@@ -79,7 +81,9 @@ def test_a_run_of_one_batch_is_seen(rows, tmp_path, monkeypatch):
     metrics = tmp_path / "metrics.csv"
     metrics.write_text(f"step,time,return_mean\n{rows}")
     figures = []
-    monkeypatch.setattr("recipes.results.plot._save", lambda figure, _: figures.append(figure))
+    monkeypatch.setattr(
+        "recipes.results.plot.save_figure", lambda figure, _: figures.append(figure)
+    )
     plot_learning_curve(metrics, tmp_path / "curve.png", title="")
     (axes,) = figures[0].axes
     point = "2.0" in rows

@@ -146,7 +146,7 @@ def test_scores_and_returns_are_not_of_one_measure(tmp_path):
     picture = tmp_path / "table.png"
     figures: list[Figure] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plot, "_save", lambda figure, _: figures.append(figure))
+        patch.setattr(plot, "save_figure", lambda figure, _: figures.append(figure))
         plot.plot_table(cells, picture)
     panels = [axes for axes in figures[0].axes if axes.get_visible()]
     assert [axes.get_xlabel() for axes in panels] == ["normalized score", "return"]
