@@ -77,7 +77,7 @@ MEMORY_RECIPES: dict[str, PPO] = (
         f"ppo/tmaze-{length}/{network}": PPO(
             name=f"ppo/tmaze-{length}/{network}",
             env="TMaze-v0",
-            env_settings=(f"corridor_length={length}",),
+            env_settings=(f"corridor_length={length}", "end_when_behind=True"),
             total_steps=total_steps,
             backbone=backbone,
             **_t_maze_settings(length),

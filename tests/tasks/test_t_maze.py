@@ -56,6 +56,17 @@ def test_falling_behind_costs_and_never_pays():
         assert sum(rewards) == pytest.approx(-falls / 4)
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_ending_where_it_falls_behind_returns_the_same(seed):
+    env, ending = TMaze(4), TMaze(4, end_when_behind=True)
+    actions = np.random.default_rng(seed).choice(4, size=5, p=[0.7, 0.1, 0.1, 0.1])
+    observations, rewards = play(env, seed, actions)
+    steps = next((i for i, reward in enumerate(rewards, start=1) if reward < 0), 5)
+    ended, ends = play(ending, seed, actions[:steps])
+    assert ended.tolist() == observations[: steps + 1].tolist()
+    assert sum(ends) == pytest.approx(sum(rewards))
+
+
 def test_turning_is_for_the_junction():
     env = TMaze(3)
     observations, _ = play(env, 0, [UP, UP, DOWN, UP])

@@ -31,6 +31,9 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
 
     Args:
         corridor_length: steps from the start to the junction, at least 1.
+        end_when_behind: whether the first step that falls behind ends the episode, at the cost of
+            all remaining ones. No action makes up for such a step, so each episode returns the
+            same; but what a mistake costs is known at once, however long the corridor is.
 
     Raises:
         ValueError: if the length is not a positive integer.
@@ -48,10 +51,16 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}  # noqa: RUF012
 
-    def __init__(self, corridor_length: int = 10, render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        corridor_length: int = 10,
+        end_when_behind: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
         if type(corridor_length) is not int or corridor_length < 1:
             raise ValueError(f"corridor_length must be an integer from 1 on, not {corridor_length}")
         self.corridor_length = corridor_length
+        self.end_when_behind = end_when_behind
         self.render_mode = render_mode
         self.observation_space = spaces.Box(-1, 1, (2,), np.float32)
         self.action_space = spaces.Discrete(4)
@@ -75,11 +84,15 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
             self._x = min(max(self._x + int(right), 0), self.corridor_length)
         elif up and at_junction:
             self._y = int(up)  # at the last step: all others are needed to reach the junction
-        over = self._steps > self.corridor_length
-        if over:
+        left = self.corridor_length + 1 - self._steps
+        behind = self._x < self._steps
+        if not left:
             reward = float(self._y == self._goal)
+        elif behind:
+            reward = -(left if self.end_when_behind else 1) / self.corridor_length
         else:
-            reward = -float(self._x < self._steps) / self.corridor_length
+            reward = 0.0
+        over = not left or (behind and self.end_when_behind)
         return self._observe(), reward, over, False, {}
 
     def render(self) -> np.ndarray | None:
