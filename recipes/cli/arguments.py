@@ -7,6 +7,7 @@ import io
 import sys
 from contextlib import redirect_stderr
 from dataclasses import make_dataclass, replace
+from inspect import getdoc
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
@@ -57,16 +58,14 @@ def override(recipe: Recipe, **fields: Any) -> Recipe:
     return replace(recipe, **{key: value for key, value in fields.items() if value is not None})
 
 
-def parse_fields(
-    fields: list[Any], arguments: list[str], command: str, description: str | None
-) -> Any:
+def parse_fields(fields: list[Any], arguments: list[str], command: str, described: type) -> Any:
     """Reads dataclasses from the command line.
 
     Args:
         fields: what to read, as :func:`dataclasses.make_dataclass` takes it.
         arguments: the arguments after the command's name.
         command: the command, for the help.
-        description: the text at the start of the help.
+        described: the class whose docstring starts the help.
     """
     import tyro  # takes half a second; other commands do not need it
 
@@ -78,7 +77,7 @@ def parse_fields(
                 tyro.conf.AvoidSubcommands[settings],  # type: ignore[misc, valid-type]
                 args=arguments,
                 prog=f"{program()} {command}",
-                description=f"{description}\n\n{OPTION} MODULE: {HELP}.",
+                description=f"{getdoc(described)}\n\n{OPTION} MODULE: {HELP}.",
             )
     except SystemExit as stop:
         if stop.code:

@@ -38,7 +38,7 @@ def _collect(arguments: list[str]) -> None:
         ],
         arguments,
         "data collect",
-        Collection.__doc__,
+        Collection,
     )
     words = [*program().split(), "data", "collect", *arguments, *import_options()]
     try:

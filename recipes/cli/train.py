@@ -61,7 +61,7 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
         ],
         arguments,
         f"train {recipe.name}",
-        type(recipe).__doc__,
+        type(recipe),
     )
     return check_recipe(parsed.recipe), parsed
 

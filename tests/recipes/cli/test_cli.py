@@ -96,6 +96,7 @@ def test_help_explains_every_field(capsys):
     for option in ("--seed", "--out", "--device", "--threads", "--backbone.frame.embed-dim"):
         assert option in out
     assert "Width D of a token" in out
+    assert "\n\nThe defaults are those of the paper" in out  # not indented, as in the source
 
 
 @pytest.mark.parametrize(
