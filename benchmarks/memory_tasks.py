@@ -24,7 +24,7 @@ from recipes import runner
 from recipes.callback import Callback
 from recipes.outcomes import Outcome
 from recipes.recipe import Recipe
-from recipes.registry import get_recipe
+from recipes.registry import find_recipe
 from recipes.run import Run
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.evaluation import finished_returns
@@ -121,17 +121,21 @@ def measure(recipe: Recipe, folder: Path, threshold: float) -> list[object]:
 def main(arguments: list[str] | None = None) -> None:
     """Trains all recipes with all seeds that have no row yet."""
     parser = argparse.ArgumentParser("python -m benchmarks.memory_tasks")
-    parser.add_argument("recipes", nargs="+", metavar="RECIPE", help="names of recipes")
+    parser.add_argument(
+        "recipes", nargs="+", metavar="RECIPE", help="names, or files with a recipe"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--threshold", type=float, default=0.0, help="successes return more")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs and runs.csv")
     options = parser.parse_args(arguments)
 
+    recipes = {recipe.name: recipe for recipe in map(find_recipe, options.recipes)}
+
     def measure_run(name: str, seed: int) -> list[object]:
-        recipe = replace(get_recipe(name), seed=seed)
+        recipe = replace(recipes[name], seed=seed)
         return measure(recipe, options.out / name / f"seed-{seed}", options.threshold)
 
-    runs = [(name, seed) for seed in options.seeds for name in options.recipes]
+    runs = [(name, seed) for seed in options.seeds for name in recipes]
     add_missing_rows(options.out / "runs.csv", COLUMNS, runs, measure_run)
 
 

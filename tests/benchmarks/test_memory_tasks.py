@@ -9,11 +9,12 @@ import pytest
 from benchmarks import memory_tasks
 from benchmarks.memory_tasks import EPISODES, Successes
 from recipes import runner
-from recipes.registry import get_recipe
+from recipes.registry import find_recipe
 from recipes.run import Run
 
 NAME = "ppo/tmaze-10/frames-4"
 SHORT: dict[str, Any] = {
+    "env_settings": ("corridor_length=10",),  # episodes of 11 steps
     "total_steps": 512,
     "num_envs": 2,
     "steps_per_batch": 128,
@@ -32,7 +33,9 @@ def rows_of(path):
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setattr(memory_tasks, "get_recipe", lambda name: replace(get_recipe(name), **SHORT))
+    monkeypatch.setattr(
+        memory_tasks, "find_recipe", lambda name: replace(find_recipe(name), **SHORT)
+    )
 
 
 def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
@@ -59,7 +62,7 @@ def test_training_ends_where_the_task_is_solved(short, tmp_path, monkeypatch):
 
 
 def test_a_stopped_run_goes_on(short, tmp_path):
-    recipe = memory_tasks.get_recipe(NAME)
+    recipe = memory_tasks.find_recipe(NAME)
 
     class Stopped(Exception):
         pass
