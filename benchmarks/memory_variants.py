@@ -1,6 +1,7 @@
-"""Other networks for the memory tasks: ``benchmarks/memory_variants.py:ppo/tmaze-50/gru``.
+"""Variants of memory recipes to compare: ``benchmarks/memory_variants.py:ppo/tmaze-50/gru``.
 
-Each differs from a named recipe in one thing, and is a recipe for every command that takes one.
+Each differs from a named recipe in what its name says, and every command that takes a recipe takes
+it. docs/results/memory.md has the results.
 """
 
 from __future__ import annotations
@@ -10,40 +11,64 @@ from typing import Any
 
 from recipes.ppo import PPO
 from recipes.registry import get_recipe
-from torchrl_tit.settings import GRU, Network, Outer
-from torchrl_tit.settings.histories import ChainedOuter
+from torchrl_tit.settings import GRU, Inner, Network, Outer
+from torchrl_tit.settings.histories import ChainedOuter, PairedOuter
 
 
-def _variant(recipe: str, name: str, **changes: Any) -> PPO:
-    """Returns a recipe with another network; a history encoder keeps its positions."""
+def _variant(recipe: str, name: str, network: dict[str, Any] | None = None, **fields: Any) -> PPO:
+    """Returns a recipe with other settings of its network, and other fields."""
     named = get_recipe(recipe)
     assert isinstance(named, PPO)
     assert isinstance(named.backbone, Network)
-    backbone = replace(named.backbone, **changes)
-    return replace(named, name=f"{recipe.rpartition('/')[0]}/{name}", backbone=backbone)
+    task = recipe.rpartition("/")[0]
+    backbone = replace(named.backbone, **network or {})
+    return replace(named, name=f"{task}/{name}", backbone=backbone, **fields)
 
 
-def _positions(kind: str) -> Any:
-    backbone: Any = get_recipe("ppo/tmaze-50/enhanced-tit").backbone
-    return replace(backbone.history, temporal_positions=kind)
-
+_T_MAZE, _S7 = "ppo/tmaze-50", "ppo/memory-s7"
+_ROTARY: dict[str, Any] = {"temporal_positions": "rotary"}
 
 RECIPES: dict[str, PPO] = {
     recipe.name: recipe
     for recipe in (
-        _variant("ppo/memory-s7/frames-4", "frames-1", num_frames=1),
-        _variant("ppo/memory-s7/frames-4", "frames-32", num_frames=32),
-        _variant("ppo/tmaze-50/lstm", "gru", history=GRU(hidden_dim=64)),
-        _variant("ppo/tmaze-50/gtrxl", "vanilla-tit", history=Outer(temporal_positions="rotary")),
+        _variant(f"{_S7}/frames-4", "frames-1", {"num_frames": 1}),
+        _variant(f"{_S7}/frames-4", "frames-32", {"num_frames": 32}),
+        _variant(f"{_S7}/enhanced-tit", "shuffled-windows", sequence_length=None),
+        _variant(f"{_S7}/enhanced-tit", "next-frame", next_frame_coeff=1.0),
+        _variant(f"{_S7}/enhanced-tit", "reconstruction", reconstruction_coeff=0.1),
         _variant(
-            "ppo/tmaze-50/enhanced-tit",
-            "chained-tit",
-            history=ChainedOuter(temporal_positions="rotary"),
+            f"{_S7}/enhanced-tit",
+            "tiles-of-28-pixels",
+            {"frame": Inner(patch_size=28, patch_weights="own")},
+            wrappers=(
+                "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=28)",
+                "minigrid.wrappers:ImgObsWrapper",
+                "torchrl_tit.tasks:FirstActions(count=3)",
+            ),
         ),
-        *(
-            _variant("ppo/tmaze-50/enhanced-tit", f"enhanced-tit-{kind}", history=_positions(kind))
-            for kind in ("none", "learned", "relative")
+        _variant(
+            f"{_S7}/enhanced-tit",
+            "own-limit-seven-actions",
+            env_settings=("agent_view_size=3",),
+            wrappers=(
+                "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)",
+                "minigrid.wrappers:ImgObsWrapper",
+            ),
         ),
-        _variant("ppo/tmaze-50/enhanced-tit", "enhanced-tit-k32", num_frames=32),
+        _variant(f"{_T_MAZE}/lstm", "gru", {"history": GRU(hidden_dim=64)}),
+        _variant(f"{_T_MAZE}/gtrxl", "vanilla-tit", {"history": Outer(**_ROTARY)}),
+        _variant(f"{_T_MAZE}/enhanced-tit", "chained-tit", {"history": ChainedOuter(**_ROTARY)}),
+        _variant(f"{_T_MAZE}/enhanced-tit", "no-positions", {"history": PairedOuter()}),
+        _variant(
+            f"{_T_MAZE}/enhanced-tit",
+            "learned-positions",
+            {"history": PairedOuter(temporal_positions="learned")},
+        ),
+        _variant(
+            f"{_T_MAZE}/enhanced-tit",
+            "relative-positions",
+            {"history": PairedOuter(temporal_positions="relative")},
+        ),
+        _variant(f"{_T_MAZE}/enhanced-tit", "last-32-steps", {"num_frames": 32}),
     )
 }
