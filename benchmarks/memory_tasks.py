@@ -7,6 +7,8 @@ evaluated. There is
 
 - a row in ``runs.csv`` for each run; runs that have one are not repeated;
 - ``successes.csv`` in each run's folder: episodes and successes of each batch.
+
+At the end, a table of all rows is printed: interquartile means over the seeds, with 95 % intervals.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from recipes.callback import Callback
 from recipes.outcomes import Outcome
 from recipes.recipe import Recipe
 from recipes.registry import find_recipe
+from recipes.results.interval import interval_of
 from recipes.run import Run
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.evaluation import finished_returns
@@ -118,6 +121,26 @@ def measure(recipe: Recipe, folder: Path, threshold: float) -> list[object]:
     return [recipe.name, recipe.seed, weights, step, reached, success, round(fmean(returns), 4)]
 
 
+def to_markdown(rows: Sequence[dict[str, str]]) -> str:
+    """Writes a table of ``runs.csv``, a row for each recipe."""
+    lines = [
+        "| recipe | weights | seeds | success | return | steps to 0.9, thousands |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name in dict.fromkeys(row["recipe"] for row in rows):
+        runs = [row for row in rows if row["recipe"] == name]
+        success, returned = (
+            interval_of([float(run[column]) for run in runs]) for column in ("success", "return")
+        )
+        reached = [float(run["steps_to_0.9"]) / 1000 for run in runs if run["steps_to_0.9"]]
+        steps = [f"{interval_of(reached):.0f}"] if reached else []
+        if missing := len(runs) - len(reached):
+            steps.append(f"not by {missing} of {len(runs)}")
+        cells = [name, runs[0]["weights"], len(runs), success, returned, ", ".join(steps)]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Trains all recipes with all seeds that have no row yet."""
     parser = argparse.ArgumentParser("python -m benchmarks.memory_tasks")
@@ -136,7 +159,10 @@ def main(arguments: list[str] | None = None) -> None:
         return measure(recipe, options.out / name / f"seed-{seed}", options.threshold)
 
     runs = [(name, seed) for seed in options.seeds for name in recipes]
-    add_missing_rows(options.out / "runs.csv", COLUMNS, runs, measure_run)
+    path = options.out / "runs.csv"
+    add_missing_rows(path, COLUMNS, runs, measure_run)
+    with path.open(newline="", encoding="utf-8") as file:
+        print(to_markdown(list(csv.DictReader(file))), end="")
 
 
 if __name__ == "__main__":

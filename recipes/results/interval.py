@@ -18,10 +18,13 @@ class Interval:
     high: float
 
     def __str__(self) -> str:
-        """As "0.31 [0.28, 0.35]"."""
-        if np.isnan(self.low):
-            return f"{self.iqm:.3f}"
-        return f"{self.iqm:.3f} [{self.low:.3f}, {self.high:.3f}]"
+        """As "0.310 [0.280, 0.350]"."""
+        return f"{self:.3f}"
+
+    def __format__(self, spec: str) -> str:
+        """Each number in a format, such as ".0f"."""
+        numbers = [format(value, spec or ".3f") for value in (self.iqm, self.low, self.high)]
+        return numbers[0] if np.isnan(self.low) else "{} [{}, {}]".format(*numbers)
 
 
 def interval_of(values: Sequence[float] | np.ndarray) -> Interval:

@@ -47,7 +47,9 @@ def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
     batches = rows_of(tmp_path / NAME / "seed-0" / "successes.csv")
     assert [int(batch["step"]) for batch in batches] == [128, 256, 384, 512]
     assert sum(int(batch["episodes"]) for batch in batches) >= 44  # of 11 steps
-    assert capsys.readouterr().out.startswith(f"{NAME} 0 ")
+    printed = capsys.readouterr().out
+    assert printed.startswith(f"{NAME} 0 ")
+    assert f"| {NAME} | {row['weights']} | 1 | " in printed
     monkeypatch.setattr(memory_tasks, "measure", lambda *_: pytest.fail("measured again"))
     memory_tasks.main(words)
 
@@ -88,3 +90,18 @@ def test_when_nine_in_ten_are_reached(tmp_path):
     successes.batches.append((6, 40, 36))
     assert successes.reached() == 6
     assert EPISODES == 500
+
+
+def test_the_table_has_a_row_a_recipe():
+    columns = memory_tasks.COLUMNS
+    rows = [
+        ["a", "0", "9", "500", "1000", "1.0", "0.5"],
+        ["b", "0", "7", "500", "", "0.4", "0.2"],
+        ["a", "1", "9", "500", "3000", "0.8", "0.5"],
+        ["b", "1", "7", "500", "2000", "0.4", "0.2"],
+    ]
+    table = memory_tasks.to_markdown([dict(zip(columns, row, strict=True)) for row in rows])
+    assert table.splitlines()[2:] == [
+        "| a | 9 | 2 | 0.900 [0.800, 1.000] | 0.500 [0.500, 0.500] | 2 [1, 3] |",
+        "| b | 7 | 2 | 0.400 [0.400, 0.400] | 0.200 [0.200, 0.200] | 2, not by 1 of 2 |",
+    ]
