@@ -1,9 +1,13 @@
 """Success on tasks that need a past: ``python -m benchmarks.memory_tasks RECIPE ... --out FOLDER``.
 
 Each recipe is trained with each seed in a run folder. A run that was stopped goes on when the
-command is repeated. Training ends early once 98 % of the last 500 episodes were successful: had a
-return above ``--threshold``, which fits MiniGrid-Memory and the T-Maze. Then the final weights are
-evaluated. There is
+command is repeated. An episode is successful if it returns more than ``--threshold``, whose default
+fits MiniGrid-Memory and the T-Maze.
+
+Training ends early once 98 % of the last 500 episodes were successful, and then 98 % of as many
+episodes as the recipe's evaluation has, with the most likely actions and seeds of their own. If
+those fail, training goes on for at least 500 episodes. In the end, the final weights are evaluated.
+There is
 
 - a row in ``runs.csv`` for each run; runs that have one are not repeated;
 - ``successes.csv`` in each run's folder: episodes and successes of each batch.
@@ -24,7 +28,6 @@ from typing import Any
 
 from recipes import runner
 from recipes.callback import Callback
-from recipes.outcomes import Outcome
 from recipes.recipe import Recipe
 from recipes.registry import find_recipe
 from recipes.results.interval import interval_of
@@ -38,11 +41,13 @@ from .rows import add_missing_rows
 SOLVED, EPISODES = 0.98, 500
 REACHED, WINDOW = 0.9, 100
 """``steps_to_0.9`` is where the share of successes first is this high over so many episodes."""
+VALIDATION_SEED = 2_000_000
+"""The seed of the first episode that decides whether training ends early."""
 COLUMNS = ["recipe", "seed", "weights", "steps", "steps_to_0.9", "success", "return"]
 
 
 class Successes(Callback):
-    """Counts successful episodes, and ends training when nearly all are.
+    """Counts successful episodes, and stops training when nearly all are.
 
     Args:
         path: CSV of the batches so far. Rows after the step are dropped: they are repeated.
@@ -55,8 +60,6 @@ class Successes(Callback):
         self.threshold = threshold
         self.batches: list[tuple[int, int, int]] = []
         """Step, episodes and successes of each batch."""
-        self.returns: list[float] = []
-        """Returns of the evaluation."""
         self._last: deque[bool] = deque(maxlen=EPISODES)
         if step:
             with path.open(newline="", encoding="utf-8") as file:
@@ -71,13 +74,12 @@ class Successes(Callback):
         self.add(step, returns.numel(), int((returns > self.threshold).sum()))
 
     def updated(self, step: int, policy: Any) -> bool:
-        """Returns whether the task is solved."""
+        """Returns whether nearly all of the last episodes were successful."""
         return len(self._last) == EPISODES and fmean(self._last) >= SOLVED
 
-    def evaluated(self, step: int, outcomes: Sequence[Outcome]) -> None:
-        """Keeps the returns."""
-        [outcome] = outcomes
-        self.returns = outcome.returns
+    def start_again(self) -> None:
+        """Lets training go on until nearly all of as many further episodes are successful."""
+        self._last.clear()
 
     def saving(self, step: int) -> None:
         """Writes the batches, before the checkpoint that they belong to."""
@@ -105,20 +107,29 @@ class Successes(Callback):
 
 def measure(recipe: Recipe, folder: Path, threshold: float) -> list[object]:
     """Trains and evaluates in a run folder, from its newest checkpoint; returns the row."""
+
+    def succeeded(evaluation: dict[str, Any]) -> float:
+        return fmean(value > threshold for value in evaluation["returns"])
+
     started = (folder / "recipe.json").exists()
     with Run.open(folder) if started else Run.create(folder, recipe) as run:
+        validation = replace(run.recipe, evaluation_seed=VALIDATION_SEED)
         step = max(checkpoint_steps(run.checkpoints), default=0)
         successes = Successes(folder / "successes.csv", step, threshold)
-        if not successes.updated(step, None):
+        while step < run.recipe.final_step:
+            if successes.updated(step, None):
+                if succeeded(runner.evaluate(run, validation)) >= SOLVED:
+                    break
+                successes.start_again()
             runner.train(run.recipe, run, [successes])
-        evaluation = runner.evaluate(run, callbacks=[successes])
+            step = max(checkpoint_steps(run.checkpoints))
+        evaluation = runner.evaluate(run)
         run.save_evaluation(evaluation)
-        step, algorithm, _ = runner.load_trained(run)
-    returns = successes.returns
+        _, algorithm, _ = runner.load_trained(run)
     weights = sum(weight.numel() for weight in algorithm.policy.parameters())
-    success = fmean(value > threshold for value in returns)
     reached = successes.reached()
-    return [recipe.name, recipe.seed, weights, step, reached, success, round(fmean(returns), 4)]
+    success, returned = succeeded(evaluation), round(evaluation["mean"], 4)
+    return [recipe.name, recipe.seed, weights, step, reached, success, returned]
 
 
 def to_markdown(rows: Sequence[dict[str, str]]) -> str:

@@ -63,6 +63,26 @@ def test_training_ends_where_the_task_is_solved(short, tmp_path, monkeypatch):
     assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
 
 
+def test_training_goes_on_if_the_most_likely_actions_fail(short, tmp_path, monkeypatch):
+    monkeypatch.setattr(memory_tasks, "EPISODES", 20)
+    shares, evaluate = iter([0.97, 0.98]), runner.evaluate
+
+    def checked(run, recipe=None):
+        evaluation = evaluate(run, recipe)
+        if recipe is not None:
+            assert recipe.evaluation_seed == memory_tasks.VALIDATION_SEED
+            right = round(100 * next(shares))
+            evaluation["returns"] = [1.0] * right + [-3.0] * (100 - right)
+        return evaluation
+
+    monkeypatch.setattr(runner, "evaluate", checked)
+    memory_tasks.main([NAME, "--seeds", "0", "--threshold", "-2", "--out", str(tmp_path)])
+    [row] = rows_of(tmp_path / "runs.csv")
+    assert (row["steps"], row["success"]) == ("512", "1.0")  # twice as many episodes
+    batches = rows_of(tmp_path / NAME / "seed-0" / "successes.csv")
+    assert [int(batch["step"]) for batch in batches] == [128, 256, 384, 512]
+
+
 def test_a_stopped_run_goes_on(short, tmp_path):
     recipe = memory_tasks.find_recipe(NAME)
 

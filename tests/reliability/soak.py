@@ -5,8 +5,10 @@
 - ``soak.csv``: a row a sample, written as it is taken, so that a shorter run says something too;
 - ``soak.md``: slopes over time with 95 % intervals. What leaks has a slope above zero.
 
-Resident memory has two parts. A run's own memory is what it has allocated. Pages of files are
-mostly the code of libraries: the kernel takes them from a process that waits and reads them again.
+Resident memory has two parts. A run's own memory is what it has allocated, with what the allocator
+keeps of freed memory until the next checkpoint returns it; what a run still uses is the least of
+it in a while. Pages of files are mostly the code of libraries: the kernel takes them from a process
+that waits and reads them again.
 Speed is steps per second of processor time, which other work on the machine changes little.
 """
 
@@ -19,6 +21,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -29,12 +32,13 @@ from scipy import stats
 from torchrl_tit.files import write_text_atomic
 
 COLUMNS = ["run", "seconds", "memory_mb", "file_mb", "descriptors", "processor_seconds", "steps"]
-MEASURES = {
-    "memory_mb": "memory of its own, MB",
-    "file_mb": "pages of files, MB",
-    "descriptors": "open files",
-    "speed": "steps per processor second",
+MEASURES: dict[str, tuple[str, Callable[[np.ndarray], np.floating]]] = {
+    "memory of its own, MB": ("memory_mb", np.mean),
+    "least memory of its own, MB": ("memory_mb", np.min),
+    "pages of files, MB": ("file_mb", np.mean),
+    "open files": ("descriptors", np.mean),
 }
+"""What is fitted: a column, and how the samples of a block are summarised."""
 _BLOCKS = 12
 """Blocks of time whose means are fitted: neighbouring samples are not independent."""
 _FOREVER = "1000000000"
@@ -146,14 +150,15 @@ def summarize(path: Path) -> str:
         if edges[1] - edges[0] < 2:
             lines.append(f"| {name} | {60 * hours[-1]:.0f} | too few samples yet | | | | | |")
             continue
-        for measure, what in MEASURES.items():
-            blocks = [slice(*pair) for pair in pairwise(edges)]
-            if measure == "speed":
-                took = np.diff(samples["processor_seconds"][edges])
-                values = np.diff(samples["steps"][edges]) / np.maximum(took, 1e-9)
-            else:
-                values = np.array([samples[measure][block].mean() for block in blocks])
-            times = np.array([hours[block].mean() for block in blocks])
+        blocks = [slice(*pair) for pair in pairwise(edges)]
+        times = np.array([hours[block].mean() for block in blocks])
+        took = np.diff(samples["processor_seconds"][edges])
+        fitted = {
+            what: np.array([summary(samples[column][block]) for block in blocks])
+            for what, (column, summary) in MEASURES.items()
+        }
+        fitted["steps per processor second"] = np.diff(samples["steps"][edges]) / took.clip(1e-9)
+        for what, values in fitted.items():
             fit = stats.linregress(times, values)
             spread = np.nan_to_num(fit.stderr) * stats.t.ppf(0.975, _BLOCKS - 2)
             zero = "yes" if abs(fit.slope) <= spread else "no"
