@@ -29,8 +29,9 @@ MEMORY_SETTINGS: dict[str, Any] = PPO_SETTINGS | {
 }
 """The settings of all PPO recipes on arrays, but for these fields."""
 
-_T_MAZES = {10: 100_000, 50: 400_000, 250: 1_000_000, 500: 2_000_000}
-"""The number of steps by the corridor's length. At the junction, K frames just reach the cue."""
+_T_MAZES = {10: 100_000, 50: 400_000, 250: 2_000_000, 500: 4_000_000}
+"""The number of steps by the corridor's length: 8,000 episodes or more. K frames just reach the cue
+at the junction."""
 
 _REPEATS = {"easy": 500_000, "medium": 500_000}
 """The number of steps of POPGym's RepeatPrevious by difficulty: 4 or 32 steps back."""
