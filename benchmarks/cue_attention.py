@@ -7,7 +7,6 @@ first observation is the cue, such as ppo/tmaze-10/enhanced-tit.
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.report import publish
@@ -39,7 +38,10 @@ def main(arguments: list[str] | None = None) -> None:
             groups[name] = measure_decisions(run, episodes=options.episodes, seed=options.seed)
     except (ValueError, OSError, RuntimeError) as error:
         parser.error(" ".join(str(error).split()))
-    numbers = {name: [asdict(decision) for decision in found] for name, found in groups.items()}
+    numbers = {
+        name: [{"right": one.right, "shares": one.shares, "even": one.even} for one in found]
+        for name, found in groups.items()
+    }
     command = f"python -m benchmarks.cue_attention RUN ... --episodes {options.episodes}"
     publish("cue_attention", to_markdown(groups), {"runs": numbers}, options.out, command)
     if options.out is not None:

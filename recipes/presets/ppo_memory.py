@@ -49,18 +49,14 @@ _VIEW = (
 def _t_maze_settings(length: int) -> dict[str, Any]:
     """Sequences as long as an episode, so that an LSTM's gradient reaches the cue.
 
-    Of an episode's steps, one decides. Its advantage is divided by a standard deviation that falls
-    with the root of their number, so the entropy bonus has to grow with it.
+    An agent that has learnt to walk before it has seen a junction must not be too sure there.
     """
+    settings = MEMORY_SETTINGS | {"entropy_coeff": 0.05}
     if length < 128:
-        return MEMORY_SETTINGS
+        return settings
     steps = 2 ** length.bit_length()
-    return MEMORY_SETTINGS | {
-        "steps_per_batch": 16 * steps,
-        "minibatch_size": 2 * steps,
-        "sequence_length": steps,
-        "entropy_coeff": round(0.01 * (length / 10) ** 0.5, 3),
-    }
+    batch = {"steps_per_batch": 16 * steps, "minibatch_size": 2 * steps}
+    return settings | {**batch, "sequence_length": steps}
 
 
 def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[str, Network]:

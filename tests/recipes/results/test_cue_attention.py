@@ -58,8 +58,8 @@ def test_the_command_writes_what_it_prints(tmp_path, capsys):
     assert "| maze, seed 0 | wrong | 2 | " in capsys.readouterr().out
     numbers = json.loads((tmp_path / "out" / "cue_attention.json").read_text())["runs"]
     for decision in numbers["maze, seed 0"]:
-        assert decision["cue"] == [True, False, False, False]
-        assert [sum(block) for block in decision["attention"]] == pytest.approx([1, 1], abs=1e-5)
+        assert (decision["right"], decision["even"]) == (False, 0.25)
+        assert all(0 < share < 1 for share in decision["shares"])
     assert (tmp_path / "out" / "cue_attention.png").read_bytes().startswith(b"\x89PNG")
 
 
