@@ -49,9 +49,10 @@ _VIEW = (
 def _t_maze_settings(length: int) -> dict[str, Any]:
     """Sequences as long as an episode, so that an LSTM's gradient reaches the cue.
 
-    An agent that has learnt to walk before it has seen a junction must not be too sure there.
+    An agent that has learnt to walk before it has seen a junction must not be too sure there. As
+    nearly all advantages become 0, the few others must not be divided by almost nothing.
     """
-    settings = MEMORY_SETTINGS | {"entropy_coeff": 0.05}
+    settings = MEMORY_SETTINGS | {"entropy_coeff": 0.05, "advantage_floor": 0.5}
     if length < 128:
         return settings
     steps = 2 ** length.bit_length()
