@@ -14,7 +14,7 @@ from statistics import fmean
 
 from matplotlib.figure import Figure
 
-from recipes.results.plot import save_figure
+from recipes.results.plot import new_figure, save_figure
 
 _T_MAZE = re.compile(r"ppo/tmaze-(\d+)/(.+)")
 _Successes = dict[str, dict[int, list[float]]]
@@ -32,7 +32,7 @@ def read_successes(path: Path) -> _Successes:
 
 def plot_lengths(successes: _Successes) -> Figure:
     """Draws a line through each network's means, and a dot a seed."""
-    figure = Figure(figsize=(6.5, 4), dpi=120, layout="constrained")
+    figure = new_figure((6.5, 4))
     axes = figure.subplots()
     axes.axhline(0.5, ls=":", c="grey", label="a guess at the junction")
     for index, (network, found) in enumerate(sorted(successes.items())):

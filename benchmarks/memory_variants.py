@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from recipes.ppo import PPO
+from recipes.presets.ppo_memory import VIEW
 from recipes.registry import get_recipe
 from torchrl_tit.settings import GRU, Inner, Network, Outer
 from torchrl_tit.settings.histories import ChainedOuter, PairedOuter
@@ -40,20 +41,13 @@ RECIPES: dict[str, PPO] = {
             f"{_S7}/enhanced-tit",
             "tiles-of-28-pixels",
             {"frame": Inner(patch_size=28, patch_weights="own")},
-            wrappers=(
-                "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=28)",
-                "minigrid.wrappers:ImgObsWrapper",
-                "torchrl_tit.tasks:FirstActions(count=3)",
-            ),
+            wrappers=("minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=28)", *VIEW[1:]),
         ),
         _variant(
             f"{_S7}/enhanced-tit",
             "own-limit-seven-actions",
             env_settings=("agent_view_size=3",),
-            wrappers=(
-                "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)",
-                "minigrid.wrappers:ImgObsWrapper",
-            ),
+            wrappers=VIEW[:-1],
         ),
         _variant(f"{_T_MAZE}/lstm", "gru", {"history": GRU(hidden_dim=64)}),
         _variant(f"{_T_MAZE}/gtrxl", "vanilla-tit", {"history": Outer(**_ROTARY)}),

@@ -1,8 +1,9 @@
 """The named recipes of tasks that require memory, for four kinds of memory.
 
 All networks have the same frame encoder and about the same number of weights, and train with the
-same PPO settings on all tasks. They differ in how they remember: the last four observations side by
-side, a recurrent state, a gated transformer over the last K observations, and TIT's outer blocks.
+same PPO settings on all tasks, but for a few fields in T-Mazes. They differ in how they remember:
+the last four observations side by side, a recurrent state, a gated transformer over the last K
+observations, and TIT's outer blocks.
 docs/results/memory.md describes how the settings were found, and the results.
 """
 
@@ -39,11 +40,12 @@ _REPEATS = {"easy": 500_000, "medium": 500_000}
 _MINIGRIDS = {7: 1_000_000, 9: 2_000_000, 11: 4_000_000}
 """The number of steps by the size of the maze."""
 
-_VIEW = (
+VIEW = (
     "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)",
     "minigrid.wrappers:ImgObsWrapper",
     "torchrl_tit.tasks:FirstActions(count=3)",  # left, right, forward
 )
+"""The wrappers of MiniGrid: a picture of tiles of 8 pixels, and three actions."""
 
 
 def _t_maze_settings(length: int) -> dict[str, Any]:
@@ -112,7 +114,7 @@ MEMORY_RECIPES: dict[str, PPO] = (
             name=f"ppo/memory-s{size}/{network}",
             env=f"MiniGrid-MemoryS{size}-v0",
             env_settings=("agent_view_size=3", "max_episode_steps=96"),
-            wrappers=_VIEW,
+            wrappers=VIEW,
             total_steps=total_steps,
             backbone=backbone,
             **MEMORY_SETTINGS,

@@ -19,6 +19,7 @@ from torchrl_tit.evaluation import evaluate
 
 from ..run import Run
 from ..runner import load_trained
+from .plot import new_figure
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ def plot_decisions(groups: dict[str, list[Decision]]) -> Figure:
     Attention is that of the block that reads most of the cue. Wrong decisions are the rows below
     the line.
     """
-    figure = Figure(figsize=(7.5, 3.6 * len(groups)), layout="constrained")
+    figure = new_figure((7.5, 3.6 * len(groups)))
     panels = figure.subplots(len(groups), squeeze=False)[:, 0]
     for axes, (name, decisions) in zip(panels, groups.items(), strict=True):
         rows = sorted(decisions, key=lambda decision: (not decision.right, decision.cue[::-1]))

@@ -130,7 +130,7 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     }
     breaks = max(label.count("\n") for group in labels.values() for label in group)
     height = 0.6 + (0.32 + 0.16 * breaks) * max(map(len, tasks.values()))
-    figure = _blank((4.2 * columns, height * rows + 0.6))
+    figure = new_figure((4.2 * columns, height * rows + 0.6))
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for axes, ((task, measure), group) in zip(panels, tasks.items(), strict=False):
         places = np.arange(len(group))
@@ -175,14 +175,15 @@ def _break(label: str) -> str:
     return "\n".join(wrap(label, _WIDEST_LABEL))
 
 
-def _blank(size: tuple[float, float]) -> Figure:
+def new_figure(size: tuple[float, float]) -> Figure:
+    """Returns an empty figure of a width and a height in inches."""
     figure = Figure(figsize=size, dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def _figure(title: str, offline: bool) -> Figure:
-    figure = _blank((7, 4))
+    figure = new_figure((7, 4))
     axes = figure.add_subplot()
     steps, episodes = ("gradient", "evaluation") if offline else ("environment", "training")
     axes.set(title=title, xlabel=f"{steps} steps", ylabel=f"return of {episodes} episodes")

@@ -89,3 +89,8 @@ def test_gymnasium_knows_it():
 def test_bad_lengths(length):
     with pytest.raises(ValueError, match=f"integer from 1 on, not {length}"):
         TMaze(length)
+
+
+def test_a_word_is_no_yes():
+    with pytest.raises(ValueError, match="end_when_behind must be True or False, not 'no'"):
+        gymnasium.make("TMaze-v0", end_when_behind="no")

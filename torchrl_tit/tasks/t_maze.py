@@ -27,7 +27,8 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
       side, 1 (up) or -1 (down), in the corridor 0, after the turn the agent's side.
     - **Action**, Discrete(4): right, up, left, down. Against a wall the agent stays.
     - **Reward**: at the last step 1 at the goal, else 0; before it 0, or the cost.
-    - **Terminated** after ``corridor_length + 1`` steps; never truncated.
+    - **Terminated** after ``corridor_length + 1`` steps, or earlier with ``end_when_behind``; never
+      truncated.
 
     Args:
         corridor_length: steps from the start to the junction, at least 1.
@@ -36,7 +37,7 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
             same; but what a mistake costs is known at once, however long the corridor is.
 
     Raises:
-        ValueError: if the length is not a positive integer.
+        ValueError: if the length is not a positive integer, or ``end_when_behind`` is not a bool.
 
     Example:
         >>> import gymnasium
@@ -54,11 +55,13 @@ class TMaze(gymnasium.Env[np.ndarray, np.int64]):
     def __init__(
         self,
         corridor_length: int = 10,
-        end_when_behind: bool = False,
         render_mode: str | None = None,
+        end_when_behind: bool = False,
     ) -> None:
         if type(corridor_length) is not int or corridor_length < 1:
             raise ValueError(f"corridor_length must be an integer from 1 on, not {corridor_length}")
+        if type(end_when_behind) is not bool:
+            raise ValueError(f"end_when_behind must be True or False, not {end_when_behind!r}")
         self.corridor_length = corridor_length
         self.end_when_behind = end_when_behind
         self.render_mode = render_mode
