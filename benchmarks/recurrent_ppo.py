@@ -1,15 +1,15 @@
 """sb3-contrib's RecurrentPPO on MiniGrid-Memory: ``python -m benchmarks.recurrent_ppo --out FILE``.
 
-The environments are those of the recipes ``ppo/memory-s7/...``, and success is defined as in
-``benchmarks.memory_tasks``: training ends early once 98 % of the last 500 episodes were successful.
-Steps per second are those of collecting and updating together. A row is added to --out as soon as a
-run ends; runs that have a row are not repeated.
+The environments are those of the recipes ``ppo/memory-s7/...``. Success, and when training ends
+early, are defined as in ``benchmarks.memory_tasks``. Steps per second are those of all of training.
+A row is added to --out as soon as a run ends; runs that have a row are not repeated.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from torchrl_tit.tasks import FirstActions
 
-from .memory_tasks import Successes
+from .memory_tasks import SOLVED, VALIDATION_SEED, Successes
 from .rows import add_missing_rows
 from .sb3_returns import EVALUATION_SEED
 
@@ -36,6 +36,7 @@ COLUMNS = [
     "size",
     "seed",
     "total_steps",
+    "steps",
     "weights",
     "steps_to_0.9",
     "success",
@@ -88,16 +89,23 @@ SETTINGS: dict[str, Any] = {
 
 
 class Progress(BaseCallback):
-    """Counts successful episodes, batch by batch, and ends training when nearly all are."""
+    """Counts successful episodes, batch by batch, and ends training when nearly all are.
 
-    def __init__(self) -> None:
+    Args:
+        validate: returns the share of successes with the most likely actions.
+    """
+
+    def __init__(self, validate: Callable[[], float]) -> None:
         super().__init__()
+        self.validate = validate
         self.successes = Successes(Path(), step=0, threshold=THRESHOLD)  # is not saved
         self._returns: list[float] = []
         self._solved = False
 
     def _on_rollout_start(self) -> None:
-        self._solved = self.successes.updated(self.num_timesteps, None)
+        if self.successes.updated(self.num_timesteps, None):
+            self._solved = self.validate() >= SOLVED
+            self.successes.start_again()
 
     def _on_step(self) -> bool:
         infos = self.locals["infos"]
@@ -120,27 +128,32 @@ def make_env(size: int) -> gymnasium.Env[Any, Any]:
 
 def measure(size: int, seed: int, total_steps: int, episodes: int) -> list[object]:
     """Trains once and evaluates the last weights with their most likely actions; returns a row."""
+
+    def evaluate(seed: int) -> list[float]:
+        test_envs = make_vec_env(make, NUM_ENVS, seed=seed)
+        returns, _ = evaluate_policy(agent, test_envs, episodes, return_episode_rewards=True)
+        assert isinstance(returns, list)
+        return returns
+
+    def success(returns: list[float]) -> float:
+        return fmean(value > THRESHOLD for value in returns)
+
     make = partial(make_env, size)
     envs = make_vec_env(make, NUM_ENVS, seed=seed)
     agent = RecurrentPPO("CnnLstmPolicy", envs, seed=seed, device="cpu", **SETTINGS)
-    progress = Progress()
+    progress = Progress(lambda: success(evaluate(VALIDATION_SEED)))
     start, processor_start = time.perf_counter(), time.process_time()
     agent.learn(total_steps, callback=progress)
     seconds, processor = time.perf_counter() - start, time.process_time() - processor_start
-    returns, _ = evaluate_policy(
-        agent,
-        make_vec_env(make, NUM_ENVS, seed=EVALUATION_SEED),
-        n_eval_episodes=episodes,
-        return_episode_rewards=True,
-    )
-    assert isinstance(returns, list)
+    returns = evaluate(EVALUATION_SEED)
     return [
         size,
         seed,
         total_steps,
+        progress.successes.batches[-1][0],
         sum(weight.numel() for weight in agent.policy.parameters()),
         progress.successes.reached(),
-        fmean(value > THRESHOLD for value in returns),
+        success(returns),
         round(fmean(returns), 4),
         round(agent.num_timesteps / seconds, 1),
         round(agent.num_timesteps / processor, 1),

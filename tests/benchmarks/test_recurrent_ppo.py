@@ -27,7 +27,8 @@ def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
     recurrent_ppo.main(words)
     [row] = rows_of(out)
     assert list(row) == recurrent_ppo.COLUMNS
-    assert (row["size"], row["seed"], row["total_steps"]) == ("7", "0", "256")
+    assert (row["size"], row["seed"]) == ("7", "0")
+    assert (row["total_steps"], row["steps"]) == ("256", "256")
     assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
     assert float(row["success"]) in (0, 1 / 2, 1)
     assert 0 <= float(row["return"]) <= 1
@@ -39,6 +40,19 @@ def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
 
 
 def test_training_ends_where_the_task_is_solved(short, monkeypatch):
+    evaluate_policy = recurrent_ppo.evaluate_policy
+    shares = iter([0.5, 1.0])
+    seeds = []
+
+    def evaluated(agent, envs, episodes, **settings):
+        """Returns what the last evaluation really gives; before it, half fail, and then none."""
+        seeds.append(envs._seeds[0])
+        returns, lengths = evaluate_policy(agent, envs, episodes, **settings)
+        if (share := next(shares, None)) is not None:
+            returns = [1.0 if i < share * episodes else -2.0 for i in range(episodes)]
+        return returns, lengths
+
+    monkeypatch.setattr(recurrent_ppo, "evaluate_policy", evaluated)
     monkeypatch.setattr(memory_tasks, "EPISODES", 4)
     monkeypatch.setattr(memory_tasks, "WINDOW", 4)
     monkeypatch.setattr(recurrent_ppo, "THRESHOLD", -1.0)  # all returns are at least 0
@@ -53,9 +67,13 @@ def test_training_ends_where_the_task_is_solved(short, monkeypatch):
     cells = dict(zip(recurrent_ppo.COLUMNS, row, strict=True))
     assert [step for step, _, _ in batches] == [128 * (i + 1) for i in range(len(batches))]
     assert batches[-1][0] < 5_000
-    # The batch in which the fourth episode ends is the last.
-    assert sum(episodes for _, episodes, _ in batches[:-1]) < 4
-    assert cells["steps_to_0.9"] == batches[-1][0]
+    # Four episodes succeed, but not the most likely actions; then four others, and these.
+    [fourth] = [i for i in range(len(batches)) if sum(n for _, n, _ in batches[:i]) < 4][-1:]
+    assert cells["steps_to_0.9"] == batches[fourth][0]
+    assert sum(episodes for _, episodes, _ in batches[fourth + 1 : -1]) < 4
+    assert len(batches) > fourth + 1
+    assert seeds == [memory_tasks.VALIDATION_SEED] * 2 + [recurrent_ppo.EVALUATION_SEED]
+    assert cells["steps"] == batches[-1][0]
     assert cells["success"] == 1
 
 
