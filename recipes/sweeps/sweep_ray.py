@@ -148,6 +148,8 @@ def _main() -> None:
         os.read(sys.stdin.fileno(), 1)
         os.kill(os.getpid(), signal.SIGINT)
 
+    # Where Ray blocks SIGINT in its workers, their processes inherit that.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     with raise_on_signals():
         threading.Thread(target=follow, daemon=True).start()
         runpy.run_module(PROGRAM, run_name="__main__", alter_sys=True)

@@ -129,6 +129,27 @@ def test_runs_that_fail_or_whose_worker_dies_are_named(cluster: str, tmp_path: P
     assert checkpoint_steps(killed.folder / "checkpoints")[-1] == last
 
 
+def test_a_run_can_be_stopped_where_ray_blocks_sigint(monkeypatch: pytest.MonkeyPatch) -> None:
+    def train_without_worker() -> None:
+        worker.close()
+        time.sleep(60)
+
+    def run(*_: object, **__: object) -> None:
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+        with pytest.raises(KeyboardInterrupt):
+            train_without_worker()
+
+    reading, writing = os.pipe()
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
+    try:
+        with open(reading) as stdin, open(writing, "w") as worker:
+            monkeypatch.setattr(sys, "stdin", stdin)
+            monkeypatch.setattr("runpy.run_module", run)
+            sweep_ray._main()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
 def test_runs_that_fit_no_machine_are_named(tmp_path, monkeypatch):
     ray = pytest.importorskip("ray")
     machines = [{"CPU": 1.0}, {"CPU": 4.0, "GPU": 1.0}, {"CPU": 2.0}]
