@@ -52,9 +52,11 @@ def _t_maze_settings(length: int) -> dict[str, Any]:
     """Sequences as long as an episode, so that an LSTM's gradient reaches the cue.
 
     An agent that has learnt to walk before it has seen a junction must not be too sure there. As
-    nearly all advantages become 0, the few others must not be divided by almost nothing.
+    nearly all advantages become 0, the few others must not be divided by almost nothing: by no less
+    than 25 times what falling behind by a step costs, and no more than half of the goal's reward.
     """
-    settings = MEMORY_SETTINGS | {"entropy_coeff": 0.05, "advantage_floor": 0.5}
+    floor = min(0.5, 25 / length)
+    settings = MEMORY_SETTINGS | {"entropy_coeff": 0.05, "advantage_floor": floor}
     if length < 128:
         return settings
     steps = 2 ** length.bit_length()
