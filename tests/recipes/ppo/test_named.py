@@ -87,11 +87,13 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings():
     assert len({recipe.env for recipe in others}) == 7  # the paper's
     assert len({recipe.env for recipe in memory}) == 6
     _check_one_set(others, PPO_SETTINGS)
-    # In long T-Mazes, sequences are as long as the corridor, and batches grow with them.
+    # In long T-Mazes, sequences are as long as the corridor, batches grow with them, and the floor
+    # falls with the price of a step.
     long = [recipe for recipe in memory if recipe.steps_per_sequence > 64]
     assert {recipe.name.split("/")[1] for recipe in long} == {"tmaze-250", "tmaze-500"}
+    assert {recipe.advantage_floor for recipe in long} == {25 / 250, 25 / 500}
     fields = ("steps_per_batch", "minibatch_size", "sequence_length")
-    short = {name: MEMORY_SETTINGS[name] for name in fields}
+    short = {name: MEMORY_SETTINGS[name] for name in fields} | {"advantage_floor": 0.5}
     memory = [replace(recipe, **short) if recipe in long else recipe for recipe in memory]
     mazes = [recipe for recipe in memory if recipe.env == "TMaze-v0"]
     _check_one_set(mazes, MEMORY_SETTINGS | {"entropy_coeff": 0.05, "advantage_floor": 0.5})
