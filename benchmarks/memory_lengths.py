@@ -11,6 +11,7 @@ import re
 from collections import defaultdict
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -31,16 +32,18 @@ def read_successes(path: Path) -> _Successes:
 
 
 def plot_lengths(successes: _Successes) -> Figure:
-    """Draws a line through each network's means, and a dot a seed."""
+    """Draws a line through each network's means, and a mark a seed, the networks side by side."""
     figure = new_figure((6.5, 4))
     axes = figure.subplots()
     axes.axhline(0.5, ls=":", c="grey", label="a guess at the junction")
     for index, (network, found) in enumerate(sorted(successes.items())):
-        lengths = sorted(found)
-        color = f"C{index}"
-        axes.plot(lengths, [fmean(found[length]) for length in lengths], c=color, label=network)
-        dots = [(length, success) for length in lengths for success in found[length]]
-        axes.scatter([x for x, _ in dots], [y for _, y in dots], color=color, s=18)
+        beside = 1.08 ** (index - (len(successes) - 1) / 2)
+        places = [length * beside for length in sorted(found)]
+        means = [fmean(found[length]) for length in sorted(found)]
+        style: dict[str, Any] = {"c": f"C{index}", "marker": "osD^v"[index % 5], "ms": 5}
+        axes.plot(places, means, **style, markevery=[], label=network)
+        for place, length in zip(places, sorted(found), strict=True):
+            axes.plot([place] * len(found[length]), found[length], **style, ls="")
     lengths = sorted({length for found in successes.values() for length in found})
     axes.set_xscale("log")
     axes.set_xticks(lengths, map(str, lengths))

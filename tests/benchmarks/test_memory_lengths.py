@@ -21,14 +21,17 @@ def runs(tmp_path):
     return path
 
 
-def test_means_in_order_of_length_and_a_dot_a_seed(runs):
+def test_means_in_order_of_length_and_a_mark_a_seed(runs):
     [axes] = plot_lengths(read_successes(runs)).axes
-    lines = {line.get_label(): line for line in axes.lines[1:]}  # the first is a guess
-    assert list(lines) == ["enhanced-tit", "lstm"]
-    assert np.array_equal(lines["lstm"].get_xdata(), [10, 50])
-    assert np.allclose(lines["lstm"].get_ydata(), [1.0, 0.5])
-    dots = axes.collections[1].get_offsets()
-    assert np.allclose(np.asarray(dots), [[10, 1.0], [50, 0.4], [50, 0.6]])
+    drawn = [(line.get_label(), np.asarray(line.get_data()).tolist()) for line in axes.lines[1:]]
+    names = [name for name, _ in drawn if not str(name).startswith("_")]
+    assert names == ["enhanced-tit", "lstm"]  # the first line is a guess
+    [(_, [[first], _]), _, (_, [places, means]), (_, ten), (_, fifty)] = drawn
+    assert means == [1.0, 0.5]
+    assert np.allclose(places, [10, 50], rtol=0.1)
+    assert ten == [[places[0]], [1.0]]
+    assert fifty == [[places[1]] * 2, [0.4, 0.6]]
+    assert first < 10 < places[0]  # side by side
 
 
 def test_the_command(runs, tmp_path, capsys):
