@@ -36,7 +36,12 @@ def nearest(name: str, names: Iterable[str]) -> str:
     Example:
         >>> nearest("paired-outter", ["outer", "paired-outer", "mlp"])
         'did you mean paired-outer or outer?'
+        >>> nearest("x", map(str, range(300)))
+        'choose from 0, 1, 2, 3, 4 and 295 others'
     """
     names = list(names)
-    matches = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
-    return f"did you mean {' or '.join(matches)}?" if matches else f"choose from {', '.join(names)}"
+    if matches := difflib.get_close_matches(name, names, n=3, cutoff=0.4):
+        return f"did you mean {' or '.join(matches)}?"
+    shown = len(names) if len(names) <= 30 else 5
+    others = f" and {len(names) - shown} others" if shown < len(names) else ""
+    return f"choose from {', '.join(names[:shown])}{others}"
