@@ -52,8 +52,9 @@ def _t_maze_settings(length: int) -> dict[str, Any]:
     """Sequences as long as an episode, so that an LSTM's gradient reaches the cue.
 
     An agent that has learnt to walk before it has seen a junction must not be too sure there. As
-    nearly all advantages become 0, the few others must not be divided by almost nothing: by no less
-    than 25 times what falling behind by a step costs, and no more than half of the goal's reward.
+    nearly all advantages become 0, the few others must not be divided by almost nothing. The floor,
+    in standard deviations of the return, falls with the price of a step, which is 1 / length: an
+    entropy bonus that is worth more than a step would keep the agent from walking.
     """
     floor = min(0.5, 25 / length)
     settings = MEMORY_SETTINGS | {"entropy_coeff": 0.05, "advantage_floor": floor}
