@@ -3,24 +3,28 @@
 import pytest
 import torch
 
-from torchrl_tit.histories.outer import PairedOuterTransformer
 from torchrl_tit.layers.attention import SelfAttention
+from torchrl_tit.layers.relative_attention import RelativeSelfAttention
 from torchrl_tit.layers.window_attention import attend_windows, worth_a_table
 from torchrl_tit.modules.frame_tables import find_starts, table_of_first, table_without_histories
-from torchrl_tit.networks import EnhancedTIT
+from torchrl_tit.networks import EnhancedTIT, build_network
+from torchrl_tit.settings import GTrXL, Inner, Network
 from torchrl_tit.windows import Windows, find_windows
 
 SEQUENCES, STEPS, K, WIDTH = 3, 9, 5, 8
-POSITIONS = ["none", "relative", "rotary"]
+POSITIONS = ["none", "relative", "rotary", "transformer-xl"]
 TOLERANCES = dict.fromkeys(POSITIONS, 1e-10) | {"learned": 1e-10, "rotary": 1e-5}
 """Angles are float32."""
 
 
 def make_attention(positions, **settings):
     torch.manual_seed(0)
-    attention = SelfAttention(
-        WIDTH, 2, causal=True, positions=positions, num_frames=K, **settings
-    ).double()
+    if positions == "transformer-xl":
+        attention = RelativeSelfAttention(WIDTH, 2, K).double()
+    else:
+        attention = SelfAttention(
+            WIDTH, 2, causal=True, positions=positions, num_frames=K, **settings
+        ).double()
     for parameter in attention.parameters():
         torch.nn.init.normal_(parameter, std=0.5)
     return attention
@@ -47,10 +51,11 @@ def test_attention_equals_that_on_copies(positions, stored):
     assert table.windows.span == (STEPS + K - 1 if stored else STEPS)
     assert table.windows.padded().any()
     assert not table.windows.padded().all()
+    causal = {"causal": True} if positions == "transformer-xl" else {}
     results = []
     for read in (
         lambda x: attend_windows(attention, x, table.windows),
-        lambda x: attention(table.windows.gather(x).flatten(0, 1), "last").view(
+        lambda x: attention(table.windows.gather(x).flatten(0, 1), read="last", **causal).view(
             SEQUENCES, STEPS, WIDTH
         ),
     ):
@@ -80,27 +85,43 @@ def test_dropout_drops_weights_of_single_frames():
     assert 4**2 < len(kept) <= (K + 1) ** 2
 
 
-@pytest.mark.parametrize("padding", ["same", "constant"])
-@pytest.mark.parametrize("positions", [*POSITIONS, "learned"])
-def test_the_network_reads_sequences_as_histories(positions, padding, monkeypatch):
-    torch.manual_seed(0)
-    network = EnhancedTIT((4,), K, temporal_positions=positions).double()
+def check_sequences(network, padding, tolerance, monkeypatch):
+    """Compares features of sequences with those of histories; returns whether it read a table."""
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.3)
     table = make_table(padding, width=(4,))
     calls = []
-    read_table = PairedOuterTransformer.read_table
+    read_table = network.history_encoder.read_table
 
     def counted(*arguments):
         calls.append(arguments)
         return read_table(*arguments)
 
-    monkeypatch.setattr(PairedOuterTransformer, "read_table", counted)
+    monkeypatch.setattr(network.history_encoder, "read_table", counted)
     features = network.encode_windows(table.frames, table.windows)
     expected = network(table.windows.gather(table.frames[0]))
-    tolerance = TOLERANCES[positions]
     torch.testing.assert_close(features, expected, rtol=tolerance, atol=tolerance)
-    assert len(calls) == (positions != "learned")
+    return len(calls) == 1
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("positions", ["none", "relative", "rotary", "learned"])
+def test_tit_reads_sequences_as_histories(positions, padding, monkeypatch):
+    torch.manual_seed(0)
+    network = EnhancedTIT((4,), K, temporal_positions=positions).double()
+    tables = check_sequences(network, padding, TOLERANCES[positions], monkeypatch)
+    assert tables == (positions != "learned")
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("num_blocks", [1, 2])
+def test_gtrxl_reads_sequences_as_histories(num_blocks, padding, monkeypatch):
+    torch.manual_seed(0)
+    gtrxl = GTrXL(num_blocks=num_blocks, num_heads=2)
+    settings = Network(frame=Inner(), history=gtrxl, num_frames=K)
+    network = build_network(settings, (4,)).double()
+    tables = check_sequences(network, padding, 1e-10, monkeypatch)
+    assert tables == (num_blocks == 1)
 
 
 def test_when_a_table_is_worth_it():

@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
 from torchrl_tit.layers.gated_block import GatedTransformerBlock
+from torchrl_tit.layers.window_attention import worth_a_table
+from torchrl_tit.windows import Windows
 
 
 class GatedTransformerEncoder(HistoryEncoder):
@@ -102,3 +104,16 @@ class GTrXL(GatedTransformerEncoder):
         for block in earlier:
             x = block(x, causal=True)
         return last(x, causal=True, read="last").reshape(*leading, self.out_features)
+
+    def reads_tables(self, windows: Windows) -> bool:
+        """Whether the only block can project the tokens of a frame once for all windows.
+
+        With several, what a block passes on at a frame depends on where the window begins.
+        """
+        return len(self.blocks) == 1 and worth_a_table(windows)
+
+    def read_table(self, tokens: Tensor, windows: Windows) -> Tensor:
+        """Tokens of a table of frames, float [R, L, D] -> float [N, T, D]."""
+        block = self.blocks[0]
+        assert isinstance(block, GatedTransformerBlock)
+        return block.read_windows(self.one_token(tokens), windows)

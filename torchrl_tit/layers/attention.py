@@ -160,6 +160,39 @@ class SelfAttention(nn.Module):
         query, key, _ = self._heads(x, READ_SLICES["all"])
         return self._weights(query, key, self._mask(x, mask, self.causal and mask is None))
 
+    def window_scores(
+        self, query: Tensor, key: Tensor, oldest_key: Tensor, back: Tensor, num_frames: int
+    ) -> tuple[Tensor, Tensor]:
+        """Scores of the newest frames of windows, for :func:`attend_windows`.
+
+        Args:
+            query: of the newest frames, float [N, heads, T, D / heads].
+            key: of the rows of each sequence, float [N, heads, S, D / heads].
+            oldest_key: of the oldest frames of the windows, of the shape of ``query``.
+            back: how many steps a row is before a newest frame, int64 [N, T, S]; in the future, or
+                more than K - 1, the score is not used.
+            num_frames: number K of frames of a window.
+
+        Returns:
+            Scores with each row, float [N, heads, T, S], and with the oldest frame in the place of
+            each of the K frames, float [N, heads, T, K].
+        """
+        query = query / math.sqrt(query.shape[-1])
+        if self.rotary is None:
+            scores = query @ key.mT
+            padding = (query * oldest_key).sum(-1, keepdim=True).expand(-1, -1, -1, num_frames)
+        else:
+            steps = torch.arange(key.shape[-2], device=key.device)
+            turned = self.rotary.at(query, back[:, None, :, 0])  # steps after the first row
+            scores = turned @ self.rotary.at(key, steps).mT
+            padding = self.rotary.at_each_distance(query, oldest_key)
+        if self.relative is not None:
+            bias = self.relative.bias.t()  # [K, heads]
+            chosen = bias.index_select(0, back.clamp(0, num_frames - 1).flatten())
+            scores = scores + chosen.view(*back.shape, self.num_heads).permute(0, 3, 1, 2)
+            padding = padding + self.relative.newest(num_frames).unsqueeze(1)
+        return scores, padding
+
     def extra_repr(self) -> str:
         """Shows the settings that the parameters' shapes do not."""
         return f"num_heads={self.num_heads}, causal={self.causal}"

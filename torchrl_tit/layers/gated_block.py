@@ -7,8 +7,10 @@ from torch import Tensor, nn
 
 from torchrl_tit.layers.attention import READ_SLICES, Read
 from torchrl_tit.layers.relative_attention import RelativeSelfAttention
+from torchrl_tit.layers.window_attention import attend_windows
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Count, Frames, Real, Width
+from torchrl_tit.windows import Windows
 
 
 class GRUGate(nn.Module):
@@ -100,7 +102,24 @@ class GatedTransformerBlock(nn.Module):
             read: which steps to compute and return: all, the first or the last.
         """
         mixed = self.attention(self.norm1(x), causal=causal, read=read)
-        x = self.gate1(x[:, READ_SLICES[read]], torch.relu(mixed))
+        return self._gate(x[:, READ_SLICES[read]], mixed)
+
+    def read_windows(self, x: Tensor, windows: Windows) -> Tensor:
+        """Reads the newest token of windows on a table; tokens are projected once.
+
+        Args:
+            x: tokens of the table, float [R, D].
+            windows: windows of sequences, [N, T, K].
+
+        Returns:
+            float [N, T, D]: that of ``forward(windows.gather(x), causal=True, read="last")``.
+        """
+        newest = Windows(windows.rows[..., -1], None).gather(x)
+        return self._gate(newest, attend_windows(self.attention, self.norm1(x), windows))
+
+    def _gate(self, x: Tensor, mixed: Tensor) -> Tensor:
+        """The block's output from its input and the output of attention, float [..., D] each."""
+        x = self.gate1(x, torch.relu(mixed))
         return self.gate2(x, torch.relu(self.ffn(self.norm2(x))))
 
     def attention_weights(self, x: Tensor) -> Tensor:

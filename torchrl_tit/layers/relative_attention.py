@@ -93,20 +93,41 @@ class RelativeSelfAttention(nn.Module):
     def _heads(self, x: Tensor, read: Read) -> list[Tensor]:
         """Queries of the steps read, keys and values of all, [N, heads, ..., D / heads] each."""
         if read == "all":
-            heads = self.query_key_value(x).chunk(3, dim=-1)
+            heads = self.project(x, 0, 3).chunk(3, dim=-1)
         else:
-            width = x.shape[-1]
-            weight = self.query_key_value.weight
-            query = F.linear(x[:, READ_SLICES[read]], weight[:width])
-            heads = (query, *F.linear(x, weight[width:]).chunk(2, dim=-1))
-        return [y.unflatten(-1, (self.num_heads, -1)).transpose(1, 2) for y in heads]
+            query = self.project(x[:, READ_SLICES[read]], 0, 1)
+            heads = (query, *self.project(x, 1, 3).chunk(2, dim=-1))
+        return [self.split_heads(y) for y in heads]
+
+    def project(self, x: Tensor, start: int, stop: int) -> Tensor:
+        """Applies the projections from ``start`` to ``stop`` of (query, key, value) at once."""
+        return F.linear(x, self.query_key_value.weight[start * x.shape[-1] : stop * x.shape[-1]])
+
+    def split_heads(self, x: Tensor) -> Tensor:
+        """[N, S, D] -> [N, heads, S, D / heads]."""
+        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+
+    def window_scores(
+        self, query: Tensor, key: Tensor, oldest_key: Tensor, back: Tensor, num_frames: int
+    ) -> tuple[Tensor, Tensor]:
+        """Scores of the newest frames of windows: see :meth:`SelfAttention.window_scores`."""
+        scale = 1 / math.sqrt(self.head_dim)
+        distance = self._distance_scores(query)[..., num_frames - 1 :] * scale  # 0 to K - 1 back
+        content = (query + self.content_bias) * scale
+        index = back.clamp(0, num_frames - 1).unsqueeze(1).expand(-1, self.num_heads, -1, -1)
+        scores = content @ key.mT + distance.gather(-1, index)
+        return scores, (content * oldest_key).sum(-1, keepdim=True) + distance.flip(-1)
+
+    def _distance_scores(self, query: Tensor) -> Tensor:
+        """Products (q + v) . W_R R, float [N, heads, S, 2K - 1]: from K - 1 ahead to K - 1 back."""
+        key = self.distance_key(self.distances.to(query.dtype))  # [2K - 1, D]
+        key = key.unflatten(-1, (self.num_heads, -1)).permute(1, 2, 0)
+        return (query + self.distance_bias) @ key
 
     def _weights(self, query: Tensor, key: Tensor, causal: bool, read: Read) -> Tensor:
         rows = READ_SLICES[read]
-        distance_key = self.distance_key(self.distances.to(query.dtype))  # [2K - 1, D]
-        distance_key = distance_key.unflatten(-1, (self.num_heads, -1)).permute(1, 2, 0)
         content = (query + self.content_bias) @ key.transpose(-2, -1)  # [N, heads, steps, K]
-        distance = (query + self.distance_bias) @ distance_key  # [N, heads, steps, 2K - 1]
+        distance = self._distance_scores(query)  # [N, heads, steps, 2K - 1]
         distance = distance.gather(-1, self.index[rows].expand(*content.shape[:-2], -1, -1))
         scores = (content + distance) / math.sqrt(self.head_dim)
         if causal:

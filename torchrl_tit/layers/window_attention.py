@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_tit.layers.attention import SelfAttention
+from torchrl_tit.layers.relative_attention import RelativeSelfAttention
 from torchrl_tit.windows import Windows
 
 _LARGEST_SPAN = 16
@@ -19,11 +20,13 @@ def worth_a_table(windows: Windows) -> bool:
     return windows.span is not None and windows.span <= _LARGEST_SPAN * windows.rows.shape[-1]
 
 
-def attend_windows(attention: SelfAttention, x: Tensor, windows: Windows) -> Tensor:
+def attend_windows(
+    attention: SelfAttention | RelativeSelfAttention, x: Tensor, windows: Windows
+) -> Tensor:
     """Reads the newest token of windows.
 
-    The result is that of ``attention(windows.gather(x), "last")``, up to rounding. There, a token
-    is projected and rotated anew in each of the K windows that hold it. Here all queries of a
+    The result is that of ``attention(windows.gather(x), read="last")``, up to rounding. There, a
+    token is projected and rotated anew in each of the K windows that hold it. Here all queries of a
     sequence meet all of its keys, once, and what lies outside of a window is masked; padding, where
     one key has several distances, follows as K further columns.
 
@@ -36,7 +39,7 @@ def attend_windows(attention: SelfAttention, x: Tensor, windows: Windows) -> Ten
         float [N, T, D].
     """
     count, _, num_frames = windows.rows.shape
-    span, heads = windows.span or 0, attention.num_heads
+    span = windows.span or 0
     padded = windows.padded()  # [N, T, K]
     rows = torch.arange(count * span, device=x.device).view(count, 1, span)
     back = windows.rows[..., -1:] - rows  # how many steps, [N, T, span]
@@ -48,22 +51,11 @@ def attend_windows(attention: SelfAttention, x: Tensor, windows: Windows) -> Ten
     oldest_key, oldest_value = (per_head(oldest.gather(table)) for table in (keys, values))
     key, value = (per_head(table[: count * span].view(count, span, -1)) for table in (keys, values))
     query = per_head(attention.project(newest.gather(x), 0, 1))  # [N, heads, T, D / heads]
-    query = query / math.sqrt(query.shape[-1])
-    if attention.rotary is None:
-        scores = query @ key.mT  # [N, heads, T, span]
-        padding = (query * oldest_key).sum(-1, keepdim=True).expand(-1, -1, -1, num_frames)
-    else:
-        step = windows.rows[:, None, :, -1] - rows[:, :1, :1]  # within the sequence, [N, 1, T]
-        turned = attention.rotary.at(key, torch.arange(span, device=x.device))
-        scores = attention.rotary.at(query, step) @ turned.mT
-        padding = attention.rotary.at_each_distance(query, oldest_key)
-    if attention.relative is not None:
-        bias = attention.relative.bias.t()  # [K, heads]
-        chosen = bias.index_select(0, back.clamp(0, num_frames - 1).flatten())
-        scores = scores + chosen.view(*back.shape, heads).permute(0, 3, 1, 2)
-        padding = padding + attention.relative.newest(num_frames).unsqueeze(1)
+    scores, padding = attention.window_scores(query, key, oldest_key, back, num_frames)
     seen = torch.cat([within, padded], dim=-1).unsqueeze(1)
     weights = torch.cat([scores, padding], dim=-1).masked_fill(~seen, -math.inf).softmax(dim=-1)
-    of_rows, of_padding = attention.dropout(weights).split([span, num_frames], dim=-1)
+    if isinstance(attention, SelfAttention):
+        weights = attention.dropout(weights)
+    of_rows, of_padding = weights.split([span, num_frames], dim=-1)
     mixed = of_rows @ value + of_padding.sum(-1, keepdim=True) * oldest_value
     return attention.out_proj(mixed.transpose(1, 2).flatten(2))
