@@ -1,10 +1,11 @@
-"""Outer blocks that project each frame once, compared with copies of all windows.
+"""History encoders that project each frame once, compared with copies of all windows.
 
-``python -m benchmarks.window_tables``: a training step (forward, backward and Adam) of Enhanced_TIT
-on arrays with rotary positions, on one thread, alternating. 512 steps in sequences of 64, or of K
-steps where K is larger; in each sequence, one episode begins. Both read the same table of frames
-and encode each frame once. They differ in the outer blocks: ours multiplies all queries with all
-keys of a sequence; the other one gathers the K tokens of each window first.
+``python -m benchmarks.window_tables``: a training step (forward, backward and Adam) on arrays, of
+Enhanced_TIT with rotary positions and of GTrXL with one block, on one thread, alternating. 512
+steps in sequences of 64, or of K steps where K is larger; in each sequence, one episode begins.
+Both read the same table of frames and encode each frame once. They differ in the history encoder:
+ours multiplies all queries with all keys of a sequence; the other one gathers the K tokens of each
+window first.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import argparse
 import statistics
 import time
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import torch
@@ -21,9 +23,11 @@ from torch import Tensor
 from benchmarks.report import publish, spread, table
 from benchmarks.training_step import make_descent
 from torchrl_tit.modules.frame_tables import FrameTable, table_of_first
-from torchrl_tit.networks import EnhancedTIT, HistoryNetwork
+from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, build_network
+from torchrl_tit.settings import GTrXL, Inner, Network
 
 SAMPLES, WIDTH, REPEATS = 512, 4, 5
+NETWORKS = ["Enhanced_TIT", "GTrXL"]
 NUM_FRAMES = [4, 16, 32, 64, 128, 256, 512]
 
 
@@ -43,6 +47,18 @@ def read(network: HistoryNetwork, in_table: bool, frames: FrameTable) -> Tensor:
     return network.encode_windows(frames.frames, windows).square().mean()
 
 
+def make_network(name: str, num_frames: int) -> HistoryNetwork:
+    """Builds a network on arrays, which are one patch."""
+    torch.manual_seed(0)
+    if name == "Enhanced_TIT":
+        return EnhancedTIT((WIDTH,), num_frames, patch_size=None, temporal_positions="rotary")
+    inner = Inner(patch_size=None, every_block=False)
+    settings = Network(frame=inner, history=GTrXL(num_blocks=1, num_heads=1), num_frames=num_frames)
+    network = build_network(settings, (WIDTH,))
+    assert isinstance(network, HistoryNetwork)
+    return network
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Measures, alternating, and reports."""
     parser = argparse.ArgumentParser("python -m benchmarks.window_tables")
@@ -52,10 +68,10 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     rows, numbers = [], {}
-    for num_frames in options.num_frames:
+    for name, num_frames in product(NETWORKS, options.num_frames):
         torch.manual_seed(0)
         frames = make_table(num_frames)
-        network = EnhancedTIT((WIDTH,), num_frames, patch_size=None, temporal_positions="rotary")
+        network = make_network(name, num_frames)
         losses = [read(network, in_table, frames).item() for in_table in (True, False)]
         torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-6)
         steps = [
@@ -65,8 +81,8 @@ def main(arguments: list[str] | None = None) -> None:
         pairs = [[_milliseconds(step, options.seconds) for step in steps] for _ in range(REPEATS)]
         ours, theirs = (list(column) for column in zip(*pairs, strict=True))
         ratios = [b / a for a, b in pairs]
-        rows.append([num_frames, spread(ours, 1), spread(theirs, 1), spread(ratios, 1)])
-        numbers[str(num_frames)] = {
+        rows.append([name, num_frames, spread(ours, 1), spread(theirs, 1), spread(ratios, 1)])
+        numbers[f"{name}, K = {num_frames}"] = {
             "table_ms": ours,
             "copies_ms": theirs,
             "ratios": ratios,
@@ -75,7 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
     markdown = (
         "# Windows on a table of frames\n\n"
         f"{SAMPLES} steps, one thread, {REPEATS} rounds, alternating: median (range).\n\n"
-        + table(["K", "table, ms", "copies of windows, ms", "ratio, pair by pair"], rows)
+        + table(["network", "K", "table, ms", "copies of windows, ms", "ratio, pair by pair"], rows)
     )
     command = "python -m benchmarks.window_tables"
     publish("window_tables", markdown, numbers, options.out, command)
