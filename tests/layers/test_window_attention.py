@@ -19,6 +19,7 @@ TOLERANCES = dict.fromkeys(POSITIONS, 1e-10) | {"learned": 1e-10, "rotary": 1e-5
 
 def make_attention(positions, **settings):
     torch.manual_seed(0)
+    attention: SelfAttention | RelativeSelfAttention
     if positions == "transformer-xl":
         attention = RelativeSelfAttention(WIDTH, 2, K).double()
     else:
