@@ -49,7 +49,6 @@ def read(network: HistoryNetwork, in_table: bool, frames: FrameTable) -> Tensor:
 
 def make_network(name: str, num_frames: int) -> HistoryNetwork:
     """Builds a network on arrays, which are one patch."""
-    torch.manual_seed(0)
     if name == "Enhanced_TIT":
         return EnhancedTIT((WIDTH,), num_frames, patch_size=None, temporal_positions="rotary")
     inner = Inner(patch_size=None, every_block=False)
