@@ -20,7 +20,7 @@ from __future__ import annotations
 import argparse
 import csv
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -46,6 +46,29 @@ VALIDATION_SEED = 2_000_000
 COLUMNS = ["recipe", "seed", "weights", "steps", "steps_to_0.9", "success", "return"]
 
 
+Batch = tuple[int, int, int]
+"""The step at the end of a batch, the episodes that ended in it, and their successes."""
+
+
+def read_batches(path: Path) -> list[Batch]:
+    """Reads a run's ``successes.csv``."""
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = [*csv.reader(file)][1:]
+    return [(int(step), int(episodes), int(right)) for step, episodes, right in rows]
+
+
+def shares(batches: Iterable[Batch]) -> Iterator[tuple[int, float]]:
+    """Yields steps with the share of successes in the last 100 or more episodes, once there are."""
+    window: deque[tuple[int, int]] = deque()
+    for step, episodes, right in batches:
+        window.append((episodes, right))
+        while sum(count for count, _ in window) - window[0][0] >= WINDOW:
+            window.popleft()
+        count, successes = map(sum, zip(*window, strict=True))
+        if count >= WINDOW:
+            yield step, successes / count
+
+
 class Successes(Callback):
     """Counts successful episodes, and stops training when nearly all are.
 
@@ -58,13 +81,10 @@ class Successes(Callback):
     def __init__(self, path: Path, step: int, threshold: float) -> None:
         self.path = path
         self.threshold = threshold
-        self.batches: list[tuple[int, int, int]] = []
-        """Step, episodes and successes of each batch."""
+        self.batches: list[Batch] = []
         self._last: deque[bool] = deque(maxlen=EPISODES)
         if step:
-            with path.open(newline="", encoding="utf-8") as file:
-                rows = [[int(cell) for cell in row] for row in [*csv.reader(file)][1:]]
-            for at, count, right in rows:
+            for at, count, right in read_batches(path):
                 if at <= step:
                     self.add(at, count, right)
 
@@ -88,15 +108,7 @@ class Successes(Callback):
 
     def reached(self) -> int | None:
         """Returns the first step with 90 % of successes in the last 100 or more episodes."""
-        window: deque[tuple[int, int]] = deque()
-        for step, episodes, right in self.batches:
-            window.append((episodes, right))
-            while sum(count for count, _ in window) - window[0][0] >= WINDOW:
-                window.popleft()
-            count, successes = map(sum, zip(*window, strict=True))
-            if count >= WINDOW and successes >= REACHED * count:
-                return step
-        return None
+        return next((step for step, share in shares(self.batches) if share >= REACHED), None)
 
     def add(self, step: int, episodes: int, right: int) -> None:
         """Adds a batch: the step at its end, episodes that ended in it, and successes."""
