@@ -398,7 +398,8 @@ def add_advantages(
     """Writes ``advantage`` and ``value_target`` = advantage + value into a batch.
 
     The value of the next state is the one that the collector computed a step later, except where
-    the episode or the batch ends: there the critic evaluates the true next observation.
+    a time limit or the batch cuts an episode off: there the critic evaluates the true next
+    observation. Where an episode terminates, nothing follows, and the estimator ignores the value.
 
     Args:
         batch: [envs, time], with the values of its states.
@@ -407,21 +408,23 @@ def add_advantages(
         gae: TorchRL's estimator, which stops at terminations and continues at time limits.
         bootstrap_time_limit: if off, a time limit counts as a termination.
     """
-    ends = rollout.ends
-    next_value = batch["state_value"].roll(-1, dims=1)  # [envs, time, 1]
-    states = batch["next"][ends].select(*agent.state_keys)
-    next_value[ends] = next_values(rollout, states, agent)
-    batch["next", "state_value"] = next_value
     if not bootstrap_time_limit:
         batch["next", "terminated"] = batch["next", "done"]
+    next_value = batch["state_value"].roll(-1, dims=1)  # [envs, time, 1]
+    cut_off = rollout.ends & ~batch["next", "terminated"].squeeze(-1)
+    if cut_off.any():
+        states = batch["next"][cut_off].select(*agent.state_keys)
+        next_value[cut_off] = next_values(rollout, cut_off, states, agent)
+    batch["next", "state_value"] = next_value
     gae(batch)
 
 
-def next_values(rollout: Rollout, states: TensorDictBase, agent: Agent) -> Tensor:
-    """Evaluates the true next states where episodes or the batch end.
+def next_values(rollout: Rollout, steps: Tensor, states: TensorDictBase, agent: Agent) -> Tensor:
+    """Evaluates true next states.
 
     Args:
         rollout: the observations.
+        steps: the E steps before these states, among ``rollout.ends``, bool [envs, time].
         states: the network's state there, if it carries one, [E].
         agent: the agent whose critic is used.
 
@@ -429,7 +432,7 @@ def next_values(rollout: Rollout, states: TensorDictBase, agent: Agent) -> Tenso
         float [E, 1].
     """
     backbone, values, start = agent.backbone, [], 0
-    for frames, windows in rollout.next_windows():
+    for frames, windows in rollout.next_windows(steps):
         samples = states[start : start + len(windows.rows)]
         start += len(samples)
         if backbone.is_recurrent:

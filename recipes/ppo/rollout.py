@@ -137,18 +137,21 @@ class Rollout:
         windows = self._windows(self.newest[steps], self.oldest[steps])
         return [windows.gather(frames) for frames in self.frames]
 
-    def next_windows(self, max_frames: int = 1024) -> Iterator[tuple[list[Tensor], Windows]]:
-        """Yields the windows of the true next states at ``ends``, in their order.
+    def next_windows(
+        self, steps: Tensor, max_frames: int = 1024
+    ) -> Iterator[tuple[list[Tensor], Windows]]:
+        """Yields the windows of the true next states of steps, in their order.
 
         Args:
+            steps: the E steps, among ``ends``, bool [envs, time].
             max_frames: maximum number of frames to encode at once, but at least one window.
 
         Yields:
-            Frames, each once, [R, *observation_shape] of each observation, and windows on them,
-            [E, K].
+            Frames, each once, [R, *observation_shape] of each observation, and the next windows on
+            them, [..., K]; E windows in all.
         """
-        ends = self.ends.flatten()
-        newest, oldest = self.newest[ends] + 1, self.oldest[ends]
+        chosen = steps.flatten()
+        newest, oldest = self.newest[chosen] + 1, self.oldest[chosen]
         size = max(1, max_frames // self.num_frames)
         for pair in zip(newest.split(size), oldest.split(size), strict=True):
             rows, windows = self._windows(*pair).used()

@@ -106,10 +106,14 @@ def test_windows_are_those_that_the_policy_read(envs, frames, padding):
         ends[:, -1] = True
         assert torch.equal(rollout.ends, ends)
         newest = whole["next", "observation"].unsqueeze(2)
-        expected = torch.cat([read[:, :, 1:], newest], 2)[ends]
-        parts = [w.gather(table) for [table], w in rollout.next_windows(max_frames=frames * 3)]
-        assert torch.equal(torch.cat(parts), expected)
-        assert all(len(part) <= 3 for part in parts)
+        following = torch.cat([read[:, :, 1:], newest], 2)
+        last = torch.zeros_like(ends)
+        last[:, -1] = True
+        for steps in (ends, last):
+            pairs = rollout.next_windows(steps, max_frames=frames * 3)
+            parts = [windows.gather(table) for [table], windows in pairs]
+            assert torch.equal(torch.cat(parts), following[steps])
+            assert all(len(part) <= 3 for part in parts)
         assert len(rollout.frames[0]) == envs * (frames - 1 + 13) + ends.sum()
         assert "observation" not in batch
         assert "observation" not in batch["next"]
@@ -179,13 +183,26 @@ def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstr
         value, next_value = agent.critic(agent.backbone(states))["state_value"]
         batch["state_value"] = value
         add_advantages(batch, rollout, agent, gae, bootstrap)
-    assert_near(batch["next", "state_value"], next_value)
-
     stops = done & ~truncated if bootstrap else done
+    assert_near(batch["next", "state_value"][~stops], next_value[~stops])
     reward = batch["next", "reward"]
     expected = by_hand.advantages(reward, value, next_value, done, stops, 0.875, 0.75)
     assert_near(batch["advantage"], expected)
     assert_near(batch["value_target"], expected + value)
+
+
+@torch.no_grad()
+def test_no_frame_is_encoded_for_what_follows_a_termination(tmp_path):
+    algorithm, batch, rollout, _ = collected(SHORT_EPISODES, tmp_path)
+    agent, done = algorithm.agent, batch["next", "done"]
+    assert done[:, :-1].sum() >= 6
+    counted = CountedFrames(agent.backbone.module)
+    add_advantages(batch, rollout, agent, algorithm.gae, bootstrap_time_limit=False)
+    assert 0 < counted.take() <= 3 * 4  # where the batch cuts episodes off
+    done[:, -1] = True
+    add_advantages(batch, rollout, agent, algorithm.gae, bootstrap_time_limit=False)
+    assert counted.take() == 0
+    assert batch["advantage"].isfinite().all()
 
 
 def features_by_hand(agent, minibatch, padding):
