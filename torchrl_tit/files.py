@@ -15,19 +15,19 @@ _HIDDEN = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp")
 
 
 def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file atomically: readers see the old content or the new, never a part of it.
+    """Writes a file atomically: readers see the old content or the new, never a part of it.
 
     The bytes go to a hidden file next to the target, are flushed to the disk, and take the target's
     name in one rename. If anything fails (a full disk, say), the hidden file is removed and the old
     content stays at `path`.
 
     Args:
-        path: The file to write; its folder must exist.
-        data: All of its new content.
+        path: the file to write; its folder must exist.
+        data: all of its new content.
 
     Raises:
-        FileNotFoundError: There is no such folder.
-        OSError: The file could not be written.
+        FileNotFoundError: there is no such folder.
+        OSError: the file could not be written.
 
     Example:
         >>> import tempfile
@@ -56,15 +56,15 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
 
 @contextlib.contextmanager
 def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Add the name of the file being written to system errors.
+    """Adds the name of the file being written to system errors.
 
     If the disk is full, flushing an open file fails, and the error does not name the file.
 
     Args:
-        path: The file.
+        path: the file.
 
     Raises:
-        OSError: The original error, with the file's name.
+        OSError: the original error, with the file's name.
 
     Example:
         >>> import errno
@@ -83,15 +83,15 @@ def naming(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
-    """Write a UTF-8 text file atomically, see :func:`write_bytes_atomic`.
+    """Writes a UTF-8 text file atomically, see :func:`write_bytes_atomic`.
 
     Args:
-        path: The file to write; its folder must exist.
-        text: All of its new content; line endings are kept.
+        path: the file to write; its folder must exist.
+        text: all of its new content; line endings are kept.
 
     Raises:
-        FileNotFoundError: There is no such folder.
-        OSError: The file could not be written.
+        FileNotFoundError: there is no such folder.
+        OSError: the file could not be written.
 
     Example:
         >>> import tempfile
@@ -105,11 +105,11 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
 
 
 def remove_leftovers(folder: str | os.PathLike[str], names: Collection[str] | None = None) -> None:
-    """Remove the hidden files and folders that killed writes have left in a folder.
+    """Removes the hidden files and folders that killed writes have left in a folder.
 
     Args:
-        folder: A folder into which no other process writes.
-        names: Names of the files that were being written; any if None.
+        folder: a folder into which no other process writes.
+        names: names of the files that were being written; any if None.
 
     Example:
         >>> import tempfile
@@ -133,18 +133,18 @@ def remove_leftovers(folder: str | os.PathLike[str], names: Collection[str] | No
 
 @contextlib.contextmanager
 def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Make a file or folder under a hidden name, and rename it when it is complete.
+    """Makes a file or folder under a hidden name, and renames it when it is complete.
 
     Args:
-        path: The file or folder to make, which must not exist yet; its parent folder must exist.
+        path: the file or folder to make, which must not exist yet; its parent folder must exist.
 
     Yields:
         The hidden name next to it, under which to make the file or folder.
 
     Raises:
-        FileExistsError: It exists already; it is left unchanged.
-        FileNotFoundError: There is no such parent folder.
-        OSError: It could not be written.
+        FileExistsError: it exists already; it is left unchanged.
+        FileNotFoundError: there is no such parent folder.
+        OSError: it could not be written.
 
     Example:
         >>> import tempfile
@@ -178,13 +178,13 @@ def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def fsync_file(path: str | os.PathLike[str]) -> None:
-    """Flush a file's content to the disk.
+    """Flushes a file's content to the disk.
 
     Args:
-        path: An existing file.
+        path: an existing file.
 
     Raises:
-        OSError: The flush failed.
+        OSError: the flush failed.
 
     Example:
         >>> import tempfile
@@ -200,13 +200,13 @@ def fsync_file(path: str | os.PathLike[str]) -> None:
 
 
 def fsync_directory(path: str | os.PathLike[str]) -> None:
-    """Flush a folder's list of names to the disk, so that a rename survives a power failure.
+    """Flushes a folder's list of names to the disk, so that a rename survives a power failure.
 
     Args:
-        path: An existing folder.
+        path: an existing folder.
 
     Raises:
-        OSError: The flush failed.
+        OSError: the flush failed.
 
     Example:
         >>> import tempfile
@@ -222,6 +222,6 @@ def fsync_directory(path: str | os.PathLike[str]) -> None:
 
 
 def _check_folder(path: Path) -> None:
-    """Raise an error that names the file and its folder, not the hidden file."""
+    """Raises an error that names the file and its folder, not the hidden file."""
     if not path.absolute().parent.is_dir():
         raise FileNotFoundError(f"{path} cannot be written: there is no folder {path.parent}")

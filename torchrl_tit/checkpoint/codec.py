@@ -33,10 +33,10 @@ _EXACT_IN_JSON = 2**53  # other JSON readers use doubles
 
 
 def encode(state: Any) -> tuple[dict[str, Tensor], Any]:
-    """Split a nested state into tensors and a tree for JSON.
+    """Splits a nested state into tensors and a tree for JSON.
 
     Args:
-        state: Dicts with str or int keys (also ordered ones), lists, tuples, `torch.Size`, None,
+        state: dicts with str or int keys (also ordered ones), lists, tuples, `torch.Size`, None,
             bools, ints of any size, floats (also infinite ones and NaN), strings, dense tensors of
             any dtype and shape, numpy arrays and scalars, and TensorDicts of these.
 
@@ -46,7 +46,7 @@ def encode(state: Any) -> tuple[dict[str, Tensor], Any]:
         parameters become plain tensors.
 
     Raises:
-        TypeError: The state holds anything else; the message gives the place and the type.
+        TypeError: the state holds anything else; the message gives the place and the type.
 
     Example:
         >>> import torch
@@ -61,17 +61,17 @@ def encode(state: Any) -> tuple[dict[str, Tensor], Any]:
 
 
 def decode(tensors: dict[str, Tensor], tree: Any) -> Any:
-    """Rebuild a state that :func:`encode` split.
+    """Rebuilds a state that :func:`encode` split.
 
     Args:
-        tensors: Tensors by their place in the state.
-        tree: The tree, as made by :func:`encode` or read back from JSON.
+        tensors: tensors by their place in the state.
+        tree: the tree, as made by :func:`encode` or read back from JSON.
 
     Returns:
         The state, with the same types, keys, dtypes and values, on the CPU.
 
     Raises:
-        ValueError: The tree and the tensors do not match, or a tag is unknown.
+        ValueError: the tree and the tensors do not match, or a tag is unknown.
 
     Example:
         >>> decode(*encode({0: (1, 2.5, float("inf"))}))

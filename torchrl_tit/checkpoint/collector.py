@@ -12,14 +12,14 @@ from torchrl_tit.checkpoint.environment import can_save_env, env_state, set_env_
 
 
 def collector_state(collector: Collector) -> dict[str, Any]:
-    """Return the state of a collector between two of its batches.
+    """Returns the state of a collector between two of its batches.
 
     TorchRL's own `state_dict` lacks the environment and the tensordict that the collector carries
     from one batch to the next; this state has both. The policy is not included and must be saved
     separately.
 
     Args:
-        collector: A synchronous collector.
+        collector: a synchronous collector.
 
     Returns:
         A state that a checkpoint can hold; it shares no memory with the collector. If
@@ -46,17 +46,17 @@ def collector_state(collector: Collector) -> dict[str, Any]:
 
 
 def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
-    """Restore the state of a collector, before iterating over it.
+    """Restores the state of a collector, before iterating over it.
 
     Building a collector and its environment draws from the global random generators, so restore
     those last.
 
     Args:
-        collector: A collector with the same settings and policy weights as the saved one.
-        state: What :func:`collector_state` returned.
+        collector: a collector with the same settings and policy weights as the saved one.
+        state: what :func:`collector_state` returned.
 
     Raises:
-        ValueError: The state is from another kind of environment, only one of the two collectors
+        ValueError: the state is from another kind of environment, only one of the two collectors
             tracks trajectories, or a count is invalid.
 
     Example:
@@ -88,16 +88,16 @@ def set_collector_state(collector: Collector, state: dict[str, Any]) -> None:
 
 
 def reset_unsavable_env(collector: BaseCollector, seed: int, step: int) -> None:
-    """Start new episodes if the environment cannot be saved.
+    """Starts new episodes if the environment cannot be saved.
 
     Call it after saving a checkpoint and after loading one. The seed depends only on the run's seed
     and the step, so a resumed run is the same as one that was not stopped. Environments that can be
     saved, and collectors with several processes, are left unchanged.
 
     Args:
-        collector: The run's collector.
-        seed: The run's seed.
-        step: The checkpoint's step.
+        collector: the run's collector.
+        seed: the run's seed.
+        step: the checkpoint's step.
 
     Example:
         >>> from torchrl.collectors import Collector
@@ -114,7 +114,7 @@ def reset_unsavable_env(collector: BaseCollector, seed: int, step: int) -> None:
 
 
 def _placed_like(carried: TensorDictBase, present: TensorDictBase) -> TensorDictBase:
-    """Copy a loaded tensordict to the devices of the present one."""
+    """Copies a loaded tensordict to the devices of the present one."""
     placed = carried.clone().clear_device_()
     for key, value in present.items(include_nested=True, leaves_only=True):
         if key in placed.keys(include_nested=True):

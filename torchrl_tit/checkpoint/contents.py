@@ -23,17 +23,17 @@ _VERSION = 1
 
 
 def write_contents(path: Path, step: int, tensors: dict[str, Tensor], tree: Any) -> None:
-    """Write a checkpoint's files into an empty folder and flush them to the disk.
+    """Writes a checkpoint's files into an empty folder and flushes them to the disk.
 
     Args:
-        path: The folder.
-        step: The checkpoint's number.
-        tensors: Tensors by name, see :func:`~torchrl_tit.checkpoint.codec.encode`.
-        tree: The tree that belongs to the tensors.
+        path: the folder.
+        step: the checkpoint's number.
+        tensors: tensors by name, see :func:`~torchrl_tit.checkpoint.codec.encode`.
+        tree: the tree that belongs to the tensors.
 
     Raises:
-        OSError: A file could not be written.
-        SafetensorError: The tensors could not be written.
+        OSError: a file could not be written.
+        SafetensorError: the tensors could not be written.
 
     Example:
         >>> import tempfile
@@ -65,17 +65,17 @@ def write_contents(path: Path, step: int, tensors: dict[str, Tensor], tree: Any)
 
 
 def read_contents(path: Path, step: int) -> Any:
-    """Check a checkpoint's files against their checksums and read them.
+    """Checks a checkpoint's files against their checksums and reads them.
 
     Args:
-        path: The checkpoint's folder.
-        step: The step in its name.
+        path: the checkpoint's folder.
+        step: the step in its name.
 
     Returns:
         The state.
 
     Raises:
-        CheckpointError: The checkpoint is damaged, from another program or version, or contains an
+        CheckpointError: the checkpoint is damaged, from another program or version, or contains an
             unknown file.
 
     Example:

@@ -16,7 +16,7 @@ from torchrl_tit.envs import GymVectorEnv
 
 
 def can_save_env(env: EnvBase) -> bool:
-    """Return whether an environment can be saved and resumed.
+    """Returns whether an environment can be saved and resumed.
 
     All layers must be known: Gymnasium's classic control, toy text and MuJoCo tasks (v4, v5) and
     the T-Maze, with the wrappers that `gymnasium.make` adds and a few more, single or in a
@@ -24,7 +24,7 @@ def can_save_env(env: EnvBase) -> bool:
     environments, such as Atari, MiniGrid and TorchRL's own, must be reset at each checkpoint.
 
     Args:
-        env: A TorchRL environment.
+        env: a TorchRL environment.
 
     Returns:
         Whether :func:`env_state` accepts it.
@@ -38,7 +38,7 @@ def can_save_env(env: EnvBase) -> bool:
 
 
 def env_state(env: EnvBase) -> dict[str, Any]:
-    """Return the whole state of an environment.
+    """Returns the whole state of an environment.
 
     It consists of the physics, the random generators, the elapsed steps and flags of wrappers, the
     buffers of vector environments, and the buffers of TorchRL's transforms, such as the histories
@@ -47,13 +47,13 @@ def env_state(env: EnvBase) -> dict[str, Any]:
     tensordict that the caller carries from step to step is not part of the state.
 
     Args:
-        env: An environment for which :func:`can_save_env` is True.
+        env: an environment for which :func:`can_save_env` is True.
 
     Returns:
         A state that a checkpoint can hold; it shares no memory with the environment.
 
     Raises:
-        TypeError: The environment or one of its wrappers cannot be saved; the message names it.
+        TypeError: the environment or one of its wrappers cannot be saved; the message names it.
 
     Example:
         >>> from torchrl.envs import GymEnv
@@ -77,15 +77,15 @@ def env_state(env: EnvBase) -> dict[str, Any]:
 
 
 def set_env_state(env: EnvBase, state: dict[str, Any]) -> None:
-    """Restore the state of an environment, which need not have been reset.
+    """Restores the state of an environment, which need not have been reset.
 
     Args:
-        env: An environment with the same settings as the saved one.
-        state: What :func:`env_state` returned.
+        env: an environment with the same settings as the saved one.
+        state: what :func:`env_state` returned.
 
     Raises:
-        TypeError: The environment cannot be saved.
-        ValueError: The state is from another kind of environment.
+        TypeError: the environment cannot be saved.
+        ValueError: the state is from another kind of environment.
 
     Example:
         >>> from torchrl.envs import GymEnv
@@ -118,7 +118,7 @@ def set_env_state(env: EnvBase, state: dict[str, Any]) -> None:
 
 
 def _unwrap(env: EnvBase) -> tuple[list[nn.Module], EnvBase]:
-    """Return the modules with buffers, from the outermost transform to the core, and the core."""
+    """Returns the modules with buffers, from the outermost transform to the core, and the core."""
     transforms: list[nn.Module] = []
     while isinstance(env, TransformedEnv):
         transforms.append(env.transform)
@@ -127,7 +127,7 @@ def _unwrap(env: EnvBase) -> tuple[list[nn.Module], EnvBase]:
 
 
 def _obstacle(env: EnvBase) -> str | None:
-    """Return the name of the class that prevents an environment from being saved, if any."""
+    """Returns the name of the class that prevents an environment from being saved, if any."""
     _, base = _unwrap(env)
     if type(base) not in (GymVectorEnv, GymWrapper, GymEnv):
         return class_name(base)

@@ -30,7 +30,7 @@ _TEMPORARY = ".tmp-"
 
 
 def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep: int = 3) -> Path:
-    """Save a state as a new numbered checkpoint and remove the oldest ones.
+    """Saves a state as a new numbered checkpoint and removes the oldest ones.
 
     The checkpoint is written into a hidden folder, flushed to the disk and renamed, so a process
     that is killed at any moment leaves a complete checkpoint or none. Saving a step again replaces
@@ -38,10 +38,10 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep:
     folder.
 
     Args:
-        folder: Folder of the run's checkpoints; created if missing.
-        step: Environment steps or updates done so far; the checkpoint's number.
-        state: A nested state that :func:`~torchrl_tit.checkpoint.encode` accepts.
-        keep: How many checkpoints to keep: this one and the ones before it. Checkpoints of later
+        folder: folder of the run's checkpoints; created if missing.
+        step: environment steps or updates done so far; the checkpoint's number.
+        state: a nested state that :func:`~torchrl_tit.checkpoint.encode` accepts.
+        keep: how many checkpoints to keep: this one and the ones before it. Checkpoints of later
             steps (of a run that was resumed from an earlier one) are also kept.
 
     Returns:
@@ -49,8 +49,8 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep:
 
     Raises:
         ValueError: `step` is negative or `keep` is not positive.
-        TypeError: The state holds something that a checkpoint cannot hold.
-        CheckpointError: It could not be written (for example, because the disk is full). Earlier
+        TypeError: the state holds something that a checkpoint cannot hold.
+        CheckpointError: it could not be written (for example, because the disk is full). Earlier
             checkpoints remain.
 
     Example:
@@ -84,20 +84,20 @@ def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep:
 
 
 def load_checkpoint(folder: str | os.PathLike[str], step: int | None = None) -> tuple[int, Any]:
-    """Load the newest checkpoint, or the one of a step.
+    """Loads the newest checkpoint, or the one of a step.
 
     Nothing in a checkpoint is ever executed, and both files are checked against their checksums.
 
     Args:
-        folder: Folder of the run's checkpoints.
-        step: The checkpoint's number; the newest one by default.
+        folder: folder of the run's checkpoints.
+        step: the checkpoint's number; the newest one by default.
 
     Returns:
         The step and the state, its tensors on the CPU.
 
     Raises:
-        CheckpointNotFoundError: There is no checkpoint, or none of this step.
-        CheckpointError: The checkpoint is damaged, from another program or version, or contains an
+        CheckpointNotFoundError: there is no checkpoint, or none of this step.
+        CheckpointError: the checkpoint is damaged, from another program or version, or contains an
             unknown file. The message names its folder.
 
     Example:
@@ -128,10 +128,10 @@ def load_checkpoint(folder: str | os.PathLike[str], step: int | None = None) -> 
 
 
 def checkpoint_steps(folder: str | os.PathLike[str]) -> list[int]:
-    """List the checkpoints in a folder.
+    """Lists the checkpoints in a folder.
 
     Args:
-        folder: Folder of the run's checkpoints; it need not exist.
+        folder: folder of the run's checkpoints; it need not exist.
 
     Returns:
         Their steps, the oldest first.
@@ -144,10 +144,10 @@ def checkpoint_steps(folder: str | os.PathLike[str]) -> list[int]:
 
 
 def latest_step(folder: str | os.PathLike[str]) -> int | None:
-    """Find the newest checkpoint in a folder.
+    """Finds the newest checkpoint in a folder.
 
     Args:
-        folder: Folder of the run's checkpoints; it need not exist.
+        folder: folder of the run's checkpoints; it need not exist.
 
     Returns:
         Its step, or None if there is none.
@@ -160,11 +160,11 @@ def latest_step(folder: str | os.PathLike[str]) -> int | None:
 
 
 def remove_checkpoint(folder: str | os.PathLike[str], step: int) -> None:
-    """Remove a checkpoint, if it is there.
+    """Removes a checkpoint, if it is there.
 
     Args:
-        folder: Folder of the run's checkpoints.
-        step: The checkpoint's number.
+        folder: folder of the run's checkpoints.
+        step: the checkpoint's number.
 
     Example:
         >>> import tempfile
@@ -184,7 +184,7 @@ def _name(step: int) -> str:
 
 
 def _checkpoints(folder: Path) -> dict[int, Path]:
-    """Return the folder of each step's checkpoint; of two of the same step, the newer one."""
+    """Returns the folder of each step's checkpoint; of two of the same step, the newer one."""
     found: dict[int, Path] = {}
     # In sorted order, "NAME.new" comes after "NAME" and replaces it.
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
@@ -211,7 +211,7 @@ def _add(folder: Path, step: int, tensors: dict[str, Any], tree: Any) -> Path:
 
 
 def _promote(new: Path) -> None:
-    """Replace a step's checkpoint with the one saved again."""
+    """Replaces a step's checkpoint with the one saved again."""
     path = new.with_suffix("")
     if path.exists():
         _remove(path)
@@ -227,7 +227,7 @@ def _remove(path: Path) -> None:
 
 
 def _tidy(folder: Path) -> None:
-    """Complete or remove the leftovers of a killed process."""
+    """Completes or removes the leftovers of a killed process."""
     for path in list(folder.iterdir()):
         if path.name.startswith(_TEMPORARY):
             shutil.rmtree(path)

@@ -19,10 +19,10 @@ _SPACES = ("action_space", "observation_space", "_action_space", "_observation_s
 
 
 def layers(env: _Layer) -> Iterator[_Layer]:
-    """Iterate over an environment from its outermost wrapper to its core.
+    """Iterates over an environment from its outermost wrapper to its core.
 
     Args:
-        env: A Gymnasium environment or vector of environments.
+        env: a Gymnasium environment or vector of environments.
 
     Yields:
         Each wrapper, the environment itself, and the layers of each copy in a vector.
@@ -41,10 +41,10 @@ def layers(env: _Layer) -> Iterator[_Layer]:
 
 
 def layer_state(layer: _Layer) -> dict[str, Any]:
-    """Return the state of one layer.
+    """Returns the state of one layer.
 
     Args:
-        layer: One of :func:`layers`; its class must be listed in
+        layer: one of :func:`layers`; its class must be listed in
             :data:`~torchrl_tit.checkpoint.physics.ATTRIBUTES`.
 
     Returns:
@@ -78,14 +78,14 @@ def layer_state(layer: _Layer) -> dict[str, Any]:
 
 
 def set_layer_state(layer: _Layer, state: dict[str, Any]) -> None:
-    """Restore the state of one layer, see :func:`layer_state`.
+    """Restores the state of one layer, see :func:`layer_state`.
 
     Args:
-        layer: A layer of the same class.
-        state: What :func:`layer_state` returned.
+        layer: a layer of the same class.
+        state: what :func:`layer_state` returned.
 
     Raises:
-        ValueError: The attributes of the state are not those that change in such a layer.
+        ValueError: the attributes of the state are not those that change in such a layer.
 
     Example:
         >>> import gymnasium as gym
@@ -130,7 +130,7 @@ def _is_core(layer: _Layer) -> bool:
 
 
 def _spaces(layer: _Layer) -> dict[str, gym.Space[Any]]:
-    """Return a layer's own spaces; a wrapper also shows those of the layer below."""
+    """Returns a layer's own spaces; a wrapper also shows those of the layer below."""
     owned = {key: vars(layer).get(key) for key in _SPACES}
     return {key: space for key, space in owned.items() if isinstance(space, gym.Space)}
 

@@ -78,10 +78,10 @@ _LATE_POSITIONS = ("xpos", "xipos")
 
 
 def class_name(env: object) -> str:
-    """Return the full name of an object's class.
+    """Returns the full name of an object's class.
 
     Args:
-        env: An environment or a wrapper.
+        env: an environment or a wrapper.
 
     Returns:
         Module and class.
@@ -95,10 +95,10 @@ def class_name(env: object) -> str:
 
 
 def mujoco_state(env: Any) -> dict[str, np.ndarray]:
-    """Return the physics state of a MuJoCo environment.
+    """Returns the physics state of a MuJoCo environment.
 
     Args:
-        env: An unwrapped Gymnasium MuJoCo environment.
+        env: an unwrapped Gymnasium MuJoCo environment.
 
     Returns:
         MuJoCo's integration state (float64), including the solver's warm start, and body positions
@@ -119,11 +119,11 @@ def mujoco_state(env: Any) -> dict[str, np.ndarray]:
 
 
 def set_mujoco_state(env: Any, state: dict[str, np.ndarray]) -> None:
-    """Restore the physics state of a MuJoCo environment, see :func:`mujoco_state`.
+    """Restores the physics state of a MuJoCo environment, see :func:`mujoco_state`.
 
     Args:
-        env: An unwrapped environment of the same model.
-        state: What :func:`mujoco_state` returned.
+        env: an unwrapped environment of the same model.
+        state: what :func:`mujoco_state` returned.
 
     Example:
         >>> import gymnasium as gym

@@ -10,7 +10,7 @@ import torch
 
 
 def global_rng_state() -> dict[str, Any]:
-    """Return the states of the global random generators of Python, NumPy and PyTorch (CPU, GPUs).
+    """Returns the states of the global random generators of Python, NumPy and PyTorch (CPU, GPUs).
 
     Returns:
         A state that a checkpoint can hold. `"cuda"` is empty if this process has not used CUDA.
@@ -33,10 +33,10 @@ def global_rng_state() -> dict[str, Any]:
 
 
 def set_global_rng_state(state: dict[str, Any]) -> None:
-    """Restore the states of the global random generators, see :func:`global_rng_state`.
+    """Restores the states of the global random generators, see :func:`global_rng_state`.
 
     Args:
-        state: What :func:`global_rng_state` returned. States of GPUs that this machine lacks are
+        state: what :func:`global_rng_state` returned. States of GPUs that this machine lacks are
             ignored; GPUs that the state lacks keep theirs.
 
     Example:
