@@ -2,6 +2,8 @@
 
 The environments are those of the recipes ``ppo/memory-s7/...``. Success, and when training ends
 early, are defined as in ``benchmarks.memory_tasks``. Steps per second are those of all of training.
+The settings are the library's defaults, or with ``--settings recipe`` those of these recipes, as
+far as the library has them.
 A row is added to --out as soon as a run ends; runs that have a row are not repeated.
 """
 
@@ -24,8 +26,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
 
+from recipes.presets.ppo_memory import MEMORY_SETTINGS
 from torchrl_tit.tasks import FirstActions
 
 from .memory_tasks import SOLVED, VALIDATION_SEED, Successes
@@ -36,6 +40,7 @@ COLUMNS = [
     "size",
     "seed",
     "total_steps",
+    "settings",
     "steps",
     "weights",
     "steps_to_0.9",
@@ -60,12 +65,20 @@ class Tiles(BaseFeaturesExtractor):
     Args:
         observation_space: that of images of 3 x 3 tiles, channels first.
         features_dim: number of features.
+        normalize: whether to normalize pixels by channel.
     """
 
-    def __init__(self, observation_space: gymnasium.spaces.Box, features_dim: int = 64) -> None:
+    def __init__(
+        self,
+        observation_space: gymnasium.spaces.Box,
+        features_dim: int = 64,
+        normalize: bool = False,
+    ) -> None:
         super().__init__(observation_space, features_dim)
+        channels = observation_space.shape[0]
         self.layers = nn.Sequential(
-            nn.Conv2d(observation_space.shape[0], 32, kernel_size=8, stride=8),
+            nn.BatchNorm2d(channels, affine=False) if normalize else nn.Identity(),
+            nn.Conv2d(channels, 32, kernel_size=8, stride=8),
             nn.ReLU(),
             nn.Conv2d(32, 64, kernel_size=3),
             nn.ReLU(),
@@ -78,14 +91,20 @@ class Tiles(BaseFeaturesExtractor):
         return self.layers(observations)
 
 
-SETTINGS: dict[str, Any] = {
-    "n_epochs": 4,  # instead of 10
-    "policy_kwargs": {
-        "features_extractor_class": Tiles,
-        "lstm_hidden_size": 64,  # instead of 256; as in the recipe with an LSTM
+SETTINGS: dict[str, dict[str, Any]] = {
+    "default": {"n_epochs": 4},  # instead of 10
+    "recipe": {
+        "batch_size": MEMORY_SETTINGS["minibatch_size"],
+        "n_epochs": MEMORY_SETTINGS["epochs"],
+        "gamma": MEMORY_SETTINGS["gamma"],
+        "gae_lambda": MEMORY_SETTINGS["gae_lambda"],
+        "ent_coef": MEMORY_SETTINGS["entropy_coeff"],
+        "target_kl": MEMORY_SETTINGS["target_kl"],
+        "learning_rate": lambda left: 3e-4 * left,  # left falls from 1 to 0
     },
 }
-"""All other settings are the library's defaults: the actor and the critic have an LSTM each."""
+"""All other settings are the library's defaults: the actor and the critic have an LSTM each. As in
+the recipe with an LSTM, it has 64 entries, not 256."""
 
 
 class Progress(BaseCallback):
@@ -126,7 +145,7 @@ def make_env(size: int) -> gymnasium.Env[Any, Any]:
     return FirstActions(ImgObsWrapper(RGBImgPartialObsWrapper(env, tile_size=8)), count=3)
 
 
-def measure(size: int, seed: int, total_steps: int, episodes: int) -> list[object]:
+def measure(size: int, seed: int, total_steps: int, settings: str, episodes: int) -> list[object]:
     """Trains once and evaluates the last weights with their most likely actions; returns a row."""
 
     def evaluate(seed: int) -> list[float]:
@@ -139,8 +158,23 @@ def measure(size: int, seed: int, total_steps: int, episodes: int) -> list[objec
         return fmean(value > THRESHOLD for value in returns)
 
     make = partial(make_env, size)
-    envs = make_vec_env(make, NUM_ENVS, seed=seed)
-    agent = RecurrentPPO("CnnLstmPolicy", envs, seed=seed, device="cpu", **SETTINGS)
+    like_recipe = settings == "recipe"
+    envs: VecEnv = make_vec_env(make, NUM_ENVS, seed=seed)
+    if like_recipe:
+        envs = VecNormalize(envs, norm_obs=False, gamma=MEMORY_SETTINGS["gamma"])
+    network = {
+        "features_extractor_class": Tiles,
+        "features_extractor_kwargs": {"normalize": like_recipe},
+        "lstm_hidden_size": 64,
+    }
+    agent = RecurrentPPO(
+        "CnnLstmPolicy",
+        envs,
+        seed=seed,
+        device="cpu",
+        policy_kwargs=network,
+        **SETTINGS[settings],
+    )
     progress = Progress(lambda: success(evaluate(VALIDATION_SEED)))
     start, processor_start = time.perf_counter(), time.process_time()
     agent.learn(total_steps, callback=progress)
@@ -150,6 +184,7 @@ def measure(size: int, seed: int, total_steps: int, episodes: int) -> list[objec
         size,
         seed,
         total_steps,
+        settings,
         progress.successes.batches[-1][0],
         sum(weight.numel() for weight in agent.policy.parameters()),
         progress.successes.reached(),
@@ -167,12 +202,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--size", type=int, default=7, help="of MiniGrid-MemoryS{size}-v0")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--total-steps", type=int, default=1_000_000)
+    parser.add_argument("--settings", choices=SETTINGS, default="default")
     parser.add_argument("--episodes", type=int, default=100, help="episodes of the evaluation")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="CSV that rows are added to")
     options = parser.parse_args(arguments)
     torch.set_num_threads(options.threads)
-    runs = [(options.size, seed, options.total_steps) for seed in options.seeds]
+    runs = [(options.size, seed, options.total_steps, options.settings) for seed in options.seeds]
     measure_run = partial(measure, episodes=options.episodes)
     add_missing_rows(options.out, COLUMNS, runs, measure_run)
 

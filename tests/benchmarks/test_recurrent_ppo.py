@@ -3,7 +3,8 @@
 import csv
 
 import pytest
-from gymnasium.spaces import Discrete
+import torch
+from gymnasium.spaces import Box, Discrete
 
 pytest.importorskip("minigrid")
 
@@ -17,24 +18,27 @@ def rows_of(path):
 
 @pytest.fixture
 def short(monkeypatch):
-    monkeypatch.setitem(recurrent_ppo.SETTINGS, "n_steps", 8)  # 128 steps in a batch
-    monkeypatch.setitem(recurrent_ppo.SETTINGS, "n_epochs", 1)
+    for settings in recurrent_ppo.SETTINGS.values():
+        monkeypatch.setitem(settings, "n_steps", 8)  # 128 steps in a batch
+        monkeypatch.setitem(settings, "n_epochs", 1)
 
 
-def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("settings", ["default", "recipe"])
+def test_a_row_a_run_and_none_twice(settings, short, tmp_path, monkeypatch, capsys):
     out = tmp_path / "new" / "recurrent.csv"
     words = ["--total-steps", "256", "--episodes", "2", "--out", str(out), "--seeds", "0"]
+    words += ["--settings", settings]
     recurrent_ppo.main(words)
     [row] = rows_of(out)
     assert list(row) == recurrent_ppo.COLUMNS
     assert (row["size"], row["seed"]) == ("7", "0")
-    assert (row["total_steps"], row["steps"]) == ("256", "256")
+    assert (row["total_steps"], row["settings"], row["steps"]) == ("256", settings, "256")
     assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
     assert float(row["success"]) in (0, 1 / 2, 1)
     assert 0 <= float(row["return"]) <= 1
     assert float(row["steps_per_second"]) > 0
     assert float(row["processor_steps_per_second"]) > 0
-    assert capsys.readouterr().out.startswith("7 0 256 ")
+    assert capsys.readouterr().out.startswith(f"7 0 256 {settings} ")
     monkeypatch.setattr(recurrent_ppo, "measure", lambda *_: pytest.fail("measured again"))
     recurrent_ppo.main(words)
 
@@ -63,7 +67,7 @@ def test_training_ends_where_the_task_is_solved(short, monkeypatch):
             batches.extend(self.successes.batches)
 
     monkeypatch.setattr(recurrent_ppo, "Progress", Progress)
-    row = recurrent_ppo.measure(7, 0, 5_000, 2)
+    row = recurrent_ppo.measure(7, 0, 5_000, "default", 2)
     cells = dict(zip(recurrent_ppo.COLUMNS, row, strict=True))
     assert [step for step, _, _ in batches] == [128 * (i + 1) for i in range(len(batches))]
     assert batches[-1][0] < 5_000
@@ -75,6 +79,15 @@ def test_training_ends_where_the_task_is_solved(short, monkeypatch):
     assert seeds == [memory_tasks.VALIDATION_SEED] * 2 + [recurrent_ppo.EVALUATION_SEED]
     assert cells["steps"] == batches[-1][0]
     assert cells["success"] == 1
+
+
+def test_pixels_are_normalized_by_channel():
+    space = Box(0, 1, (3, 24, 24))
+    pixels = torch.rand(64, 3, 24, 24) * torch.tensor([1.0, 0.2, 0.5])[:, None, None]
+    first = recurrent_ppo.Tiles(space, normalize=True).layers[0](pixels)
+    assert first.mean((0, 2, 3)).abs().max() < 1e-4
+    assert (first.std((0, 2, 3)) - 1).abs().max() < 1e-2
+    assert torch.equal(recurrent_ppo.Tiles(space).layers[0](pixels), pixels)
 
 
 def test_the_environment_is_that_of_the_recipes():
