@@ -399,7 +399,7 @@ def add_advantages(
 
     The value of the next state is the one that the collector computed a step later, except where
     a time limit or the batch cuts an episode off: there the critic evaluates the true next
-    observation. Where an episode terminates, nothing follows, and the estimator ignores the value.
+    observation. Where an episode terminates, nothing follows, and the value is 0.
 
     Args:
         batch: [envs, time], with the values of its states.
@@ -410,8 +410,9 @@ def add_advantages(
     """
     if not bootstrap_time_limit:
         batch["next", "terminated"] = batch["next", "done"]
-    next_value = batch["state_value"].roll(-1, dims=1)  # [envs, time, 1]
-    cut_off = rollout.ends & ~batch["next", "terminated"].squeeze(-1)
+    terminated = batch["next", "terminated"]
+    next_value = batch["state_value"].roll(-1, dims=1).masked_fill(terminated, 0)  # [envs, time, 1]
+    cut_off = rollout.ends & ~terminated.squeeze(-1)
     if cut_off.any():
         states = batch["next"][cut_off].select(*agent.state_keys)
         next_value[cut_off] = next_values(rollout, cut_off, states, agent)

@@ -63,14 +63,13 @@ def test_the_next_values_know_the_state_before_them(batch):
     following = agent.critic(agent.backbone(states.clone()))
     rollout = Rollout(batch, 1, "same")
     add_advantages(batch, rollout, agent, gae, bootstrap_time_limit=True)
-    goes_on = ~batch["next", "terminated"]
-    next_value = batch["next", "state_value"][goes_on]
-    torch.testing.assert_close(next_value, following["state_value"][goes_on])
+    terminated, next_value = batch["next", "terminated"], batch["next", "state_value"]
+    torch.testing.assert_close(next_value, following["state_value"].masked_fill(terminated, 0))
     forgetful = states
     for key in ("recurrent_state_h", "recurrent_state_c"):
         forgetful[key] = torch.zeros_like(forgetful[key])
     forgetful = agent.critic(agent.backbone(forgetful))["state_value"]
-    assert (next_value - forgetful[goes_on]).abs().max() > 1e-3
+    assert (next_value - forgetful)[~terminated].abs().max() > 1e-3
 
 
 def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
