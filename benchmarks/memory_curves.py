@@ -34,7 +34,7 @@ def read_curves(folders: Sequence[Path]) -> _Curves:
         task, _, network = Run.open(folder).recipe.name.rpartition("/")
         points = np.array(list(shares(read_batches(folder / "successes.csv"))))
         if not len(points):
-            raise ValueError(f"{folder} has less than a hundred episodes: train it for longer")
+            raise ValueError(f"{folder} has fewer than a hundred episodes: train it for longer")
         found[task][network].append((points[:, 0], points[:, 1]))
     return found
 

@@ -29,7 +29,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
 
-from recipes.presets.ppo_memory import MEMORY_SETTINGS
+from recipes.presets.ppo_memory import MEMORY_RECIPES
 from torchrl_tit.tasks import FirstActions
 
 from .memory_tasks import SOLVED, VALIDATION_SEED, Successes
@@ -91,20 +91,21 @@ class Tiles(BaseFeaturesExtractor):
         return self.layers(observations)
 
 
+_RECIPE = MEMORY_RECIPES["ppo/memory-s7/lstm"]
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {"n_epochs": 4},  # instead of 10
     "recipe": {
-        "batch_size": MEMORY_SETTINGS["minibatch_size"],
-        "n_epochs": MEMORY_SETTINGS["epochs"],
-        "gamma": MEMORY_SETTINGS["gamma"],
-        "gae_lambda": MEMORY_SETTINGS["gae_lambda"],
-        "ent_coef": MEMORY_SETTINGS["entropy_coeff"],
-        "target_kl": MEMORY_SETTINGS["target_kl"],
-        "learning_rate": lambda left: 3e-4 * left,  # left falls from 1 to 0
+        "batch_size": _RECIPE.minibatch_size,
+        "n_epochs": _RECIPE.epochs,
+        "gamma": _RECIPE.gamma,
+        "gae_lambda": _RECIPE.gae_lambda,
+        "ent_coef": _RECIPE.entropy_coeff,
+        "target_kl": _RECIPE.target_kl,
+        "learning_rate": lambda left: _RECIPE.learning_rate * left,  # left falls from 1 to 0
     },
 }
-"""All other settings are the library's defaults: the actor and the critic have an LSTM each. As in
-the recipe with an LSTM, it has 64 entries, not 256."""
+"""All other settings are the library's defaults, so the actor and the critic have an LSTM each.
+These have 64 entries, as in the recipe, instead of 256."""
 
 
 class Progress(BaseCallback):
@@ -161,7 +162,7 @@ def measure(size: int, seed: int, total_steps: int, settings: str, episodes: int
     like_recipe = settings == "recipe"
     envs: VecEnv = make_vec_env(make, NUM_ENVS, seed=seed)
     if like_recipe:
-        envs = VecNormalize(envs, norm_obs=False, gamma=MEMORY_SETTINGS["gamma"])
+        envs = VecNormalize(envs, norm_obs=False, gamma=_RECIPE.gamma)
     network = {
         "features_extractor_class": Tiles,
         "features_extractor_kwargs": {"normalize": like_recipe},

@@ -66,7 +66,7 @@ def test_the_command(make_run, tmp_path, capsys):
     assert out.read_bytes().startswith(b"\x89PNG")
     for folder, said in [
         (tmp_path / "nothing", "is not a run folder"),
-        (make_run("ppo/memory-s9/lstm", 1, []), "has less than a hundred episodes"),
+        (make_run("ppo/memory-s9/lstm", 1, []), "has fewer than a hundred episodes"),
     ]:
         with pytest.raises(SystemExit):
             main([str(folder), "--out", str(tmp_path / "none.png")])
