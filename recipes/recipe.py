@@ -37,6 +37,8 @@ class Recipe:
     """Whether it trains offline: steps are gradient steps, and returns are from evaluations."""
     supplies_actions: ClassVar[bool] = False
     """Whether networks read past actions and returns-to-go in addition to observations."""
+    removed: ClassVar[dict[str, Any]] = {}
+    """Fields of older versions that no longer exist, with the values at which they did nothing."""
     length: ClassVar[str] = "total_steps"
     """The field that sets the length of a run, which ``train --resume RUN`` can raise."""
 

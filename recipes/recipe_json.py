@@ -53,7 +53,14 @@ def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
         fields = json.loads(text)
         if not isinstance(fields, dict):
             raise ValueError("expected an object with the recipe's fields")
-        return _convert(get_recipe_class(fields.pop("algorithm", None)), fields)
+        kind = get_recipe_class(fields.pop("algorithm", None))
+        for name, value in kind.removed.items():
+            if fields.pop(name, value) != value:
+                raise ValueError(
+                    f"field {name!r} no longer exists, and only {value!r} can be read, which did "
+                    "nothing: leave it out"
+                )
+        return _convert(kind, fields)
     except (RecursionError, ValueError) as error:  # json.JSONDecodeError is one
         raise ValueError(f"{source} cannot be read as a recipe: {error}") from error
 

@@ -60,7 +60,7 @@ def _default_sac(settings: Collection) -> SAC:
 def _adapted(recipe: Recipe, settings: Collection) -> Recipe:
     """The recipe with the collection's seed, threads and checkpoints, and a single collector."""
     # With several collectors, a batch does not continue the one before.
-    single: dict[str, Any] = {"collectors": 1, "async_collection": False, "ray": None}
+    single: dict[str, Any] = {"collectors": 1, "ray": None}
     names = {field.name for field in fields(recipe)}
     return replace(
         recipe,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 from torchrl_tit.settings import CoBERL
 from torchrl_tit.settings.checks import check_at_least
@@ -36,6 +36,8 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
 
     The defaults are those of the paper's runs on arrays (arXiv 2212.14538, appendix).
     """
+
+    removed: ClassVar[dict[str, Any]] = {"async_collection": False}
 
     padding: Padding = "same"
     """What fills a history before the first observation: that observation, or zeros."""
@@ -141,14 +143,10 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     """Environment steps between checkpoints."""
     collectors: Copies = 1
     """Number of processes that collect, each with its share of the environments; 1 collects in the
-    training process, unless ray is set. Use several for slow environments. A run with several can
-    be resumed, but then draws other random numbers than an uninterrupted run."""
+    training process, unless ray is set. Use several for slow environments."""
     ray: str | None = None
     """Address of a Ray cluster whose machines the collectors run on: auto, or HOST:PORT. See
     docs/recipes.md."""
-    async_collection: bool = False
-    """Whether several collectors continue to collect during updates. Each batch then comes from one
-    collector, whose policy is up to one update old."""
     compile: Compile = "auto"
     """Whether collection and update run through torch.compile, which needs a C++ compiler and about
     a minute at the start. "auto" compiles if that works and the run is long enough to be worth it.
@@ -181,14 +179,7 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
             _check_divides(self, "sequence_length", "steps_per_batch / num_envs", steps)
         if self.is_recurrent and self.precision == "bfloat16":
             raise ValueError("precision is bfloat16, but a recurrent network computes in float32")
-        if self.async_collection and self.collectors == 1:
-            raise ValueError("async_collection is on, but there is one collector: set collectors")
         check_address(self)
-        if self.async_collection and self.ray is not None:
-            raise ValueError(
-                "async_collection is on, but collectors on Ray wait for the weights of each "
-                "update: switch it off"
-            )
 
     @property
     def is_recurrent(self) -> bool:

@@ -139,7 +139,7 @@ def test_sac_is_named_for_short(tmp_path: Path) -> None:
 
 def test_a_recipe_is_trained_no_longer_than_it_says(tmp_path: Path) -> None:
     """And in one process, whose batches continue one another."""
-    recipe = replace(CARTPOLE_RECIPE, total_steps=1000, collectors=2, async_collection=True)
+    recipe = replace(CARTPOLE_RECIPE, total_steps=1000, collectors=2)
     (tmp_path / "short.json").write_text(recipe_to_json(recipe))
     settings = replace(CARTPOLE, agent=str(tmp_path / "short.json"))
     for total_steps, final_step in ((8192, 1024), (512, 512)):
