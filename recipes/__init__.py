@@ -15,7 +15,6 @@ share_modules(__name__)
 _HOMES = {
     "Algorithm": "algorithm",
     "Callback": "callback",
-    "CollectorState": "stateful",
     "DatasetAlgorithm": "dataset_algorithm",
     "DatasetRecipe": "dataset_recipe",
     "NotFiniteError": "algorithm",
@@ -32,6 +31,7 @@ _HOMES = {
     "recipe_from_json": "recipe_json",
     "recipe_to_json": "recipe_json",
     "register_recipes": "registry",
+    "seed_copies": "task",
     "train": "runner",
     "weights_from": "initial_weights",
 }

@@ -29,8 +29,8 @@ from .policies import make_backbone
 from .ray_collector import ClusterCollector, check_cluster
 from .replay_recipe import ReplayRecipe
 from .shares import make_share
-from .stateful import BufferState, CollectorState
-from .task import make_task
+from .stateful import BufferState
+from .task import make_task, seed_copies
 
 RecipeT = TypeVar("RecipeT", bound=ReplayRecipe)
 
@@ -93,7 +93,6 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
         recipe = self.recipe
         self.policy.eval()
         self.collector = self._make_collector(step)
-        self.collector_state = CollectorState(self.collector, recipe.seed, step)
         storage = OnlineHistoryStorage(
             recipe.buffer_size,
             recipe.backbone.num_frames,
@@ -110,15 +109,15 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
         self.buffer_state = BufferState(self.buffer, folder / "replay")
 
     def state(self) -> Mapping[str, Stateful]:
-        """Optimizer, collector and environment, and the replay buffer."""
+        """Optimizer and replay buffer."""
         return {
             "optimizer": self.optimizer,
-            "collector": self.collector_state,
             "buffer": self.buffer_state,
         }
 
     def batches(self) -> Iterator[TensorDictBase]:
-        """Yields collected batches, [envs, time]."""
+        """Yields collected batches, [envs, time]; the environments begin new episodes."""
+        self.buffer_state.storage.end_episodes()
         return while_acting(self.behaviour, self.collector)
 
     def size(self, batch: TensorDictBase) -> int:
@@ -133,9 +132,8 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
         """Stores a batch, then takes gradient steps on samples from the buffer."""
         recipe = self.recipe
         self.buffer.extend(self.stored(batch))
-        self.collector_state.step = step + batch.numel()
         values = torch.full((len(self.columns),), torch.nan)
-        if self.collector_state.step > recipe.random_steps:
+        if step + batch.numel() > recipe.random_steps:
             before = (step - recipe.random_steps) // recipe.steps_per_batch
             self.policy.train()
             for number in range(recipe.updates_per_batch):
@@ -170,6 +168,11 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
         """Builds the collector of batches [envs, time], in this process or on Ray."""
         recipe = self.recipe
         random_steps = recipe.random_steps if self.draws_random_steps else 0
+        steps: dict[str, Any] = {
+            "frames_per_batch": recipe.steps_per_batch,
+            "total_frames": recipe.final_step - step,
+            "init_random_frames": max(0, random_steps - step),
+        }
         own: dict[str, Any] = {
             "trust_policy": True,  # ours is on the right device already
             "track_traj_ids": False,
@@ -177,12 +180,10 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
         }
         if recipe.ray is None:
             return Collector(
-                self.make_env(recipe.num_envs, recipe.seed),
+                seed_copies(self.make_env(recipe.num_envs), recipe.seed, step),
                 self.behaviour,
-                frames_per_batch=recipe.steps_per_batch,
-                total_frames=recipe.final_step,
-                init_random_frames=random_steps or None,
                 device=self.device,
+                **steps,
                 **own,
             )
         there = replace(recipe, device="cpu")
@@ -197,11 +198,9 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
             address=recipe.ray,
             threads=recipe.threads,
             device=self.device,
-            frames_per_batch=recipe.steps_per_batch,
-            total_frames=recipe.final_step - step,
-            init_random_frames=max(0, random_steps - step),
             collector_class=ActingCollector,
             settings=own,
+            **steps,
         )
 
     @abstractmethod

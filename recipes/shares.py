@@ -9,10 +9,11 @@ import torch
 from torchrl.envs import EnvBase
 
 from .recipe import Recipe
+from .task import seed_copies
 
 
 def make_share(
-    make_envs: Callable[[int, int], EnvBase],
+    make_envs: Callable[[int], EnvBase],
     recipe: Recipe,
     num_envs: int,
     step: int,
@@ -23,7 +24,7 @@ def make_share(
     Random numbers depend on the run's seed and on the step at which the process starts.
 
     Args:
-        make_envs: builds environments, given their number and the seed of the first one.
+        make_envs: builds a number of environments.
         recipe: the settings.
         num_envs: number of environments that each collector has.
         step: number of steps that the run has done.
@@ -32,6 +33,5 @@ def make_share(
     torch.set_num_threads(recipe.threads)
     seeds = np.random.SeedSequence([recipe.seed, index, step])
     torch.manual_seed(seeds.generate_state(1).item())
-    # At the start, the environments have the same seeds as in one process.
-    seed = recipe.seed + index * num_envs if step == 0 else seeds.generate_state(2)[1].item() >> 1
-    return make_envs(num_envs, seed)
+    # The environments have the same seeds as in one process.
+    return seed_copies(make_envs(num_envs), recipe.seed, step, first=index * num_envs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
+import numpy as np
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs import make_env, time_limit
@@ -54,6 +55,31 @@ def make_task(
         **settings,
     }
     return make_env(recipe.env, num_envs, seed=seed, **values)
+
+
+def seed_copies(env: EnvBase, seed: int, step: int = 0, first: int = 0) -> EnvBase:
+    """Seeds the environments in which a run trains, each from a random stream of its own.
+
+    So runs with neighbouring seeds have no environment in common.
+
+    Args:
+        env: the environments, [N], which are reset.
+        seed: the run's seed.
+        step: steps that the run has done; a resumed run begins new episodes with other seeds.
+        first: number of the first environment, if there are more elsewhere.
+
+    Returns:
+        The environments.
+
+    Example:
+        >>> from torchrl_tit.envs import make_env
+        >>> env = seed_copies(make_env("CartPole-v1", 2), seed=0)
+        >>> env.close()
+    """
+    copies = range(first, first + env.batch_size.numel())
+    streams = [np.random.SeedSequence(seed, spawn_key=(step, copy)) for copy in copies]
+    env.reset(seed=[int(stream.generate_state(1)[0]) >> 1 for stream in streams])
+    return env
 
 
 def task_limit(recipe: Recipe) -> int | None:

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-import numpy as np
 import torch
 from pytorch_optimizer import Lamb
 from tensordict import TensorDictBase
@@ -18,6 +17,7 @@ from torchrl_tit.datasets import Episodes
 from torchrl_tit.modules import acting, make_dt_actor
 
 from ..algorithm import Stateful, check_finite
+from ..task import seed_copies
 from .odt_data import OnlineData
 from .odt_exploration import play_episodes, scale_noise
 from .sequence_algorithm import SequenceAlgorithm
@@ -111,8 +111,8 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
             number: number of the round, which determines its seeds together with the recipe's seed.
         """
         recipe = self.recipe
-        seed = int(np.random.SeedSequence([recipe.seed, number]).generate_state(1)[0]) % 2**31
-        env = self.make_env(recipe.episodes_per_round, seed, target_return=recipe.online_return)
+        env = self.make_env(recipe.episodes_per_round, target_return=recipe.online_return)
+        seed_copies(env, recipe.seed, number)
         actor = scale_noise(self.policy, recipe.exploration_scale)
         self.agent.eval()
         with torch.no_grad(), acting(actor), set_exploration_type(ExplorationType.RANDOM):

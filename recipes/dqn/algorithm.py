@@ -86,7 +86,7 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
     def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
         """As :meth:`ReplayAlgorithm.update`; random actions then become less likely."""
         terms = super().update(batch, step)
-        if self.collector_state.step > self.recipe.random_steps:
+        if step + batch.numel() > self.recipe.random_steps:
             self.exploration.step(batch.numel())
         return terms
 

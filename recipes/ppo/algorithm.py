@@ -37,7 +37,6 @@ from ..compilation import (
 )
 from ..outcomes import Outcome
 from ..ray_collector import check_cluster
-from ..stateful import CollectorState
 from ..task import make_task
 from .auxiliary import AuxiliaryLosses
 from .collectors import make_collector, with_state
@@ -205,13 +204,11 @@ class PPOAlgorithm(Algorithm[PPO]):
         self.collector = make_collector(
             recipe, agent.policy, agent.backbone, step, compiled=compiled
         )
-        self.collector_state = CollectorState(self.collector, recipe.seed, step)
 
     def state(self) -> Mapping[str, Stateful]:
-        """Optimizer, collector and environment."""
+        """Optimizer, running scales and the learning rate's factor."""
         return {
             "optimizer": self.optimizer,
-            "collector": self.collector_state,
             "return_scale": self.return_scale,
             "advantage_scale": self.advantage_scale,
             "rate": self.rate,
@@ -284,7 +281,6 @@ class PPOAlgorithm(Algorithm[PPO]):
         terms = torch.stack(steps)  # [gradient steps, terms]
         if recipe.collectors > 1 or recipe.ray is not None:
             self.collector.update_policy_weights_()
-        self.collector_state.step = step + batch.numel()
         # If this goes to 0, the features are the same in all states, and so is the policy.
         features = batch[agent.backbone.features_keys[0]].flatten(0, -2)  # [steps, features]
         return {

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import BaseCollector, MultiAsyncCollector, MultiSyncCollector
+from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 
 from torchrl_tit.modules import Backbone
@@ -18,7 +18,7 @@ from ..algorithm import torch_device
 from ..compilation import STATIC_SHAPES
 from ..ray_collector import ClusterCollector
 from ..shares import make_share
-from ..task import make_task
+from ..task import make_task, seed_copies
 from .rollout import FrameCollector
 from .settings import PPO
 
@@ -28,8 +28,8 @@ def make_collector(
 ) -> BaseCollector:
     """Builds the collector of batches [num_envs, time]: in this process, in several, or on Ray.
 
-    Several processes share the environments, each with a copy of the policy. If they are
-    asynchronous, each batch comes from one of them.
+    Several processes share the environments, each with a copy of the policy. Environments begin new
+    episodes, also if the run is resumed.
 
     Args:
         recipe: the settings.
@@ -67,17 +67,16 @@ def make_collector(
         # The tokens to reuse are chosen between two parts that are compiled separately.
         whole = compiled and not backbone.keeps_frames
         return FrameCollector(
-            _make_envs(recipe, backbone, recipe.num_envs, recipe.seed),
+            seed_copies(_make_envs(recipe, backbone, recipe.num_envs), recipe.seed, step),
             policy,
-            total_frames=recipe.final_step,
+            total_frames=recipe.final_step - step,
             compile_policy=STATIC_SHAPES if whole else None,
             track_traj_ids=False,
             return_same_td=True,  # without buffers, each batch has its own memory
             **settings,
         )
-    kind = MultiAsyncCollector if recipe.async_collection else MultiSyncCollector
     make_envs = partial(_make_envs, recipe, backbone)
-    return kind(
+    return MultiSyncCollector(
         [
             partial(_make_share, make_envs, recipe, share, step, index)
             for index in range(recipe.collectors)
@@ -100,8 +99,8 @@ def _make_share(*args: Any) -> EnvBase:
     return make_share(*args)
 
 
-def _make_envs(recipe: PPO, backbone: Backbone, num_envs: int, seed: int) -> EnvBase:
+def _make_envs(recipe: PPO, backbone: Backbone, num_envs: int) -> EnvBase:
     """Builds environments whose steps keep each observation once."""
     mode = recipe.vectorization_mode
-    task = make_task(recipe, num_envs, seed, vectorization_mode=mode, keep_histories=False)
+    task = make_task(recipe, num_envs, vectorization_mode=mode, keep_histories=False)
     return with_state(task, backbone)

@@ -63,12 +63,12 @@ class ReturnScale:
         return (self.statistics[2] / total).sqrt().float()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the statistics and the returns of the current episodes."""
-        return {"statistics": self.statistics, "returns": self.returns}
+        """Returns the statistics; a resumed run begins new episodes."""
+        return {"statistics": self.statistics}
 
     def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
         """Restores a state."""
-        self.statistics, self.returns = state_dict["statistics"], state_dict["returns"]
+        self.statistics, self.returns = state_dict["statistics"], None
 
 
 class AdvantageScale:

@@ -366,3 +366,10 @@ def test_killed_at_any_moment(tmp_path: Path) -> None:
         reached = step
         assert state["step"] == step
         assert state["weight"].equal(torch.full((100_000,), float(step)))
+
+
+def test_both_files_are_read_by_the_same_people(tmp_path):
+    folder = save_checkpoint(tmp_path, 1, {"weight": torch.ones(2)})
+    modes = {path.stat().st_mode & 0o777 for path in folder.iterdir()}
+    (tmp_path / "other").touch()  # with the mode that this process gives to files
+    assert modes == {(tmp_path / "other").stat().st_mode & 0o777}

@@ -341,3 +341,26 @@ def test_what_spaces_draw_follows_from_the_seed():
         assert [first.action_space.sample() for _ in range(20)] == drawn[-2]
     assert drawn[:2] == drawn[2:]
     assert drawn[0] != drawn[1]
+
+
+def test_processes_have_the_numbers_of_one():
+    envs = [
+        make_env("CartPole-v1", 3, seed=0, num_frames=2, vectorization_mode=mode)
+        for mode in ("sync", "async")
+    ]
+    roots = [env.reset() for env in envs]
+    ended = 0
+    torch.manual_seed(0)
+    for _ in range(60):
+        action = envs[0].rand_action(roots[0])["action"]
+        steps = [
+            env.step_and_maybe_reset(root.set("action", action))
+            for env, root in zip(envs, roots, strict=True)
+        ]
+        (first, _), (second, _) = steps
+        assert (first == second).all()
+        roots = [root for _, root in steps]
+        ended += int(first["next", "done"].sum())
+    assert ended > 3
+    for env in envs:
+        env.close()

@@ -50,11 +50,6 @@ def run(trained, tmp_path) -> Run:
     return Run(tmp_path / "run", replace(RECIPE, total_steps=2 * STEPS))
 
 
-def layer(state: dict[str, Any]) -> dict[str, Any]:
-    """The state of the innermost layer of the first copy of the task."""
-    return state["collector"]["collector"]["env"]["layers"][-1]
-
-
 def weight(state: dict[str, Any]) -> tuple[dict[str, Any], str]:
     return state["networks"], next(iter(state["networks"]))
 
@@ -75,16 +70,6 @@ def change_moment(state: dict[str, Any]) -> None:
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "generators lost": (lambda s: s.pop("rng"), "rng"),
     "generators of text": (lambda s: s.update(rng="torch"), "indices"),
-    "negative count of steps": (
-        lambda s: s["collector"]["collector"].update(frames=-STEPS),
-        f"has -{STEPS} steps, but the checkpoint {STEPS}",
-    ),
-    "negative count of batches": (
-        lambda s: s["collector"]["collector"].update(iteration=-1),
-        "iteration is -1, not a whole number",
-    ),
-    "count of text": (lambda s: s["collector"]["collector"].update(frames="32"), "has '32' steps"),
-    "another gravity": (lambda s: layer(s)["attributes"].update(gravity=0.0), "gravity"),
     "weights of another dtype": (change_weight(lambda w: w.double()), "float64, not torch.float32"),
     "weights that are no numbers": (change_weight(lambda w: w * torch.nan), "not finite"),
     "weights of text": (change_weight(lambda w: "weights"), ""),

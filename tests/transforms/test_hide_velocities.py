@@ -8,7 +8,6 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, GymEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_tit.checkpoint import can_save_env, env_state, set_env_state
 from torchrl_tit.envs import make_env
 from torchrl_tit.transforms import VELOCITIES, HideEntries, HideVelocities, History
 
@@ -76,17 +75,6 @@ def test_nested_keys_and_tensordicts():
     joints = torch.randn(5, 7, 3)
     result = transform(TensorDict({"sensors": {"joints": joints}}, [5]))
     assert torch.equal(result["sensors", "joints"], joints[..., 1:])
-
-
-def test_can_be_saved():
-    first, second = (
-        make_env("CartPole-v1", 2, seed=seed, num_frames=3, hide_velocities=True) for seed in (0, 1)
-    )
-    assert can_save_env(first)
-    root = first.rand_action(first.rollout(4)[:, -1]["next"])
-    set_env_state(second, env_state(first))
-    step, other = first.step(root.clone()), second.step(root.clone())
-    assert torch.equal(step["next", "history"], other["next", "history"])
 
 
 def test_bad_input():

@@ -159,7 +159,8 @@ class OnlineHistoryStorage(GatheringStorage):
         last = self._rows(begin - 1, begin)  # the newest steps so far
         if begin:
             newest = self._frames[self._frame_rows(begin, begin + 1)]
-            goes_on[0] = ~_flag(self._steps[last], "done") & _equal(newest, frames[0])
+            same = (self._ends[last] < 0) & ~_flag(self._steps[last], "done")
+            goes_on[0] = same & _equal(newest, frames[0])
         if (is_init := data.get("is_init", None)) is not None:
             goes_on &= ~is_init.reshape(count, envs)
         if begin:  # only the new steps show whether these ended an episode
@@ -181,6 +182,18 @@ class OnlineHistoryStorage(GatheringStorage):
             [frames, following[-1:]]
         ).flatten()
         self._count += count
+
+    def end_episodes(self) -> None:
+        """Ends the episodes of the newest steps: what is written next belongs to others.
+
+        Steps that are not done keep their next observations, from which values are bootstrapped.
+        """
+        if not self._count:
+            return
+        last = self._rows(self._count - 1, self._count)
+        going = self._ends[last] < 0
+        newest = self._frames[self._frame_rows(self._count, self._count + 1)]
+        self._ends[last[going]] = self._push(newest[going])
 
     def _push(self, frames: TensorDictBase) -> Tensor:
         return self._end_frames.push(frames).to(self.device)

@@ -134,13 +134,19 @@ class TorchRLTask(EnvBase):
 
 
 class _SeededCopies(BatchedEnvBase):
-    """Copies whose resets take a seed: copy i is seeded with ``seed + i``."""
+    """Copies whose resets take a seed: copy i gets ``seed + i``, or entry i of a sequence."""
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        seed: int | Sequence[int] | None = None,
+        **kwargs: Any,
     ) -> TensorDictBase:
+        if isinstance(seed, int):
+            seed = range(seed, seed + self.num_workers)
         if seed is not None:
-            kwargs["list_of_kwargs"] = [{"seed": seed + i} for i in range(self.num_workers)]
+            kwargs["list_of_kwargs"] = [{"seed": own} for own in seed]
         return super()._reset(tensordict, **kwargs)
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
@@ -151,7 +157,9 @@ class _SeededCopies(BatchedEnvBase):
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes the copies, if they have been started; closing twice is allowed."""
         if not self.is_closed:
+            threads = torch.get_num_threads()
             super().close(raise_if_closed=raise_if_closed)
+            torch.set_num_threads(threads)  # TorchRL raises it by the number of copies
 
 
 class SerialTasks(_SeededCopies, SerialEnv):
@@ -216,7 +224,8 @@ def make_torchrl_tasks(
     copy = partial(_copy, make, name, tuple(wrappers), task_settings, reading)
     copy().close()  # so that errors are raised here, not in other processes
     kind = SerialTasks if vectorization_mode == "sync" else ParallelTasks
-    return kind(num_envs, copy, device=device)
+    # Without num_threads, TorchRL lowers the number of threads of this process, too.
+    return kind(num_envs, copy, device=device, num_threads=torch.get_num_threads())
 
 
 def _copy(

@@ -85,8 +85,7 @@ class TransformedVectorEnv(TransformedEnv):
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         """Draws an action; an allowed one, if the tensordict has an "action_mask".
 
-        TorchRL's `ActionMask` could do this, but keeps the mask in the spec, which checkpoints
-        lack.
+        TorchRL's `ActionMask` could do this, but keeps the mask in the spec.
 
         Args:
             tensordict: The environment's output; [N].

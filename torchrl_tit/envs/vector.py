@@ -132,7 +132,10 @@ class GymVectorEnv(EnvBase):
         )
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        seed: int | Sequence[int] | None = None,
     ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         options = None if mask is None else {"reset_mask": mask.flatten().numpy(force=True)}
@@ -220,15 +223,16 @@ class GymVectorEnv(EnvBase):
         self._seed_spaces(seed)
         self._env.reset(seed=seed)
 
-    def _seed_spaces(self, seed: int | None) -> None:
+    def _seed_spaces(self, seed: int | Sequence[int] | None) -> None:
         """Seeds the spaces, which resets do not; those in other processes are unchanged."""
         if seed is None:
             return
+        seeds = range(seed, seed + self._env.num_envs) if isinstance(seed, int) else seed
         copies = getattr(self._env.unwrapped, "envs", ())
-        for number, layer in enumerate([self._env, *copies]):
+        for own, layer in zip([seeds[0], *seeds], [self._env, *copies], strict=False):
             while True:
                 for space in (layer.action_space, layer.observation_space):
-                    space.seed(seed + number)
+                    space.seed(own)
                 if not isinstance(layer, gymnasium.Wrapper | gymnasium.vector.VectorWrapper):
                     break
                 layer = layer.env

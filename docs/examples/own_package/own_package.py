@@ -30,12 +30,12 @@ from torchrl_tit.modules import Backbone, history_keys, make_actor
 from torchrl_tit.networks import build_network
 from torchrl_tit.recipes import (
     Algorithm,
-    CollectorState,
     Outcome,
     Recipe,
     check_finite,
     make_task,
     register_recipes,
+    seed_copies,
 )
 from torchrl_tit.settings import FrameSettings, HistorySettings, Network
 
@@ -188,16 +188,15 @@ class ReinforceAlgorithm(Algorithm[Reinforce]):
         recipe = self.recipe
         self.optimizer = torch.optim.Adam(self.agent.parameters(), lr=recipe.learning_rate)
         self.collector = Collector(
-            self.make_env(recipe.num_envs, recipe.seed),
+            seed_copies(self.make_env(recipe.num_envs), recipe.seed, step),
             self.agent.eval(),
             frames_per_batch=recipe.steps_per_batch,
             total_frames=-1,  # the runner ends the loop
             auto_register_policy_transforms=False,
         )
-        self.collector_state = CollectorState(self.collector, recipe.seed, step)
 
     def state(self) -> Mapping[str, Any]:  # what a checkpoint holds beside the networks
-        return {"optimizer": self.optimizer, "collector": self.collector_state}
+        return {"optimizer": self.optimizer}
 
     def batches(self) -> Iterator[TensorDictBase]:  # [envs, time]
         return iter(self.collector)
@@ -217,7 +216,6 @@ class ReinforceAlgorithm(Algorithm[Reinforce]):
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()
-        self.collector_state.step = step + batch.numel()
         return {"loss": loss.detach()}
 
     def play(self, step: int) -> list[Outcome]:

@@ -22,8 +22,6 @@ from recipes.registry import RECIPES, get_recipe
 from recipes.run import Run
 from recipes.runner import train
 from tests.recipes.cql.cql_runs import tit
-from tests.recipes.states import TIMES, assert_same
-from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import lstm, mlp
 
 SEVERAL = "SeveralActions-v0"
@@ -153,35 +151,6 @@ def test_slices_have_the_loss_of_their_transitions(tmp_path: Path) -> None:
         batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
         losses.append(algorithm._step(batch, 0)[0])
     torch.testing.assert_close(losses[1], losses[0], rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"backbone": tit(2), "buffer_size": 30},  # which is overwritten
-        {"backbone": mlp(2, hidden_dim=8), "slice_length": 2, "num_envs": 2},
-    ],
-    ids=["tit", "slices"],
-)
-def test_resumed_is_bit_for_bit_the_same(changes: dict[str, Any], tmp_path: Path) -> None:
-    recipe = replace(SMALL, **changes)
-    with Run.create(tmp_path / "whole", recipe) as run:
-        train(recipe, run)
-    with Run.create(tmp_path / "stopped", recipe) as run:
-        train(recipe, run, [Batches(last=40)])
-        torch.manual_seed(123)  # the resuming process may be in any state
-        train(recipe, run)
-    (step, state), (expected_step, expected) = (
-        load_checkpoint(tmp_path / name / "checkpoints") for name in ("stopped", "whole")
-    )
-    assert step == expected_step == 60
-    for name in ("networks", "optimizer", "exploration", "record", "rng"):
-        assert_same(state[name], expected[name])
-    rows, expected_rows = (
-        [{n: str(v) for n, v in row.items() if n not in TIMES} for row in read_metrics(path)]
-        for path in (tmp_path / name / "metrics.csv" for name in ("stopped", "whole"))
-    )
-    assert rows == expected_rows
 
 
 def test_exploration(tmp_path: Path) -> None:

@@ -17,12 +17,9 @@ from recipes.compilation import compile_and_time
 from recipes.ppo import PPO
 from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
 from recipes.ppo.rollout import FrameCollector, Rollout
-from recipes.run import Run
-from recipes.runner import train
 from tests.modules.frames import CountedFrames
 from tests.numerics import assert_near
 from tests.recipes.ppo import by_hand
-from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.envs import make_env
 from torchrl_tit.settings import CoBERL, Inner, Network
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp, vanilla_tit
@@ -293,23 +290,6 @@ def test_the_compiled_objective_is_one_graph_and_the_eager_one(tmp_path):
         assert_near(*results)
     assert counters["stats"]["unique_graphs"]
     assert not counters["graph_break"]
-
-
-@pytest.mark.parametrize("frames", [4, 24])  # some windows begin two batches ago
-def test_resumed_is_bit_for_bit_the_same(frames, tmp_path):
-    backbone = replace(RECIPE.backbone, num_frames=frames)
-    recipe = replace(RECIPE, backbone=backbone, steps_per_batch=48, checkpoint_interval=48)
-
-    def weights(run):
-        return TensorDict(load_checkpoint(run.checkpoints)[1]["networks"])
-
-    with Run.create(tmp_path / "whole", recipe) as run:
-        train(recipe, run)
-        expected = weights(run)
-    with Run.create(tmp_path / "parts", recipe) as run:
-        for steps in (48, 144, 192):
-            train(replace(recipe, total_steps=steps), run)
-        assert (weights(run) == expected).all()
 
 
 @pytest.mark.parametrize(

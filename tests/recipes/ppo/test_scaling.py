@@ -13,7 +13,6 @@ from recipes.ppo.learning_rate import KLAdaptiveRate
 from recipes.ppo.scaling import ReturnScale, ValueHead
 from recipes.run import Run
 from recipes.runner import load_trained, train
-from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.frames.normalized import NormalizedFrames
 from torchrl_tit.settings.networks import enhanced_tit, mlp
@@ -245,28 +244,6 @@ def test_the_learning_rate_follows_the_target_divergence(tmp_path):
     assert rows[0]["learning_rate"] == 0.01
     assert rows[-1]["learning_rate"] < 0.005
     assert all(row["epochs"] == 8 for row in rows)
-
-
-def test_a_run_with_all_of_them_resumes_bit_for_bit(tmp_path):
-    recipe = replace(
-        RECIPE,
-        normalize_rewards=True,
-        running_advantage_floor=0.5,
-        normalize_values=True,
-        value_gradient=0.5,
-        normalize_observations=True,
-        target_kl=0.01,
-        at_target_kl="adapt",
-    )
-    whole = run_of(recipe, tmp_path / "whole")
-    with Run.create(tmp_path / "half", recipe) as run:
-        train(replace(recipe, total_steps=128), run)
-        train(recipe, run)
-    states = [load_checkpoint(run.checkpoints)[1] for run in (whole, run)]
-    assert_same(states[0]["networks"], states[1]["networks"])
-    assert_same(states[0]["return_scale"], states[1]["return_scale"])
-    assert_same(states[0]["advantage_scale"], states[1]["advantage_scale"])
-    assert_same(states[0]["rate"], states[1]["rate"])
 
 
 def test_collectors_of_other_processes_get_the_statistics(tmp_path, monkeypatch):

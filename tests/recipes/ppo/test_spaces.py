@@ -114,17 +114,6 @@ def test_an_observation_in_parts_trains_as_a_whole(frames, tmp_path):
     assert rows == other_rows
 
 
-@pytest.mark.parametrize("name", ["masked MultiDiscrete", "lstm"])
-def test_resumed_is_bit_for_bit_the_same(name, tmp_path):
-    recipe = replace(RECIPE, **TASKS[name], checkpoint_interval=32)
-    expected, _ = trained(recipe, tmp_path / "whole")
-    with Run.create(tmp_path / "parts", recipe) as run:
-        for steps in (32, 64):
-            train(replace(recipe, total_steps=steps), run)
-        weights = TensorDict(load_checkpoint(run.checkpoints)[1]["networks"])
-    assert (weights == expected).all()
-
-
 def test_taxi_never_takes_a_forbidden_action(tmp_path):
     recipe = replace(RECIPE, env="Taxi-v4", mask_actions=True, steps_per_batch=64, total_steps=128)
     algorithm = PPOAlgorithm(recipe)

@@ -20,7 +20,6 @@ from recipes.runner import evaluate, train
 from recipes.sac import SAC
 from recipes.sac import algorithm as sac
 from recipes.sac.algorithm import SACAlgorithm
-from tests.recipes.states import TIMES
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.modules import Backbone
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
@@ -84,37 +83,6 @@ def assert_same(left: Any, right: Any) -> None:
             assert_same(a, b)
     elif isinstance(left, Tensor):
         assert torch.equal(left, right)
-
-
-@pytest.mark.parametrize("critic", ["mlp", "backbone"])
-@pytest.mark.parametrize("backbone", [SMALL.backbone, replace(SMALL.backbone, num_frames=2), TIT])
-def test_resumed_is_bit_for_bit_the_same(backbone: Any, critic: Any, tmp_path: Path) -> None:
-    """Stopped before the first checkpoint, between two of them, and at one."""
-    recipe = replace(SMALL, backbone=backbone, critic=critic)
-    with Run.create(tmp_path / "whole", recipe) as run:
-        train(recipe, run)
-    with Run.create(tmp_path / "stopped", recipe) as run:
-        for stop in (Batches(fail=20), Batches(fail=50), Batches(last=40), Batches(fail=50)):
-            if stop.last:
-                train(recipe, run, [stop])
-            else:
-                with pytest.raises(KeyError, match="killed"):
-                    train(recipe, run, [stop])
-        train(recipe, run)
-    (step, state), (expected_step, expected) = trained(run.folder), trained(tmp_path / "whole")
-    assert step == expected_step == 60
-    assert checkpoint_steps(run.folder / "replay") == [30, 40, 60]
-    assert checkpoint_steps(tmp_path / "whole" / "replay") == [30, 60]
-    for name in ("networks", "optimizer", "collector", "rng"):
-        assert_same(state[name], expected[name])
-    rows, expected_rows = (
-        [{name: str(value) for name, value in row.items() if name not in TIMES} for row in metrics]
-        for metrics in (
-            read_metrics(folder / "metrics.csv") for folder in (run.folder, tmp_path / "whole")
-        )
-    )
-    assert rows == expected_rows
-    assert [row["step"] for row in rows] == ["20.0", "40.0", "60.0"]
 
 
 def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:

@@ -1,0 +1,245 @@
+"""No number of a run depends on when it is saved or evaluated, and a resumed run loses nothing."""
+
+from __future__ import annotations
+
+import importlib.util
+import random
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+
+from recipes.algorithm import NotFiniteError, make_algorithm
+from recipes.callback import Callback
+from recipes.dqn import DQN
+from recipes.metrics import read_metrics
+from recipes.ppo import PPO
+from recipes.recipe import Recipe
+from recipes.run import Run
+from recipes.runner import train
+from recipes.sac import SAC
+from recipes.task import make_task, seed_copies
+from tests.envs import tasks
+from tests.recipes.states import TIMES, assert_same
+from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.envs import AtariGames
+from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp, nature_cnn
+
+# Active dropout draws from the global generator too.
+TIT = enhanced_tit(3, embed_dim=8, features_dim=8, ffn_dropout_inner=0.1)
+PPO_RECIPE = PPO(
+    env="CartPole-v1",
+    backbone=TIT,
+    num_envs=2,
+    total_steps=160,
+    steps_per_batch=32,
+    minibatch_size=16,
+    epochs=1,
+    learning_rate=0.01,
+    normalize_rewards=True,
+    normalize_observations=True,
+    running_advantage_floor=0.5,
+    log_interval=64,
+    checkpoint_interval=10**6,
+    evaluation_episodes=2,
+    compile="off",
+)
+_REPLAY: dict[str, Any] = {
+    "num_envs": 2,
+    "total_steps": 160,
+    "random_steps": 32,
+    "steps_per_batch": 32,
+    "updates_per_step": 0.1,
+    "batch_size": 8,
+    "log_interval": 64,
+    "checkpoint_interval": 10**6,
+    "evaluation_episodes": 1,
+}
+SAC_RECIPE = SAC(env="Pendulum-v1", backbone=mlp(2, hidden_dim=8), critic_hidden=(8,), **_REPLAY)
+DQN_RECIPE = DQN(env="CartPole-v1", backbone=TIT, buffer_size=64, slice_length=4, **_REPLAY)
+IMAGES = ("minigrid.wrappers:ImgObsWrapper",)
+RECIPES: dict[str, Recipe] = {
+    "CartPole": PPO_RECIPE,
+    "recurrent": replace(PPO_RECIPE, backbone=lstm(embed_dim=8, hidden_dim=8, features_dim=8)),
+    "MuJoCo": replace(PPO_RECIPE, env="Hopper-v5", backbone=mlp()),
+    "ale_py": replace(PPO_RECIPE, env="ALE/Breakout-v5", backbone=nature_cnn()),
+    "minigrid": replace(PPO_RECIPE, env="MiniGrid-Empty-5x5-v0", wrappers=IMAGES, backbone=mlp()),
+    "TorchRL": replace(
+        PPO_RECIPE, env="torchrl.envs:PendulumEnv", env_settings=("max_episode_steps=10",)
+    ),
+    "one's own": replace(
+        PPO_RECIPE,
+        env=f"{tasks.__name__}:Robot-v0",
+        observation_keys=("arm/joint_angles",),
+        backbone=mlp(),
+    ),
+    "processes": replace(PPO_RECIPE, vectorization_mode="async"),
+    "collectors": replace(PPO_RECIPE, collectors=2),
+    "SAC": SAC_RECIPE,
+    "DQN": DQN_RECIPE,
+}
+KINDS = [
+    pytest.param(name, marks=pytest.mark.slow if name in ("ale_py", "collectors") else ())
+    for name in RECIPES
+]
+
+
+def recipe_of(kind: str) -> Recipe:
+    if kind in ("ale_py", "minigrid") and importlib.util.find_spec(kind) is None:
+        pytest.skip(f"{kind} is an extra")
+    return RECIPES[kind]
+
+
+def train_in(folder: Path, recipe: Recipe, *callbacks: Callback) -> dict[str, Any]:
+    """Trains in a run folder, new or not, and returns the newest checkpoint."""
+    run = Run(folder, recipe) if folder.exists() else Run.create(folder, recipe)
+    with run:
+        train(recipe, run, callbacks)
+    return load_checkpoint(run.checkpoints)[1]
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    """The rows of metrics, without the clock and without evaluations between them."""
+    rows = [
+        {name: str(value) for name, value in row.items() if name not in TIMES}
+        for row in read_metrics(folder / "metrics.csv")
+    ]
+    evaluations = [row.pop("evaluation_return", None) for row in rows]
+    both = zip(rows, evaluations, strict=True)
+    return [row for row, evaluation in both if evaluation in (None, "nan") or row_is_due(row)]
+
+
+def row_is_due(row: dict[str, str]) -> bool:
+    return float(row["step"]) % 64 == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_depends_on_checkpoints_and_evaluations(kind: str, tmp_path: Path) -> None:
+    recipe = recipe_of(kind)
+    whole = train_in(tmp_path / "whole", recipe)
+    rows = rows_of(tmp_path / "whole")
+    assert [float(row["step"]) for row in rows] == [64, 128]
+    for saved, evaluated in ((32, 96), (64, 32)):
+        changes: dict[str, Any] = {
+            "checkpoint_interval": saved,
+            "evaluation_interval": evaluated,
+        }
+        other = train_in(tmp_path / f"{saved}", replace(recipe, **changes))
+        assert rows_of(tmp_path / f"{saved}") == rows
+        for part in whole.keys() - {"record", "best", "buffer"}:
+            assert_same(other[part], whole[part])
+        for name in ("sums", "count", "returns"):
+            assert_same(other["record"][name], whole["record"][name])
+
+
+class Stop(Callback):
+    """Ends the training at a step, and keeps what is observed first after a resume."""
+
+    def __init__(self, step: int = 0) -> None:
+        self.step = step
+        self.batches: list[Any] = []
+
+    def collected(self, step: int, batch: Any) -> None:
+        self.batches.append(batch.clone())
+
+    def updated(self, step: int, policy: Any) -> bool:
+        return step == self.step
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path: Path) -> None:
+    recipe = recipe_of(kind)
+    train_in(tmp_path / "first", recipe, Stop(96))
+    shutil.copytree(tmp_path / "first", tmp_path / "second")
+    stopped = rows_of(tmp_path / "first")
+    states, seen = [], []
+    for number, name in enumerate(("first", "second")):
+        torch.manual_seed(number)  # the resuming process may be in any state
+        random.seed(number)
+        np.random.seed(number)
+        stop = Stop()
+        states.append(train_in(tmp_path / name, recipe, stop))
+        seen.append(stop.batches)
+    assert [len(batches) for batches in seen] == [2, 2]
+    assert_same(seen[0][0], seen[1][0])
+    assert_same(*states)
+    assert rows_of(tmp_path / "first") == rows_of(tmp_path / "second")
+    assert rows_of(tmp_path / "first")[: len(stopped)] == stopped
+    # Episodes and histories are new ones.
+    batch = seen[0][0]
+    if kind not in ("ale_py", "minigrid"):
+        assert (batch["next", "episode_reward"] - batch["next", "reward"])[:, 0].abs().max() == 0
+    if "is_init" in batch.keys():  # noqa: SIM118 (a tensordict)
+        assert batch["is_init"][:, 0].all()
+
+
+@pytest.mark.parametrize("kind", [kind for kind in RECIPES if kind not in ("ale_py", "minigrid")])
+def test_neighbouring_seeds_share_no_environment(kind: str, tmp_path: Path) -> None:
+    """No copy of one begins as a copy of another; other tasks are seeded in the same way."""
+    starts = []
+    for seed in (20, 21, 22):
+        algorithm = make_algorithm(replace(RECIPES[kind], seed=seed))
+        algorithm.prepare(0, tmp_path)
+        observation = next(iter(algorithm.batches()))["observation"]
+        algorithm.close()
+        if not isinstance(observation, torch.Tensor):
+            observation = torch.cat([*observation.values()], -1)
+        starts += [tuple(start.tolist()) for start in observation[:, 0]]
+    assert len(set(starts)) == len(starts) == 6
+
+
+def test_neighbouring_seeds_share_no_game(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ale_py")
+    seeds: list[int] = []
+    begin = AtariGames._begin
+
+    def record(games: AtariGames, which: np.ndarray, given: Sequence[int] | None) -> None:
+        seeds.extend(given or ())
+        begin(games, which, given)
+
+    monkeypatch.setattr(AtariGames, "_begin", record)
+    for seed in (20, 21, 22):
+        seed_copies(make_task(RECIPES["ale_py"], 2), seed).close()
+    assert len(set(seeds)) == len(seeds) == 6
+
+
+class Paying(gymnasium.RewardWrapper):
+    """Pays another reward in an episode's fifth step."""
+
+    def __init__(self, env: gymnasium.Env, reward: str) -> None:
+        super().__init__(env)
+        self.value, self.steps = float(reward), 0
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.steps = 0
+        return self.env.reset(**kwargs)
+
+    def reward(self, reward: Any) -> float:
+        self.steps += 1
+        return self.value if self.steps == 5 else float(reward)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        *(("CartPole", "inf"), ("CartPole", "-inf"), ("CartPole", "1e39")),
+        *(("processes", "nan"), ("SAC", "nan"), ("DQN", "nan")),
+        pytest.param("collectors", "nan", marks=pytest.mark.slow),
+    ],
+)
+def test_a_reward_that_is_not_finite_is_named_in_training(
+    kind: str, value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In single precision, 1e39 is infinite."""
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", __name__)  # in other processes, too
+    recipe = replace(RECIPES[kind], wrappers=(f"{__name__}:Paying(reward={value!r})",))
+    said = "inf" if value == "1e39" else value
+    message = rf"^the reward of copy \d is {said} in {recipe.env} after step \d+; none was saved$"
+    with pytest.raises(NotFiniteError, match=message):
+        train_in(tmp_path / "run", recipe)
