@@ -32,7 +32,7 @@ class Stateful(Protocol):
 
 
 class NotFiniteError(FloatingPointError):
-    """A loss, a gradient or a weight became NaN or infinite."""
+    """A reward, a loss, a gradient or a weight is NaN or infinite."""
 
 
 class Algorithm(ABC, Generic[RecipeT]):

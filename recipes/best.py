@@ -16,11 +16,11 @@ EPISODES = 20
 class Best:
     """Keeps a copy of the weights with the highest return so far.
 
-    Online, that is the mean return of the last 20 training episodes, and the weights are those that
-    collected the last of them. Offline, it is the mean return of an evaluation. If returns are
-    equal, the later weights are kept. The copy is part of each checkpoint.
+    That is the mean return of an evaluation during training. Where there is none, it is that of the
+    last 20 training episodes, and the weights are those that collected the last of them. If returns
+    are equal, the later weights are kept. The copy is part of each checkpoint.
 
-    The maximum of many noisy means is biased upwards: evaluate the weights to learn their return.
+    The maximum of many noisy means is biased upwards: only new episodes say what the weights reach.
 
     Args:
         networks: the networks that are trained.
@@ -45,6 +45,10 @@ class Best:
         self._returns += returns
         if returns and len(self._returns) == EPISODES:
             self.offer(step, sum(self._returns) / EPISODES)
+
+    def forget(self) -> None:
+        """Drops the weights, before they are compared by another kind of return."""
+        self.step, self.return_mean, self._weights = None, float("-inf"), {}
 
     def offer(self, step: int, return_mean: float) -> None:
         """Keeps the current weights if no earlier ones had a higher return."""

@@ -6,7 +6,7 @@ import math
 import random
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 
 import msgspec
@@ -38,8 +38,11 @@ from .run import Run
 def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     """Trains a recipe in a run folder, from its newest checkpoint if there is one.
 
-    A run that is killed at any moment and resumed reaches the same weights, bit for bit, as an
-    uninterrupted one.
+    No number of a run depends on when it is saved or evaluated. A run that is killed and resumed
+    restores all that a checkpoint holds; what it then trains on follows from the checkpoint alone.
+    On a data set, it reaches the same weights, bit for bit, as an uninterrupted one. Environments
+    cannot be saved, so an online run begins new episodes, whose seeds follow from the run's seed
+    and the step.
 
     Args:
         recipe: the settings.
@@ -47,7 +50,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
         callbacks: hooks on batches, updates, evaluations and checkpoints; they can end training.
 
     Raises:
-        FloatingPointError: if a loss, a gradient or a weight is not finite.
+        FloatingPointError: if a reward, a loss, a gradient or a weight is not finite.
         KeyboardInterrupt: after Ctrl-C, once a checkpoint is saved.
     """
     torch.set_num_threads(recipe.threads)
@@ -85,14 +88,16 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
         interrupt = stack.enter_context(Interrupt())
         batches = iter(algorithm.batches())
         while step < recipe.final_step:
-            batch = next(batches)
+            with _naming(f"in {recipe.env} after step {step}", saved_step):
+                batch = next(batches)
             before, step = step, step + algorithm.size(batch)
             for callback in callbacks:
                 callback.collected(step, batch)
-            returns = algorithm.returns(batch)
-            if returns is not None:
+            with _naming(f"in {recipe.env} after step {before}", saved_step):
+                returns = algorithm.returns(batch)
+            if returns is not None and not record.outcomes:
                 best.add_episodes(before, returns.flatten().tolist())
-            with _naming(step, saved_step):
+            with _naming(f"in the update at step {step}", saved_step):
                 record.add(returns, algorithm.update(batch, before))
             progress.update(step - before)
 
@@ -100,18 +105,20 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             # Intervals count from the start, so a resumed run logs and saves at the same steps.
             log_due = step // recipe.log_interval > before // recipe.log_interval
             if log_due or evaluation_due:
-                with _naming(step, saved_step):
+                with _naming(f"in the update at step {step}", saved_step):
                     record.check()
             enough = any([callback.updated(step, algorithm.policy) for callback in callbacks])
             if evaluation_due:
-                outcomes = algorithm.play(step)
+                with _naming(f"in {recipe.env}, in the evaluation at step {step}", saved_step):
+                    outcomes = algorithm.play(step)
+                if not record.outcomes:
+                    best.forget()  # training episodes do not count where there are evaluations
                 record.outcomes += outcomes
-                if recipe.offline:
-                    best.offer(step, max(outcome.mean for outcome in outcomes))
+                best.offer(step, max(outcome.mean for outcome in outcomes))
                 for callback in callbacks:
                     callback.evaluated(step, outcomes)
             if log_due or evaluation_due:
-                row = record.take_row(step)
+                row = record.take_row(step, means=log_due)
                 written = metrics.log(step, **row)
                 for callback in callbacks:
                     callback.logged(step, written)
@@ -121,7 +128,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             interval = recipe.checkpoint_interval
             due = step // interval > before // interval or step >= recipe.final_step
             if due or evaluation_due or enough or interrupt.requested:
-                with _naming(step, saved_step):
+                with _naming(f"in the update at step {step}", saved_step):
                     record.check()
                 metrics.sync()  # the checkpoint's rows must be on the disk before it
                 for callback in callbacks:
@@ -182,22 +189,30 @@ class Record:
             names = [n for n, needed in zip(self._names, self._required, strict=True) if needed]
             check_finite(names, self._sums[required])
 
-    def take_row(self, step: int) -> dict[str, float]:
-        """Returns a row of metrics: means since the last one, and the step's evaluation."""
-        assert self._sums is not None
-        means = (self._sums / self._count).tolist()
+    def take_row(self, step: int, *, means: bool = True) -> dict[str, float]:
+        """Returns a row of metrics: the step's evaluation, and means since the last row of means.
+
+        Args:
+            step: number of steps so far.
+            means: if off, the row has the evaluation only, and the means await a later row: they
+                must not depend on when the run is evaluated.
+        """
+        row = dict.fromkeys(self.columns, math.nan)
         now = [outcome for outcome in self.outcomes if outcome.step == step]
-        means_of_now = [outcome.mean for outcome in now]
-        if self._recipe.offline:
-            row = {"return_mean": max(means_of_now, default=math.nan)}
-        else:
-            episodes = len(self._returns)
-            mean = sum(self._returns) / episodes if episodes else math.nan  # if none has ended
-            row = {"return_mean": mean, "episodes": episodes}
         for target, column in self._recipe.target_columns.items():
             row[column] = next((o.mean for o in now if o.target_return == target), math.nan)
+        if self._recipe.offline:
+            row["return_mean"] = max((outcome.mean for outcome in now), default=math.nan)
+        if not means:
+            return row
+        assert self._sums is not None
+        row |= dict(zip(self._names, (self._sums / self._count).tolist(), strict=True))
+        if not self._recipe.offline:
+            episodes = len(self._returns)
+            row["episodes"] = episodes
+            row["return_mean"] = sum(self._returns) / episodes if episodes else math.nan
         self._sums, self._count, self._returns = None, 0, []
-        return row | dict(zip(self._names, means, strict=True))
+        return row
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the state that the next row and the next evaluation need."""
@@ -239,7 +254,7 @@ def load_trained(
     Args:
         run: a run folder with a checkpoint.
         recipe: the run's recipe, if some of its settings are overridden.
-        best: whether to load the weights with the highest return in training (see
+        best: whether to load the weights with the highest return so far (see
             :class:`~recipes.best.Best`) instead of the last ones.
 
     Returns:
@@ -249,8 +264,15 @@ def load_trained(
         FileNotFoundError: if there is no checkpoint.
         ValueError: if the checkpoint has no best weights yet.
     """
-    recipe = recipe or run.recipe
     step, state = run.load_trained()
+    step, algorithm = _load_networks(run, recipe or run.recipe, step, state, best=best)
+    return step, algorithm, state
+
+
+def _load_networks(
+    run: Run, recipe: Recipe, step: int, state: dict[str, Any], *, best: bool
+) -> tuple[int, Algorithm[Any]]:
+    """Builds an algorithm with the weights of a checkpoint; returns their step, and it."""
     torch.set_num_threads(recipe.threads)
     algorithm = make_algorithm(recipe)
     with run.restoring(step):
@@ -265,7 +287,7 @@ def load_trained(
     with run.restoring(step):
         load_weights(algorithm.networks(), weights)
     algorithm.policy.eval()  # without dropout
-    return step, algorithm, state
+    return step, algorithm
 
 
 def evaluate(
@@ -277,7 +299,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluates a run's newest checkpoint: full episodes, the most likely action, raw rewards.
 
-    Episodes already played with these weights and seeds are not played again.
+    Episodes already played with these weights and seeds are not played again. But the best weights
+    are those whose evaluation in training was luckiest, so they play new episodes, whose seeds come
+    after those of these evaluations.
 
     Args:
         run: a run folder with a checkpoint.
@@ -294,10 +318,14 @@ def evaluate(
         ValueError: if the checkpoint has no best weights yet.
     """
     recipe = recipe or run.recipe
-    step, algorithm, state = load_trained(run, recipe, best=best)
+    step, state = run.load_trained()
     with run.restoring(step):
         record = msgspec.convert(state["record"], _RecordState)
     outcomes = record.outcomes
+    if best:
+        recipe = replace(recipe, evaluation_seed=_fresh_seed(recipe, record))
+        outcomes = []  # by which the weights were chosen
+    step, algorithm = _load_networks(run, recipe, step, state, best=best)
     same_seed = record.evaluation_seed == recipe.evaluation_seed
     targets: list[float | None] = [*recipe.target_columns] or [None]
     now = [
@@ -324,14 +352,22 @@ def evaluate(
     }
 
 
+def _fresh_seed(recipe: Recipe, record: _RecordState) -> int:
+    """The recipe's evaluation seed, or the first one after those of the evaluations in training."""
+    used = max((len(outcome.returns) for outcome in record.outcomes), default=0)
+    first, end = recipe.evaluation_seed, record.evaluation_seed + used
+    overlaps = first < end and record.evaluation_seed < first + recipe.evaluation_episodes
+    return end if overlaps else first
+
+
 @contextmanager
-def _naming(step: int, saved_step: int) -> Iterator[None]:
-    """Adds the step and the last good checkpoint to the message of a NotFiniteError."""
+def _naming(where: str, saved_step: int) -> Iterator[None]:
+    """Adds the place and the last good checkpoint to the message of a FloatingPointError."""
     try:
         yield
-    except NotFiniteError as error:
+    except FloatingPointError as error:
         saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
-        raise NotFiniteError(f"{error} in the update at step {step}; {saved}") from error
+        raise NotFiniteError(f"{error} {where}; {saved}") from error
 
 
 def _save(run: Run, step: int, parts: Mapping[str, Stateful]) -> None:

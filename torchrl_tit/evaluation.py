@@ -58,6 +58,7 @@ def evaluate(
 
     Raises:
         ValueError: If ``episodes`` is less than 1.
+        FloatingPointError: If a reward in one of these episodes is NaN or infinite.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
     2212.14538), section 4: the final model over 100 episodes.
@@ -138,9 +139,11 @@ def _play(
         step, tensordict = env.step_and_maybe_reset(acted)
         outcome = step["next"]
         # An environment whose episode has ended starts another one, which does not count.
+        reward = outcome[reward_key].flatten().masked_fill(~playing, 0)
+        check_rewards(reward)
         game_over = outcome.get("game_over", None)
         if game_over is None:
-            returns += outcome[reward_key].flatten() * playing
+            returns += reward
             playing &= ~outcome["done"].flatten()
         else:
             returns = outcome["game_return"].flatten().double().where(playing, returns)
@@ -174,6 +177,9 @@ def finished_returns(batch: TensorDictBase) -> Tensor:
     Returns:
         The undiscounted return of each episode, in the task's own rewards; [episodes].
 
+    Raises:
+        FloatingPointError: If a reward in the batch is NaN or infinite.
+
     Example:
         >>> from torchrl_tit.envs import make_env
         >>> env = make_env("CartPole-v1", seed=0)
@@ -181,10 +187,32 @@ def finished_returns(batch: TensorDictBase) -> Tensor:
         tensor(True)
     """
     outcome = batch["next"]
+    check_rewards(outcome["reward"].reshape(batch.shape))
     game_over = outcome.get("game_over", None)
     if game_over is None:
         return outcome["episode_reward"][outcome["done"]]
     return outcome["game_return"][game_over]
+
+
+def check_rewards(rewards: Tensor) -> None:
+    """Checks that rewards are finite.
+
+    Args:
+        rewards: Rewards of N copies of a task, [N] or [N, time].
+
+    Raises:
+        FloatingPointError: If one is NaN or infinite.
+
+    Example:
+        >>> check_rewards(torch.tensor([0.5, torch.inf]))
+        Traceback (most recent call last):
+            ...
+        FloatingPointError: the reward of copy 1 is inf
+    """
+    finite = rewards.isfinite()
+    if not finite.all():
+        index = tuple(finite.logical_not().nonzero()[0].tolist())
+        raise FloatingPointError(f"the reward of copy {index[0]} is {rewards[index].item()}")
 
 
 @contextmanager

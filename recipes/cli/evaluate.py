@@ -19,7 +19,8 @@ def evaluate(arguments: list[str]) -> None:
     parser.add_argument(
         "--best",
         action="store_true",
-        help="the weights with the highest return in training, not the last ones",
+        help="the weights with the highest return so far, not the last ones; they play new "
+        "episodes, with other seeds than those by which they were chosen",
     )
     parser.add_argument(
         "--out",
@@ -63,10 +64,11 @@ def _file_name(own: Recipe, recipe: Recipe, best: bool) -> str:
 
 def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
     """Returns an evaluation in one line."""
+    new = f", on new episodes from seed {evaluation['seed']}"
     return (
         f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
         f"{evaluation['episodes']} episodes after {evaluation['steps']} {recipe.unit} "
-        f"({evaluation['weights']} weights)"
+        f"({evaluation['weights']} weights{new if evaluation['weights'] == 'best' else ''})"
     )
 
 

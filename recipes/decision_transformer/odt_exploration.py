@@ -11,6 +11,7 @@ from tensordict.nn import (
 from torchrl.envs import EnvBase
 
 from torchrl_tit.datasets import Episodes, episodes_from_arrays, join_episodes
+from torchrl_tit.evaluation import check_rewards
 from torchrl_tit.modules.tensor_module import TensorModule
 
 _STEP: list[NestedKey] = [
@@ -42,12 +43,16 @@ def play_episodes(env: EnvBase, policy: TensorDictModuleBase) -> Episodes:
     Args:
         env: the environments, [N].
         policy: the policy that acts in them.
+
+    Raises:
+        FloatingPointError: if a reward of these episodes is NaN or infinite.
     """
     steps: list[TensorDictBase] = []
     tensordict = env.reset()
     playing = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
     while playing.any():
         step, tensordict = env.step_and_maybe_reset(policy(tensordict))
+        check_rewards(step["next", "reward"].squeeze(-1).masked_fill(~playing, 0))
         steps.append(step.select(*_STEP).cpu())
         playing &= ~step["next", "done"].squeeze(-1)
     return join_episodes([_first_episode(rollout) for rollout in torch.stack(steps, dim=1)])
