@@ -5,8 +5,11 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch import nn
 from torch.nn import functional as F
-from torchrl.data import Binary, Categorical, MultiCategorical, TensorSpec, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, TensorSpec, Unbounded
+from torchrl.modules import Actor, ProbabilisticActor, TanhDelta
 
 from torchrl_tit.modules import make_actor
 from torchrl_tit.objectives import LikelihoodBCLoss
@@ -25,8 +28,8 @@ from torchrl_tit.objectives import LikelihoodBCLoss
 def test_negative_log_likelihood(spec: TensorSpec) -> None:
     torch.manual_seed(0)
     actor = make_actor(8, spec).double()
-    (linear,) = (m for m in actor.modules() if isinstance(m, torch.nn.Linear))
-    torch.nn.init.normal_(linear.weight)
+    (linear,) = (m for m in actor.modules() if isinstance(m, nn.Linear))
+    nn.init.normal_(linear.weight)
     loss = LikelihoodBCLoss(actor)
     features, action = torch.randn(5, 8, dtype=torch.float64), spec.rand((5,))
     with torch.no_grad():
@@ -48,3 +51,39 @@ def test_negative_log_likelihood(spec: TensorSpec) -> None:
     result.backward()
     assert set(batch.keys()) == {"features", "action"}
     assert any(weight.grad is not None for weight in loss.parameters())
+
+
+@pytest.mark.parametrize("reduction", ["mean", "sum", "none"])
+def test_padding_does_not_count(reduction):
+    """Under the key of TorchRL's `BCLoss`, and with its results."""
+    actor = make_actor(8, Categorical(3)).double()
+    loss = LikelihoodBCLoss(actor, reduction=reduction)
+    loss.set_keys(pad_mask="padding")
+    padding = torch.arange(6).expand(4, 6) >= torch.tensor([[2], [6], [5], [0]])
+    features = torch.randn(4, 6, 8, dtype=torch.float64, requires_grad=True)
+    action = torch.randint(3, (4, 6))
+    batch = TensorDict({"features": features, "action": action, "padding": padding}, [4])
+    result = loss(batch)["loss_bc"]
+    logits = actor(batch.copy())["logits"]
+    expected = F.cross_entropy(logits[~padding], action[~padding], reduction=reduction)
+    torch.testing.assert_close(result, expected)
+    result.sum().backward()
+    assert features.grad is not None
+    assert torch.equal(features.grad.any(-1), ~padding)
+    with pytest.raises(KeyError, match="padding"):
+        loss(batch.exclude("padding"))
+
+
+@pytest.mark.parametrize("kind", ["Actor", "ProbabilisticActor"])
+def test_deterministic_policies_are_refused(kind):
+    """TorchRL's have a distribution, too, in which every action of the data is impossible."""
+    linear, spec = nn.Linear(4, 2), Bounded(-1, 1, (2,))
+    actor = Actor(linear, spec=spec)
+    if kind == "ProbabilisticActor":
+        module = TensorDictModule(linear, ["observation"], ["param"])
+        actor = ProbabilisticActor(
+            module, in_keys=["param"], spec=spec, distribution_class=TanhDelta
+        )
+    with pytest.raises(ValueError, match=f"not the deterministic {kind}, .*BCLoss") as error:
+        LikelihoodBCLoss(actor)
+    assert "\n" not in str(error.value)

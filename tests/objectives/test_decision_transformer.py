@@ -112,3 +112,15 @@ def test_an_unknown_loss_function_is_refused_at_once():
     predictor = make_dt_predictor(*make_network())
     with pytest.raises(ValueError, match=r"'loss_function' is 'l3', not one of \('l2', "):
         MaskedDTLoss(predictor, loss_function="l3")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("space", ["continuous", "discrete"])
+def test_a_batch_without_a_mask_is_refused(space):
+    """Otherwise, its padding would count."""
+    function: Literal["cross_entropy", "l2"] = "cross_entropy" if space == "discrete" else "l2"
+    predictor = make_dt_predictor(*make_network(space=space))
+    batch = make_batch(kind=space)
+    with pytest.raises(KeyError, match=r"no mask 'mask', only \['action', .*False at padding"):
+        MaskedDTLoss(predictor, loss_function=function)(batch.exclude("mask"))
+    with pytest.raises(KeyError, match="no mask 'valid'"):
+        MaskedDTLoss(predictor, loss_function=function, mask_key="valid")(batch)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Literal
 
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
+from torch import nn
+from torchrl.modules import Actor, Delta, TanhDelta
 from torchrl.objectives import BCLoss
 
 from torchrl_tit.settings.arguments import checked_arguments
@@ -20,14 +22,17 @@ class LikelihoodBCLoss(BCLoss):
 
     `BCLoss` of TorchRL 0.14.1 passes the sampled action, instead of the logits, to the
     cross-entropy if actions are integers; if they are not, it runs a stochastic policy twice. This
-    loss gets the policy's distribution in one pass.
+    loss gets the policy's distribution in one pass. As in `BCLoss`, ``set_keys(pad_mask=...)``
+    names an entry, bool [*B], that is True at padding, which then does not count.
 
     Args:
-        actor_network: a policy with ``get_dist``, such as a `ProbabilisticActor`.
+        actor_network: a stochastic policy with ``get_dist``, such as a `ProbabilisticActor`.
         reduction: how to reduce the losses of a batch.
 
     Raises:
-        ValueError: if there is no such ``reduction``, or the policy has no ``get_dist``.
+        ValueError: if there is no such ``reduction``, or the policy has no ``get_dist`` or is
+            deterministic.
+        KeyError: in ``forward``, if ``pad_mask`` is set and the batch has no such entry.
 
     Example:
         >>> import torch
@@ -49,13 +54,38 @@ class LikelihoodBCLoss(BCLoss):
         reduction: Literal["none", "mean", "sum"] = "mean",
     ) -> None:
         if not hasattr(actor_network, "get_dist"):
-            raise ValueError(f"actor_network must be a policy with get_dist, not {actor_network!r}")
+            raise ValueError(
+                f"actor_network must be a policy with get_dist, not {_name_of(actor_network)}"
+            )
+        if _is_deterministic(actor_network):
+            raise ValueError(
+                "actor_network must be a stochastic policy, such as a ProbabilisticActor, not the "
+                f"deterministic {_name_of(actor_network)}, whose actions have no density: train it "
+                "with TorchRL's BCLoss"
+            )
         super().__init__(actor_network, reduction=reduction)
 
+    def _set_in_keys(self) -> None:
+        # In BCLoss, a set: its order, that of positional arguments, differs from run to run.
+        keys = [*self.actor_network.in_keys, self.tensor_keys.action, self.tensor_keys.pad_mask]
+        self._in_keys = [key for key in dict.fromkeys(keys) if key is not None]
+
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the loss of a batch [*B], which is left unchanged."""
-        action = tensordict.get(self.tensor_keys.action)
+        action, pad_mask = tensordict[self.tensor_keys.action], self.tensor_keys.pad_mask
+        mask = None if pad_mask is None else ~tensordict[pad_mask]
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(tensordict.copy())
-        loss = self._reduce_loss(-dist.log_prob(action), tensordict=tensordict)
+        loss = self._reduce_loss(-dist.log_prob(action), tensordict=tensordict, mask=mask)
         return TensorDict({"loss_bc": loss})
+
+
+def _is_deterministic(policy: nn.Module) -> bool:
+    """Whether a policy gives one action a probability of 1, so that all others have none."""
+    kinds = [getattr(module, "distribution_class", None) for module in policy.modules()]
+    return isinstance(policy, Actor) or Delta in kinds or TanhDelta in kinds
+
+
+def _name_of(value: object) -> str:
+    return type(value).__name__ if isinstance(value, nn.Module) else repr(value)

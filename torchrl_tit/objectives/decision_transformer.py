@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, dispatch
 from torch.nn import functional as F
 from torchrl.objectives import DTLoss
 
@@ -33,6 +33,7 @@ class MaskedDTLoss(DTLoss):
 
     Raises:
         ValueError: if there is no such ``loss_function`` or ``reduction``.
+        KeyError: in ``forward``, if the batch has no mask.
         TypeError: in ``forward``, if the loss function does not suit the actions of the batch.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3.
@@ -68,8 +69,19 @@ class MaskedDTLoss(DTLoss):
         super().__init__(actor_network, loss_function=loss_function, reduction=reduction)
         self.loss_mask_key = mask_key
 
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        self._in_keys = sorted({*self._in_keys, self.loss_mask_key}, key=str)
+
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the loss of a batch [...], which is left unchanged."""
+        if tensordict.get(self.loss_mask_key, None) is None:
+            raise KeyError(
+                f"the batch has no mask {self.loss_mask_key!r}, only "
+                f"{sorted(map(str, tensordict.keys(True, True)))}: store one, bool [..., K] and "
+                "False at padding, or name its key in mask_key"
+            )
         target = tensordict[self.tensor_keys.action_target]
         discrete = self.loss_function == "cross_entropy"
         if discrete == target.is_floating_point():
