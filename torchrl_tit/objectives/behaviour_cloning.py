@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from torch import nn
 from torchrl.modules import Actor, Delta, TanhDelta
@@ -27,7 +27,7 @@ class LikelihoodBCLoss(BCLoss):
 
     Args:
         actor_network: a stochastic policy with ``get_dist``, such as a `ProbabilisticActor`.
-        reduction: how to reduce the losses of a batch.
+        reduction: how to reduce the losses of a batch; None, as in TorchRL, is "mean".
 
     Raises:
         ValueError: if there is no such ``reduction``, or the policy has no ``get_dist`` or is
@@ -40,10 +40,11 @@ class LikelihoodBCLoss(BCLoss):
         >>> from torchrl_tit.modules import make_actor
         >>> loss = LikelihoodBCLoss(make_actor(8, Categorical(3)))
         >>> batch = {"features": torch.randn(16, 8), "action": torch.randint(3, (16,))}
-        >>> loss(TensorDict(batch, [16]))["loss_bc"].shape
-        torch.Size([])
+        >>> torch.equal(loss(TensorDict(batch, [16]))["loss_bc"], loss(**batch))
+        True
     """
 
+    out_keys = ("loss_bc",)
     target_actor_network_params: TensorDictParams
 
     @checked_arguments
@@ -51,7 +52,7 @@ class LikelihoodBCLoss(BCLoss):
         self,
         actor_network: ProbabilisticTensorDictSequential,
         *,
-        reduction: Literal["none", "mean", "sum"] = "mean",
+        reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
         if not hasattr(actor_network, "get_dist"):
             raise ValueError(
@@ -65,10 +66,11 @@ class LikelihoodBCLoss(BCLoss):
             )
         super().__init__(actor_network, reduction=reduction)
 
-    def _set_in_keys(self) -> None:
-        # In BCLoss, a set: its order, that of positional arguments, differs from run to run.
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of the entries that the loss reads, in the order of positional arguments."""
         keys = [*self.actor_network.in_keys, self.tensor_keys.action, self.tensor_keys.pad_mask]
-        self._in_keys = [key for key in dict.fromkeys(keys) if key is not None]
+        return [key for key in dict.fromkeys(keys) if key is not None]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

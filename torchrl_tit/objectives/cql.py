@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.modules import set_recurrent_mode
@@ -139,6 +139,20 @@ class ContinuousCQLLoss(CQLLoss):
         self.register_buffer("_low", action_spec.space.low.clone())
         self.register_buffer("_high", action_spec.space.high.clone())
 
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of the entries that the loss reads, in the order of positional arguments."""
+        action, *outcome = (
+            self.tensor_keys.action,
+            self.tensor_keys.reward,
+            self.tensor_keys.terminated,
+            self.tensor_keys.done,
+        )
+        read = dict.fromkeys([*self.actor_network.in_keys, *self.qvalue_network.in_keys])
+        state = [key for key in read if key != action]
+        return [*state, action, *(unravel_key(("next", key)) for key in [*state, *outcome])]
+
+    @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes all terms of a batch [*B], which is not changed.
 
@@ -146,6 +160,9 @@ class ContinuousCQLLoss(CQLLoss):
             "loss_actor", "loss_qvalue", "loss_cql" (weighted), "loss_alpha", "alpha" (the
             temperature) and "entropy" (of the policy, estimated), float [] each.
         """
+        batch_dims = tensordict.get(self.tensor_keys.action).ndim - 1
+        if tensordict.ndim > batch_dims:  # dispatch takes all that the entries have in common
+            tensordict.auto_batch_size_(batch_dims)
         samples = self.sample_policy(tensordict)
         loss_qvalue, loss_cql = self.critic_losses(tensordict, samples)
         return TensorDict(

@@ -26,7 +26,7 @@ class MaskedDTLoss(DTLoss):
         loss_function: "l2", "l1" or "smooth_l1" between continuous actions [..., K, A], or
             "cross_entropy" between logits and discrete ones, integers [..., K] or one-hot.
         mask_key: Key of the mask, bool [..., K], False at padding.
-        reduction: How to reduce the losses of the steps.
+        reduction: How to reduce the losses of the steps; None, as in TorchRL, is "mean".
 
     Returns:
         In ``forward``, a tensordict with "loss", float [].
@@ -64,14 +64,16 @@ class MaskedDTLoss(DTLoss):
         *,
         loss_function: Literal["l2", "l1", "smooth_l1", "cross_entropy"] = "l2",
         mask_key: NestedKey = "mask",
-        reduction: Literal["none", "mean", "sum"] = "mean",
+        reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
         super().__init__(actor_network, loss_function=loss_function, reduction=reduction)
         self.loss_mask_key = mask_key
 
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        self._in_keys = sorted({*self._in_keys, self.loss_mask_key}, key=str)
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of the entries that the loss reads, in the order of positional arguments."""
+        target, mask = self.tensor_keys.action_target, self.loss_mask_key
+        return list(dict.fromkeys([*self.actor_network.in_keys, target, mask]))
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -63,6 +63,8 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         >>> (losses["loss_qvalue"] + losses["loss_cql"]).backward()
     """
 
+    out_keys = ("loss_qvalue", "loss_cql")
+
     @checked_arguments
     def __init__(
         self,
