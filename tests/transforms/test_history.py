@@ -1,11 +1,12 @@
 """History writes the last K observations of each environment, and nothing else."""
 
 import warnings
+from inspect import signature
 from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDictBase, assert_close
+from tensordict import TensorDict, TensorDictBase, assert_close
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
 from torchrl.envs import (
     CatFrames,
@@ -162,6 +163,38 @@ def test_stored_trajectories_get_the_same_histories(num_frames, padding):
     assert torch.equal(again["history"], rollout["history"])
 
 
+@pytest.mark.parametrize("padding", ["same", "constant"])
+def test_next_observations_can_be_named_as_for_cat_frames(padding):
+    env = TransformedEnv(StreamEnv([4]), History(3, padding=padding))
+    rollout = env.rollout(30, break_when_any_done=False)
+    stored = rollout.exclude("history", ("next", "history"))
+    keys = ["observation", ("next", "observation")], ["history", ("next", "history")]
+    again = History(3, *keys, padding=padding)(stored)
+    assert torch.equal(again["history"], rollout["history"])
+    assert torch.equal(again["next", "history"], rollout["next", "history"])
+    same = TransformedEnv(StreamEnv([4]), History(3, *keys, padding=padding))
+    assert_histories(same, 3, padding)
+
+
+def test_without_an_environment_it_is_cat_frames():
+    """Steps begin with zeros; a reset pads."""
+    history = History(3)
+    history.reset_key = "_reset"
+    cat_frames = CatFrames(3, -2, ["observation"], ["history"], reset_key="_reset")
+    resets = [None, None, torch.tensor([True, False]), None, torch.tensor([True, True])]
+    for reset in resets:
+        step = TensorDict({"observation": torch.randn(2, 4)}, [2])
+        expected = step.apply(lambda frame: frame.unsqueeze(-2))
+        if reset is not None:
+            step["_reset"] = expected["_reset"] = reset.unsqueeze(-1)
+        for transform, entries in ((history, step), (cat_frames, expected)):
+            if reset is None:
+                transform._call(entries)
+            else:
+                transform._reset(entries, entries)
+        assert torch.equal(step["history"], expected["history"])
+
+
 def stored_once(history: History, **settings: Any) -> tuple[TensorDictBase, ReplayBuffer]:
     """Steps with the environment's histories, and a buffer that stores them without."""
     rollout = TransformedEnv(StreamEnv([]), history).rollout(50, break_when_any_done=False)
@@ -253,11 +286,31 @@ def test_takes_one_key_as_a_name():
         ({"num_frames": 2, "in_keys": ["a", "b"]}, ValueError, r"in_keys=\['a', 'b'\]"),
         ({"num_frames": 2, "in_keys": [], "out_keys": []}, ValueError, "at least one"),
         ({"num_frames": 2, "out_keys": ["observation"]}, ValueError, "needs a key of its own"),
+        (
+            {"num_frames": 2, "in_keys": [("next", "observation")]},
+            ValueError,
+            r"'history' of \('next', 'observation'\) cannot be made: name the observation itself",
+        ),
+        (
+            {"num_frames": 2, "in_keys": ["o", ("next", "o")], "out_keys": ["h", "next_h"]},
+            ValueError,
+            "'next_h' of .* cannot be made: .*its history under \"next\" like the one at the root",
+        ),
+        ({"num_frames": 2, "in_keys": -2}, TypeError, "in_keys must be keys, not -2.*no dimension"),
     ],
 )
 def test_wrong_arguments(arguments, error, words):
     with pytest.raises(error, match=words):
         History(**arguments)
+
+
+OPTIONS = set(signature(CatFrames.__init__).parameters) - set(signature(History).parameters)
+
+
+@pytest.mark.parametrize("option", sorted(OPTIONS - {"self"}))
+def test_other_options_of_cat_frames_are_refused_by_name(option):
+    with pytest.raises(TypeError, match=f"unexpected keyword argument '{option}'"):
+        History(2, **{option: None})
 
 
 @pytest.mark.parametrize("wrap", [lambda history: history, lambda history: Compose(history)])

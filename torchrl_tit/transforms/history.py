@@ -33,7 +33,9 @@ class History(CatFrames):
 
     Args:
         num_frames: K, the number of observations in a history, at least 1.
-        in_keys: Keys of the observations: a list, whose entries may be nested, or one name.
+        in_keys: Keys of the observations: a list, whose entries may be nested, or one name. On
+            stored data, the histories of the next observations are made in any case; they can be
+            named as `CatFrames` requires, ``["observation", ("next", "observation")]``.
         out_keys: Keys of the histories, one for each of ``in_keys`` and different from all of them.
         observation_ndim: Number of dimensions of one observation: 1 for arrays [D], 2 for grey
             images [H, W], 3 for images [C, H, W].
@@ -41,10 +43,11 @@ class History(CatFrames):
             observation, ``"constant"`` writes zeros.
 
     Raises:
-        TypeError: If ``num_frames`` or ``observation_ndim`` is not an integer.
-        ValueError: If one of them is too small, the padding is unknown, the keys do not pair up,
-            or, when the transform is added to an environment, its observation does not have
-            ``observation_ndim`` dimensions.
+        TypeError: If ``num_frames`` or ``observation_ndim`` is not an integer, or ``in_keys`` or
+            ``out_keys`` are no keys.
+        ValueError: If one of them is too small, the padding is unknown, the keys do not pair up, a
+            key under "next" is not that of an observation in ``in_keys``, or, when the transform is
+            added to an environment, its observation does not have ``observation_ndim`` dimensions.
         KeyError: If the environment has no such observation.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
@@ -71,8 +74,9 @@ class History(CatFrames):
         if padding not in get_args(Padding):
             known = ", ".join(map(repr, get_args(Padding)))
             raise ValueError(f"padding must be one of {known}, not {padding!r}")
-        observations, histories = _key_list(in_keys), _key_list(out_keys)
+        observations, histories = _key_list("in_keys", in_keys), _key_list("out_keys", out_keys)
         _check_keys(observations, histories)
+        observations, histories = _without_next(observations, histories)
         super().__init__(
             num_frames,
             dim=-(observation_ndim + 1),
@@ -116,7 +120,11 @@ class History(CatFrames):
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             history = next_tensordict.get(in_key).unsqueeze(self.dim)  # [..., 1, *obs]
             if self.N > 1:
-                history = self._push(self._buffers[_buffer_name(in_key)], history, _reset)
+                name = _buffer_name(in_key)
+                if name not in self._buffers:  # no environment has made it
+                    zeros = torch.zeros_like(history).repeat_interleave(self.N, self.dim)
+                    self._make_buffer(name, zeros)
+                history = self._push(self._buffers[name], history, _reset)
             next_tensordict.set(out_key, history)
         return next_tensordict
 
@@ -286,8 +294,29 @@ def _check_integer(name: str, value: int, minimum: int) -> None:
         raise ValueError(f"{name} must be at least {minimum}, not {value}")
 
 
-def _key_list(keys: Sequence[NestedKey] | str) -> list[NestedKey]:
+def _key_list(name: str, keys: Sequence[NestedKey] | str) -> list[NestedKey]:
+    if not isinstance(keys, Sequence):
+        raise TypeError(
+            f"{name} must be keys, not {keys!r}: unlike CatFrames, History takes no dimension, but "
+            "the number of an observation's dimensions, observation_ndim"
+        )
     return [unravel_key(key) for key in ([keys] if isinstance(keys, str) else keys)]
+
+
+def _without_next(
+    in_keys: list[NestedKey], out_keys: list[NestedKey]
+) -> tuple[list[NestedKey], list[NestedKey]]:
+    """Leaves out the keys of next observations, whose histories are those of the others, moved."""
+    pairs = dict(zip(in_keys, out_keys, strict=True))
+    following = {unravel_key(("next", k)): unravel_key(("next", out)) for k, out in pairs.items()}
+    pairs = {key: out for key, out in pairs.items() if following.get(key) != out}
+    for key, out in pairs.items():
+        if isinstance(key, tuple) and key[0] == "next":
+            raise ValueError(
+                f"the history {out!r} of {key!r} cannot be made: name the observation itself too, "
+                'and its history under "next" like the one at the root'
+            )
+    return list(pairs), list(pairs.values())
 
 
 def _check_keys(in_keys: list[NestedKey], out_keys: list[NestedKey]) -> None:
