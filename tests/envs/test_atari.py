@@ -6,7 +6,6 @@ import pytest
 import torch
 from tensordict import assert_close
 from torchrl.envs import SignTransform, TransformedEnv
-from torchrl.envs.utils import check_env_specs
 
 from tests.transforms.streams import assert_histories
 from torchrl_tit.envs import AtariEnv, AtariGames, make_env
@@ -164,7 +163,6 @@ def test_only_a_full_reset_begins_new_games(breakout):
 
 def test_contract():
     env = make_env("ALE/Breakout-v5", 2, seed=0, num_frames=3)
-    check_env_specs(env)
     assert env.observation_spec["history"].shape == (2, 3, 84, 84)
     assert env.reset()["history"].dtype is torch.uint8
     assert env.action_spec.space.n == 4

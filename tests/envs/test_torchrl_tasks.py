@@ -66,7 +66,6 @@ def test_keys_and_kinds():
     assert kinds(env) == expected
     assert type(env.action_spec) is Categorical
     assert env.action_spec.shape == (3,)
-    check_env_specs(env)
     for name in expected:
         assert_histories(env, 2, "same", 20, ("observation", name), ("history", name))
 

@@ -88,15 +88,6 @@ def test_equals_gym_wrapper_and_transforms(name, limit, num_envs, num_frames, pa
     assert ended > num_envs
 
 
-@pytest.mark.parametrize("num_frames", [1, 4])
-@pytest.mark.parametrize("top", [lambda env: env, lambda env: TransformedEnv(env, StepCounter())])
-@pytest.mark.parametrize("name", ["CartPole-v1", "Pendulum-v1"])
-def test_specs_tell_the_truth(name, top, num_frames):
-    for clip in (True, False):
-        check_env_specs(top(make_env(name, 2, num_frames=num_frames, clip_actions=clip)))
-    check_env_specs(top(make_env(name, 1, num_frames=num_frames, device="cpu")))
-
-
 @pytest.mark.parametrize("top", [lambda env: env, lambda env: env.append_transform(StepCounter())])
 def test_short_cut_equals_the_general_way(top):
     short, general = (top(make_env("CartPole-v1", 3, seed=0, num_frames=3)) for _ in range(2))
