@@ -296,7 +296,7 @@ def test_takes_one_key_as_a_name():
             ValueError,
             "'next_h' of .* cannot be made: .*its history under \"next\" like the one at the root",
         ),
-        ({"num_frames": 2, "in_keys": -2}, TypeError, "in_keys must be keys, not -2.*no dimension"),
+        ({"num_frames": 2, "in_keys": -2}, TypeError, "in_keys must be .* -2; .* no dim"),
     ],
 )
 def test_wrong_arguments(arguments, error, words):
@@ -309,8 +309,9 @@ OPTIONS = set(signature(CatFrames.__init__).parameters) - set(signature(History)
 
 @pytest.mark.parametrize("option", sorted(OPTIONS - {"self"}))
 def test_other_options_of_cat_frames_are_refused_by_name(option):
+    options: dict[str, Any] = {option: None}
     with pytest.raises(TypeError, match=f"unexpected keyword argument '{option}'"):
-        History(2, **{option: None})
+        History(2, **options)
 
 
 @pytest.mark.parametrize("wrap", [lambda history: history, lambda history: Compose(history)])

@@ -1,6 +1,6 @@
 """The last K observations of an environment, under a key of their own."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, get_args
 
 import torch
@@ -295,10 +295,10 @@ def _check_integer(name: str, value: int, minimum: int) -> None:
 
 
 def _key_list(name: str, keys: Sequence[NestedKey] | str) -> list[NestedKey]:
-    if not isinstance(keys, Sequence):
+    if not isinstance(keys, Iterable):
         raise TypeError(
-            f"{name} must be keys, not {keys!r}: unlike CatFrames, History takes no dimension, but "
-            "the number of an observation's dimensions, observation_ndim"
+            f"{name} must be keys, not {keys!r}; History takes no dim as CatFrames does, but the "
+            "number of an observation's dimensions, observation_ndim"
         )
     return [unravel_key(key) for key in ([keys] if isinstance(keys, str) else keys)]
 
