@@ -49,12 +49,16 @@ class LinearFrameEncoder(FrameEncoder):
         self.index = None if categories is None else CategoryIndex(categories)
         entries = math.prod(shape) if categories is None else sum(categories)
         self.linear = nn.Linear(entries, settings.embed_dim, bias=settings.bias)
-        if categories is not None:  # as many inputs are 1 as there are categories
-            bound = 1 / math.sqrt(len(categories))
-            nn.init.uniform_(self.linear.weight, -bound, bound)
         self.activation: nn.Module = nn.Identity()
         if settings.activation != "none":
             self.activation = make_activation(settings.activation)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises the weights of categories. Others are those of the linear layer."""
+        if self.index is not None:  # as many inputs are 1 as there are entries
+            bound = 1 / math.sqrt(len(self.index.first))
+            nn.init.uniform_(self.linear.weight, -bound, bound)
 
     def forward(self, observation: Tensor) -> Tensor:
         """[..., *observation_shape], float, uint8 or categories -> float [..., 1, D]."""

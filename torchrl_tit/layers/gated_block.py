@@ -43,7 +43,13 @@ class GRUGate(nn.Module):
         self.candidate_y = nn.Linear(embed_dim, embed_dim, bias=False)
         self.candidate_x = nn.Linear(embed_dim, embed_dim, bias=False)
         # Not a linear layer's bias, because initialisations set those to zero.
-        self.bias = nn.Parameter(torch.full((embed_dim,), float(bias)))
+        self.bias = nn.Parameter(torch.empty(embed_dim))
+        self.initial_bias = float(bias)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises the bias. The linear layers initialise themselves."""
+        nn.init.constant_(self.bias, self.initial_bias)
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
         """Stream x and update y, float [..., D] each -> float [..., D]."""

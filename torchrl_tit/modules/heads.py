@@ -99,17 +99,16 @@ def make_actor(
     """
     shape = action_shape(action_spec, batch_dims)
     if isinstance(action_spec, Categorical | OneHot) and not isinstance(action_spec, Binary):
-        parts = _choices(features_dim, action_spec, shape, mask_key)
+        parts = _choices(features_dim, action_spec, shape, mask_key, gain)
     elif mask_key is not None:
         raise ValueError(
             f"no action mask for the action space {describe(action_spec)}, only for Categorical, "
             "OneHot, MultiCategorical and MultiOneHot: leave out mask_key"
         )
     elif isinstance(action_spec, Binary):
-        parts = _switches(features_dim, action_spec, shape)
+        parts = _switches(features_dim, action_spec, shape, gain)
     else:
-        parts = _gaussian(features_dim, action_spec, shape)
-    init_orthogonal_(parts.network, gain=gain)
+        parts = _gaussian(features_dim, action_spec, shape, gain)
     in_keys = [in_key] if mask_key is None else [in_key, mask_key]
     return ProbabilisticActor(
         TensorModule(parts.network, in_keys=in_keys, out_keys=list(parts.parameters.values())),
@@ -139,9 +138,7 @@ def make_value(features_dim: Size, *, in_key: NestedKey = "features") -> ValueOp
         >>> make_value(64)(TensorDict({"features": torch.randn(5, 64)}, [5]))["state_value"].shape
         torch.Size([5, 1])
     """
-    layer = nn.Linear(features_dim, 1)
-    init_orthogonal_(layer, gain=1.0)
-    return TensorValue(layer, in_keys=[in_key])
+    return TensorValue(_Linear(features_dim, 1, gain=1.0), in_keys=[in_key])
 
 
 class _Parts(NamedTuple):
@@ -155,7 +152,11 @@ class _Parts(NamedTuple):
 
 
 def _choices(
-    features_dim: int, spec: Categorical | OneHot, shape: torch.Size, mask_key: NestedKey | None
+    features_dim: int,
+    spec: Categorical | OneHot,
+    shape: torch.Size,
+    mask_key: NestedKey | None,
+    gain: float,
 ) -> _Parts:
     """Parts for actions whose components each are one of several options."""
     distribution: type[distributions.Distribution]
@@ -176,29 +177,48 @@ def _choices(
     else:
         # Validating logits and samples takes a third of the head's time at each step.
         distribution, settings = distributions.Categorical, {"validate_args": False}
-        return _Parts(nn.Linear(features_dim, sizes[0]), parameters, distribution, settings)
-    network = _ChoicesHead(features_dim, sizes, shape, mask_key)
+        return _Parts(_Linear(features_dim, sizes[0], gain), parameters, distribution, settings)
+    network = _ChoicesHead(features_dim, sizes, shape, mask_key, gain)
     return _Parts(network, parameters, distribution, settings)
 
 
-def _switches(features_dim: int, spec: Binary, shape: torch.Size) -> _Parts:
+def _switches(features_dim: int, spec: Binary, shape: torch.Size, gain: float) -> _Parts:
     """Parts for actions whose components each are on or off."""
-    layer = nn.Linear(features_dim, math.prod(shape))
+    layer = _Linear(features_dim, math.prod(shape), gain)
     network = layer if len(shape) == 1 else nn.Sequential(layer, _Fit(shape))
     settings = {"event_dim": len(shape), "dtype": spec.dtype}
     return _Parts(network, {"logits": "logits"}, IndependentBernoulli, settings)
 
 
-def _gaussian(features_dim: int, spec: TensorSpec, shape: torch.Size) -> _Parts:
+def _gaussian(features_dim: int, spec: TensorSpec, shape: torch.Size, gain: float) -> _Parts:
     """Parts for continuous actions."""
     size = math.prod(shape)
-    network = nn.Sequential(
-        nn.Linear(features_dim, size), AddStateIndependentNormalScale(size, scale_lb=0.0)
-    )
+    network = nn.Sequential(_Linear(features_dim, size, gain), _Scale(size, scale_lb=0.0))
     if len(shape) != 1 or spec.dtype != torch.float32:
         network.append(_Fit(shape, spec.dtype))
     settings = {"event_dim": len(shape), "validate_args": False}
     return _Parts(network, {"loc": "loc", "scale": "scale"}, IndependentNormal, settings)
+
+
+class _Linear(nn.Linear):
+    """A linear layer whose weights start orthogonal and whose bias starts at 0."""
+
+    def __init__(self, in_features: int, out_features: int, gain: float) -> None:
+        self.gain = gain  # first, because nn.Linear initialises itself
+        super().__init__(in_features, out_features)
+
+    def reset_parameters(self) -> None:
+        """Initialises the weights and the bias."""
+        super().reset_parameters()
+        init_orthogonal_(self, gain=self.gain)
+
+
+class _Scale(AddStateIndependentNormalScale):
+    """TensorDict's scale of a Gaussian, whose logarithm can be set back to 0."""
+
+    def reset_parameters(self) -> None:
+        """Initialises the logarithm of the scale."""
+        nn.init.zeros_(self.state_independent_scale)
 
 
 class _Fit(nn.Module):
@@ -225,13 +245,19 @@ class _ChoicesHead(nn.Module):
         sizes: number of options of each component.
         shape: the components' shape.
         mask_key: key of the action mask, for error messages; None if there is none.
+        gain: gain of the initial weights.
     """
 
     def __init__(
-        self, features_dim: int, sizes: list[int], shape: torch.Size, mask_key: NestedKey | None
+        self,
+        features_dim: int,
+        sizes: list[int],
+        shape: torch.Size,
+        mask_key: NestedKey | None,
+        gain: float,
     ) -> None:
         super().__init__()
-        self.linear = nn.Linear(features_dim, sum(sizes))
+        self.linear = _Linear(features_dim, sum(sizes), gain)
         self.mask_key = mask_key
         # The logit of each option of each component; the index after the last stands for none.
         columns = torch.full((len(sizes), max(sizes)), sum(sizes))

@@ -121,7 +121,12 @@ class HistoryNetwork(nn.Module):
         self.head, self.features_dim = _make_head(
             self.history_encoder.out_features, head or settings.Head()
         )
-        if initialization == "normal":
+        self.initialization = initialization
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initialises as ``initialization`` says, after all layers have initialised themselves."""
+        if self.initialization == "normal":
             init_normal_(self)
 
     def forward(self, *inputs: Tensor) -> Tensor:
