@@ -15,7 +15,16 @@ from torch.func import functional_call, stack_module_state
 from tests.networks.reference import randomize
 from tests.numerics import assert_near
 from torchrl_tit.layers import init_normal_, init_orthogonal_
-from torchrl_tit.networks import D2RL, MLP, Catformer, CoBERL, NatureCNN, OFENet, ResNet
+from torchrl_tit.networks import (
+    D2RL,
+    MLP,
+    Catformer,
+    CoBERL,
+    EnhancedTIT,
+    NatureCNN,
+    OFENet,
+    ResNet,
+)
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -207,7 +216,7 @@ def test_array_networks_read_the_entries_of_images_too(kind: type[Any]) -> None:
 
 
 def test_unknown_hyperparameter_is_named() -> None:
-    with pytest.raises(TypeError, match="unexpected keyword argument 'width'"):
-        MLP((5,), width=3)
-    with pytest.raises(TypeError, match="unexpected keyword argument 'width'"):
-        Catformer((20, 20), 2, width=3)
+    for kind in (MLP, Catformer, EnhancedTIT):
+        message = rf"^{kind.__name__}\(\) got an unexpected keyword argument 'width'"
+        with pytest.raises(TypeError, match=message):
+            kind((20, 20), 2, width=3)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -43,7 +44,7 @@ class System(HistoryNetwork):
     ) -> None:
         if num_frames is not None:
             hyperparameters["num_frames"] = num_frames
-        network = self.system(**hyperparameters)
+        network = _describe(self, **hyperparameters)
         super().__init__(
             frames_by_kind(network, observation_shape),
             network.history,
@@ -53,6 +54,15 @@ class System(HistoryNetwork):
             initialization=network.initialization,
             action_dim=action_dim,
         )
+
+
+def _describe(system: System | TwoTrunkSystem, **hyperparameters: Any) -> settings.Network:
+    """Returns the settings of a system; a TypeError names its class, as that of a call does."""
+    try:
+        return system.system(**hyperparameters)
+    except TypeError as error:  # raised by the function that takes the hyperparameters in the end
+        message = re.sub(r"^[\w.]+\(\)", f"{type(system).__name__}()", str(error))
+        raise TypeError(message) from None
 
 
 class VanillaTIT(System):
@@ -218,7 +228,7 @@ class TwoTrunkSystem(TwoTrunks):
     def __init__(
         self, observation_shape: Observations, num_frames: int = 1, **hyperparameters: Any
     ) -> None:
-        network = self.system(num_frames, **hyperparameters)
+        network = _describe(self, num_frames=num_frames, **hyperparameters)
         super().__init__(*(build_trunk(network, observation_shape) for _ in range(2)))
 
 
