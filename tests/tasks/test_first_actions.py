@@ -26,3 +26,10 @@ def test_bad_counts(count):
 def test_other_kinds_of_actions():
     with pytest.raises(ValueError, match="needs Discrete actions, not Box"):
         FirstActions(gymnasium.make("Pendulum-v1"), 1)
+
+
+def test_a_spec_recreates_it():
+    env = FirstActions(gymnasium.make("Taxi-v4"), 4)
+    again = gymnasium.make(env.spec)
+    assert again.action_space == Discrete(4)
+    assert again.spec == env.spec

@@ -8,7 +8,7 @@ import gymnasium
 from gymnasium import spaces
 
 
-class FirstActions(gymnasium.ActionWrapper[Any, Any, Any]):
+class FirstActions(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.RecordConstructorArgs):
     """Keeps the first ``count`` actions of a Discrete task whose other actions are useless.
 
     MiniGrid gives every task the same seven actions. MiniGrid-Memory needs three: left, right and
@@ -28,6 +28,7 @@ class FirstActions(gymnasium.ActionWrapper[Any, Any, Any]):
     """
 
     def __init__(self, env: gymnasium.Env, count: int) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self, count=count)
         super().__init__(env)
         space = env.action_space
         if not isinstance(space, spaces.Discrete):
