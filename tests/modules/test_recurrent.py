@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
-from torchrl.modules import set_recurrent_mode
+from torchrl.modules import get_primers_from_module, set_recurrent_mode
 
 from tests.modules.frames import CountedFrames
 from tests.numerics import assert_near
@@ -140,6 +140,45 @@ def test_a_rollout_as_sequences_has_the_features_of_its_steps(trunks):
             again = backbone(batch.select(*backbone.in_keys).reshape(-1, 20))
         for key in backbone.features_keys:
             assert_near(again[key].reshape(batch[key].shape), batch[key])
+    collector.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("name", "trunks", "num_frames"),
+    [
+        ("lstm", "shared", 1),
+        ("lstm", "separate", 1),
+        ("gru", "separate", 1),
+        ("lstm", "shared", 4),
+        ("enhanced-tit", "shared", 4),
+    ],
+)
+def test_a_collector_registers_what_the_policy_needs(name, trunks, num_frames):
+    network = build_network(settings.NETWORKS[name](num_frames), (4,), trunks=trunks)
+    out_keys = ["features"] if isinstance(network, HistoryNetwork) else ["policy", "value"]
+    backbone = Backbone(network, out_keys=out_keys)
+    env = make_env("CartPole-v1", 2, seed=0, num_frames=num_frames)
+    primer = get_primers_from_module(backbone)
+    keys = set(primer.primers.keys()) if backbone.is_recurrent else set()
+    assert keys == set(backbone.state_shapes)
+    key = backbone.features_keys[0]
+    head = make_actor(backbone.features_dim, env.action_spec_unbatched, in_key=key)
+    collector = Collector(
+        env,
+        TensorDictSequential(backbone, head),
+        frames_per_batch=100,
+        total_frames=100,
+        auto_register_policy_transforms=True,
+    )
+    (batch,) = collector
+    assert batch["is_init"][:, 1:].any()
+    for key in backbone.state_shapes:
+        assert not batch[key][batch["is_init"].squeeze(-1)].any()
+    assert {key for key in batch.keys() if "recurrent" in key} == set(backbone.state_shapes)
+    with set_recurrent_mode(True), torch.no_grad():
+        again = backbone(batch.exclude(*backbone.features_keys))
+    for key in backbone.features_keys:
+        assert_near(again[key], batch[key])
     collector.shutdown()
 
 

@@ -90,6 +90,18 @@ class _TorchRLEncoder(RecurrentEncoder):
         return layers
 
 
+class _LSTMModule(LSTMModule):
+    """TorchRL's module without a primer: the backbone makes it, for the keys of its tensordict."""
+
+    make_tensordict_primer = property()
+
+
+class _GRUModule(GRUModule):
+    """TorchRL's module without a primer, like :class:`_LSTMModule`."""
+
+    make_tensordict_primer = property()
+
+
 class LSTM(_TorchRLEncoder):
     """An LSTM over frames: TorchRL's `LSTMModule`.
 
@@ -106,7 +118,7 @@ class LSTM(_TorchRLEncoder):
         torch.Size([8, 64])
     """
 
-    memory_class = LSTMModule
+    memory_class = _LSTMModule
     layer_name = "lstm"
     state = ("recurrent_state_h", "recurrent_state_c")
 
@@ -128,6 +140,6 @@ class GRU(_TorchRLEncoder):
         torch.Size([8, 64])
     """
 
-    memory_class = GRUModule
+    memory_class = _GRUModule
     layer_name = "gru"
     state = ("recurrent_state_h",)

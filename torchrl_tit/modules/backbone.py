@@ -11,7 +11,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, skip_existing
 from torch import Tensor, nn
 from torchrl.data import Unbounded
-from torchrl.envs import Compose, InitTracker, TensorDictPrimer
+from torchrl.envs import Compose, InitTracker, TensorDictPrimer, Transform
 
 from torchrl_tit.histories.encoder import RecurrentEncoder
 from torchrl_tit.modules.acting_network import ActingNetwork
@@ -204,8 +204,21 @@ class Backbone(TensorDictModule):
         """
         if not self.is_recurrent:
             return Compose()
+        return Compose(InitTracker(), self.make_tensordict_primer())
+
+    def make_tensordict_primer(self) -> Transform:
+        """Builds the transform that starts each episode with a state of zeros.
+
+        TorchRL calls it for the environments of collectors (``auto_register_policy_transforms``)
+        and in ``torchrl.modules.get_primers_from_module``.
+
+        Returns:
+            TorchRL's `TensorDictPrimer`; an empty `Compose` if the network is not recurrent.
+        """
+        if not self.is_recurrent:
+            return Compose()
         specs = {key: Unbounded(shape=shape) for key, shape in self.state_shapes.items()}
-        return Compose(InitTracker(), TensorDictPrimer(specs, expand_specs=True))
+        return TensorDictPrimer(specs, expand_specs=True)
 
     @contextmanager
     def acting(self) -> Iterator[None]:
