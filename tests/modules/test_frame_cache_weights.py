@@ -59,16 +59,42 @@ def load(module, assign=False):
     module.load_state_dict(weights, assign=assign)
 
 
+def step(module):
+    for parameter in module.parameters():
+        parameter.grad = torch.ones_like(parameter)
+    torch.optim.Adam(module.parameters(), lr=0.1).step()
+
+
+def more(weights):
+    return weights.apply(lambda weight: weight.detach() + 0.1)
+
+
 @pytest.mark.parametrize(
     "change",
     [
         load,
         partial(load, assign=True),
         lambda backbone: load(nn.Sequential(backbone)),
+        lambda backbone: load(backbone.module),
+        lambda backbone: load(encoder_of(backbone.module)),
+        lambda backbone: load(encoder_of(backbone.module), assign=True),
+        lambda backbone: step(encoder_of(backbone.module)),
+        lambda backbone: more(TensorDict.from_module(backbone)).to_module(backbone),
         lambda backbone: backbone.half().double(),
         lambda backbone: nn.Sequential(backbone).half().double(),
     ],
-    ids=["load", "assign", "load around it", "cast", "cast around it"],
+    ids=[
+        "load",
+        "assign",
+        "load around it",
+        "load the network",
+        "load the frame encoder",
+        "assign to the frame encoder",
+        "optimizer",
+        "to_module",
+        "cast",
+        "cast around it",
+    ],
 )
 @torch.no_grad()
 def test_loaded_and_cast_weights_are_used(change):
@@ -81,6 +107,30 @@ def test_loaded_and_cast_weights_are_used(change):
                 change(backbone)
                 assert not torch.equal(encoder_of(backbone.module).class_token, before)
             assert_exact(backbone, stream[:, start : start + 4])
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.inference_mode])
+def test_weights_that_to_module_swaps_are_used(mode):
+    """The swapped weights are no parameters, which is how TorchRL's losses call a network."""
+    backbone, _, shape = make()
+    first = more(TensorDict.from_module(backbone))
+    second = more(first)
+    stream = torch.randn(5, 9, *shape)
+    with backbone.acting(), mode():
+        for start, weights in enumerate([first, second, second, first]):
+            with weights.to_module(backbone):
+                assert_exact(backbone, stream[:, start : start + 4])
+
+
+@torch.inference_mode()
+def test_weights_of_inference_mode_are_used():
+    backbone, network, shape = make()
+    stream = torch.randn(5, 9, *shape)
+    with backbone.acting():
+        for start in range(4):
+            assert_exact(backbone, stream[:, start : start + 4])
+            for parameter in network.parameters():
+                parameter.add_(0.1)
 
 
 @pytest.mark.parametrize("part", ["history_encoder", "head"])

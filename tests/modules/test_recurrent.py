@@ -174,7 +174,7 @@ def test_a_collector_registers_what_the_policy_needs(name, trunks, num_frames):
     assert batch["is_init"][:, 1:].any()
     for key in backbone.state_shapes:
         assert not batch[key][batch["is_init"].squeeze(-1)].any()
-    assert {key for key in batch.keys() if "recurrent" in key} == set(backbone.state_shapes)
+    assert {key for key in set(batch.keys()) if "recurrent" in key} == set(backbone.state_shapes)
     with set_recurrent_mode(True), torch.no_grad():
         again = backbone(batch.exclude(*backbone.features_keys))
     for key in backbone.features_keys:

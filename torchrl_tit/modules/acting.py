@@ -28,8 +28,8 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
 
     Args:
         policy: a module that contains any number of backbones, or of other modules with a method
-            ``acting`` (see :meth:`Backbone.acting`). Other functions are left unchanged. Its
-            weights must not change within the context, unless :func:`clear_caches` follows.
+            ``acting`` (see :meth:`Backbone.acting`, also for weights that change within the
+            context). Other functions are left unchanged.
 
     Example:
         >>> from tensordict.nn import TensorDictSequential

@@ -15,7 +15,7 @@ class ActingNetwork:
     """Maps histories to features, and keeps the tokens of the frames for the next call.
 
     Args:
-        network: the network, which must not change between two calls (see :meth:`clear`).
+        network: the network (see :class:`FrameCache` for weights that change).
 
     Example:
         >>> from torchrl_tit import EnhancedTIT

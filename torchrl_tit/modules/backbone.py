@@ -229,16 +229,18 @@ class Backbone(TensorDictModule):
         :class:`~torchrl_tit.modules.FrameCache`). Has no effect while gradients are enabled, or on
         networks that encode no frames or read a single one.
 
-        **The network must not change within the context**: its weights are not compared. Optimizers
-        step between two collections, each of which enters a new context, as with
+        **Weights that change within the context** are noticed if PyTorch counts the write: when a
+        state dict is loaded into any module, within ``to_module``, and after most optimizers' step.
+        Nothing shows that a fused optimizer stepped, or that weights were written through ``.data``
+        or shared memory: call :meth:`clear_cache` afterwards; otherwise, for the next K - 1 steps,
+        frames seen before the change keep the tokens of the old weights. There is no need for it
+        between two collections, each of which enters a new context, as with
         :func:`~torchrl_tit.modules.while_acting` and :class:`~torchrl_tit.modules.ActingCollector`.
-        If you change weights within the context, call :meth:`clear_cache` afterwards; otherwise,
-        for the next K - 1 steps, frames seen before the change keep the tokens of the old weights.
 
         The cache (copies of one batch of histories and of its tokens) starts empty. It is discarded
-        at the end, and whenever the backbone or a module that contains it is moved or cast, or its
-        state dict is taken or loaded. So a run continues exactly like one that is resumed from its
-        state dict. Copies and pickles are not in acting mode.
+        at the end, when weights change, and whenever the backbone or a module that contains it is
+        moved or cast, or its state dict is taken. So a run continues exactly like one that is
+        resumed from its state dict. Copies and pickles are not in acting mode.
 
         Example:
             >>> from tensordict import TensorDict
@@ -281,10 +283,6 @@ class Backbone(TensorDictModule):
         """Returns the network's state dict, and discards the tokens that acting mode keeps."""
         self.clear_cache()
         return super().state_dict(*args, **kwargs)
-
-    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
-        self.clear_cache()  # also called when a containing module is loaded
-        super()._load_from_state_dict(*args, **kwargs)
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
         self.clear_cache()  # moved or cast

@@ -23,6 +23,7 @@ class _Kept:
     """The last K - 1 frames and their tokens, and the conditions under which they can be reused."""
 
     conditions: tuple[object, ...]
+    weights: list[Tensor]  # kept alive, because the conditions hold their ids
     words: SlidingWindow  # bytes of the frames, int [N, K - 1, words]
     tokens: SlidingWindow  # float [N, K - 1, *token_shape]
 
@@ -40,12 +41,16 @@ class FrameCache:
     output is that of the encoder, up to rounding: the last bits may differ between a frame encoded
     alone and in a batch.
 
-    The encoder must not change between two calls. After a change of its weights or modules, call
-    :meth:`clear`; otherwise, the previous frames keep the tokens of the old weights.
+    Tokens are kept while each parameter and buffer of the encoder is the same tensor of the same
+    version, PyTorch's count of writes. So a loaded state dict, ``to_module``, ``copy_`` and most
+    optimizers are noticed. Writes through ``.data``, through shared memory and by fused optimizers
+    leave no trace, and modules that replace others are not looked for: call :meth:`clear`
+    afterwards, or the previous frames keep the tokens of the old weights.
 
     Nothing is kept or reused while gradients are enabled, dropout or batch normalisation is active
-    in the encoder, under ``vmap`` and the other transforms of ``torch.func``, or while
-    ``torch.compile``, ``torch.export`` or a CUDA graph is recording.
+    in the encoder, ``to_module`` has put tensors in the place of parameters, under ``vmap`` and the
+    other transforms of ``torch.func``, or while ``torch.compile``, ``torch.export`` or a CUDA graph
+    is recording.
 
     Args:
         encoder: maps observations [..., *observation_shape] to tokens [..., *token_shape], each
@@ -73,12 +78,18 @@ class FrameCache:
         """Maps observations to tokens."""
         self._observation_ndim = observation_ndim
         self._encode_newest = encoder if encode_newest is None else encode_newest
+        modules = list(encoder.modules())
         # All modules that behave differently in training mode.
         self._mode_dependent = [
             module
-            for module in encoder.modules()
+            for module in modules
             if isinstance(module, _BatchNorm) or (isinstance(module, _DropoutNd) and module.p > 0)
         ]
+        # Looked up at every step, for which named_parameters() takes too long.
+        self._weights = [
+            x for module in modules for x in (module._parameters, module._buffers) if x
+        ]
+        self._number_of_weights = len(self._present_weights())
         self._kept: _Kept | None = None
 
     def clear(self) -> None:
@@ -96,8 +107,14 @@ class FrameCache:
         """
         if self._must_bypass(window):
             return self.encoder(window)
+        weights = self._present_weights()
+        versions = _versions(weights)
+        if len(weights) != self._number_of_weights or versions is None:
+            return self.encoder(window)  # a later change of the weights would leave no trace
         device = window.device.type
         conditions = (
+            *map(id, weights),
+            *versions,
             window.shape,
             window.dtype,
             window.device,
@@ -117,7 +134,7 @@ class FrameCache:
         else:
             tokens = torch.cat([self._encode_older(frames, words, newest, kept), newest], dim=1)
             self._kept = _Kept(
-                conditions, SlidingWindow(words[:, 1:]), SlidingWindow(tokens[:, 1:])
+                conditions, weights, SlidingWindow(words[:, 1:]), SlidingWindow(tokens[:, 1:])
             )
         return tokens.reshape(*leading, *tokens.shape[1:])
 
@@ -138,6 +155,10 @@ class FrameCache:
             tokens[unknown] = self.encoder(distinct)[index]
         return tokens
 
+    def _present_weights(self) -> list[Tensor]:
+        """The parameters and buffers of the encoder, without those that to_module has replaced."""
+        return [x for tensors in self._weights for x in tensors.values() if x is not None]
+
     def _must_bypass(self, window: Tensor) -> bool:
         """Whether reused tokens would lack gradients or randomness, or cannot be compared."""
         return (
@@ -151,3 +172,11 @@ class FrameCache:
             or torch._C._functorch.peek_interpreter_stack() is not None  # vmap, jvp, ...
             or (window.is_cuda and torch.cuda.is_current_stream_capturing())
         )
+
+
+def _versions(tensors: list[Tensor]) -> list[int] | None:
+    """How often each tensor has been written, as PyTorch counts for autograd."""
+    try:
+        return [tensor._version for tensor in tensors]
+    except RuntimeError:  # not counted, for tensors of inference mode
+        return None
