@@ -17,7 +17,9 @@ from torchrl.envs.utils import check_env_specs
 from tests.envs.tasks import Echo, Robot
 from tests.transforms.streams import assert_histories
 from torchrl_tit.envs import GymVectorEnv, make_env, observation_keys, observation_specs
+from torchrl_tit.envs.actions import box_action_spec
 from torchrl_tit.envs.spaces import ObservationReader
+from torchrl_tit.export.task_action import TaskAction
 
 ROBOT = "tests.envs.tasks:Robot-v0"
 NAMES = ["arm/gear", "arm/joint_angles", "camera", "contacts", "wheels"]
@@ -188,6 +190,52 @@ def test_boxes_of_any_order_are_clipped_and_restored():
     assert env.step(root)["next", "reward"].flatten().tolist() == [-8, -8]
     bounded = echo(Box(low, -low), clip_actions=False).action_spec_unbatched
     assert bounded.space.low.tolist() == low.flatten().tolist()
+
+
+@pytest.mark.parametrize("clip", [True, False])
+@pytest.mark.parametrize("dtype", [np.int8, np.uint8, np.int32, np.int64, np.uint64])
+def test_integers_are_clipped_before_they_could_wrap(dtype, clip):
+    limits = np.iinfo(dtype)
+    for low, high in ((limits.min, limits.max), (0, 5)):
+        env = echo(Box(low, high, (3,), dtype), clip_actions=clip)
+        actions = torch.tensor([[1e20, 2.6, 2.6], [-1e20, -torch.inf, 2.6]])
+        env.step(env.reset().set("action", actions))  # the task refuses what is not in its space
+        write = env.action_writer
+        assert write(actions.numpy()).tolist() == [[high, 3, 3], [low, low, 3]]
+        assert TaskAction(write)(actions).tolist() == [[high, 3, 3], [low, low, 3]]
+
+
+@pytest.mark.parametrize("clip", [True, False])
+def test_bounds_are_rounded_inwards(clip):
+    env = echo(Box(0.1, 0.3, (2,), np.float64), clip_actions=clip)
+    bounds = [torch.full((2, 2), x) for x in (-7.0, 7.0)]
+    if not clip:
+        spec = env.action_spec.space
+        bounds = [spec.low, spec.high]
+        torch.testing.assert_close(bounds, [torch.full((2, 2), 0.1), torch.full((2, 2), 0.3)])
+    for action in bounds:  # the task refuses what is not in its space
+        env.step(env.reset().set("action", action))
+    limits = (np.array([-1e300, 0.3]), np.array([1e300, 0.3]))
+    space = box_action_spec(*limits, clip=False).space
+    largest = torch.finfo(torch.float32).max
+    torch.testing.assert_close(space.low, torch.tensor([-largest, 0.3]))
+    torch.testing.assert_close(space.high, torch.tensor([largest, 0.3]))
+    assert (space.low <= space.high).all()
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.float32])
+@pytest.mark.parametrize("clip", [True, False])
+def test_an_action_that_is_not_a_number_is_refused(dtype, clip):
+    env = echo(Box(0, 9, (2,), dtype), clip_actions=clip)
+    root = env.reset().set("action", torch.tensor([[1.0, 2.0], [3.0, torch.nan]]))
+    with pytest.raises(ValueError, match=r"^the action \[3.0, nan\] is not a number: [^\n]*$"):
+        env.step(root)
+
+
+def test_actions_without_bounds_are_unbounded():
+    env = echo(Box(-np.inf, np.inf, (2,)), clip_actions=False)
+    check_env_specs(env)
+    assert isinstance(env.action_spec, Unbounded)
 
 
 def test_masks_in_info():

@@ -125,6 +125,13 @@ def test_time_limit_is_truncation():
     assert env.action_spec_unbatched.space.high.item() == 2
 
 
+@pytest.mark.parametrize("clip", [True, False])
+def test_an_action_that_is_not_a_number_is_refused(clip):
+    env = make_env("torchrl.envs:PendulumEnv", 2, seed=0, clip_actions=clip)
+    with pytest.raises(ValueError, match=r"the action \[nan\] is not a number"):
+        env.step(env.reset().set("action", torch.tensor([[1.0], [torch.nan]])))
+
+
 def test_masks():
     env = make_env(f"{__name__}:masked", 2, seed=0, mask_actions=True, observation_keys=["place"])
     rollout = env.rollout(30, break_when_any_done=False)

@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
 from numpy.typing import NDArray
+from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, TensorSpec, Unbounded
 
 from torchrl_tit.envs.spaces import categories_spec
@@ -15,7 +16,7 @@ class ActionWriter:
     Args:
         space: The action space of one task.
         clip: Whether continuous actions are clipped to their bounds, so that their spec is
-            unbounded.
+            unbounded. Actions of a Box of integers are rounded and clipped in either case.
 
     Raises:
         ValueError: If actions of that kind are not supported.
@@ -24,13 +25,16 @@ class ActionWriter:
         >>> write = ActionWriter(Discrete(3, start=-1), clip=True)
         >>> write.spec.space.n, write(np.array([0, 2]))
         (3, array([-1,  1]))
+        >>> ActionWriter(Box(0, 9, (1,), np.int64), clip=False)(np.array([[1e20]]))
+        array([[9]])
     """
 
     def __init__(self, space: Space, *, clip: bool) -> None:
         self.start: int | NDArray | None = None
         """Offset that is added to integers; None for no offset."""
         self.bounds: tuple[NDArray, NDArray] | None = None
-        """Bounds to which actions are clipped; None if they are not."""
+        """Bounds to which actions are clipped, float32 or the integers' dtype; None if they are
+        not."""
         self.shape: tuple[int, ...] | None = None
         """The shape of a task's action; None if it is the same as the spec's."""
         self.dtype: np.dtype | None = None
@@ -46,10 +50,11 @@ class ActionWriter:
             self.spec = Binary(size, shape=(size,), dtype=torch.int8)
         elif isinstance(space, Box) and space.dtype.kind in "fiu":
             low, high = (np.asarray(x).reshape(-1) for x in (space.low, space.high))
-            self.bounds = (low, high) if clip else None
             self.spec = box_action_spec(low, high, clip=clip)
             if space.dtype.kind != "f":
-                self.dtype = space.dtype
+                self.dtype, self.bounds = space.dtype, (low, high)
+            elif clip:
+                self.bounds = _float32_bounds(low, high)
         else:
             raise ValueError(
                 f"Actions of the kind {space} are not supported, only Discrete, MultiDiscrete, "
@@ -59,19 +64,53 @@ class ActionWriter:
             self.shape = space.shape
 
     def __call__(self, actions: NDArray) -> NDArray:
-        """Converts actions [N, *spec] to the tasks' actions, [N, *space]."""
-        if self.bounds is not None:
+        """Converts actions [N, *spec] to the tasks' actions, [N, *space].
+
+        Raises:
+            ValueError: If an action is NaN.
+        """
+        if actions.dtype.kind == "f":
+            refuse_nan(actions)
+        if self.dtype is not None:
+            actions = self._round(actions)
+        elif self.bounds is not None:
             actions = actions.clip(*self.bounds)
         if self.start is not None:
             actions = actions + self.start
-        if self.dtype is not None:
-            actions = np.rint(actions).astype(self.dtype)
         return actions if self.shape is None else actions.reshape(len(actions), *self.shape)
+
+    def _round(self, actions: NDArray) -> NDArray:
+        """Rounds floats to integers, clipped to the bounds before a conversion could wrap them."""
+        assert self.bounds is not None
+        low, high = self.bounds
+        actions = np.rint(actions)
+        below, above = actions <= low, actions >= high
+        inside = np.where(below | above, 0, actions).astype(self.dtype)
+        return np.where(below, low, np.where(above, high, inside))
+
+
+def refuse_nan(actions: NDArray | Tensor) -> None:
+    """Raises ValueError if an action, [..., A], is NaN, which clipping would let pass."""
+    wrong = actions != actions
+    if wrong.any():
+        raise ValueError(
+            f"the action {actions[wrong.any(-1)][0].tolist()} is not a number: expected numbers "
+            "only; look for NaN in the policy's weights and in the observations"
+        )
 
 
 def box_action_spec(low: NDArray, high: NDArray, *, clip: bool) -> TensorSpec:
-    """The spec of continuous actions; float32 [A]. The bounds are [A]."""
-    if clip:
+    """The spec of continuous actions; float32 [A]. The bounds are [A], and may be infinite."""
+    if clip or (np.isinf(low) & np.isinf(high)).all():
         return Unbounded(low.shape, dtype=torch.float32)
-    bounds = [torch.from_numpy(bound.astype(np.float32)) for bound in (low, high)]
+    bounds = [torch.from_numpy(bound) for bound in _float32_bounds(low, high)]
     return Bounded(*bounds, low.shape, dtype=torch.float32)
+
+
+def _float32_bounds(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray]:
+    """Rounds bounds inwards: the nearest float32 of 0.3, for example, is above it."""
+    with np.errstate(over="ignore"):  # to infinity, and from there to the largest float32
+        bottom, top = low.astype(np.float32), high.astype(np.float32)
+    bottom = np.where(bottom < low, np.nextafter(bottom, np.float32(np.inf)), bottom)
+    top = np.where(top > high, np.nextafter(top, np.float32(-np.inf)), top)
+    return bottom, np.maximum(bottom, top)  # equal bounds stay equal

@@ -20,7 +20,7 @@ from torchrl.data import (
 )
 
 from torchrl_tit.envs.action_masks import MASK
-from torchrl_tit.envs.actions import box_action_spec
+from torchrl_tit.envs.actions import box_action_spec, refuse_nan
 from torchrl_tit.envs.spaces import (
     ImageLayout,
     array_spec,
@@ -134,6 +134,7 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
         spec = box_action_spec(low.reshape(-1).numpy(), high.reshape(-1).numpy(), clip=clip)
 
         def bring(action: Tensor) -> Tensor:
+            refuse_nan(action)
             action = action.reshape(shape).to(dtype)
             return action.clamp(low, high) if clip else action
 

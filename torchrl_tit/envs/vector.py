@@ -45,14 +45,16 @@ class GymVectorEnv(EnvBase):
     out with a warning if there are supported ones.
 
     Continuous actions are clipped to the task's bounds only when they are passed to the task: the
-    tensordict keeps the sampled action, to which its log-probability belongs.
+    tensordict keeps the sampled action, to which its log-probability belongs. A step raises
+    ValueError if an action is NaN.
 
     Args:
         env: The vector environment, made with ``autoreset_mode=AutoresetMode.DISABLED``. Its
             observations can be Box, Discrete, MultiDiscrete and MultiBinary, and Dict and Tuple of
             these, its actions Box, Discrete, MultiDiscrete and MultiBinary.
         clip_actions: Whether continuous actions are clipped and their spec is unbounded. Otherwise
-            they are passed on unchanged, and the spec has the task's bounds.
+            they are passed on unchanged, and the spec has the task's bounds, as the nearest float32
+            within them. Integers (a Box of them) are rounded and clipped in either case.
         observation_keys: Names of the observations to keep; all by default.
         image_layout: Where images have their channels: ``"HWC"``, ``"CHW"``, or ``"auto"``, which
             infers it from their shape.

@@ -28,7 +28,7 @@ class TaskAction(nn.Module):
         integers = writer.dtype
         self.dtype = None if integers is None else torch.from_numpy(np.zeros(1, integers)).dtype
         if writer.bounds is not None:
-            low, high = (torch.from_numpy(bound).to(torch.float32) for bound in writer.bounds)
+            low, high = map(torch.from_numpy, writer.bounds)
             self.register_buffer("low", low)
             self.register_buffer("high", high)
         self.start: Tensor | None
@@ -37,10 +37,17 @@ class TaskAction(nn.Module):
 
     def forward(self, action: Tensor) -> Tensor:
         """[N, *spec] -> [N, *space]."""
-        if self.clips:
+        if self.dtype is not None:
+            action = self._round(action, self.dtype)
+        elif self.clips:
             action = action.clamp(self.get_buffer("low"), self.get_buffer("high"))
         if self.start is not None:
             action = action + self.start
-        if self.dtype is not None:
-            action = action.round().to(self.dtype)
         return action if self.shape is None else action.reshape(action.shape[0], *self.shape)
+
+    def _round(self, action: Tensor, dtype: torch.dtype) -> Tensor:
+        low, high = self.get_buffer("low"), self.get_buffer("high")
+        action = action.round()
+        below, above = action <= low, action >= high
+        inside = torch.where(below | above, 0, action).to(dtype)
+        return torch.where(below, low, torch.where(above, high, inside))
