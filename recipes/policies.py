@@ -15,6 +15,7 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor, QValueModule,
 
 from torchrl_tit.frames.observation import Observations
 from torchrl_tit.modules import Backbone, history_keys, make_actor
+from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.modules.sequences import default_observation_keys
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import build_network
@@ -61,7 +62,7 @@ def make_cloning_policy(
     Raises:
         ValueError: if there is no head for the actions.
     """
-    if not (isinstance(action_spec, Bounded) and is_continuous(action_spec)):
+    if not has_bounds(action_spec):
         return ProbabilisticTensorDictSequential(
             backbone, *make_actor(backbone.features_dim, action_spec)
         )
@@ -114,7 +115,10 @@ def is_discrete(spec: TensorSpec) -> bool:
 def describe(spec: TensorSpec) -> str:
     """Describes actions, for messages."""
     kind = "continuous" if spec.dtype.is_floating_point else "discrete"
-    return f"{kind} ({type(spec).__name__}, shape {list(spec.shape)})"
+    within = ""
+    if isinstance(spec, Bounded):
+        within = f", from {spec.space.low.tolist()} to {spec.space.high.tolist()}"
+    return f"{kind} ({type(spec).__name__}, shape {list(spec.shape)}{within})"
 
 
 def _bounded(backbone: Backbone, action_spec: Bounded, key: str) -> list[nn.Module]:

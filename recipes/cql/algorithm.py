@@ -10,16 +10,16 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor
-from torchrl.data import Bounded
 from torchrl.objectives import SoftUpdate
 
 from torchrl_tit.modules import make_squashed_actor
+from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples
 
 from ..algorithm import Stateful
 from ..compilation import compile_and_time
 from ..critics import make_critic
-from ..policies import describe, is_continuous
+from ..policies import describe
 from ..transition_algorithm import descend, parameters_of
 from .q_algorithm import QAlgorithm
 from .settings import CQL
@@ -47,7 +47,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
     def __init__(self, recipe: CQL) -> None:
         super().__init__(recipe)
         spec = self.action_spec
-        if not (isinstance(spec, Bounded) and is_continuous(spec)):
+        if not has_bounds(spec):
             raise ValueError(
                 f"cql needs continuous actions within bounds, but those of {recipe.env} are "
                 f"{describe(spec)}: use a discrete-cql recipe if they are discrete"

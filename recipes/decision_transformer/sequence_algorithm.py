@@ -260,7 +260,7 @@ def _check_task(recipe: SequenceRecipe, action_spec: Any) -> int:
     if not (discrete or isinstance(action_spec, Bounded)):
         raise ValueError(
             f"{env} has {type(action_spec).__name__} actions, but a Decision Transformer takes "
-            "one choice (Discrete) or a vector (Box): use a ppo recipe"
+            "one choice (Discrete) or a vector within bounds (Box): use a ppo recipe"
         )
     if discrete != (recipe.action_space == "discrete"):
         kind = "discrete" if discrete else "continuous"

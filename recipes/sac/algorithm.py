@@ -17,11 +17,12 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_tit.modules import Backbone
+from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.objectives import encode_pairs
 
 from ..critics import make_critic
-from ..policies import is_continuous
+from ..policies import describe
 from ..replay_algorithm import ReplayAlgorithm
 from .settings import SAC
 
@@ -43,10 +44,10 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
     def __init__(self, recipe: SAC) -> None:
         super().__init__(recipe)
         spec = self.action_spec
-        if not (isinstance(spec, Bounded) and is_continuous(spec)):
+        if not has_bounds(spec):
             raise ValueError(
                 f"sac needs continuous actions within bounds, but {recipe.env} has "
-                f"{type(spec).__name__} actions of shape {list(spec.shape)}: use a ppo recipe"
+                f"{describe(spec)} actions: use a ppo recipe"
             )
         self._policy = _make_actor(self.make_backbone(), spec).to(self.device)
         size = spec.shape[0]
@@ -102,5 +103,4 @@ def _make_actor(backbone: Backbone, action_spec: Bounded) -> ProbabilisticActor:
         in_keys=["loc", "scale"],
         distribution_class=TanhNormal,
         distribution_kwargs={"low": action_spec.space.low, "high": action_spec.space.high},
-        return_log_prob=True,
     )

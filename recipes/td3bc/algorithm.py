@@ -9,12 +9,13 @@ from pathlib import Path
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import Bounded
 from torchrl.objectives import SoftUpdate, TD3BCLoss
+
+from torchrl_tit.modules.action_specs import has_bounds
 
 from ..algorithm import Stateful
 from ..critics import make_critic
-from ..policies import describe, is_continuous, make_deterministic_policy
+from ..policies import describe, make_deterministic_policy
 from ..transition_algorithm import TransitionAlgorithm, descend, parameters_of
 from .settings import TD3BC
 
@@ -35,7 +36,7 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
     def __init__(self, recipe: TD3BC) -> None:
         super().__init__(recipe)
         spec = self.action_spec
-        if not (isinstance(spec, Bounded) and is_continuous(spec)):
+        if not has_bounds(spec):
             raise ValueError(
                 f"td3bc needs continuous actions within bounds, but those of {recipe.env} are "
                 f"{describe(spec)}: use a bc or iql recipe"

@@ -306,6 +306,9 @@ def test_actions_without_bounds_are_refused(spec):
         ContinuousCQLLoss(actor, critic, action_spec=spec)
     with pytest.raises(ValueError, match="no squashed policy for the action space"):
         make_squashed_actor(OBSERVATION, spec)
+    endless = Bounded(torch.zeros(2), torch.tensor([1.0, math.inf]))
+    with pytest.raises(ValueError, match=r"no uniform samples for actions from .* to \[1.0, inf\]"):
+        ContinuousCQLLoss(actor, critic, action_spec=endless)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import math
 import torch
 from torchrl.data import (
     Binary,
+    Bounded,
     Categorical,
     Composite,
     MultiCategorical,
@@ -92,6 +93,29 @@ def numbers_of_options(spec: Categorical | OneHot, shape: torch.Size) -> list[in
     if isinstance(spec, MultiOneHot):
         return list(spec.nvec)
     return [spec.space.n] * (1 if isinstance(spec, OneHot) else math.prod(shape))
+
+
+def has_bounds(spec: TensorSpec) -> bool:
+    """Whether actions are floats [A], each within bounds whose sum and difference are finite.
+
+    Example:
+        >>> has_bounds(Bounded(-1, 1, (3,))), has_bounds(Bounded(0, math.inf, (3,)))
+        (True, False)
+    """
+    if not isinstance(spec, Bounded) or spec.ndim != 1 or not spec.dtype.is_floating_point:
+        return False
+    low, high = spec.space.low, spec.space.high
+    return bool(((low < high) & (high - low).isfinite() & (high + low).isfinite()).all())
+
+
+def check_bounds(spec: TensorSpec, refusal: str) -> None:
+    """Raises ValueError, which begins with ``refusal``, if a `Bounded` spec lacks usable bounds."""
+    if not has_bounds(spec):
+        raise ValueError(
+            f"{refusal} for actions from {spec.space.low.tolist()} to {spec.space.high.tolist()}: "
+            "each lower bound must be below the upper one, and their difference and sum finite "
+            f"in {spec.dtype}"
+        )
 
 
 def describe(spec: TensorSpec) -> str:

@@ -7,7 +7,7 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from torchrl_tit.layers.gaussian_head import ClampedGaussianHead
-from torchrl_tit.modules.action_specs import describe
+from torchrl_tit.modules.action_specs import check_bounds, describe
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Size
@@ -27,6 +27,13 @@ def make_squashed_actor(
     -20..2. Samples are squashed by tanh and scaled to the bounds (Haarnoja et al., "Soft
     Actor-Critic", arXiv 1801.01290, appendix C). The deterministic action is the squashed mean.
 
+    With x the value before the tanh, and h half the width of the bounds, an action's log density is
+    ``sum(log N(x; loc, scale) - log(h) - 2 (log 2 - x - softplus(-2 x)))``. SAC's and CQL's losses
+    draw and score an action at once (``rsample_and_log_prob``), so they know x, and value and
+    gradient are exact up to rounding where the action has reached a bound, too. ``log_prob`` of a
+    given action recovers x, and cannot at a bound, where the density is 0: it evaluates actions
+    closer than 1e-6 h to a bound (float32; 1e-15 h in float64) at that distance from it.
+
     Args:
         features_dim: size of the features.
         action_spec: a ``Bounded`` spec of one action, without batch dimensions.
@@ -38,7 +45,7 @@ def make_squashed_actor(
 
     Raises:
         ValueError: if the actions are not continuous and bounded, or the bounds enclose no
-            interval.
+            interval of a finite width.
 
     Example:
         >>> import torch
@@ -52,11 +59,7 @@ def make_squashed_actor(
             f"no squashed policy for the action space {describe(action_spec)}: expected a Bounded "
             "spec of one dimension, such as env.action_spec_unbatched"
         )
-    if not (action_spec.space.low < action_spec.space.high).all():
-        raise ValueError(
-            f"no squashed policy for actions from {action_spec.space.low.tolist()} to "
-            f"{action_spec.space.high.tolist()}: each lower bound must be below the upper one"
-        )
+    check_bounds(action_spec, "no squashed policy")
     head = ClampedGaussianHead(features_dim, action_spec.shape[0])
     return ProbabilisticActor(
         TensorModule(head, in_keys=[in_key], out_keys=["loc", "scale"]),

@@ -14,6 +14,7 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.modules.distributions.utils import rsample_and_log_prob
 from torchrl.objectives import CQLLoss, distance_loss
 
+from torchrl_tit.modules.action_specs import check_bounds
 from torchrl_tit.modules.many_actions import ManyActions
 from torchrl_tit.objectives.cql_terms import CriticBatch, PolicySamples
 from torchrl_tit.objectives.pairs import encode_pairs, get_dist
@@ -73,7 +74,7 @@ class ContinuousCQLLoss(CQLLoss):
             does not support.
 
     Raises:
-        ValueError: if the actions have no bounds, or a setting is invalid.
+        ValueError: if the actions have no finite bounds, or a setting is invalid.
 
     Example:
         >>> from torchrl_tit.modules import make_squashed_actor
@@ -122,6 +123,7 @@ class ContinuousCQLLoss(CQLLoss):
                 f"action_spec must be a Bounded spec of one dimension, not {action_spec}: samples "
                 "are drawn uniformly between the bounds"
             )
+        check_bounds(action_spec, "no uniform samples")
         super().__init__(
             actor_network,
             [ManyActions(critic) for critic in qvalue_network]
