@@ -58,7 +58,7 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
                 self.observation,
                 size,
                 recipe.critic_hidden,
-                recipe.backbone if recipe.critic == "backbone" else None,
+                recipe.critic_backbone,
                 slices=recipe.slice_length > 1,
             ).to(self.device)
             for _ in range(2)

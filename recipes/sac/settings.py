@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from torchrl_tit.settings import Network
 from torchrl_tit.settings.numbers import Fraction, Rate, Widths
 
 from ..replay_recipe import ReplayRecipe
@@ -18,8 +19,16 @@ class SAC(ReplayRecipe, algorithm="sac", builds=f"{__package__}.algorithm:SACAlg
     """Learning rate of Adam for actor, critics and temperature."""
     tau: Fraction = 0.005
     """Coefficient of the soft update of the target critics at each gradient step, from 0 to 1."""
-    critic: Literal["mlp", "backbone"] = "mlp"
+    critic: Literal["auto", "mlp", "backbone"] = "auto"
     """Whether the critics read the newest observation, or each has a backbone with the actor's
-    settings."""
+    settings, which reads the history. "auto" takes the backbone if velocities are hidden, because
+    one observation is then not enough, else the newest observation."""
     critic_hidden: Widths = (256, 256)
     """Widths of the critics' hidden layers."""
+
+    @property
+    def critic_backbone(self) -> Network | None:
+        """The settings of each critic's backbone; None if it reads the newest observation."""
+        if self.critic == "backbone" or (self.critic == "auto" and self.hide_velocities):
+            return self.backbone
+        return None

@@ -287,6 +287,34 @@ def test_the_policy_is_a_squashed_gaussian_on_the_backbone() -> None:
     assert "action_log_prob" not in td  # at a bound, it would not be that of the sample
 
 
+@pytest.mark.parametrize(
+    ("fields", "differ"),
+    [
+        ({"hide_velocities": True}, True),
+        ({"hide_velocities": True, "critic": "mlp"}, False),
+        ({}, False),
+    ],
+)
+def test_critics_read_the_history_where_velocities_are_hidden(
+    fields: dict[str, Any], differ: bool
+) -> None:
+    """Two states with one observation: a pendulum that swings left and one that swings right."""
+    loss = make(replace(SMALL, backbone=mlp(2, hidden_dim=8), **fields)).loss
+    size = 2 if fields else 3
+    newest, before = torch.randn(1, size), torch.randn(2, size)
+    states = TensorDict(
+        {
+            "observation": newest.expand(2, size),
+            "history": torch.stack([before, newest.expand(2, size)], 1),
+            "action": torch.zeros(2, 1),
+        },
+        [2],
+    )
+    with loss.qvalue_network_params[0].to_module(loss.qvalue_network):
+        left, right = loss.qvalue_network(states)["state_action_value"]
+    assert (left != right).item() is differ
+
+
 def test_critics_start_as_they_were_built(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a single one, TorchRL's loss makes a copy whose weights it draws anew."""
     built: list[dict[str, Tensor]] = []
