@@ -33,6 +33,10 @@ class Categorical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
         """Asks Optuna for a value."""
         return trial.suggest_categorical(field, self.choices)
 
+    def contains(self, value: Any) -> bool:
+        """Whether this is one of the values."""
+        return value in self.choices
+
     def examples(self) -> list[Any]:
         """All values."""
         return list(self.choices)
@@ -51,6 +55,10 @@ class Float(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="float"
     def suggest(self, trial: optuna.Trial, field: str) -> Any:
         """Asks Optuna for a value."""
         return trial.suggest_float(field, self.low, self.high, log=self.log)
+
+    def contains(self, value: Any) -> bool:
+        """Whether this is a number between the bounds."""
+        return isinstance(value, Number) and self.low <= value <= self.high
 
     def examples(self) -> list[Any]:
         """Both bounds."""
@@ -73,6 +81,10 @@ class Int(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="int"):
     def suggest(self, trial: optuna.Trial, field: str) -> Any:
         """Asks Optuna for a value."""
         return trial.suggest_int(field, self.low, self.high, step=self.step, log=self.log)
+
+    def contains(self, value: Any) -> bool:
+        """Whether this is one of the whole numbers between the bounds."""
+        return value in range(self.low, self.high + 1, self.step)
 
     def examples(self) -> list[Any]:
         """Both bounds."""

@@ -7,22 +7,26 @@ import math
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import filelock
 import msgspec
 import optuna
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 from tqdm import tqdm
 
-from torchrl_tit.files import remove_leftovers, write_text_atomic
+from torchrl_tit.files import remove_leftovers, write_bytes_atomic, write_text_atomic
 
 from ..algorithm import make_algorithm
+from ..chosen_frames import with_chosen_frames
 from ..interrupt import raise_on_signals
 from ..metrics import read_metrics
 from ..recipe import Recipe
@@ -72,30 +76,74 @@ class Search:
         settings: the search.
 
     Raises:
-        ValueError: if the folder holds another search.
+        RuntimeError: if another process is using the search.
+        ValueError: if the folder holds another search, or ``study.log`` is damaged or holds values
+            that this search cannot have written.
     """
 
     def __init__(self, folder: Path, settings: Settings) -> None:
         self.folder = folder
         self.settings = settings
-        _write_or_compare(folder / "settings.json", _to_json(settings))
-        _write_or_compare(folder / "space.json", msgspec.json.encode(settings.space).decode())
+        self.journal = folder / "study.log"
+        folder.mkdir(parents=True, exist_ok=True)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        seed = settings.recipe.seed
-        with _journal(folder / "study.log") as storage:
-            self.study = optuna.create_study(
-                study_name=settings.recipe.name or settings.recipe.algorithm,
+        with self._locked():
+            _write_or_compare(folder / "settings.json", _to_json(settings))
+            _write_or_compare(folder / "space.json", msgspec.json.encode(settings.space).decode())
+            self.study = self._open_study()
+
+    def _open_study(self) -> optuna.Study:
+        settings, path = self.settings, self.journal
+        # The folder is locked: a lock of the journal was left behind by a process that was killed.
+        Path(f"{path}.lock").unlink(missing_ok=True)
+        name = settings.recipe.name or settings.recipe.algorithm
+        try:
+            _cut_half_line(path)
+            # Optuna's default lock is a symbolic link, which does not work with a relative path.
+            lock = JournalFileOpenLock(str(path))
+            storage = JournalStorage(JournalFileBackend(str(path), lock))
+            others = set(optuna.get_all_study_names(storage)) - {name}
+            if others:
+                raise ValueError(f"it holds the study {min(others)!r}, not {name!r}")
+            study = optuna.create_study(
+                study_name=name,
                 storage=storage,
                 direction="maximize",
                 load_if_exists=True,
-                sampler=optuna.samplers.TPESampler(
-                    n_startup_trials=settings.startup_trials, seed=seed, constant_liar=True
-                ),
                 pruner=optuna.pruners.MedianPruner(
                     n_startup_trials=settings.startup_trials,
                     n_warmup_steps=int(settings.warmup * settings.recipe.final_step),
                 ),
             )
+            if study.directions != [StudyDirection.MAXIMIZE]:
+                raise ValueError("its study does not maximize one value")
+            for trial in study.trials:
+                _check_trial(trial, settings.space)
+        except OSError:
+            raise
+        except Exception as error:  # a damaged line can fail in any way
+            reason = " ".join(str(error).split())
+            raise ValueError(
+                f"{path} is not an intact journal of this search ({type(error).__name__}: "
+                f"{reason}): remove the damaged line, or name another folder with --out"
+            ) from error
+        study.sampler = optuna.samplers.TPESampler(
+            n_startup_trials=settings.startup_trials,
+            # So that a resumed search does not draw the values of its first trials again.
+            seed=settings.recipe.seed + len(study.trials),
+            constant_liar=True,
+        )
+        return study
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        try:
+            with filelock.FileLock(self.folder / ".lock", timeout=0):
+                yield
+        except filelock.Timeout as error:
+            raise RuntimeError(
+                f"{self.folder} is in use by another process: wait for it, or stop it"
+            ) from error
 
     def run(self, trials: int, workers: int) -> list[int]:
         """Runs trials, some at a time, until the given number has ended.
@@ -110,18 +158,15 @@ class Search:
         Raises:
             KeyboardInterrupt: after Ctrl-C, once all workers have saved a checkpoint.
             RuntimeError: if another process is using the search.
+            ValueError: if a trial's folder holds a run with other settings, or an evaluation
+                without a mean return.
         """
-        try:
-            with filelock.FileLock(self.folder / ".lock", timeout=0):
-                remove_leftovers(self.folder)
-                try:
-                    return self._run(trials, workers)
-                finally:
-                    self._write_trials()
-        except filelock.Timeout as error:
-            raise RuntimeError(
-                f"{self.folder} is in use by another process: wait for it, or stop it"
-            ) from error
+        with self._locked():
+            remove_leftovers(self.folder)
+            try:
+                return self._run(trials, workers)
+            finally:
+                self._write_trials()
 
     def _run(self, trials: int, workers: int) -> list[int]:
         ended = [trial for trial in self.study.trials if trial.state.is_finished()]
@@ -132,11 +177,11 @@ class Search:
             if trial.state == TrialState.RUNNING
         ]
         failed = [t.number for t in ended if t.state == TrialState.FAIL]
-        shown = ""
         done = len(ended)  # not progress.n: a disabled progress bar does not count
         progress = tqdm(total=trials, initial=done, unit=" trials")
         with raise_on_signals(), progress:
             try:
+                self._show_best(progress)
                 while done < trials:
                     room = min(workers, trials - done)
                     while len(running) < room:
@@ -149,14 +194,10 @@ class Search:
                             done += 1
                             progress.update()
                             self._write_trials()
+                            self._show_best(progress)
                             if state == TrialState.FAIL:
                                 failed.append(trial.number)
-                    best = self.best()
-                    text = f"best {best.value:.1f}, trial {best.number}" if best else ""
-                    if text != shown:
-                        progress.set_postfix_str(text)
-                        shown = text
-            except KeyboardInterrupt:
+            except BaseException:
                 for trial in running:
                     trial.stop()
                 raise
@@ -165,16 +206,34 @@ class Search:
     def _write_trials(self) -> None:
         write_trials(self.study, list(self.settings.space), self.folder)
 
+    def _show_best(self, progress: tqdm[Any]) -> None:
+        if best := self.best():
+            progress.set_postfix_str(f"best {best.value:.1f}, trial {best.number}")
+
     def best(self) -> FrozenTrial | None:
         """The best trial so far, whose recipe is in ``best.json``; None before the first."""
         if not self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             return None
         best = self.study.best_trial
-        path = self.folder / "best.json"
-        text = (self.folder / f"trial-{best.number}.json").read_text(encoding="utf-8")
-        if not path.exists() or path.read_text(encoding="utf-8") != text:
-            write_text_atomic(path, text)
+        recipe = self.recipe(best.number, best.params)
+        write_text_atomic(self.folder / "best.json", recipe_to_json(recipe))
         return best
+
+    def recipe(self, number: int, values: Mapping[str, Any]) -> Recipe:
+        """Returns the recipe of a trial.
+
+        Args:
+            number: number of the trial.
+            values: its values, by the fields' names.
+
+        Raises:
+            ValueError: if the recipe rejects them.
+        """
+        recipe = with_values(self.settings.recipe, values, self.folder / "space.json")
+        if not recipe.name:
+            return recipe
+        # A name belongs to the settings of its recipe.
+        return replace(recipe, name=f"{recipe.name}/trial-{number}")
 
 
 class _Trial:
@@ -190,24 +249,26 @@ class _Trial:
         self.process: subprocess.Popen[bytes] | None = None
         self.reported = -1
         self.jobs: list[Job] | None = None
+        space = search.settings.space
         try:
-            values = {
-                field: search.settings.space[field].suggest(trial, field)
-                for field in search.settings.space
-            }
-            recipe = with_values(search.settings.recipe, values, search.folder / "space.json")
-            make_algorithm(recipe).check()
+            values = {field: space[field].suggest(trial, field) for field in space}
+        except ValueError as error:  # of earlier trials with other choices
+            raise ValueError(f"{search.journal} is of another search space: {error}") from error
+        try:
+            recipe = search.recipe(self.number, values)
+            algorithm = make_algorithm(recipe)
+            algorithm.check()
         except ValueError as error:  # values that do not fit together
-            self.folder.mkdir(exist_ok=True)
-            write_text_atomic(self.folder / "error.log", f"error: {error}\n")
+            self._explain(str(error))
             return
-        if recipe.name:  # a name belongs to the settings of its recipe
-            recipe = replace(recipe, name=f"{recipe.name}/trial-{self.number}")
-        write_text_atomic(self.file, recipe_to_json(recipe))
+        chosen, _ = with_chosen_frames(recipe, algorithm)
         self.jobs = [
-            Job(replace(recipe, seed=seed), self.folder / f"seed-{seed}", source=str(self.file))
+            Job(replace(chosen, seed=seed), self.folder / f"seed-{seed}", source=str(self.file))
             for seed in search.settings.seeds
         ]
+        for job in self.jobs:
+            job.check()  # a run with other settings says nothing about this trial
+        write_text_atomic(self.file, recipe_to_json(recipe))
 
     def advance(self) -> TrialState | None:
         """Starts, watches or ends the trial; returns its state once it has ended."""
@@ -222,11 +283,11 @@ class _Trial:
             return self._end(TrialState.FAIL)
         job = next((job for job in self.jobs if not job.is_complete()), None)
         if job is None:
-            means = [
-                json.loads((job.folder / "evaluation.json").read_bytes())["mean"]
-                for job in self.jobs
-            ]
-            return self._end(TrialState.COMPLETE, sum(means) / len(means))
+            value = sum(map(_read_mean, self.jobs)) / len(self.jobs)
+            if not math.isfinite(value):
+                self._explain(f"the mean return is {value}")
+                return self._end(TrialState.FAIL)
+            return self._end(TrialState.COMPLETE, value)
         if not job.is_in_use():  # by a process that a killed search left behind
             self.process = start(job)
         return None
@@ -251,20 +312,59 @@ class _Trial:
         self.trial.report(sum(returns) / len(returns), self.reported)
         return self.trial.should_prune()
 
+    def _explain(self, reason: str) -> None:
+        """Writes why the trial failed."""
+        self.folder.mkdir(exist_ok=True)
+        write_text_atomic(self.folder / "error.log", f"error: {reason}\n")
+
     def _end(self, state: TrialState, value: float | None = None) -> TrialState:
         self.study.tell(self.number, value, state=state)
         return state
 
 
-@contextmanager
-def _journal(path: Path) -> Iterator[JournalStorage]:
-    """Optuna's storage; raises ValueError if it cannot read what is in the file."""
+def _cut_half_line(path: Path) -> None:
+    """Removes the last line of a journal if a process was killed while writing it.
+
+    Raises:
+        ValueError: if another line is not JSON.
+    """
+    content = path.read_bytes() if path.exists() else b""
+    whole = content[: content.rfind(b"\n") + 1]
+    for number, line in enumerate(whole.splitlines(), start=1):
+        try:
+            json.loads(line)
+        except ValueError as error:
+            raise ValueError(f"line {number}: {error}") from error
+    if whole != content:
+        write_bytes_atomic(path, whole)
+        warnings.warn(
+            f"removed the last line of {path}, which was written only in part", stacklevel=2
+        )
+
+
+def _check_trial(trial: FrozenTrial, space: SearchSpace) -> None:
+    """Raises ValueError if a search in this space cannot have written the trial."""
+    for field, value in (trial.system_attrs.get("fixed_params", {}) | trial.params).items():
+        if field not in space or not space[field].contains(value):
+            raise ValueError(f"trial {trial.number} has {field} {value!r}, not in the search space")
+    values, reported = trial.values or [], trial.intermediate_values
+    for number in [*values, *reported, *reported.values()]:
+        if not isinstance(number, float | int) or not math.isfinite(number):
+            raise ValueError(f"trial {trial.number} has the return {number!r}, not a finite number")
+    complete = len(values) == 1 and trial.params.keys() == space.keys()
+    if len(values) > 1 or (trial.state == TrialState.COMPLETE and not complete):
+        raise ValueError(f"trial {trial.number} lacks a field, or does not have one return")
+
+
+def _read_mean(job: Job) -> float:
+    """Reads the mean return of a complete run."""
+    path = job.folder / "evaluation.json"
     try:
-        yield JournalStorage(JournalFileBackend(str(path)))
-    except (AssertionError, KeyError, TypeError, ValueError) as error:  # of damaged lines
+        return float(json.loads(path.read_bytes())["mean"])
+    except (LookupError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{path} is no whole journal of Optuna's ({type(error).__name__}: {error}): name "
-            "another folder with --out, or take the damaged line out"
+            f"{path} has no mean return ({type(error).__name__}: {error}): delete it, and the same "
+            "command evaluates the run again"
         ) from error
 
 
@@ -280,7 +380,11 @@ def _to_json(settings: Settings) -> str:
 
 def _write_or_compare(path: Path, text: str) -> None:
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
+        if (path.parent / "study.log").exists():
+            raise ValueError(
+                f"{path} is missing, so it is not known which search {path.parent} holds: name "
+                "another folder with --out, or move it away"
+            )
         write_text_atomic(path, text)
         return
     try:

@@ -1,6 +1,7 @@
 """Hyperparameter search: spaces as data, pruning, and searches that were killed."""
 
 import json
+import math
 import signal
 import time
 from functools import partial
@@ -98,9 +99,7 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, monkeypatch):
     space = load_space(None, RECIPE)
     search = Search(tmp_path, Settings(RECIPE, space, startup_trials=2, warmup=0.25))
     for _ in range(2):
-        trial = search.study.ask()
-        for field, values in space.items():
-            values.suggest(trial, field)
+        trial = ask(search)
         for step in (64, 128, 192):
             trial.report(100.0, step)
         search.study.tell(trial, 100.0)
@@ -184,6 +183,14 @@ def test_values_that_do_not_go_together_fail_the_trial_only(tmp_path):
     assert "width 32" in (tmp_path / "out/trial-0/error.log").read_text()
 
 
+def ask(search):
+    """Draws a trial with all its values."""
+    trial = search.study.ask()
+    for field, values in search.settings.space.items():
+        values.suggest(trial, field)
+    return trial
+
+
 class FailingWorker:
     """A worker's process that fails at once."""
 
@@ -195,7 +202,7 @@ class FailingWorker:
 
 def test_a_run_that_a_killed_search_left_at_work_is_waited_for(tmp_path, monkeypatch):
     search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
-    search.study.ask()
+    recipe = search.recipe(0, ask(search).params)
     events = []
 
     def sleep(_):
@@ -208,7 +215,7 @@ def test_a_run_that_a_killed_search_left_at_work_is_waited_for(tmp_path, monkeyp
         return FailingWorker()
 
     monkeypatch.setattr("recipes.sweeps.tune.start", start)
-    with Run.create(tmp_path / "trial-0" / "seed-0", RECIPE) as left:
+    with Run.create(tmp_path / "trial-0" / "seed-0", recipe) as left:
         monkeypatch.setattr(time, "sleep", sleep)
         assert search.run(1, workers=1) == [0]
     assert events == ["wait"] * 3 + ["start trial-0", "wait"]
@@ -247,9 +254,136 @@ def test_a_journal_that_optuna_did_not_write_is_named(tmp_path, line):
     Search(tmp_path, settings)
     with (tmp_path / "study.log").open("a") as file:
         file.write(f"{line}\n")
-    with pytest.raises(ValueError, match=r"study\.log is no whole journal of Optuna's") as error:
+    before = (tmp_path / "study.log").read_bytes()
+    with pytest.raises(ValueError, match=r"study\.log is not an intact journal") as error:
         Search(tmp_path, settings)
     assert "\n" not in str(error.value)
+    assert (tmp_path / "study.log").read_bytes() == before
+
+
+def search_with_a_trial(folder):
+    """A search that has told Optuna of one trial."""
+    (folder / "space.json").write_text(json.dumps(SPACE))
+    settings = Settings(RECIPE, load_space(folder / "space.json", RECIPE))
+    search = Search(folder / "out", settings)
+    search.study.tell(ask(search), 7.5)
+    return settings, folder / "out" / "study.log"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("learning_rate", 1e9, "trial 0 has learning_rate 1000000000.0, not in the search space"),
+        ("learning_rate", math.nan, "learning_rate nan, not in the search space"),
+        ("learning_rate", "fast", "learning_rate 'fast', not in the search space"),
+        ("backbone.history.hidden_dim", 9, "IndexError: .* out of range"),
+        ("values", [math.nan], "trial 0 has the return nan, not a finite number"),
+        ("values", ["high"], "trial 0 has the return 'high', not a finite number"),
+        ("directions", [1], "its study does not maximize one value"),
+        ("study_name", "other", "it holds the study 'other', not 'ppo/cartpole/mine'"),
+    ],
+)
+def test_a_journal_that_the_search_did_not_write_is_refused(tmp_path, field, value, message):
+    settings, journal = search_with_a_trial(tmp_path)
+    lines = [json.loads(line) for line in journal.read_text().splitlines()]
+    for line in lines:
+        if line.get("param_name") == field:
+            line["param_value_internal"] = value
+        elif field in line:
+            line[field] = value
+    journal.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+    with pytest.raises(ValueError, match=rf"out/study\.log is not .*{message}") as error:
+        Search(tmp_path / "out", settings)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("cut", [1, 40, -1])
+def test_a_half_written_last_line_of_the_journal_is_removed(tmp_path, cut):
+    settings, journal = search_with_a_trial(tmp_path)
+    content = journal.read_bytes()
+    last = content.splitlines(keepends=True)[-1]
+    journal.write_bytes(content.removesuffix(last) + last[:cut])
+    with pytest.warns(UserWarning, match=r"removed the last line of .*study\.log"):
+        search = Search(tmp_path / "out", settings)
+    (trial,) = search.study.trials
+    assert trial.state == optuna.trial.TrialState.RUNNING  # its end was not recorded
+    search.study.tell(0, 7.5)
+    assert Search(tmp_path / "out", settings).study.best_value == 7.5
+
+
+def test_a_lock_that_a_killed_search_left_behind_is_removed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = Settings(RECIPE, load_space(None, RECIPE))
+    Search(Path("out"), settings)
+    Path("out/study.log.lock").symlink_to("out/study.log")  # relative: it leads nowhere
+    search = Search(Path("out"), settings)
+    search.study.ask()
+    assert not Path("out/study.log.lock").is_symlink()
+
+
+def test_a_resumed_search_draws_other_values(tmp_path):
+    settings, _ = search_with_a_trial(tmp_path)
+    search = Search(tmp_path / "out", settings)
+    assert ask(search).params != search.study.trials[0].params
+
+
+class DoneWorker:
+    """A worker's process that has completed its run."""
+
+    returncode = 0
+
+    def poll(self):
+        return 0
+
+
+def complete(job, mean=None):
+    """Completes a run; its return is its learning rate."""
+    run = Run.create(job.folder, job.recipe)
+    mean = job.recipe.learning_rate if mean is None else mean
+    run.save_evaluation({"mean": mean, "steps": job.recipe.final_step})
+    run.curve.touch()
+    return DoneWorker()
+
+
+def test_a_trial_is_not_credited_with_the_run_of_another(tmp_path, monkeypatch):
+    monkeypatch.setattr("recipes.sweeps.tune.start", complete)
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    settings = Settings(RECIPE, load_space(None, RECIPE))
+    search = Search(tmp_path, settings)
+    search.run(2, workers=1)
+    best = (tmp_path / "best.json").read_text()
+    assert json.loads(best)["learning_rate"] == search.study.best_value
+    files = [tmp_path / f"trial-{number}.json" for number in (0, 1)]
+    texts = [file.read_text() for file in files]
+    for file, text in zip(files, reversed(texts), strict=True):
+        file.write_text(text)
+    Search(tmp_path, settings).best()
+    assert (tmp_path / "best.json").read_text() == best
+
+    (tmp_path / "study.log").unlink()
+    (tmp_path / "trial-0").rename(tmp_path / "other")
+    (tmp_path / "trial-1").rename(tmp_path / "trial-0")
+    (tmp_path / "other").rename(tmp_path / "trial-1")
+    search = Search(tmp_path, settings)
+    with pytest.raises(ValueError, match=r"trial-0/seed-0 holds a run of .* with other settings"):
+        search.run(2, workers=1)
+    assert search.best() is None
+
+
+def test_a_search_without_its_settings_is_refused(tmp_path):
+    settings = Settings(RECIPE, load_space(None, RECIPE))
+    Search(tmp_path, settings)
+    (tmp_path / "settings.json").unlink()
+    with pytest.raises(ValueError, match=r"settings\.json is missing"):
+        Search(tmp_path, settings)
+
+
+def test_a_return_that_is_not_a_number_fails_the_trial(tmp_path, monkeypatch):
+    monkeypatch.setattr("recipes.sweeps.tune.start", partial(complete, mean=math.nan))
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
+    assert search.run(1, workers=1) == [0]
+    assert "mean return is nan" in (tmp_path / "trial-0" / "error.log").read_text()
 
 
 def test_one_process_at_a_time(tmp_path):
