@@ -21,7 +21,7 @@ from torchrl_tit.envs import observation_specs
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.frames.normalized import NormalizedFrames
-from torchrl_tit.layers import init_orthogonal_, scale_residual_branches_
+from torchrl_tit.layers import init_orthogonal_, scale_residual_branches_, standardize
 from torchrl_tit.modules import Backbone, history_keys, make_actor, make_value
 from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.networks import build_network, masked_predictions
@@ -87,8 +87,8 @@ class Agent(nn.Module):
             gain=recipe.policy_gain,
         )
         self.critic = make_value(features_dim, in_key=keys[-1])
-        if recipe.normalize_values or recipe.value_gradient != 1:
-            self.critic.module = ValueHead(self.critic.module, gradient=recipe.value_gradient)
+        if recipe.value_gradient != 1:
+            self.critic.module = ValueHead(self.critic.module, recipe.value_gradient)
         self.auxiliary = AuxiliaryLosses(recipe, self.backbone, env.action_spec_unbatched)
 
     def encode(self, samples: TensorDictBase) -> TensorDictBase:
@@ -115,16 +115,17 @@ class Agent(nn.Module):
         results = ["action", "action_log_prob", "advantage", "value_target"]
         return [*self.state_keys, *masks, *results]
 
-    def update_statistics(self, frames: Sequence[Tensor]) -> None:
-        """Adds a batch to the statistics that normalise observations.
+    def update_statistics(self, rollout: Rollout) -> None:
+        """Adds the observation of each step of a batch to the statistics that normalise them.
 
-        Args:
-            frames: frames of each observation, [R, *observation_shape].
+        Neither padding nor the frames before the batch are added, nor the last observation of an
+        episode, in which nobody acts. Call it between an update and the next batch: a batch is then
+        collected and learned from with the same statistics.
         """
         for trunk in trunks_of(self.backbone.module).values():
-            for encoder, table in zip(trunk.frame_encoders.values(), frames, strict=True):
+            for encoder, table in zip(trunk.frames, rollout.frames, strict=True):
                 if isinstance(encoder, NormalizedFrames):
-                    encoder.update(table)
+                    encoder.update(table[rollout.newest])
 
     @property
     def policy(self) -> TensorDictModuleBase:
@@ -243,15 +244,11 @@ class PPOAlgorithm(Algorithm[PPO]):
         batch["next", "reward"] = reward * recipe.reward_scale
         if recipe.normalize_rewards:
             scale = self.return_scale.update(batch["next", "reward"], batch["next", "done"])
-            batch["next", "reward"] = batch["next", "reward"] / (scale + 1e-4)
+            batch["next", "reward"] = standardize(batch["next", "reward"], 0.0, scale, eps=1e-4)
         rollout = agent.rollout(batch)
-        agent.update_statistics(rollout.frames)
         with torch.no_grad():
             add_advantages(batch, rollout, agent, self.gae, recipe.bootstrap_time_limit)
         target, value = batch["value_target"], batch["state_value"]
-        if recipe.normalize_values:
-            agent.critic.module.update(target)
-            self.loss.critic_coeff.fill_(recipe.critic_coeff / agent.critic.module.std**2)
         floor = recipe.advantage_floor
         if recipe.running_advantage_floor:
             running = self.advantage_scale.update(batch["advantage"])
@@ -279,6 +276,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         self._check_update(steps, minibatch)
         policy_gradient, value_gradient = self._gradient_norms(minibatch)
         terms = torch.stack(steps)  # [gradient steps, terms]
+        agent.update_statistics(rollout)
         if recipe.collectors > 1 or recipe.ray is not None:
             self.collector.update_policy_weights_()
         # If this goes to 0, the features are the same in all states, and so is the policy.
@@ -344,6 +342,9 @@ class PPOAlgorithm(Algorithm[PPO]):
         """The loss, float [], and its terms, float [terms]."""
         self.agent.encode(minibatch)  # once; the heads read its features
         terms = self.loss(minibatch)
+        # TorchRL's estimate of the divergence, mean(-log r), can be negative. Schulman's,
+        # mean((r - 1) - log r), cannot (http://joschu.net/blog/kl-approx.html).
+        terms["kl_approx"] += terms["mean_ratio"] - 1
         total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
         values = [terms[name].detach() for name in TERMS]
         if self.recipe.contrastive_coeff:

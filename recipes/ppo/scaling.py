@@ -1,4 +1,4 @@
-"""Running scales of rewards and values, for tasks with returns of any scale."""
+"""Running scales of rewards and advantages, for tasks with returns of any scale."""
 
 from __future__ import annotations
 
@@ -8,14 +8,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_tit.layers import standardize
+
 
 class ReturnScale:
     """The running standard deviation of the discounted return, by which rewards are divided.
 
     As in `VecNormalize` of Stable-Baselines3 and OpenAI Baselines, the return of the rewards so
     far, ``r_t + gamma * R_{t-1}``, starts at 0 in each episode. Here the statistics are those up to
-    the end of a batch. TorchRL's `VecNormV2` and `RewardScaling` scale by single rewards, or by a
-    number that is known in advance.
+    the end of the batch whose rewards are divided; no policy reads them. A resumed run begins new
+    episodes, so a checkpoint holds the statistics alone. TorchRL's `VecNormV2` and `RewardScaling`
+    scale by single rewards, or by a number that is known in advance.
 
     Args:
         gamma: discount factor.
@@ -39,9 +42,7 @@ class ReturnScale:
             reward: float [envs, time, 1].
             done: bool [envs, time, 1].
         """
-        current = self.returns
-        if current is None or current.shape != reward[:, 0].shape:
-            current = torch.zeros_like(reward[:, 0])
+        current = torch.zeros_like(reward[:, 0]) if self.returns is None else self.returns
         returns = []
         for now, ended in zip(reward.unbind(1), done.unbind(1), strict=True):
             current = current * self.gamma + now
@@ -63,11 +64,11 @@ class ReturnScale:
         return (self.statistics[2] / total).sqrt().float()
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the statistics; a resumed run begins new episodes."""
+        """Returns the statistics."""
         return {"statistics": self.statistics}
 
     def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
-        """Restores a state."""
+        """Restores a state; all episodes begin anew."""
         self.statistics, self.returns = state_dict["statistics"], None
 
 
@@ -112,58 +113,22 @@ def normalize_advantages(advantage: Tensor, floor: float) -> Tensor:
     """
     if advantage.numel() == 1:
         return advantage
-    return (advantage - advantage.mean()) / advantage.std().clamp(min=floor)
+    return standardize(advantage, advantage.mean(), advantage.std().clamp(min=floor), eps=1e-8)
 
 
 class ValueHead(nn.Module):
-    """A value head that adapts to the scale of the returns and can scale its gradient on features.
-
-    The value is ``linear(features) * std + mean``, with the running mean and standard deviation of
-    the value targets (PopArt, arXiv 1602.07714). When these change, the linear layer is adjusted so
-    that all values stay the same. A squared error divided by ``std ** 2`` is that of the normalised
-    values.
+    """A value head that scales the gradient on the features it reads.
 
     Args:
         linear: the value head, [..., F] -> [..., 1].
         gradient: factor on the gradient that reaches the features; 0 stops it.
-        decay: fraction of the old statistics that each batch keeps.
-
-    Example:
-        >>> head = ValueHead(nn.Linear(4, 1))
-        >>> features = torch.randn(8, 4)
-        >>> before = head(features)
-        >>> head.update(torch.randn(64) * 10 - 50)
-        >>> torch.allclose(head(features), before, atol=1e-4)
-        True
     """
 
-    moments: Tensor
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, linear: nn.Linear, *, gradient: float = 1.0, decay: float = 0.9) -> None:
+    def __init__(self, linear: nn.Linear, gradient: float) -> None:
         super().__init__()
         self.linear = linear
         self.gradient = gradient
-        self.decay = decay
-        self.register_buffer("moments", torch.zeros(3))  # weight, mean, mean square
-        self.register_buffer("mean", torch.zeros(()))
-        self.register_buffer("std", torch.ones(()))
 
     def forward(self, features: Tensor) -> Tensor:
         """[..., F] -> values, float [..., 1]."""
-        if self.gradient != 1:
-            features = torch.lerp(features.detach(), features, self.gradient)
-        return self.linear(features) * self.std + self.mean
-
-    @torch.no_grad()
-    def update(self, targets: Tensor) -> None:
-        """Adds a batch of value targets, float of any shape."""
-        batch = torch.stack([torch.ones_like(self.mean), targets.mean(), targets.square().mean()])
-        self.moments.lerp_(batch, 1 - self.decay)
-        mean, square = self.moments[1:] / self.moments[0]
-        std = (square - mean.square()).clamp(min=1e-4).sqrt()
-        self.linear.weight.mul_(self.std / std)
-        self.linear.bias.mul_(self.std).add_(self.mean - mean).div_(std)
-        self.mean.copy_(mean)
-        self.std.copy_(std)
+        return self.linear(torch.lerp(features.detach(), features, self.gradient))

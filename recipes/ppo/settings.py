@@ -37,7 +37,7 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     The defaults are those of the paper's runs on arrays (arXiv 2212.14538, appendix).
     """
 
-    removed: ClassVar[dict[str, Any]] = {"async_collection": False}
+    removed: ClassVar[dict[str, Any]] = {"async_collection": False, "normalize_values": False}
 
     padding: Padding = "same"
     """What fills a history before the first observation: that observation, or zeros."""
@@ -109,18 +109,17 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     running_advantage_floor: Weight = 0.0
     """The same, as a fraction of the running standard deviation of the advantages of all batches so
     far, for tasks whose advantages differ in scale. The larger of the two floors applies."""
-    normalize_values: bool = False
-    """Whether the critic learns values normalised to a running mean of 0 and standard deviation of
-    1 (PopArt, arXiv 1602.07714; arXiv 2006.05990, "value function normalization")."""
     value_gradient: Weight = 1.0
     """Factor on the gradient of the value loss where it enters a backbone that policy and value
     share; 0 trains the backbone on the policy's loss alone (compared in arXiv 2009.04416)."""
     normalize_observations: bool = False
     """Whether the network reads observations normalised to a running mean of 0 and standard
     deviation of 1, per entry of an array and per channel of an image (as in VecNormalize; arXiv
-    2006.05990, "observation normalization")."""
+    2006.05990, "observation normalization"). The observations of a batch are added after its
+    update, so the first batch is read as it is."""
     target_kl: Positive | None = None
-    """Target KL divergence of an update; see at_target_kl."""
+    """Target KL divergence of an update, estimated by the mean of (r - 1) - log r over the ratios r
+    of an epoch, as in Stable-Baselines3; see at_target_kl."""
     at_target_kl: Literal["stop", "adapt"] = "stop"
     """With a target_kl: "stop" ends an update after the epoch that exceeds it (as in OpenAI's
     Spinning Up), "adapt" adjusts the learning rate to approach it (as in rl_games and skrl)."""

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.layers.images import bytes_to_floats
+from torchrl_tit.layers.standardize import standardize
 
 _IMAGES = 256
 """Images converted to floats at a time; floats take four times the memory of bytes."""
@@ -75,7 +76,7 @@ class NormalizedFrames(FrameEncoder):
     def normalize(self, observation: Tensor) -> Tensor:
         """Normalises observations, float or uint8 [..., *observation_shape] -> float."""
         floats = bytes_to_floats(observation, self.mean.dtype)
-        normal = (floats - self.mean) * (self.variance + 1e-8).rsqrt()
+        normal = standardize(floats, self.mean, (self.variance + 1e-8).sqrt(), eps=0.0)
         return normal.clamp(-self.limit, self.limit)
 
     def forward(self, observation: Tensor) -> Tensor:

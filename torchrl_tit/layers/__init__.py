@@ -15,6 +15,7 @@ from torchrl_tit.layers.initialization import (
 from torchrl_tit.layers.patches import ArrayPatchEmbedding, ImagePatchEmbedding
 from torchrl_tit.layers.positions import RelativeBias, Rotary
 from torchrl_tit.layers.relative_attention import RelativeSelfAttention
+from torchrl_tit.layers.standardize import standardize
 
 # TorchRL's losses call two critics with torch.vmap. PyTorch's attention kernel for CPUs, and
 # dropout, then run once per critic, as without vmap; PyTorch warns about this.
@@ -35,4 +36,5 @@ __all__ = [
     "init_normal_",
     "init_orthogonal_",
     "scale_residual_branches_",
+    "standardize",
 ]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gymnasium
 import numpy as np
+import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
+from torchrl.envs import DTypeCastTransform
 
 
 class Split(gymnasium.ObservationWrapper):
@@ -19,6 +21,13 @@ class Split(gymnasium.ObservationWrapper):
 
     def observation(self, observation):
         return {"cart": observation[:2], "pole": observation[2:]}
+
+
+class Double(DTypeCastTransform):
+    """Observations in float64."""
+
+    def __init__(self) -> None:
+        super().__init__(torch.float32, torch.float64, in_keys=["observation"])
 
 
 class Mixed(gymnasium.Env):

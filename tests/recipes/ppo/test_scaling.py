@@ -1,5 +1,6 @@
 """Settings that keep PPO's updates of one size, whatever the task's rewards and observations."""
 
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -13,9 +14,11 @@ from recipes.ppo.learning_rate import KLAdaptiveRate
 from recipes.ppo.scaling import ReturnScale, ValueHead
 from recipes.run import Run
 from recipes.runner import load_trained, train
+from tests.recipes.ppo import tasks
+from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.frames.normalized import NormalizedFrames
-from torchrl_tit.settings.networks import enhanced_tit, mlp
+from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
 RECIPE = PPO(
     env="CartPole-v1",
@@ -59,29 +62,12 @@ def test_return_scale_is_the_deviation_of_discounted_returns():
         assert found.item() == pytest.approx(seen.std(unbiased=False).item(), rel=1e-5)
 
 
-def test_value_head_keeps_its_values_when_their_scale_changes():
-    torch.manual_seed(0)
-    head, features = ValueHead(nn.Linear(8, 1)), torch.randn(64, 8)
-    before = head(features)
-    for mean, std in ((-90.0, 3.0), (4.0, 200.0), (0.0, 1e-3)):
-        head.update(mean + std * torch.randn(256))
-        torch.testing.assert_close(head(features), before, rtol=1e-4, atol=1e-3)
-
-
-def test_value_head_follows_the_targets():
-    head = ValueHead(nn.Linear(8, 1))
-    targets = 50 + 20 * torch.randn(10_000)
-    head.update(targets)  # the first batch counts alone
-    assert head.mean.item() == pytest.approx(targets.mean().item(), rel=1e-4)
-    assert head.std.item() == pytest.approx(targets.std().item(), rel=1e-3)
-
-
 @pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
 def test_value_head_passes_a_share_of_its_gradient(share):
     linear = nn.Linear(8, 1)
     features = torch.randn(4, 8, requires_grad=True)
     whole, weight = torch.autograd.grad(linear(features).sum(), [features, linear.weight])
-    head = ValueHead(linear, gradient=share)
+    head = ValueHead(linear, share)
     value = head(features)
     torch.testing.assert_close(value, linear(features))
     passed, head_weight = torch.autograd.grad(value.sum(), [features, linear.weight])
@@ -119,6 +105,18 @@ def test_rewards_are_divided_by_the_deviation_of_returns(tmp_path, monkeypatch):
     deviation = (squares / count).sqrt().item()
     assert batches[-1].unique().item() == pytest.approx(100 / (deviation + 1e-4), rel=1e-5)
     assert read_metrics(run.folder / "metrics.csv")[-1]["return_mean"] > 5  # not scaled
+
+
+def test_a_resumed_run_begins_with_returns_of_zero():
+    """Also on another device: the state holds nothing of the steps."""
+    scale, done = ReturnScale(gamma=1.0), torch.zeros(2, 8, 1, dtype=torch.bool)
+    scale.update(torch.ones(2, 8, 1), done)
+    resumed = ReturnScale(gamma=1.0)
+    resumed.load_state_dict(scale.state_dict())
+    again = torch.full((2, 8, 1), 3.0)
+    found = resumed.update(again, done)
+    returns = torch.cat([torch.ones(8).cumsum(0), again[0, :, 0].cumsum(0)])
+    assert found.item() == pytest.approx(returns.std(correction=0).item(), rel=1e-5)
 
 
 def test_advantages_are_divided_by_a_floor_at_least(tmp_path, monkeypatch):
@@ -189,26 +187,83 @@ def test_one_number_has_no_deviation():
     assert algorithm.normalize_advantages(torch.tensor([2.0]), 0.5).tolist() == [2.0]
 
 
-@pytest.mark.parametrize("backbone", [RECIPE.backbone, mlp()])
-def test_observations_are_normalized_in_training_and_evaluation(tmp_path, monkeypatch, backbone):
-    frames = []
-    original = algorithm.Rollout.__init__
+@pytest.mark.parametrize(("frames", "padding"), [(1, "same"), (8, "same"), (8, "constant")])
+def test_each_observation_counts_once(frames, padding, monkeypatch):
+    """Neither padding nor the frames before a batch; here many episodes, and short batches."""
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", tasks.__name__)
+    backbone = enhanced_tit(frames, embed_dim=8, features_dim=8)
+    wrappers = (f"{tasks.__name__}:Split",)
+    recipe = replace(RECIPE, backbone=backbone, padding=padding, wrappers=wrappers)
+    recipe = replace(recipe, normalize_observations=True, steps_per_batch=16, minibatch_size=16)
+    seen = []
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, None)
+    for step, batch in enumerate(algorithm.batches()):
+        seen.append(batch["observation"].flatten())
+        algorithm.update(batch, step * 16)
+    algorithm.close()
+    encoders = normalized_frames(algorithm.networks())
+    assert len(encoders) == 2
+    for key, encoder in zip(["cart", "pole"], encoders, strict=True):
+        expected = torch.cat(seen)[key]
+        assert encoder.count == len(expected) == 256
+        torch.testing.assert_close(encoder.mean, expected.mean(0), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(encoder.variance, expected.var(0, unbiased=False))
 
-    def recording(rollout, *args):
-        original(rollout, *args)
-        frames.extend(rollout.frames)
 
-    monkeypatch.setattr(algorithm.Rollout, "__init__", recording)
-    run = run_of(replace(RECIPE, normalize_observations=True, backbone=backbone), tmp_path / "run")
-    _, trained, _ = load_trained(run)
-    seen = torch.cat(frames)
-    encoders = normalized_frames(trained.networks())
-    for normalized in encoders:
-        torch.testing.assert_close(normalized.mean, seen.mean(0), rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(normalized.variance, seen.var(0, unbiased=False))
-        normal = normalized.normalize(seen)
-        torch.testing.assert_close(normal.std(0), torch.ones(4), rtol=1e-2, atol=0)
-    assert len(encoders) == (2 if backbone == mlp() else 1)
+@pytest.mark.parametrize(
+    "backbone",
+    [
+        enhanced_tit(1, embed_dim=8, features_dim=8),
+        enhanced_tit(4, embed_dim=8, features_dim=8),
+        lstm(embed_dim=8, hidden_dim=8, features_dim=8),
+        mlp(hidden_dim=8),
+    ],
+    ids=["K=1", "K=4", "recurrent", "separate trunks"],
+)
+def test_acting_and_updating_read_the_same_statistics(backbone, monkeypatch):
+    """Before an update's first step all ratios are 1, and all values those that were acted on."""
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", tasks.__name__)
+    recipe = replace(
+        RECIPE,
+        env="Pendulum-v1",
+        wrappers=(f"{tasks.__name__}:Double",),
+        backbone=backbone,
+        learning_rate=1e-2,
+        normalize_observations=True,
+        normalize_rewards=True,
+        compile="off",
+    )
+    before, original = [], algorithm.minibatches
+
+    @torch.no_grad()
+    def recording(batch, rollout, agent, recipe):
+        before.append(torch.zeros(2, dtype=torch.float64))
+        agent.eval()
+        for minibatch in original(batch, rollout, agent, replace(recipe, epochs=1)):
+            agent.encode(minibatch)
+            log_prob = agent.actor.get_dist(minibatch).log_prob(minibatch["action"])
+            value = agent.critic(minibatch)["state_value"]
+            acted = minibatch["value_target"] - minibatch["advantage"]
+            apart = [log_prob - minibatch["action_log_prob"], value - acted]
+            before[-1] = before[-1].maximum(torch.stack([x.abs().max() for x in apart]))
+        agent.train()
+        yield from original(batch, rollout, agent, recipe)
+
+    monkeypatch.setattr(algorithm, "minibatches", recording)
+    torch.set_default_dtype(torch.float64)
+    try:
+        trained = make_algorithm(recipe)
+        trained.prepare(0, None)
+        for step, batch in zip((0, 64, 128), trained.batches()):  # noqa: B905
+            assert trained.update(batch, step)["kl_approx"] > 1e-5  # it moves the policy
+        trained.close()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    (*_, normalized) = normalized_frames(trained.networks())
+    assert normalized.variance.max() > 2 * normalized.variance.min()
+    assert torch.stack(before).shape == (3, 2)
+    assert torch.stack(before).max() < 1e-9
 
 
 def test_images_are_normalized_by_channel_and_categories_are_not(tmp_path):
@@ -232,6 +287,30 @@ def test_images_are_normalized_by_channel_and_categories_are_not(tmp_path):
     assert not normalized_frames(make_algorithm(categories).networks())
 
 
+def test_the_divergence_is_never_negative(monkeypatch):
+    """It is Schulman's estimate, as in Stable-Baselines3, of the whole minibatch."""
+    found, original = [], algorithm.PPOAlgorithm._objective
+
+    def recording(self, minibatch):
+        total, values = original(self, minibatch)
+        with torch.no_grad():
+            log_prob = self.agent.actor.get_dist(minibatch).log_prob(minibatch["action"])
+        log_ratio = (log_prob - minibatch["action_log_prob"]).double()
+        expected = (log_ratio.expm1() - log_ratio).mean().item()
+        found.append((values[algorithm.TERMS.index("kl_approx")].item(), expected))
+        return total, values
+
+    monkeypatch.setattr(algorithm.PPOAlgorithm, "_objective", recording)
+    trained = make_algorithm(replace(RECIPE, learning_rate=0.01, epochs=8))
+    trained.prepare(0, None)
+    for step, batch in zip((0, 64), trained.batches()):  # noqa: B905
+        trained.update(batch, step)
+    trained.close()
+    assert min(expected for _, expected in found[2:16]) > 1e-5
+    for mine, expected in found:
+        assert mine == pytest.approx(expected, rel=1e-3, abs=1e-6)
+
+
 def test_an_update_ends_at_the_target_divergence(tmp_path):
     recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=1e-4)
     rows = read_metrics(run_of(recipe, tmp_path / "run").folder / "metrics.csv")
@@ -244,6 +323,29 @@ def test_the_learning_rate_follows_the_target_divergence(tmp_path):
     assert rows[0]["learning_rate"] == 0.01
     assert rows[-1]["learning_rate"] < 0.005
     assert all(row["epochs"] == 8 for row in rows)
+
+
+def test_two_resumes_of_a_run_with_all_of_them_are_equal(tmp_path):
+    recipe = replace(
+        RECIPE,
+        normalize_rewards=True,
+        running_advantage_floor=0.5,
+        value_gradient=0.5,
+        normalize_observations=True,
+        target_kl=0.01,
+        at_target_kl="adapt",
+    )
+    half = run_of(replace(recipe, total_steps=128), tmp_path / "half")
+    states = []
+    for name in ("one", "other"):
+        shutil.copytree(half.folder, tmp_path / name)
+        with Run.open(tmp_path / name) as run:
+            train(recipe, run)
+        states.append(load_checkpoint(run.checkpoints)[1])
+    assert_same(states[0]["networks"], states[1]["networks"])
+    assert_same(states[0]["return_scale"], states[1]["return_scale"])
+    assert_same(states[0]["advantage_scale"], states[1]["advantage_scale"])
+    assert_same(states[0]["rate"], states[1]["rate"])
 
 
 def test_collectors_of_other_processes_get_the_statistics(tmp_path, monkeypatch):
