@@ -1,5 +1,6 @@
 """Evaluation plays whole episodes, deterministically, and leaves no trace in training."""
 
+import math
 import random
 
 import gymnasium
@@ -182,3 +183,58 @@ def test_closes_what_it_made_and_nothing_else():
 def test_no_episodes():
     with pytest.raises(ValueError, match="episodes must be at least 1, not 0"):
         evaluate(make_env("CartPole-v1"), lean, episodes=0)
+
+
+class Paying(gymnasium.Env):
+    """Episodes of one step or, with an odd seed, three; later ones pay another reward."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,))
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, later: float, now: float = 1.0) -> None:
+        self.pays, self.later = now, later
+
+    def reset(self, *, seed=None, options=None):
+        if seed is None:
+            self.pays = self.later
+        self.left = 3 if seed is None or seed % 2 else 1
+        return self.observation_space.low, {}
+
+    def step(self, action):
+        self.left -= 1
+        return self.observation_space.low, self.pays, self.left == 0, False, {}
+
+
+gymnasium.register("Paying-v0", Paying)
+
+
+@pytest.mark.parametrize("later", [math.inf, math.nan])
+def test_rewards_of_later_episodes_do_not_count(later):
+    returns = evaluate(lambda n: make_env("Paying-v0", n, later=later), go, episodes=4)
+    assert returns.tolist() == [1, 3, 1, 3]
+
+
+@pytest.mark.parametrize("now", [math.inf, -math.inf, math.nan])
+def test_a_reward_that_is_not_finite_is_named(now):
+    with pytest.raises(FloatingPointError, match=rf"^the reward of copy 0 is {now}$"):
+        evaluate(lambda n: make_env("Paying-v0", n, later=1.0, now=now), go, episodes=4)
+
+
+def go(tensordict):
+    return tensordict.set("action", torch.zeros(tensordict.shape, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_the_number_of_threads_stays(mode, monkeypatch):
+    """TorchRL raises it when it closes copies of its environments."""
+    monkeypatch.setattr("torchrl._THREAD_POOL_INIT", 4)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        env = make_env("torchrl.envs:PendulumEnv", 2, max_episode_steps=2, vectorization_mode=mode)
+        evaluate(env, lambda step: env.rand_action(step), episodes=2)
+        assert torch.get_num_threads() == 2
+        env.close()
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

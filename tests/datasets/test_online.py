@@ -254,6 +254,37 @@ def test_an_empty_buffer_starts_anew() -> None:
     assert len(other) == 0
 
 
+@pytest.mark.parametrize("envs", [None, 2])
+def test_an_episode_that_a_resume_cut_off_stays_cut_off(envs: int | None, tmp_path: Path) -> None:
+    """Also where the new episode begins with the very observation that the old one lacked."""
+    shape = [8] if envs is None else [envs, 8]
+    frames = torch.ones(*shape, 1)
+    flag = torch.zeros(*shape, 1, dtype=torch.bool)
+    outcome = {"observation": frames, "reward": frames, "terminated": flag, "done": flag}
+    steps = TensorDict({"observation": frames, "action": flag, "next": outcome}, shape)
+    before = make(envs, 8 * (envs or 1), 3, is_init=True, padding="constant")
+    before.extend(steps[..., :5])
+    state = BufferState(before, tmp_path).state_dict()
+    items = []
+    for _ in range(2):  # the second time from a checkpoint after the cut
+        buffer = make(envs, 8 * (envs or 1), 3, is_init=True, padding="constant")
+        saving = BufferState(buffer, tmp_path)
+        saving.load_state_dict(state)
+        if buffer.storage.num_written < 8 * (envs or 1):
+            buffer.storage.end_episodes()
+            buffer.extend(steps[..., 5:])
+        state = saving.state_dict()
+        items.append(buffer[:].reshape(-1, 8))
+    assert (items[0] == items[1]).all()
+    for copy in items[0]:
+        assert copy["is_init"].flatten().nonzero().flatten().tolist() == [0, 5]
+        assert copy["episode"][4] != copy["episode"][5]
+        # The last step before the cut bootstraps from its own next history.
+        assert copy["next", "history"][4].flatten().tolist() == [1, 1, 1]
+        assert copy["history"][5].flatten().tolist() == [0, 0, 1]
+        assert not copy["next", "terminated"].any()
+
+
 def test_what_is_refused() -> None:
     steps = without_histories(play_several(3, 12, 2, "same"))
     buffer = make(3, 31, 2)

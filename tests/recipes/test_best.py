@@ -96,7 +96,8 @@ def test_the_best_weights_are_evaluated(tmp_path, capsys):
     assert (last["weights"], last["steps"]) == ("last", 1024)
     assert (best["weights"], best["steps"]) == ("best", step)
     main(["evaluate", str(run.folder), "--best"])
-    assert f"after {step} steps (best weights)" in capsys.readouterr().out
+    said = f"after {step} steps (best weights, on new episodes from seed {best['seed']})"
+    assert said in capsys.readouterr().out
     written = json.loads((run.folder / "evaluation_best.json").read_text())
     assert written == best
     assert not (run.folder / "evaluation.json").exists()
@@ -124,3 +125,9 @@ def test_evaluations_during_training_do_not_change_it(tmp_path, recipe):
     means = [torch.tensor(outcome["returns"]).mean().item() for outcome in outcomes]
     assert [measured[step] for step in steps] == pytest.approx(means)
     assert evaluate(evaluated)["returns"] == outcomes[-1]["returns"]
+    # Where there are evaluations, they choose the best weights, not the training episodes.
+    best = states[1]["best"]
+    assert best["return_mean"] == pytest.approx(max(means))
+    highest = max(measured[step] for step in steps)
+    assert best["step"] in [step for step in steps if measured[step] == highest]
+    assert evaluate(evaluated, best=True)["seed"] == 1_000_000 + recipe.evaluation_episodes

@@ -402,6 +402,19 @@ def test_evaluations_are_played_once(tmp_path):
     assert log == [("play", 20)] * 2
 
 
+def test_the_best_weights_play_new_episodes(tmp_path):
+    """Their evaluation in training chose them: its episodes and its return do not count."""
+    run = start(replace(SMALL, total_steps=22), tmp_path / "run")
+    ToyAlgorithm.log.clear()
+    best = evaluate(run, best=True)
+    assert ToyAlgorithm.log == [("play", 20)]
+    assert (best["steps"], best["seed"], best["weights"]) == (20, 1_000_002, "best")
+    for seed, expected in ((999_999, 1_000_002), (1_000_001, 1_000_002), (1_000_002, 1_000_002)):
+        chosen = replace(run.recipe, evaluation_seed=seed)
+        assert evaluate(run, chosen, best=True)["seed"] == expected
+    assert evaluate(run, replace(run.recipe, evaluation_seed=5), best=True)["seed"] == 5
+
+
 def test_evaluations_of_other_weights_do_not_count(tmp_path):
     run = start(SMALL, tmp_path / "run")
     ToyAlgorithm.log.clear()

@@ -8,7 +8,6 @@ import imageio.v3 as imageio
 import pytest
 import torch
 
-from recipes import runner
 from recipes.cli import main
 from recipes.cql import DiscreteCQL
 from recipes.ppo import PPO
@@ -49,33 +48,14 @@ TASKS = {
 }
 
 
-def weights(run):
-    loaded = run.load()
-    assert loaded is not None
-    return loaded[1]["networks"]
-
-
 @pytest.mark.parametrize("name", TASKS)
-def test_trains_evaluates_resumes_and_renders(name, tmp_path, capsys):
+def test_trains_evaluates_and_renders(name, tmp_path, capsys):
     for module in {"minigrid": ["minigrid", "pygame"], "repeat-previous": ["popgym"]}.get(
         name, ["pygame"]
     ):
         pytest.importorskip(module)
     main([str(word) for word in [*OPTIONS, *TASKS[name], "--out", tmp_path / "whole"]])
     whole = Run.open(tmp_path / "whole")
-    recipe = whole.recipe
-    assert isinstance(recipe, PPO)
-    (tmp_path / "stopped").mkdir()
-    for steps in (BATCH, 2 * BATCH):
-        part = replace(recipe, total_steps=steps)
-        with Run(tmp_path / "stopped", part) as stopped:
-            runner.train(part, stopped)
-        if steps == BATCH:
-            early = weights(stopped)
-    expected, late = weights(whole), weights(stopped)
-    assert any(not torch.equal(early[key], late[key]) for key in late)
-    assert all(torch.equal(expected[key], late[key]) for key in expected)
-
     capsys.readouterr()
     main(["evaluate", str(whole.folder)])
     assert "2 episodes" in capsys.readouterr().out
