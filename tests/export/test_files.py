@@ -11,12 +11,13 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch import nn
 
-from tests.export.policies import make_policy, shake
+from tests.export.policies import make_policy, program_of, shake
+from tests.recipes.ppo import tasks  # noqa: F401 - registers its tasks
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.export import NotTheSameError, export_policy
 from torchrl_tit.export import policy as exporting
-from torchrl_tit.settings import MLP, Flat
+from torchrl_tit.settings import LSTM, MLP, Flat, Linear
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
@@ -107,6 +108,48 @@ def test_nothing_is_left_of_a_file_that_acts_differently(tmp_path, monkeypatch):
     with pytest.raises(NotTheSameError, match="expected at most 1e-05, so nothing was written"):
         export_policy(policy, task, tmp_path / "policy.pt2")
     assert not any(tmp_path.iterdir())
+
+
+def test_an_onnx_file_refuses_what_the_runtime_would_misread(tmp_path):
+    """And it passes NaN on, as the live policy does."""
+    pytest.importorskip("onnxscript")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    policy, task = make_policy(
+        "MultiDiscreteActions-v0",
+        Linear(embed_dim=4),
+        LSTM(hidden_dim=4),
+        num_frames=1,
+        mask_actions=True,
+    )
+    export_policy(policy, task, tmp_path / "policy.onnx")
+    session = onnxruntime.InferenceSession(tmp_path / "policy.onnx")
+    names = [output.name for output in session.get_outputs()]
+
+    def run(inputs):
+        outputs = session.run(names, {name: x.numpy() for name, x in inputs.items()})
+        return dict(zip(names, map(torch.from_numpy, outputs), strict=True))
+
+    program = program_of(policy, task)
+    given = program.examples(3)
+    given["observation_state_0"][1, 0] = torch.nan
+    with torch.no_grad():
+        live = program(given)
+    acted = run(given)
+    assert live["logits"].isnan().flatten(1).any(1).tolist() == [False, True, False]
+    assert live["next_recurrent_state_c"].isnan().flatten(1).any(1).tolist() == [False, True, False]
+    for name, entry in live.items():
+        assert torch.equal(acted[name].isnan(), entry.isnan()), name
+    for name, entry in given.items():
+        with pytest.raises(onnxruntime.capi.onnxruntime_pybind11_state.Fail):
+            run({**given, name: entry[:1]})
+    with pytest.raises(onnxruntime.capi.onnxruntime_pybind11_state.InvalidArgument):
+        run({name: entry[:0] for name, entry in given.items()})
+
+    forbidden = program.examples(1)
+    forbidden["action_mask"].zero_()
+    with pytest.raises(ValueError, match="allows no action"):
+        program(forbidden)
+    assert run(forbidden)["action"].tolist() == [[0, 0, 0]]  # a file cannot raise this error
 
 
 class Determinant(nn.Module):

@@ -106,6 +106,7 @@ class ONNX(Format):
         except Exception as error:  # the exporter's own errors, which have no public base
             raise ValueError(f"{_missing_operator(error)}: export to .pt2 instead") from error
         assert converted is not None
+        _require_one_batch_size(converted.model.graph)
         converted.model.metadata_props[METADATA] = json.dumps(facts)
         converted.save(path, external_data=False)
 
@@ -193,6 +194,34 @@ def _quiet() -> Iterator[None]:
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
+
+
+def _require_one_batch_size(graph: Any) -> None:
+    """Makes a graph refuse inputs of different batch sizes, and an empty batch.
+
+    ONNX Runtime does not compare the sizes that a graph names alike, so an input with one row would
+    be read for every row, and some of its operators end the process if the batch is empty.
+    """
+    from onnxscript import ir
+
+    tape = ir.tape.Tape()
+
+    def numbers(*values: int) -> ir.Value:
+        return tape.op("Constant", [], {"value_ints": ir.AttrInt64s("value_ints", values)})
+
+    readers = [list(x.uses()) for x in graph.inputs]
+    size = tape.op("Shape", [graph.inputs[0]], {"start": 0, "end": 1})
+    zeros = tape.op("ConstantOfShape", [size], {"value": ir.tensor([0])})
+    # Adds the first of the zeros: an empty batch has none.
+    size = tape.op("Add", [size, tape.op("Gather", [zeros, numbers(0)])])
+    for x, uses in zip(graph.inputs, readers, strict=True):
+        assert x.shape is not None
+        shape = tape.op("Concat", [size, numbers(*map(int, x.shape[1:]))], {"axis": 0})
+        checked = tape.op("Reshape", [x, shape], {"allowzero": 1})
+        checked.shape, checked.dtype = x.shape, x.dtype
+        for node, index in uses:
+            node.replace_input_with(index, checked)
+    graph.insert_before(graph[0], tape.nodes)
 
 
 def _missing_operator(error: BaseException) -> str:

@@ -71,17 +71,23 @@ class _TorchRLEncoder(RecurrentEncoder):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Like :meth:`step` on single steps, without branches on values and batch sizes."""
         x = self.one_token(tokens)  # [*B, D]
-        first = is_init.reshape(-1, 1, 1)
-        before = [state[key].reshape(-1, 1, self.out_features) for key in self.state]
-        hidden = [x.masked_fill(first, 0).transpose(0, 1).contiguous() for x in before]
-        given = tuple(hidden) if len(hidden) > 1 else hidden[0]
-        outputs, after = self._layers(x.reshape(-1, 1, x.shape[-1]), given)
-        states = after if len(hidden) > 1 else (after,)
+        first = is_init.reshape(-1, 1)
+        before = [
+            state[key].reshape(-1, self.out_features).masked_fill(first, 0) for key in self.state
+        ]
+        after = self.cell(x.reshape(-1, x.shape[-1]), before)
         leading = tokens.shape[:-2]
-        return outputs.reshape(*leading, self.out_features), {
-            key: value.transpose(0, 1).reshape(*leading, 1, self.out_features)
-            for key, value in zip(self.state, states, strict=True)
+        return after[0].reshape(*leading, self.out_features), {
+            key: value.reshape(*leading, 1, self.out_features)
+            for key, value in zip(self.state, after, strict=True)
         }
+
+    def cell(self, x: Tensor, state: list[Tensor]) -> tuple[Tensor, ...]:
+        """Reads one step: [N, D] and the state before, [N, E] each -> the state after.
+
+        As single operators: the LSTM and GRU of ONNX Runtime turn NaN into finite numbers.
+        """
+        raise NotImplementedError
 
     @property
     def _layers(self) -> nn.Module:
@@ -122,6 +128,10 @@ class LSTM(_TorchRLEncoder):
     layer_name = "lstm"
     state = ("recurrent_state_h", "recurrent_state_c")
 
+    def cell(self, x: Tensor, state: list[Tensor]) -> tuple[Tensor, ...]:
+        """See :meth:`_TorchRLEncoder.cell`."""
+        return torch.lstm_cell(x, state, *self._layers.parameters())
+
 
 class GRU(_TorchRLEncoder):
     """A GRU over frames: TorchRL's `GRUModule`.
@@ -143,3 +153,7 @@ class GRU(_TorchRLEncoder):
     memory_class = _GRUModule
     layer_name = "gru"
     state = ("recurrent_state_h",)
+
+    def cell(self, x: Tensor, state: list[Tensor]) -> tuple[Tensor, ...]:
+        """See :meth:`_TorchRLEncoder.cell`."""
+        return (torch.gru_cell(x, *state, *self._layers.parameters()),)
