@@ -11,7 +11,7 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequentia
 from torch import nn
 from torchrl.data import Bounded, Categorical, Unbounded
 from torchrl.modules import MLP, ValueOperator
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import HardUpdate, SoftUpdate
 
 from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.modules import make_squashed_actor
@@ -232,21 +232,116 @@ def test_the_policy_is_sampled_where_it_should_be():
         np.testing.assert_allclose(samples.next_action[b].numpy(), best, rtol=1e-6)
 
 
-def test_forward_computes_the_same_terms_and_does_not_change_the_batch(monkeypatch):
+def test_forward_computes_the_same_terms_and_adds_priorities_to_the_batch(monkeypatch):
     loss, batch, samples = make_loss(), make_batch(), make_samples()
     uniform_actions(monkeypatch)
     monkeypatch.setattr(loss, "sample_policy", lambda _: samples)
     before = batch.clone()
     terms = loss(batch)
-    assert (batch == before).all()
-    assert batch.keys() == before.keys()
+    assert (batch.exclude("td_error") == before).all()
+    assert batch.keys() == {*before.keys(), "td_error"}
     loss_qvalue, loss_cql = loss.critic_losses(batch, samples)
+    errors = loss.q_loss(batch, samples)[1]["td_error"]
+    assert errors.shape == (2, BATCH)
+    assert not errors.requires_grad
+    torch.testing.assert_close(errors.sum(0).mean(), loss_qvalue)
+    torch.testing.assert_close(batch["td_error"], errors.max(0).values)
     torch.testing.assert_close(terms["loss_qvalue"], loss_qvalue)
     torch.testing.assert_close(terms["loss_cql"], loss_cql)
     torch.testing.assert_close(terms["loss_actor"], loss.actor_loss(batch, samples)[0])
     torch.testing.assert_close(terms["loss_alpha"], loss.alpha_loss(samples))
     torch.testing.assert_close(terms["entropy"], -samples.log_prob.detach().mean())
     assert set(terms.keys()) == set(loss.out_keys)
+
+
+@pytest.mark.parametrize("over_critics", ["mean", "sum"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_reductions(monkeypatch, over_critics, masked):
+    """Each is that of the states' losses, without the states that TorchRL's mask leaves out."""
+    names = ["loss_actor", "loss_qvalue", "loss_cql", "loss_alpha"]
+    batch, samples = make_batch(), make_samples()
+    uniform_actions(monkeypatch)
+    kept = torch.ones(BATCH, dtype=torch.bool)
+    if masked:
+        kept = torch.tensor([True, False, True, True, False])
+        batch["collector", "mask"] = kept.unsqueeze(-1)
+    losses = {}
+    for reduction in ("none", "mean", "sum", None):
+        torch.manual_seed(0)
+        loss = make_loss(over_critics=over_critics, reduction=reduction)
+        monkeypatch.setattr(loss, "sample_policy", lambda _: samples)
+        losses[reduction] = loss(batch).select(*names)
+        total = (losses[reduction]["loss_qvalue"] + losses[reduction]["loss_cql"]).sum()
+        total.backward()
+        params = dict(loss.qvalue_network_params.items(True, True))
+        whole = {key: weight.grad.clone() for key, weight in params.items()}
+        loss.zero_grad()
+        in_chunks = sum(loss.critic_gradients(batch, samples, chunk_size=2))
+        torch.testing.assert_close(in_chunks, total.detach())
+        for key, weight in params.items():
+            torch.testing.assert_close(weight.grad, whole[key])
+    for name in names:
+        each = losses["none"][name]
+        assert each.shape == (BATCH,)
+        assert torch.equal(each != 0, kept)
+        torch.testing.assert_close(losses["sum"][name], each.sum())
+        torch.testing.assert_close(losses["mean"][name], each[kept].mean())
+        torch.testing.assert_close(losses[None][name], losses["mean"][name])
+
+
+def test_keys_can_be_set():
+    names = {
+        "action": "a",
+        "reward": "r",
+        "done": "d",
+        "terminated": "t",
+        "priority": "p",
+        "state_action_value": "q",
+        "log_prob": "l",
+    }
+    actor = make_squashed_actor(OBSERVATION, SPEC, in_key="observation", action_key="a").double()
+    mlp = MLP(OBSERVATION + ACTION, 1, num_cells=[8]).double()
+    critic = ValueOperator(mlp, in_keys=["state", "a"], out_keys=["q"])
+    loss = ContinuousCQLLoss(actor, critic, action_spec=SPEC)
+    plain = ContinuousCQLLoss(
+        make_squashed_actor(OBSERVATION, SPEC, in_key="observation").double(),
+        ValueOperator(mlp, in_keys=["state", "action"]),
+        action_spec=SPEC,
+    )
+    for one in (loss, plain):
+        one.make_value_estimator(gamma=GAMMA)
+    loss.set_keys(**names)
+    plain.load_state_dict(loss.state_dict())
+    batch = make_batch()
+    renamed = batch.clone().rename_key_("action", "a")
+    for name in ("reward", "done", "terminated"):
+        renamed.rename_key_(("next", name), ("next", names[name]))
+    torch.manual_seed(0)
+    expected = plain(batch)
+    torch.manual_seed(0)
+    torch.testing.assert_close(loss(renamed), expected)
+    torch.testing.assert_close(renamed["p"], batch["td_error"])
+    metadata = loss.actor_loss(renamed)[1]
+    assert metadata["l"].shape == (BATCH,)
+    assert not metadata["l"].requires_grad
+
+
+@pytest.mark.parametrize("updater", [SoftUpdate, HardUpdate])
+def test_state_and_targets_are_those_of_torchrl_losses(updater):
+    loss, other, batch = make_loss(), make_loss(), make_batch()
+    settings = {"tau": 0.5} if updater is SoftUpdate else {"value_network_update_interval": 0}
+    target = updater(loss, **settings)
+    loss.qvalue_network_params.data.add_(1.0)
+    before = loss.target_qvalue_network_params.clone()
+    target.step()
+    fraction = 0.5 if updater is SoftUpdate else 1.0
+    trained, moved = loss.qvalue_network_params.data, loss.target_qvalue_network_params.data
+    torch.testing.assert_close(moved - before, (trained - before) * fraction)
+    other.load_state_dict(loss.state_dict())
+    torch.manual_seed(0)
+    expected = loss(batch)
+    torch.manual_seed(0)
+    torch.testing.assert_close(other(batch), expected)
 
 
 def test_backbones_run_once_a_state_and_all_of_it_trains():

@@ -38,14 +38,14 @@ def test_mean_squared_error_of_unmasked_actions():
 
 
 @pytest.mark.parametrize("kind", ["discrete", "one-hot"])
-@pytest.mark.parametrize("reduction", ["mean", "sum"])
+@pytest.mark.parametrize("reduction", ["mean", "sum", None])
 def test_cross_entropy_of_unmasked_actions(kind, reduction):
     (network, head), batch = make_network(space="discrete"), make_batch(kind=kind)
     predictor = make_dt_predictor(network, head)
     loss = MaskedDTLoss(predictor, loss_function="cross_entropy", reduction=reduction)
     logits, mask = predictor(batch.clone())["action"], batch["mask"]
     target = batch["action"].argmax(-1) if kind == "one-hot" else batch["action"]
-    expected = F.cross_entropy(logits[mask], target[mask], reduction=reduction)
+    expected = F.cross_entropy(logits[mask], target[mask], reduction=reduction or "mean")
     torch.testing.assert_close(loss(batch)["loss"], expected)
 
 

@@ -19,10 +19,10 @@ BATCH, OBSERVATION, ACTIONS, GAMMA = 6, 4, 3, 0.9
 SPECS = {"categorical": Categorical(ACTIONS), "one-hot": OneHot(ACTIONS)}
 
 
-def make_loss(kind="categorical", network=None):
+def make_loss(kind="categorical", network=None, **settings):
     network = network or nn.Linear(OBSERVATION, ACTIONS)
     actor = QValueActor(network.double(), in_keys=["state"], spec=SPECS[kind])
-    loss = DelayedDiscreteCQLLoss(actor, action_space=SPECS[kind])
+    loss = DelayedDiscreteCQLLoss(actor, action_space=SPECS[kind], **settings)
     loss.make_value_estimator(gamma=GAMMA)
     for weight in loss.target_value_network_params.values(True, True):
         weight.data.normal_()
@@ -99,3 +99,32 @@ def test_the_loss_depends_on_the_target_network():
     assert loss(batch.clone())["target_value"] != before
     expected = batch["next", "reward"].mean()
     torch.testing.assert_close(loss(batch.clone())["target_value"], expected)
+
+
+def test_reductions():
+    names, batch = ["loss_qvalue", "loss_cql"], make_batch()
+    first = make_loss()
+    losses = {}
+    for reduction in ("none", "mean", "sum", None):
+        loss = make_loss(reduction=reduction)
+        loss.load_state_dict(first.state_dict())
+        losses[reduction] = loss(batch).select(*names)
+    for name in names:
+        each = losses["none"][name]
+        assert each.shape == (BATCH,)
+        torch.testing.assert_close(losses["sum"][name], each.sum())
+        torch.testing.assert_close(losses["mean"][name], each.mean())
+        torch.testing.assert_close(losses[None][name], each.mean())
+
+
+def test_keys_can_be_set():
+    names = {"action": "a", "reward": "r", "done": "d", "terminated": "t", "priority": "p"}
+    loss, batch = make_loss(), make_batch()
+    renamed = batch.clone().rename_key_("action", "a")
+    for name in ("reward", "done", "terminated"):
+        renamed.rename_key_(("next", name), ("next", names[name]))
+    expected = loss(batch)
+    loss.set_keys(**names)
+    torch.testing.assert_close(loss(renamed), expected)
+    torch.testing.assert_close(renamed["p"], batch["td_error"])
+    assert batch["td_error"].shape == (BATCH, 1)

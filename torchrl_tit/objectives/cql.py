@@ -22,6 +22,7 @@ from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Count, Positive, Real, Weight
 
 OverCritics = Literal["mean", "sum"]
+Reduction = Literal["none", "mean", "sum"]
 Distance = Literal["l1", "l2", "smooth_l1"]
 
 
@@ -70,6 +71,8 @@ class ContinuousCQLLoss(CQLLoss):
         target_entropy: entropy that the temperature aims for; "auto" is minus the number of entries
             of an action.
         loss_function: distance to the target; "l2" is the square.
+        reduction: how to reduce the losses of a batch; "none" leaves one of each state. None is
+            "mean".
         deactivate_vmap: whether to run the critics one after the other, for networks that vmap
             does not support.
 
@@ -116,6 +119,7 @@ class ContinuousCQLLoss(CQLLoss):
         alpha_init: Positive = 1.0,
         target_entropy: Real | Literal["auto"] = "auto",
         loss_function: Distance = "l2",
+        reduction: Reduction | None = "mean",
         deactivate_vmap: bool = False,
     ) -> None:
         if not isinstance(action_spec, Bounded) or action_spec.ndim != 1:
@@ -124,11 +128,12 @@ class ContinuousCQLLoss(CQLLoss):
                 "are drawn uniformly between the bounds"
             )
         check_bounds(action_spec, "no uniform samples")
+        action_key = actor_network.dist_sample_keys[0]
         super().__init__(
             actor_network,
-            [ManyActions(critic) for critic in qvalue_network]
+            [ManyActions(critic, action_key) for critic in qvalue_network]
             if isinstance(qvalue_network, Sequence)
-            else ManyActions(qvalue_network),
+            else ManyActions(qvalue_network, action_key),
             loss_function=loss_function,
             alpha_init=alpha_init,
             action_spec=action_spec,
@@ -137,6 +142,8 @@ class ContinuousCQLLoss(CQLLoss):
             num_random=num_random,
             deactivate_vmap=deactivate_vmap,
         )
+        self.reduction = reduction or "mean"
+        self._action_key = action_key
         self.over_critics = over_critics
         self.register_buffer("_low", action_spec.space.low.clone())
         self.register_buffer("_high", action_spec.space.high.clone())
@@ -156,23 +163,28 @@ class ContinuousCQLLoss(CQLLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Computes all terms of a batch [*B], which is not changed.
+        """Computes all terms of a batch [*B].
+
+        Writes each state's squared error, float [*B], the larger of the critics', into the batch:
+        "td_error", from which prioritized replay buffers compute priorities.
 
         Returns:
-            "loss_actor", "loss_qvalue", "loss_cql" (weighted), "loss_alpha", "alpha" (the
-            temperature) and "entropy" (of the policy, estimated), float [] each.
+            "loss_actor", "loss_qvalue", "loss_cql" (weighted) and "loss_alpha", float [], or [*B]
+            without a reduction; "alpha" (the temperature) and "entropy" (of the policy, estimated),
+            float [].
         """
         batch_dims = tensordict.get(self.tensor_keys.action).ndim - 1
         if tensordict.ndim > batch_dims:  # dispatch takes all that the entries have in common
             tensordict.auto_batch_size_(batch_dims)
         samples = self.sample_policy(tensordict)
-        loss_qvalue, loss_cql = self.critic_losses(tensordict, samples)
+        loss_qvalue, loss_cql, td_error = self._critic_terms(tensordict, samples)
+        tensordict.set(self.tensor_keys.priority, td_error.amax(0))
         return TensorDict(
             {
                 "loss_actor": self.actor_loss(tensordict, samples)[0],
                 "loss_qvalue": loss_qvalue,
                 "loss_cql": loss_cql,
-                "loss_alpha": self.alpha_loss(samples),
+                "loss_alpha": self.alpha_loss(samples, tensordict),
                 "alpha": self._alpha,
                 "entropy": -samples.log_prob.detach().mean(),
             }
@@ -204,10 +216,17 @@ class ContinuousCQLLoss(CQLLoss):
             next_action = next_dist.deterministic_sample
         return PolicySamples(action, log_prob, actions, log_probs, next_action)
 
-    def alpha_loss(self, samples: PolicySamples) -> Tensor:
-        """The temperature's loss, float []."""
+    def alpha_loss(
+        self, samples: PolicySamples, tensordict: TensorDictBase | None = None
+    ) -> Tensor:
+        """The temperature's loss, float [].
+
+        Args:
+            samples: from :meth:`sample_policy`.
+            tensordict: the batch, which can have a mask (see TorchRL's `loss_mask_key`).
+        """
         excess = samples.log_prob.detach() + self.target_entropy
-        return -(self.log_alpha.exp() * excess).mean()
+        return self._reduce_loss(-self.log_alpha.exp() * excess, tensordict=tensordict)
 
     def critic_losses(
         self, tensordict: TensorDictBase, samples: PolicySamples | None = None
@@ -218,10 +237,8 @@ class ContinuousCQLLoss(CQLLoss):
             tensordict: a batch [*B].
             samples: from :meth:`sample_policy`; sampled here if not given.
         """
-        batch = self._critic_batch(tensordict, samples or self.sample_policy(tensordict))
-        with set_recurrent_mode(True):
-            values = self._values(batch.inputs, self.qvalue_network_params)
-        return self._losses(values, batch, batch.target.numel())
+        loss_qvalue, loss_cql, _ = self._critic_terms(tensordict, samples)
+        return loss_qvalue, loss_cql
 
     def critic_gradients(
         self, tensordict: TensorDictBase, samples: PolicySamples, chunk_size: int
@@ -239,9 +256,11 @@ class ContinuousCQLLoss(CQLLoss):
                 states if the batch is [N, T].
 
         Returns:
-            The values of :meth:`critic_losses`, detached.
+            The values of :meth:`critic_losses`, detached; without a reduction, their sums.
         """
         batch = self._critic_batch(tensordict, samples)
+        each = self._reduce_loss(torch.ones_like(batch.target), tensordict, reduction="sum")
+        divisor = each.clamp_min(1) if self.reduction == "mean" else 1
         losses = []
         for critic in self._critics():
             with (
@@ -251,7 +270,10 @@ class ContinuousCQLLoss(CQLLoss):
                 for chunk in batch.split(chunk_size):
                     outputs = self.qvalue_network(chunk.inputs.copy())
                     values = outputs.get(self.tensor_keys.state_action_value).squeeze(-1)
-                    loss_qvalue, loss_cql = self._losses(values, chunk, batch.target.numel())
+                    loss_qvalue, loss_cql = (
+                        self._reduce_loss(loss, chunk.inputs, reduction="sum") / divisor
+                        for loss in self._losses(values, chunk)
+                    )
                     (loss_qvalue + loss_cql).backward()
                     losses.append(torch.stack([loss_qvalue, loss_cql]).detach())
         loss_qvalue, loss_cql = torch.stack(losses).sum(dim=0).unbind()
@@ -260,8 +282,14 @@ class ContinuousCQLLoss(CQLLoss):
     def q_loss(
         self, tensordict: TensorDictBase, samples: PolicySamples | None = None
     ) -> tuple[Tensor, dict[str, Any]]:
-        """The critics' squared error alone; call :meth:`critic_losses` if you need both."""
-        return self.critic_losses(tensordict, samples)[0], {}
+        """The critics' squared error alone; call :meth:`critic_losses` if you need both.
+
+        Returns:
+            The loss, and "td_error", the squared error of each critic in each state, float
+            [critics, *B].
+        """
+        loss_qvalue, _, td_error = self._critic_terms(tensordict, samples)
+        return loss_qvalue, {"td_error": td_error}
 
     def cql_loss(
         self, tensordict: TensorDictBase, samples: PolicySamples | None = None
@@ -277,13 +305,29 @@ class ContinuousCQLLoss(CQLLoss):
         Args:
             tensordict: a batch [*B].
             samples: from :meth:`sample_policy`; sampled here if not given.
+
+        Returns:
+            The loss, and the actions' log-probability, float [*B], under
+            ``tensor_keys.log_prob``.
         """
         samples = samples or self.sample_policy(tensordict)
         inputs = self._inputs(tensordict, samples.action.unsqueeze(-2))
         values = self._values(inputs, self.qvalue_network_params.detach())  # [critics, *B, 1]
         value = values.squeeze(-1).amin(0)  # [*B]
         alpha = self.log_alpha.detach().exp()
-        return (alpha * samples.log_prob - value).mean(), {}
+        loss = self._reduce_loss(alpha * samples.log_prob - value, tensordict)
+        return loss, {self.tensor_keys.log_prob: samples.log_prob.detach()}
+
+    def _critic_terms(
+        self, tensordict: TensorDictBase, samples: PolicySamples | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The losses of :meth:`critic_losses`, and the squared errors, float [critics, *B]."""
+        batch = self._critic_batch(tensordict, samples or self.sample_policy(tensordict))
+        with set_recurrent_mode(True):
+            values = self._values(batch.inputs, self.qvalue_network_params)
+        errors, gaps = self._losses(values, batch)
+        td_error = (values[..., -1].detach() - batch.target).square()
+        return self._reduce_loss(errors, tensordict), self._reduce_loss(gaps, tensordict), td_error
 
     def _critic_batch(self, tensordict: TensorDictBase, samples: PolicySamples) -> CriticBatch:
         """Adds uniform samples to those of the policy, and computes the target."""
@@ -314,30 +358,30 @@ class ContinuousCQLLoss(CQLLoss):
             return self.value_estimator.value_estimate(batch).squeeze(-1)
 
     def _inputs(self, tensordict: TensorDictBase, actions: Tensor) -> TensorDictBase:
-        """The critics' inputs: each state, with m actions, [*B, m, A]."""
-        keys = [key for key in self.qvalue_network.in_keys if key != self.tensor_keys.action]
-        return tensordict.select(*keys, strict=False).set(self.tensor_keys.action, actions)
+        """The critics' inputs: each state, with m actions, [*B, m, A], and its mask, if any."""
+        keys = {*self.qvalue_network.in_keys, *self._loss_mask_keys()} - {self._action_key}
+        return tensordict.select(*keys, strict=False).set(self._action_key, actions)
 
     def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> Tensor:
         """Values of m actions in each state by all critics; [critics, *B, m]."""
         outputs = self._vmap_qvalue_networkN0(inputs, params)
         return outputs.get(self.tensor_keys.state_action_value).squeeze(-1)
 
-    def _losses(self, values: Tensor, batch: CriticBatch, num_states: int) -> tuple[Tensor, Tensor]:
-        """The two losses over some states of a batch, for one critic or all of them.
+    def _losses(self, values: Tensor, batch: CriticBatch) -> tuple[Tensor, Tensor]:
+        """The two losses of some states of a batch, for one critic or all of them; float [*b] each.
 
         Args:
             values: the actions' values, float [*b, 3m + 1] or [critics, *b, 3m + 1].
             batch: these states, [*b].
-            num_states: number of states of the whole batch.
         """
         value = values[..., -1]  # of the action taken; [*b] or [critics, *b]
         errors = distance_loss(value, batch.target.expand_as(value), self.loss_function)
         soft_maximum = torch.logsumexp(values[..., :-1] - batch.log_density, dim=-1)
-        gap = (soft_maximum - value).sum() / num_states
+        shape = batch.target.shape
+        errors, gaps = (x.reshape(-1, *shape).sum(0) for x in (errors, soft_maximum - value))
         if self.over_critics == "mean":
-            gap = gap / self.num_qvalue_nets
-        return errors.sum() / num_states, self.min_q_weight * gap
+            gaps = gaps / self.num_qvalue_nets
+        return errors, self.min_q_weight * gaps
 
     def _critics(self) -> list[TensorDictBase]:
         """The weights of each critic, as leaves whose gradients are views of the stacked ones."""

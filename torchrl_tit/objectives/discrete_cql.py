@@ -33,7 +33,7 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         value_network: writes "action_value", float [..., n], and "chosen_action_value", float
             [..., 1].
         loss_function: distance to the target; "l2" is the square.
-        reduction: how to reduce the losses of a batch.
+        reduction: how to reduce the losses of a batch; None is "mean".
         **settings: passed to `DiscreteCQLLoss`: ``action_space``.
 
     Raises:
@@ -71,7 +71,7 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         value_network: Any,
         *,
         loss_function: Literal["l1", "l2", "smooth_l1"] = "l2",
-        reduction: Literal["none", "mean", "sum"] = "mean",
+        reduction: Literal["none", "mean", "sum"] | None = "mean",
         **settings: Any,
     ) -> None:
         super().__init__(
