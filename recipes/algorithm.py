@@ -10,7 +10,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_tit.settings import resolve
@@ -62,7 +62,11 @@ class Algorithm(ABC, Generic[RecipeT]):
     @property
     @abstractmethod
     def policy(self) -> TensorDictModuleBase:
-        """The policy, which acts in the environments of :meth:`make_env`."""
+        """The policy, which acts in the environments of :meth:`make_env`.
+
+        It holds all that acting needs: weights, statistics, bounds of actions. Agents and exported
+        files are made of it alone.
+        """
 
     @abstractmethod
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
@@ -77,13 +81,6 @@ class Algorithm(ABC, Generic[RecipeT]):
     @abstractmethod
     def networks(self) -> Stateful:
         """Returns the networks with all weights, for evaluation and checkpoints."""
-
-    def acting_networks(self) -> nn.Module:
-        """Returns the networks that acting needs, for trained agents; by default, the policy.
-
-        Override it if :meth:`make_env` has weights or statistics too.
-        """
-        return self.policy
 
     @abstractmethod
     def prepare(self, step: int, folder: Path) -> None:
@@ -188,7 +185,7 @@ def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
         RuntimeError: if names or shapes differ.
 
     Example:
-        >>> load_weights(nn.Linear(1, 1), {"weight": torch.tensor([[torch.nan]])})
+        >>> load_weights(torch.nn.Linear(1, 1), {"weight": torch.tensor([[torch.nan]])})
         Traceback (most recent call last):
             ...
         ValueError: weight has entries that are not finite

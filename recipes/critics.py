@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.modules import MLP
 
+from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.frames.observation import Observations, read_observations
-from torchrl_tit.modules.tensor_module import TensorValue
-from torchrl_tit.settings import Network
+from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
+from torchrl_tit.settings import Flat, Network
 
 from .policies import make_backbone
 
@@ -24,6 +26,7 @@ def make_critic(
     values: int = 1,
     out_key: str = "state_action_value",
     slices: bool = False,
+    eps: float | None = None,
 ) -> TensorDictModuleBase:
     """Builds an MLP on the newest observation or a backbone's features, and on the action, if any.
 
@@ -36,6 +39,7 @@ def make_critic(
         out_key: key of the values.
         slices: whether the backbone reads slices of consecutive steps [..., T] in TorchRL's
             recurrent mode; it then also reads "observation" and "is_init".
+        eps: as in :func:`~recipes.policies.make_backbone`; normalises what an MLP reads, too.
 
     Returns:
         A module that reads "observation" [..., D], or "history" [..., K, *obs], and "action"
@@ -47,10 +51,14 @@ def make_critic(
     modules: list[TensorDictModuleBase] = []
     if network is not None:
         key = "critic_features"
-        backbone = make_backbone(network, observation, out_key=key, slices=slices)
+        backbone = make_backbone(network, observation, out_key=key, slices=slices, eps=eps)
         modules, size = [backbone], backbone.features_dim
     else:
         key, size = "observation", _array_size(observation)
+        if eps is not None:
+            frames = NormalizedFrames(Flat().build((size,)), math.inf, eps=eps)
+            flat = nn.Sequential(frames, nn.Flatten(-2))
+            modules, key = [TensorModule(flat, [key], ["normalized"])], "normalized"
     mlp = MLP(
         size + action_dim,
         values,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from tensordict.nn import (
     AddStateIndependentNormalScale,
@@ -13,9 +14,11 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl.modules import IndependentNormal, ProbabilisticActor, QValueModule, TanhModule
 
+from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.frames.observation import Observations
 from torchrl_tit.modules import Backbone, history_keys, make_actor
 from torchrl_tit.modules.action_specs import has_bounds
+from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.modules.sequences import default_observation_keys
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import build_network
@@ -25,7 +28,12 @@ _MIN_LOG_STD = -5.0
 
 
 def make_backbone(
-    network: Network, observation: Observations, *, out_key: str = "features", slices: bool = False
+    network: Network,
+    observation: Observations,
+    *,
+    out_key: str = "features",
+    slices: bool = False,
+    eps: float | None = None,
 ) -> Backbone:
     """Builds the backbone of an actor or of a critic.
 
@@ -35,14 +43,34 @@ def make_backbone(
         out_key: key of the features.
         slices: whether it reads slices of consecutive steps [..., T] in TorchRL's recurrent mode;
             it then also reads the observations and "is_init".
+        eps: if given, it normalises observations by the statistics of a data set; see
+            :class:`~torchrl_tit.frames.NormalizedFrames`.
     """
     histories = history_keys(observation)
+    built = build_network(network, observation, trunks="shared")
+    if eps is not None:
+        normalize_frames(built, limit=math.inf, eps=eps)
     return Backbone(
-        build_network(network, observation, trunks="shared"),
+        built,
         in_keys=histories,
         out_keys=[out_key],
         observation_keys=default_observation_keys(histories) if slices else None,
     )
+
+
+def normalize_frames(network: nn.Module, **settings: Any) -> None:
+    """Puts a :class:`NormalizedFrames` in front of each frame encoder but those of categories.
+
+    Args:
+        network: the network, with one trunk or two.
+        **settings: those of :class:`NormalizedFrames`.
+    """
+    for trunk in trunks_of(network).values():
+        names = list(trunk.frame_encoders)
+        seen = zip(names, trunk.frames, trunk.observations.values(), strict=True)
+        for key, encoder, observation in seen:
+            if observation.categories is None:
+                trunk.frame_encoders[key] = NormalizedFrames(encoder, **settings)
 
 
 def make_cloning_policy(

@@ -9,12 +9,13 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer, TensorSpec
-from torchrl.envs import EnvBase, ObservationNorm
+from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from torchrl_tit.datasets import Episodes, HistoryStorage, load_episodes, make_replay_buffer
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.evaluation import evaluate
+from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.modules import Backbone
 
 from .algorithm import check_finite
@@ -47,7 +48,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
-        task = self._make_task(1)
+        task = self.make_env(1)
         self.action_spec = task.action_spec_unbatched.to(self.device)
         observation = observation_specs(task)
         task.close()
@@ -57,17 +58,14 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
                 f"({', '.join(observation)}): choose one with observation_keys"
             )
         self.observation: TensorSpec = observation
-        self.statistics = nn.Module()
-        """The statistics that normalise observations, filled in from the data."""
-        if recipe.normalize_observations:
-            if not observation.dtype.is_floating_point:
-                raise ValueError(
-                    f"normalize_observations is on, but observations of {recipe.env} are "
-                    f"{observation.dtype}, not floats: switch it off"
-                )
-            mean = torch.zeros(observation.shape, device=self.device)
-            self.statistics.register_buffer("mean", mean)
-            self.statistics.register_buffer("std", torch.ones_like(mean))
+        if recipe.normalize_observations and not observation.dtype.is_floating_point:
+            raise ValueError(
+                f"normalize_observations is on, but observations of {recipe.env} are "
+                f"{observation.dtype}, not floats: switch it off"
+            )
+        self.eps = 1e-3 if recipe.normalize_observations else None
+        """What is added to the deviations that normalise observations, as by the authors of TD3+BC
+        and by d3rlpy; None if they are not normalised."""
 
     @property
     def continuous(self) -> bool:
@@ -80,23 +78,13 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
         return self._policy
 
     def networks(self) -> nn.Module:
-        """All networks and their targets, and the statistics of normalised observations."""
-        if not self.recipe.normalize_observations:
-            return self.loss
-        return nn.ModuleDict({"loss": self.loss, "statistics": self.statistics})
-
-    def acting_networks(self) -> nn.Module:
-        """The policy, and the statistics of normalised observations."""
-        if not self.recipe.normalize_observations:
-            return self.policy
-        return nn.ModuleDict({"policy": self.policy, "statistics": self.statistics})
+        """All networks and their targets."""
+        return self.loss
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
-        """Builds the task, with histories, and with normalised observations if requested."""
-        env = self._make_task(num_envs, seed, **settings)
-        if self.recipe.normalize_observations:
-            env = env.append_transform(self._normalization("observation", "history"))
-        return env
+        """Builds the task, with histories."""
+        clips = self.clips_actions
+        return make_task(self.recipe, num_envs, seed, clip_actions=clips, **settings)
 
     def make_backbone(self, *, slices: bool = False) -> Backbone:
         """Builds the policy's backbone.
@@ -106,7 +94,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
                 slices.
         """
         slices = slices or self.recipe.slice_length > 1
-        return make_backbone(self.recipe.backbone, self.observation, slices=slices)
+        return make_backbone(self.recipe.backbone, self.observation, slices=slices, eps=self.eps)
 
     def load_data(self) -> Episodes:
         """Loads the data set.
@@ -126,15 +114,14 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
         return episodes
 
     def make_buffer(self) -> ReplayBuffer:
-        """Reads the data set into a replay buffer of transitions with histories."""
+        """Reads the data set into a replay buffer of transitions with histories.
+
+        The networks then normalise observations by its statistics, if they do.
+        """
         recipe = self.recipe
         episodes = self.load_data()
-        settings: dict[str, Any] = {}
         if recipe.normalize_observations:
-            mean, std = episodes.observation_statistics()
-            self.statistics.load_state_dict({"mean": mean, "std": std})
-            keys = ("observation", "history")
-            settings["transform"] = self._normalization(*keys, *(("next", key) for key in keys))
+            self._set_statistics(*episodes.observation_statistics())
         storage = HistoryStorage(
             episodes.to(self.device), recipe.backbone.num_frames, **recipe.drawing()
         )
@@ -143,7 +130,6 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
             recipe.batch_size,
             seed=recipe.seed,
             slice_length=recipe.slice_length,
-            **settings,
         )
 
     def named(self, terms: Tensor) -> Mapping[str, Tensor]:
@@ -162,14 +148,17 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
         returns = evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=True)
         return [Outcome(step, returns.tolist())]
 
-    def _make_task(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
-        clips = self.clips_actions
-        return make_task(self.recipe, num_envs, seed, clip_actions=clips, **settings)
-
-    def _normalization(self, *keys: Any) -> ObservationNorm:
-        """Subtracts the data's mean from entries, and divides by the data's standard deviation."""
-        mean, std = self.statistics.buffers()
-        return ObservationNorm(mean, std, in_keys=list(keys), standard_normal=True)
+    @torch.no_grad()
+    def _set_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Sets the statistics of all networks: the policy's, the critics' and the targets'."""
+        (frames,) = (m for m in self.policy.modules() if isinstance(m, NormalizedFrames))
+        frames.set_statistics(mean, std)
+        statistics = dict(frames.named_buffers(recurse=False))
+        buffers = dict(self.loss.named_buffers())  # it stacks those of the critics
+        for name, buffer in buffers.items():
+            path, _, leaf = name.rpartition(".")
+            if leaf in statistics and all(f"{path}.{own}" in buffers for own in statistics):
+                buffer.copy_(statistics[leaf])
 
 
 def parameters_of(params: Any) -> list[nn.Parameter]:

@@ -45,7 +45,7 @@ def agent_from_files(files: AgentFiles, name: str, device: Device) -> TrainedAge
             f"the agent {files.folder} cannot be used: its networks cannot be built "
             f"({' '.join(str(error).split())})"
         ) from error
-    networks = algorithm.acting_networks()
+    networks = algorithm.policy
     try:
         load_weights(networks, files.weights)
     except (RuntimeError, ValueError) as error:

@@ -61,7 +61,7 @@ def pack(
             f"`evaluate {folder}` first"
         )
     versions = read_json(folder / "versions.json")
-    networks = algorithm.acting_networks()
+    networks = algorithm.policy
     recipe = without_places(run.recipe)
     if isinstance(recipe, DatasetRecipe):
         evaluation["dataset"] = recipe.dataset

@@ -63,6 +63,7 @@ class CQLAlgorithm(QAlgorithm[CQL]):
                 recipe.critic_hidden,
                 network,
                 slices=recipe.slice_length > 1,
+                eps=self.eps,
             )
             for _ in range(2)
         ]

@@ -2,52 +2,50 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, TypeVar
 
-import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import nn
 from torchrl.data import Bounded, Categorical, MultiCategorical, TensorSpec
-from torchrl.envs import Compose, EnvBase, ObservationNorm, TargetReturn
+from torchrl.envs import Compose, EnvBase, TargetReturn
 
 from torchrl_tit.datasets import Episodes, SequenceStorage, load_episodes
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.evaluation import evaluate
+from torchrl_tit.frames import NormalizedFrames
+from torchrl_tit.histories.decision_transformer import DecisionTransformer
 from torchrl_tit.modules import DTHead, make_dt_actor
 from torchrl_tit.networks import HistoryNetwork, build_network
 from torchrl_tit.transforms import SequenceHistory
 
 from ..dataset_algorithm import DatasetAlgorithm
 from ..outcomes import Outcome
+from ..policies import normalize_frames
 from ..task import make_task, task_limit
 from .settings import SequenceRecipe
 
 RecipeT = TypeVar("RecipeT", bound=SequenceRecipe)
 
+_EPS = 1e-6
+"""What the authors of Decision Transformer add to the deviations that normalise observations."""
+
 
 class Agent(nn.Module):
-    """Network and head, with the statistics that normalise observations.
+    """Network and head.
 
     Args:
         network: predicts features.
         head: maps features to actions.
-        observation_shape: shape of an observation.
     """
 
-    mean: Tensor
-    std: Tensor
-
-    def __init__(
-        self, network: HistoryNetwork, head: DTHead, observation_shape: Sequence[int]
-    ) -> None:
+    def __init__(self, network: HistoryNetwork, head: DTHead) -> None:
         super().__init__()
         self.network = network
         self.head = head
-        self.register_buffer("mean", torch.zeros(observation_shape))
-        self.register_buffer("std", torch.ones(observation_shape))
 
 
 class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
@@ -68,15 +66,17 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         task = make_task(recipe, num_frames=1, clip_actions=False)
         spec = _check_observation(recipe, observation_specs(task))
         shape = spec.shape
-        self.normalizes = spec.dtype.is_floating_point
-        """Whether observations are normalised; uint8 images, which networks divide by 255, are
-        not."""
         self.action_dim = _check_task(recipe, task.action_spec_unbatched)
         task.close()
         network = build_network(recipe.backbone, shape, action_dim=self.action_dim, trunks="shared")
         assert isinstance(network, HistoryNetwork)
+        if spec.dtype.is_floating_point:  # not bytes, which networks divide by 255
+            normalize_frames(network, limit=math.inf, eps=_EPS)
+        encoder = network.history_encoder
+        assert isinstance(encoder, DecisionTransformer)
+        encoder.return_scale.fill_(recipe.return_scale)
         head = DTHead(network.features_dim, self.action_dim, recipe.action_space)
-        self.agent = Agent(network, head, shape).to(self.device).eval()
+        self.agent = Agent(network, head).to(self.device).eval()
         self._policy = make_dt_actor(network, head)
 
     @property
@@ -85,11 +85,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         return self._policy
 
     def networks(self) -> nn.Module:
-        """Network and head, with the statistics of the data."""
-        return self.agent
-
-    def acting_networks(self) -> nn.Module:
-        """The same networks, because the environments normalise observations."""
+        """Network and head."""
         return self.agent
 
     def make_env(
@@ -110,33 +106,20 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             target_return: the return that the network aims for; the recipe's first one if None.
             **settings: further settings of the task.
         """
-        recipe, agent = self.recipe, self.agent
+        recipe = self.recipe
         if task_limit(recipe) is None:
             settings = {"max_episode_steps": recipe.history.max_ep_len, **settings}
         env = make_task(recipe, num_envs, seed, num_frames=1, clip_actions=False, **settings)
         if target_return is None:
             target_return = recipe.target_returns[0]
-        key = "observation"
-        transforms = [TargetReturn(target_return)]
-        if self.normalizes:
-            key = "normalized_observation"  # new data keep the original observation
-            normalization = ObservationNorm(
-                agent.mean,
-                agent.std,
-                in_keys=["observation"],
-                out_keys=[key],
-                standard_normal=True,
-            )
-            transforms.append(normalization)
         history = SequenceHistory(
             recipe.acting_num_frames or recipe.backbone.num_frames,
-            return_scale=recipe.return_scale,
-            observation_key=key,
+            return_scale=1.0,  # the network divides
         )
-        return env.append_transform(Compose(*transforms, history))
+        return env.append_transform(Compose(TargetReturn(target_return), history))
 
     def load_data(self) -> Episodes:
-        """Loads the data set and computes its statistics.
+        """Loads the data set, by whose statistics the network then normalises observations.
 
         Raises:
             ValueError: if its actions are of another kind, no episode is finished, or one is longer
@@ -147,21 +130,18 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         episodes = load_episodes(recipe.dataset, **recipe.reading())
         check_data(recipe, episodes)
         warn_of_targets(recipe.target_returns, episodes)
-        if self.normalizes:
-            mean, std = episodes.observation_statistics()
-            self.agent.mean.copy_(mean)
-            self.agent.std.copy_(std)
+        for encoder in self.agent.network.frames:
+            if isinstance(encoder, NormalizedFrames):
+                encoder.set_statistics(*episodes.observation_statistics())
         return episodes.to(self.device)
 
     def make_storage(self, episodes: Episodes) -> SequenceStorage:
-        """Cuts normalised windows out of episodes."""
-        recipe, agent = self.recipe, self.agent
+        """Cuts windows out of episodes."""
+        recipe = self.recipe
         return SequenceStorage(
             episodes,
             recipe.backbone.num_frames,
-            mean=agent.mean if self.normalizes else None,
-            std=agent.std if self.normalizes else None,
-            return_scale=recipe.return_scale,
+            return_scale=1.0,
             action_padding=self.action_padding,
         )
 

@@ -136,5 +136,6 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
             values=spec.space.n if of_actions and discrete else 1,
             out_key=out_key,
             slices=recipe.slice_length > 1,
+            eps=self.eps,
         )
         return critic.to(self.device)

@@ -36,6 +36,7 @@ from ..compilation import (
     should_compile,
 )
 from ..outcomes import Outcome
+from ..policies import normalize_frames
 from ..ray_collector import check_cluster
 from ..task import make_task
 from .auxiliary import AuxiliaryLosses
@@ -377,16 +378,6 @@ class PPOAlgorithm(Algorithm[PPO]):
         value = self.agent.critic(self.agent.encode(samples))["state_value"].mean()
         weights = nn.utils.get_total_norm(self.parameters)
         check_finite(["weights", "value"], torch.stack([weights, value]))
-
-
-def normalize_frames(network: nn.Module) -> None:
-    """Puts a :class:`NormalizedFrames` in front of each frame encoder but those of categories."""
-    for trunk in trunks_of(network).values():
-        names = list(trunk.frame_encoders)
-        seen = zip(names, trunk.frames, trunk.observations.values(), strict=True)
-        for key, encoder, observation in seen:
-            if observation.categories is None:
-                trunk.frame_encoders[key] = NormalizedFrames(encoder)
 
 
 def add_advantages(

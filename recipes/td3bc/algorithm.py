@@ -51,6 +51,7 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
                 recipe.critic_hidden,
                 recipe.backbone if recipe.critic == "backbone" else None,
                 slices=recipe.slice_length > 1,
+                eps=self.eps,
             ).to(self.device)
             for _ in range(2)
         ]

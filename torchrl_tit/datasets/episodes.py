@@ -118,14 +118,13 @@ class Episodes:
         """Computes the mean and standard deviation of the observations of finished episodes.
 
         Returns:
-            Mean and population standard deviation + 1e-6; float32 [*obs] each.
-
-        Source: "Decision Transformer" (arXiv 2106.01345), its authors' code.
+            Mean and population standard deviation, float32 [*obs] each, for
+            :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`.
         """
         count = self.lengths[self.finished].sum()
         mean = sum(chunk.double().sum(0) for chunk in self._observations()) / count
         squares = sum(chunk.double().sub_(mean).square_().sum(0) for chunk in self._observations())
-        return mean.float(), (squares / count).sqrt().float() + 1e-6
+        return mean.float(), (squares / count).sqrt().float()
 
     def _observations(self) -> Iterator[Tensor]:
         """The observations at the steps of finished episodes, in chunks."""

@@ -24,16 +24,11 @@ class SequenceStorage(EpisodeStorage):
     Args:
         episodes: The data.
         num_frames: Number K of steps, at least 1.
-        mean: Subtracted from observations; [*obs], for example from
-            :meth:`~torchrl_tit.datasets.Episodes.observation_statistics`.
-        std: Divisor of the observations; [*obs].
         return_scale: Divisor of the returns-to-go.
         action_padding: Value of the actions at padding, where all other entries are 0.
 
     Raises:
-        ValueError: If ``num_frames`` is less than 1, ``return_scale`` is not positive, or ``mean``
-            and ``std`` are not finite, do not have the observations' shape, or one of them is
-            missing.
+        ValueError: If ``num_frames`` is less than 1, or ``return_scale`` is not positive.
         DatasetError: If no episode is finished.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3 and its authors' code.
@@ -53,24 +48,12 @@ class SequenceStorage(EpisodeStorage):
         episodes: Episodes,
         num_frames: Frames = 20,
         *,
-        mean: Tensor | None = None,
-        std: Tensor | None = None,
         return_scale: Positive = 1000.0,
         action_padding: Real = -10.0,
     ) -> None:
-        if (mean is None) != (std is None):
-            raise ValueError("mean and std go together: give both, or neither")
-        shape = episodes.rows["observation"].shape[1:]
-        for name, values in {"mean": mean, "std": std}.items():
-            if values is not None and not (values.shape == shape and values.isfinite().all()):
-                raise ValueError(f"{name} must be finite numbers {list(shape)}, not {values}")
-        if std is not None and not (std > 0).all():
-            raise ValueError(f"std must be positive, not {std}")
         super().__init__(episodes, episodes.lengths * episodes.finished)
         self._last_rows = episodes.last_rows
         self._returns_to_go = _returns_to_go(episodes).div_(return_scale).float()  # [R]
-        self._mean = None if mean is None else mean.to(self.device)
-        self._std = None if std is None else std.to(self.device)
         self._action_padding = action_padding
         self._steps = torch.arange(num_frames, device=self.device)
 
@@ -80,12 +63,6 @@ class SequenceStorage(EpisodeStorage):
         step = self._steps - (len(self._steps) - length)  # [..., K]: below 0 at padding
         mask = step >= 0
         rows = row + step.clamp(min=0)
-
-        def observation() -> Tensor:
-            values = self._take("observation", rows)  # [..., K, *obs]
-            if self._mean is not None and self._std is not None:
-                values = (values - self._mean) / self._std
-            return _fill(values, mask, 0)
 
         def action() -> Tensor:
             values = self._take("action", rows)  # [..., K, *action]
@@ -97,7 +74,7 @@ class SequenceStorage(EpisodeStorage):
             return _fill(rows - self._first_rows[episode].unsqueeze(-1), mask, 0)
 
         return {
-            "observation": observation,
+            "observation": lambda: _fill(self._take("observation", rows), mask, 0),
             "action": action,
             "return_to_go": lambda: _fill(self._returns_to_go[rows], mask, 0).unsqueeze(-1),
             "timestep": timestep,

@@ -11,7 +11,7 @@ from tensordict import NestedKey
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.data import Composite
-from torchrl.envs import EnvBase, ObservationNorm, TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import ObservationTransform, Transform
 
 from torchrl_tit.transforms import History, SequenceHistory
@@ -50,30 +50,9 @@ class Select(nn.Module):
         return observation.index_select(-1, self.entries)
 
 
-class Standardize(nn.Module):
-    """Subtracts a mean and divides by a standard deviation.
-
-    Args:
-        mean: the mean, with the shape of an observation.
-        std: the standard deviation, with the same shape.
-    """
-
-    mean: Tensor
-    std: Tensor
-
-    def __init__(self, mean: Tensor, std: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("mean", mean.clone())
-        self.register_buffer("std", std.clone())
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """[..., *obs] -> [..., *obs]."""
-        return (observation - self.mean) / self.std
-
-
 @dataclass(frozen=True)
 class Observed:
-    """An observation of a task, before normalisation and before velocities are hidden."""
+    """An observation of a task, before velocities are hidden."""
 
     name: str
     """Its name, if there are several; empty if it is the only one."""
@@ -158,8 +137,6 @@ def trace(env: EnvBase, history_key: NestedKey, name: str = "") -> Observed:
             shape = env.observation_spec[history_key].shape
             size = shape[-1] + len(transform.hidden)
             layers.append(Select([i for i in range(size) if i not in transform.hidden]))
-        elif isinstance(transform, ObservationNorm) and transform.standard_normal:
-            layers.append(Standardize(transform.loc, transform.scale))
         else:
             break  # this one writes the observation
         key, place = source, index

@@ -119,7 +119,7 @@ class Step:
     """The data of one step of an episode that a program may read."""
 
     observations: Sequence[Tensor]
-    """The value of each observation, [N, *obs], before anything is hidden or normalised."""
+    """The value of each observation, [N, *obs], before anything is hidden."""
     tensordict: TensorDictBase
     """The live policy's inputs and outputs, [N]."""
     reward: Tensor

@@ -1,4 +1,4 @@
-"""Normalises observations by their running mean and standard deviation for a frame encoder."""
+"""Normalises observations by their mean and standard deviation for a frame encoder."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ _IMAGES = 256
 
 
 class NormalizedFrames(FrameEncoder):
-    """A frame encoder that reads observations normalised by running statistics.
+    """A frame encoder that reads observations normalised by their mean and standard deviation.
 
-    Each entry of an array has its own mean and standard deviation, as in `VecNormalize` of
-    Stable-Baselines3. So has each channel of an image, whose bytes are first scaled to 0..1: if all
-    pixels are positive, a network first sees what all images have in common. Results beyond
-    +-``limit`` are clipped.
+    The statistics are running ones (:meth:`update`), or those of a data set
+    (:meth:`set_statistics`). Until then, observations are read as they are. Each entry of an array
+    has its own mean and standard deviation, as in `VecNormalize` of Stable-Baselines3. So has each
+    channel of an image, whose bytes are first scaled to 0..1: if all pixels are positive, a network
+    first sees what all images have in common. Results beyond +-``limit`` are clipped.
 
     The statistics are buffers of the network, so checkpoints, evaluation, copies and exports have
     them, and a frame's tokens stay the same while a batch is collected. TorchRL's `VecNormV2` is a
@@ -29,7 +30,9 @@ class NormalizedFrames(FrameEncoder):
 
     Args:
         encoder: the frame encoder.
-        limit: bound to which normalised entries are clipped.
+        limit: bound to which normalised entries are clipped; infinite for none.
+        eps: is added to the standard deviation; None adds 1e-8 to the variance, as `VecNormalize`
+            does. It decides how entries are read that never changed so far.
 
     Example:
         >>> from torchrl_tit import settings
@@ -43,18 +46,32 @@ class NormalizedFrames(FrameEncoder):
     mean: Tensor
     variance: Tensor
 
-    def __init__(self, encoder: FrameEncoder, limit: float = 10.0) -> None:
+    def __init__(
+        self, encoder: FrameEncoder, limit: float = 10.0, *, eps: float | None = None
+    ) -> None:
         super().__init__(
             encoder.observation_shape, num_tokens=encoder.num_tokens, width=encoder.width
         )
         self.encoder = encoder
         self.limit = limit
+        self.eps = eps
         shape = encoder.observation_shape
         self.is_image = len(shape) > 1
         shape = (*shape[:-2], 1, 1) if self.is_image else shape
         self.register_buffer("count", torch.zeros(()))
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("variance", torch.ones(shape))
+
+    @torch.no_grad()
+    def set_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Replaces the statistics by those of a data set, float [*observation_shape] each."""
+        variance = std.square()
+        if self.is_image:  # of a channel: the mean of its variances, and the variance of its means
+            over = (-2, -1)
+            variance = variance.mean(over, keepdim=True) + mean.var(over, False, keepdim=True)
+            mean = mean.mean(over, keepdim=True)
+        self.mean.copy_(mean)
+        self.variance.copy_(variance)
 
     @torch.no_grad()
     def update(self, observations: Tensor) -> None:
@@ -76,7 +93,8 @@ class NormalizedFrames(FrameEncoder):
     def normalize(self, observation: Tensor) -> Tensor:
         """Normalises observations, float or uint8 [..., *observation_shape] -> float."""
         floats = bytes_to_floats(observation, self.mean.dtype)
-        normal = standardize(floats, self.mean, (self.variance + 1e-8).sqrt(), eps=0.0)
+        root, eps = (1e-8, 0.0) if self.eps is None else (0.0, self.eps)
+        normal = standardize(floats, self.mean, (self.variance + root).sqrt(), eps)
         return normal.clamp(-self.limit, self.limit)
 
     def forward(self, observation: Tensor) -> Tensor:

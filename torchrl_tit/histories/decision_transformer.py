@@ -32,6 +32,8 @@ class DecisionTransformer(HistoryEncoder):
     The last block computes only the state tokens, because only these are read. No state sees the
     action of the last step, so that action is not read.
 
+    Returns to go are divided by the buffer ``return_scale``, which is 1 unless it is filled.
+
     Args:
         settings: blocks, heads, FFN, dropout and time steps.
         shape: shape of the input; its ``action_dim`` is required.
@@ -55,6 +57,7 @@ class DecisionTransformer(HistoryEncoder):
     context = ("action", "return_to_go", "timestep", "mask")
     reads_any_length = True
     encodes_every_frame = True
+    return_scale: Tensor
 
     def __init__(self, settings: settings.DecisionTransformer, shape: HistoryShape) -> None:
         if shape.action_dim is None:
@@ -71,6 +74,7 @@ class DecisionTransformer(HistoryEncoder):
         self.max_ep_len = settings.max_ep_len
         self.one_token = OneToken(shape)
         self.action_embedding = nn.Linear(shape.action_dim, width)
+        self.register_buffer("return_scale", torch.ones(()), persistent=False)
         self.return_embedding = nn.Linear(1, width)
         self.timestep_embedding = (
             nn.Embedding(settings.max_ep_len, width) if settings.timestep_embedding else None
@@ -199,9 +203,8 @@ class DecisionTransformer(HistoryEncoder):
         _check(action, (*leading, steps, self.action_dim), "action")
         _check(return_to_go, (*leading, steps, 1), "return_to_go")
         _check(timestep, (*leading, steps), "timestep")
-        x = torch.stack(
-            [self.return_embedding(return_to_go), state, self.action_embedding(action)], dim=-2
-        )  # [..., K, 3, D]
+        to_go = self.return_embedding(return_to_go / self.return_scale)
+        x = torch.stack([to_go, state, self.action_embedding(action)], dim=-2)  # [..., K, 3, D]
         if self.timestep_embedding is not None:
             x = x + self._embed_time(timestep).unsqueeze(-2)
         # The sequence ends with the last state: no state sees the last action.

@@ -78,7 +78,7 @@ def test_an_agent_plays_as_its_run_did(kind, tmp_path):
     _, algorithm, _ = load_trained(Run.open(run))
     everything = {tuple(x.flatten().tolist()) for x in algorithm.networks().state_dict().values()}
     assert all(tuple(weight.flatten().tolist()) in everything for weight in saved.values())
-    assert len(saved) == len(algorithm.acting_networks().state_dict())
+    assert len(saved) == len(algorithm.policy.state_dict())
 
 
 def test_a_run_is_an_agent_too(run):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -78,13 +79,15 @@ def test_a_step_is_the_protocols(tmp_path):
 
     episodes = load_episodes(recipe.dataset)
     mean, std = episodes.observation_statistics()
-    storage = SequenceStorage(episodes, 6, mean=mean, std=std, return_scale=50.0)
+    storage = SequenceStorage(episodes, 6, return_scale=50.0)
     generator = torch.Generator().manual_seed(recipe.seed)
     torch.manual_seed(recipe.seed)
     agent = make_algorithm(recipe).agent
+    agent.network.history_encoder.return_scale.fill_(1.0)
     optimizer = torch.optim.AdamW(agent.parameters(), lr=1.0, weight_decay=10.0)
     for step in range(2):
         batch = storage[torch.randint(len(storage), (8,), generator=generator)]
+        batch["observation"] = (batch["observation"] - mean) / (std + 1e-6)
         names = ("observation", "action", "return_to_go", "timestep", "mask")
         features = agent.network.every_frame(*(batch[name] for name in names))
         error = (agent.head(features) - batch["action"])[batch["mask"]]
@@ -96,8 +99,9 @@ def test_a_step_is_the_protocols(tmp_path):
     for name, weight in agent.named_parameters():
         trained = state["networks"][name]
         torch.testing.assert_close(trained, weight.detach(), rtol=1e-4, atol=1e-6, msg=name)
-    torch.testing.assert_close(state["networks"]["mean"], mean)
-    torch.testing.assert_close(state["networks"]["std"], std)
+    frames = "network.frame_encoders.observation"
+    torch.testing.assert_close(state["networks"][f"{frames}.mean"], mean)
+    torch.testing.assert_close(state["networks"][f"{frames}.variance"], std**2)
 
 
 def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
@@ -107,13 +111,15 @@ def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
         tmp_path, acting_num_frames=4, return_scale=50.0, evaluation_seed=3, **settings
     )
     algorithm = make_algorithm(recipe)
-    algorithm.load_data()
-    agent = algorithm.agent
+    agent = deepcopy(algorithm.agent)
+    agent.network.history_encoder.return_scale.fill_(1.0)
+    mean, std = algorithm.load_data().observation_statistics()
     env = gymnasium.make("Hopper-v5")
     observation, _ = env.reset(seed=3)
     states, actions, to_go, ended = [], [torch.zeros(3)], [60.0], False
     while not ended:
-        states.append((torch.as_tensor(observation, dtype=torch.float32) - agent.mean) / agent.std)
+        state = torch.as_tensor(observation, dtype=torch.float32)
+        states.append((state - mean) / (std + 1e-6))
         steps = torch.arange(len(states))[-4:]
         window = [torch.stack(x)[steps] for x in (states, actions)]
         returns_to_go = torch.tensor(to_go)[steps].unsqueeze(-1) / 50

@@ -81,16 +81,18 @@ def test_a_step_is_the_protocols(tmp_path):
 
     episodes = load_episodes(recipe.dataset)
     mean, std = episodes.observation_statistics()
-    storage = SequenceStorage(episodes, 6, mean=mean, std=std, return_scale=50.0)
+    storage = SequenceStorage(episodes, 6, return_scale=50.0)
     seed = np.random.SeedSequence([recipe.seed, 0]).generate_state(1).item()
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(recipe.seed)
     agent = make_algorithm(recipe).agent
+    agent.network.history_encoder.return_scale.fill_(1.0)
     optimizer = make_lamb(list(agent.parameters()), 1.0, 1.0)
     log_alpha = torch.tensor(0.1).log().requires_grad_()
     alpha_optimizer = torch.optim.Adam([log_alpha], lr=0.1)
     for step in range(2):
         batch = storage[torch.randint(len(storage), (8,), generator=generator)]
+        batch["observation"] = (batch["observation"] - mean) / (std + 1e-6)
         names = ("observation", "action", "return_to_go", "timestep", "mask")
         features = agent.network.every_frame(*(batch[name] for name in names))
         normal = Normal(*agent.head(features))
@@ -131,7 +133,7 @@ def test_what_a_run_writes(tmp_path):
 
 def test_explores_with_drawn_actions_and_keeps_observations_as_they_are(tmp_path):
     algorithm = make_algorithm(make_odt(tmp_path))
-    algorithm.agent.mean.fill_(100.0)
+    algorithm.agent.network.frames[0].mean.fill_(100.0)
     first, again, other = (algorithm.explore(number) for number in (0, 0, 1))
     assert len(first.lengths) == 1
     assert first.finished.all()

@@ -29,8 +29,9 @@ def value(loss, network, td, params=None):
 
 
 def weights_of(loss, keep=False):
-    """The weights, or copies of them, without the bounds of actions."""
-    weights = {n: w for n, w in loss.state_dict().items() if not n.endswith(("low", "high"))}
+    """The weights, or copies of them, without the bounds of actions and the statistics."""
+    others = ("low", "high", ".count", ".mean", ".variance")
+    weights = {n: w for n, w in loss.state_dict().items() if not n.endswith(others)}
     return weights if keep else {name: weight.clone() for name, weight in weights.items()}
 
 
