@@ -55,9 +55,9 @@ class TrainedAgent:
     def make_transforms(self) -> Compose:
         """Makes the transforms that write the policy's inputs, for your own environment.
 
-        They are those of :attr:`make_env`: histories, the statistics that normalise observations,
-        the return that a Decision Transformer aims for, the state of a recurrent network. Each call
-        makes new ones, because transforms belong to one environment.
+        They are those of :attr:`make_env`: histories, the return that a Decision Transformer aims
+        for, the state of a recurrent network. Each call makes new ones, because transforms belong
+        to one environment.
 
         Example:
             >>> from torchrl.envs import GymEnv, TransformedEnv
