@@ -43,7 +43,7 @@ def first_minibatch(recipe, folder):
     batch = next(algorithm.batches())
     rollout = algorithm.agent.rollout(batch)
     with torch.no_grad():
-        algorithm.agent.update_statistics(rollout.frames)
+        algorithm.agent.update_statistics(rollout)
         add_advantages(batch, rollout, algorithm.agent, algorithm.gae, True)
     torch.manual_seed(0)
     minibatch = next(minibatches(batch, rollout, algorithm.agent, recipe))

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -188,16 +189,16 @@ def test_one_number_has_no_deviation():
 
 
 @pytest.mark.parametrize(("frames", "padding"), [(1, "same"), (8, "same"), (8, "constant")])
-def test_each_observation_counts_once(frames, padding, monkeypatch):
+def test_each_observation_counts_once(frames, padding, tmp_path, monkeypatch):
     """Neither padding nor the frames before a batch; here many episodes, and short batches."""
     monkeypatch.setenv("TORCHRL_TIT_IMPORTS", tasks.__name__)
     backbone = enhanced_tit(frames, embed_dim=8, features_dim=8)
     wrappers = (f"{tasks.__name__}:Split",)
     recipe = replace(RECIPE, backbone=backbone, padding=padding, wrappers=wrappers)
     recipe = replace(recipe, normalize_observations=True, steps_per_batch=16, minibatch_size=16)
-    seen = []
+    seen: list[Any] = []
     algorithm = make_algorithm(recipe)
-    algorithm.prepare(0, None)
+    algorithm.prepare(0, tmp_path)
     for step, batch in enumerate(algorithm.batches()):
         seen.append(batch["observation"].flatten())
         algorithm.update(batch, step * 16)
@@ -221,7 +222,7 @@ def test_each_observation_counts_once(frames, padding, monkeypatch):
     ],
     ids=["K=1", "K=4", "recurrent", "separate trunks"],
 )
-def test_acting_and_updating_read_the_same_statistics(backbone, monkeypatch):
+def test_acting_and_updating_read_the_same_statistics(backbone, tmp_path, monkeypatch):
     """Before an update's first step all ratios are 1, and all values those that were acted on."""
     monkeypatch.setenv("TORCHRL_TIT_IMPORTS", tasks.__name__)
     recipe = replace(
@@ -254,7 +255,7 @@ def test_acting_and_updating_read_the_same_statistics(backbone, monkeypatch):
     torch.set_default_dtype(torch.float64)
     try:
         trained = make_algorithm(recipe)
-        trained.prepare(0, None)
+        trained.prepare(0, tmp_path)
         for step, batch in zip((0, 64, 128), trained.batches()):  # noqa: B905
             assert trained.update(batch, step)["kl_approx"] > 1e-5  # it moves the policy
         trained.close()
@@ -287,7 +288,7 @@ def test_images_are_normalized_by_channel_and_categories_are_not(tmp_path):
     assert not normalized_frames(make_algorithm(categories).networks())
 
 
-def test_the_divergence_is_never_negative(monkeypatch):
+def test_the_divergence_is_never_negative(tmp_path, monkeypatch):
     """It is Schulman's estimate, as in Stable-Baselines3, of the whole minibatch."""
     found, original = [], algorithm.PPOAlgorithm._objective
 
@@ -302,7 +303,7 @@ def test_the_divergence_is_never_negative(monkeypatch):
 
     monkeypatch.setattr(algorithm.PPOAlgorithm, "_objective", recording)
     trained = make_algorithm(replace(RECIPE, learning_rate=0.01, epochs=8))
-    trained.prepare(0, None)
+    trained.prepare(0, tmp_path)
     for step, batch in zip((0, 64), trained.batches()):  # noqa: B905
         trained.update(batch, step)
     trained.close()
