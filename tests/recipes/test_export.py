@@ -41,7 +41,12 @@ SEQUENCES: dict[str, Any] = {"target_returns": (20.0,), "evaluation_episodes": 2
 
 
 def ppo(folder, env):
-    short: dict[str, Any] = {"total_steps": 96, "steps_per_batch": 32, "minibatch_size": 16, "epochs": 2}
+    short: dict[str, Any] = {
+        "total_steps": 96,
+        "steps_per_batch": 32,
+        "minibatch_size": 16,
+        "epochs": 2,
+    }
     return PPO(env=env, **ONLINE, **short, normalize_observations=True)
 
 

@@ -206,7 +206,7 @@ def test_each_observation_counts_once(frames, padding, tmp_path, monkeypatch):
     encoders = normalized_frames(algorithm.networks())
     assert len(encoders) == 2
     for key, encoder in zip(["cart", "pole"], encoders, strict=True):
-        expected = torch.cat(seen)[key]
+        expected = torch.cat([batch[key] for batch in seen])
         assert encoder.count == len(expected) == 256
         torch.testing.assert_close(encoder.mean, expected.mean(0), rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(encoder.variance, expected.var(0, unbiased=False))
