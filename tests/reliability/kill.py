@@ -1,9 +1,11 @@
 """Commands that are killed at random moments and resumed, against one that nobody stopped.
 
 ``make kill`` trains small recipes of each kind, sends SIGKILL to the command and all that it
-started, resumes it, and so on until it ends. Then checkpoints (networks, optimizers, environments,
-replay, random generators), metrics, evaluations and data must be the same, bit for bit, as those of
-a command that ran in one go. It writes ``kill.csv`` as it goes, a row a kill, and ``kill.md``.
+started, resumes it, and so on until it ends. On data, checkpoints (networks, optimizers, random
+generators), metrics and evaluations must then be the same, bit for bit, as those of a command that
+ran in one go. Online, a resumed run begins new episodes: it must end as a copy does that is resumed
+from the same folder, with all rows up to the checkpoint. It writes ``kill.csv`` as it goes, a row a
+kill, and ``kill.md``.
 """
 
 from __future__ import annotations
@@ -109,6 +111,8 @@ class Kind:
     kills: int
     words: Callable[[Path, Path], list[str]]
     """The command that begins, given the folder of recipes and data, and the folder to make."""
+    online: bool = True
+    """Whether it collects steps, so that a resume begins new episodes."""
     resume: bool = True
     """Whether `train --resume` goes on; otherwise the same command does."""
 
@@ -140,8 +144,8 @@ RECIPES: dict[str, Recipe] = {
 KINDS = [
     Kind("PPO", 20, _train("ppo")),
     Kind("SAC", 10, _train("sac")),
-    Kind("CQL", 10, _train("cql")),
-    Kind("DT", 10, _train("dt")),
+    Kind("CQL", 10, _train("cql"), online=False),
+    Kind("DT", 10, _train("dt"), online=False),
     Kind("collect", 10, _collect, resume=False),
     Kind("sweep", 10, _sweep, resume=False),
     Kind("PPO, compiled", 20, _train("compiled")),
@@ -215,14 +219,45 @@ def check(kind: Kind, run: int, inputs: Path, folder: Path, seed: int) -> Iterat
         steps = [int(p.name) for p in killed.rglob("checkpoints/*") if p.name.isdigit()]
         saving = any(".tmp" in path.name for path in killed.rglob(".*"))
         yield [kind.name, run, "killed", round(seconds, 2), max(steps, default=0), saving]
+        copy = folder / f"copy-{run}"
+        shutil.rmtree(copy, ignore_errors=True)
+        if kind.online and killed.exists():
+            shutil.copytree(killed, copy)
         if kind.resume and (killed / "recipe.json").exists():
             words = ["train", "--resume", str(killed)]
     assert process.exitcode == 0, f"{folder / f'killed-{run}.log'} says why it failed"
     if not kills:  # what the first call compiled need not be compiled again
         (folder / "seconds").write_text(str(time.monotonic() - before))
-    compare(whole, killed)
+    if kind.online and kills and copy.exists():
+        _resume_copy(kind, inputs, copy, folder / f"copy-{run}.log")
+        compare(killed, copy)
+        compare_saved(killed, whole)
+        shutil.rmtree(copy)
+    else:
+        compare(whole, killed)
     shutil.rmtree(killed)
     yield [kind.name, run, "identical", "", "", ""]
+
+
+def _resume_copy(kind: Kind, inputs: Path, copy: Path, log: Path) -> None:
+    """Lets a copy of what the last kill left go on to its end."""
+    resumes = kind.resume and (copy / "recipe.json").exists()
+    process = begin(["train", "--resume", str(copy)] if resumes else kind.words(inputs, copy), log)
+    process.join()
+    assert process.exitcode == 0, f"{log} says why it failed"
+
+
+def compare_saved(killed: Path, whole: Path) -> None:
+    """Raises AssertionError if a killed command made other files or steps than a whole one."""
+    for path in whole.rglob("metrics.csv"):
+        other = killed / path.relative_to(whole)
+        steps = [[row["step"] for row in read_metrics(one)] for one in (path, other)]
+        if "training" not in path.parts:  # which ends where a mark is reached
+            assert steps[0] == steps[1], path
+    for path in whole.glob("random.hdf5"):  # no training is behind them
+        with h5py.File(path) as file, h5py.File(killed / path.name) as other_file:
+            for name in file:
+                np.testing.assert_array_equal(file[name], other_file[name])
 
 
 def compare(whole: Path, killed: Path) -> None:
@@ -263,7 +298,7 @@ def prepare(inputs: Path) -> None:
 def summarize(rows: list[list[str]]) -> str:
     """Returns the table as Markdown."""
     lines = [
-        "| what was killed | SIGKILLs | of these while it saved | resumed to the end, identical |",
+        "| what was killed | SIGKILLs | of these while it saved | resumed to the end, the same |",
         "|---|---|---|---|",
     ]
     for kind in KINDS:
