@@ -205,7 +205,7 @@ class Paying(gymnasium.Env):
         return self.observation_space.low, self.pays, self.left == 0, False, {}
 
 
-gymnasium.register("Paying-v0", Paying)
+gymnasium.register("Paying-v0", f"{__name__}:Paying")
 
 
 @pytest.mark.parametrize("later", [math.inf, math.nan])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import random
 import shutil
 from collections.abc import Sequence
@@ -17,10 +18,12 @@ import torch
 
 from recipes.algorithm import NotFiniteError, make_algorithm
 from recipes.callback import Callback
+from recipes.cli import main
 from recipes.dqn import DQN
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO
 from recipes.recipe import Recipe
+from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.run import Run
 from recipes.runner import train
 from recipes.sac import SAC
@@ -243,3 +246,24 @@ def test_a_reward_that_is_not_finite_is_named_in_training(
     message = rf"^the reward of copy \d is {said} in {recipe.env} after step \d+; none was saved$"
     with pytest.raises(NotFiniteError, match=message):
         train_in(tmp_path / "run", recipe)
+
+
+def test_the_command_line_names_it_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", __name__)
+    recipe = replace(PPO_RECIPE, wrappers=(f"{__name__}:Paying(reward='nan')",))
+    (tmp_path / "recipe.json").write_text(recipe_to_json(recipe))
+    with pytest.raises(SystemExit) as exit_:
+        main(["train", str(tmp_path / "recipe.json"), "--out", str(tmp_path / "run")])
+    assert exit_.value.code == 2
+    errors = capsys.readouterr().err
+    assert "is nan in CartPole-v1 after step 0; none was saved" in errors.splitlines()[-1]
+    assert "Traceback" not in errors
+
+
+def test_a_field_that_was_removed_is_read_where_it_did_nothing() -> None:
+    fields = json.loads(recipe_to_json(PPO_RECIPE))
+    assert recipe_from_json(json.dumps({**fields, "async_collection": False}), "f") == PPO_RECIPE
+    with pytest.raises(ValueError, match="'async_collection' no longer exists, and only False"):
+        recipe_from_json(json.dumps({**fields, "async_collection": True}), "f")

@@ -143,7 +143,8 @@ class GymVectorEnv(EnvBase):
         options = None if mask is None else {"reset_mask": mask.flatten().numpy(force=True)}
         self._seed_spaces(seed)
         try:
-            observations, info = self._env.reset(seed=seed, options=options)
+            # Gymnasium's vector environments take sequences too; their base class does not say so.
+            observations, info = self._env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         except ValueError:
             self._check_shapes()
             raise
