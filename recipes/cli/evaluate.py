@@ -64,11 +64,12 @@ def _file_name(own: Recipe, recipe: Recipe, best: bool) -> str:
 
 def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
     """Returns an evaluation in one line."""
-    new = f", on new episodes from seed {evaluation['seed']}"
+    best = evaluation["weights"] == "best"
+    new = f", on new episodes from seed {evaluation['seed']}" if best else ""
     return (
         f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
         f"{evaluation['episodes']} episodes after {evaluation['steps']} {recipe.unit} "
-        f"({evaluation['weights']} weights{new if evaluation['weights'] == 'best' else ''})"
+        f"({evaluation['weights']} weights{new})"
     )
 
 
