@@ -231,8 +231,6 @@ def test_an_edited_recipe_takes_effect(tmp_path):
     "fields",
     [
         {"env": "Acrobot-v1"},
-        {"num_envs": 4},
-        {"backbone": {**BACKBONE, "num_frames": 2}},
         {"backbone": {**BACKBONE, "frame": {"encoder": "inner", "embed_dim": 16}}},
         {"backbone": {**BACKBONE, "frame": {"encoder": "linear", "embed_dim": 8}}},
         {"backbone": {**BACKBONE, "trunks": "separate"}},

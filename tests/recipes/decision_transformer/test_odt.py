@@ -125,8 +125,9 @@ def test_what_a_run_writes(tmp_path):
     assert evaluated == [6, 14, 18]  # after pre-training, two rounds, and the last one
     by_step = {row["step"]: row for row in rows}
     assert math.isnan(by_step[5]["online_return"])
-    assert not math.isnan(by_step[18]["online_return"])
-    assert by_step[18]["alpha"] != by_step[5]["alpha"]
+    assert not math.isnan(by_step[15]["online_return"])
+    assert by_step[15]["alpha"] != by_step[5]["alpha"]
+    assert math.isnan(by_step[18]["alpha"])  # an evaluation between two rows has its own
     assert evaluation["steps"] == 18
     assert evaluation["targets"].keys() == {"40", "10"}
 
