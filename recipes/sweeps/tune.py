@@ -31,6 +31,7 @@ from ..interrupt import raise_on_signals
 from ..metrics import read_metrics
 from ..recipe import Recipe
 from ..recipe_json import recipe_to_json
+from ..run import Run
 from .search_space import SearchSpace, with_values
 from .sweep import Job, start
 from .trials import write_trials
@@ -77,8 +78,8 @@ class Search:
 
     Raises:
         RuntimeError: if another process is using the search.
-        ValueError: if the folder holds another search, or ``study.log`` is damaged or holds values
-            that this search cannot have written.
+        ValueError: if the folder holds another search, ``study.log`` is damaged or holds values
+            that this search cannot have written, or the run of a trial has other values.
     """
 
     def __init__(self, folder: Path, settings: Settings) -> None:
@@ -91,6 +92,7 @@ class Search:
             _write_or_compare(folder / "settings.json", _to_json(settings))
             _write_or_compare(folder / "space.json", msgspec.json.encode(settings.space).decode())
             self.study = self._open_study()
+            self._check_runs()
 
     def _open_study(self) -> optuna.Study:
         settings, path = self.settings, self.journal
@@ -134,6 +136,21 @@ class Search:
             constant_liar=True,
         )
         return study
+
+    def _check_runs(self) -> None:
+        """Raises ValueError if the run of a complete trial has other values than the trial."""
+        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            for seed in self.settings.seeds:
+                folder = self.folder / f"trial-{trial.number}" / f"seed-{seed}"
+                path = folder / "recipe.json"
+                if not path.is_file():
+                    continue
+                recipe = Run.open(folder).recipe
+                if with_values(recipe, trial.params, path) != recipe:
+                    raise ValueError(
+                        f"{folder} holds a run with other settings than trial {trial.number} in "
+                        f"{self.journal}: name another folder with --out, or move it away"
+                    )
 
     @contextmanager
     def _locked(self) -> Iterator[None]:

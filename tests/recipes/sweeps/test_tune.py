@@ -360,10 +360,12 @@ def test_a_trial_is_not_credited_with_the_run_of_another(tmp_path, monkeypatch):
     Search(tmp_path, settings).best()
     assert (tmp_path / "best.json").read_text() == best
 
-    (tmp_path / "study.log").unlink()
     (tmp_path / "trial-0").rename(tmp_path / "other")
     (tmp_path / "trial-1").rename(tmp_path / "trial-0")
     (tmp_path / "other").rename(tmp_path / "trial-1")
+    with pytest.raises(ValueError, match=r"trial-0/seed-0 holds a run with other settings"):
+        Search(tmp_path, settings)
+    (tmp_path / "study.log").unlink()
     search = Search(tmp_path, settings)
     with pytest.raises(ValueError, match=r"trial-0/seed-0 holds a run of .* with other settings"):
         search.run(2, workers=1)
