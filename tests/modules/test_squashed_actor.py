@@ -1,6 +1,7 @@
 """The density of squashed actions, also where they have reached their bounds."""
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -47,7 +48,7 @@ def test_samples_have_their_exact_density_and_gradient(mean, std):
     x = dist.base_dist.rsample().detach().double()
     saturated = (x.abs() > 7.5).double().mean()
     assert saturated > 0.5 or mean < 8
-    tolerance = {"rtol": 1e-5, "atol": 1e-4}
+    tolerance: Any = {"rtol": 1e-5, "atol": 1e-4}
     torch.testing.assert_close(log_prob.double(), density(x, mean, std), **tolerance)
     # With the noise fixed, only the width of the normal and the tanh change with the parameters.
     slopes = torch.autograd.grad(log_prob.sum(), [dist.loc, dist.scale])
@@ -62,7 +63,7 @@ def test_given_actions_at_a_bound_are_evaluated_next_to_it(dtype, gap):
     dist = distribution(mean, std, dtype, samples=2)
     log_prob = dist.log_prob(torch.stack([LOW, HIGH]).to(dtype))
     x = torch.tensor([[gap - 1] * 2, [1 - gap] * 2], dtype=dtype).atanh().double()
-    tolerance = {"rtol": 1e-5, "atol": 0}
+    tolerance: Any = {"rtol": 1e-5, "atol": 0}
     torch.testing.assert_close(log_prob.double(), density(x, mean, std), **tolerance)
     (slope,) = torch.autograd.grad(log_prob.sum(), dist.loc)
     torch.testing.assert_close(slope.double(), (x - mean) / std**2, **tolerance)

@@ -1,5 +1,7 @@
 """Converts Gymnasium's action spaces to TorchRL's specs, and actions to those of the tasks."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
@@ -91,7 +93,7 @@ class ActionWriter:
 
 def refuse_nan(actions: NDArray | Tensor) -> None:
     """Raises ValueError if an action, [..., A], is NaN, which clipping would let pass."""
-    wrong = actions != actions
+    wrong: Any = actions != actions
     if wrong.any():
         raise ValueError(
             f"the action {actions[wrong.any(-1)][0].tolist()} is not a number: expected numbers "

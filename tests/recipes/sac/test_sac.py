@@ -380,7 +380,7 @@ class Endless(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(0 if begin else -np.inf, np.inf, (2,))
 
 
-gymnasium.register("Endless-v0", Endless)
+gymnasium.register("Endless-v0", f"{__name__}:Endless")
 
 
 @pytest.mark.parametrize("kind", [SAC, CQL, TD3BC])
