@@ -107,10 +107,7 @@ def _finish(run: Run, wandb: str | None) -> None:
         return
     step = latest_step(run.checkpoints) or 0
     if not recipe.offline and 0 < step < recipe.final_step:
-        print(
-            f"note: resuming at step {step} with new episodes: environments are not saved",
-            file=sys.stderr,
-        )
+        note(f"resuming at step {step} with new episodes: environments are not saved")
     try:
         with ExitStack() as stack:
             callbacks: list[Callback] = [] if recipe.offline else [UnusedFrames(recipe)]
