@@ -28,7 +28,8 @@ from torchrl_tit.settings.imports import allowed_modules
 
 from .metrics import Metrics
 from .recipe import Recipe
-from .recipe_json import recipe_to_json
+from .recipe_json import recipe_from_json, recipe_to_json
+from .records import Records
 from .registry import find_recipe
 
 _IMPORTS = "imports.json"
@@ -139,6 +140,18 @@ class Run:
         except ValueError as error:
             raise ValueError(f"{error}{_import_hint(folder)}") from error
 
+    def read(self, name: str) -> bytes | None:
+        """Reads a file of the run.
+
+        Args:
+            name: its name in the folder, such as evaluation.json.
+
+        Returns:
+            Its content; None if there is no such file.
+        """
+        path = self.folder / name
+        return path.read_bytes() if path.is_file() else None
+
     def lengthen(self, length: int) -> None:
         """Changes the length of an open run; training then continues to the new end.
 
@@ -173,14 +186,14 @@ class Run:
         Raises:
             ValueError: if their file is damaged.
         """
-        path = self.folder / _LENGTHS
-        try:
-            return msgspec.json.decode(path.read_bytes(), type=list[tuple[int, int]])
-        except FileNotFoundError:
+        content = self.read(_LENGTHS)
+        if content is None:
             return []
+        try:
+            return msgspec.json.decode(content, type=list[tuple[int, int]])
         except msgspec.MsgspecError as error:
             raise ValueError(
-                f"{path} is damaged: expected pairs of step and length, "
+                f"{self.folder / _LENGTHS} is damaged: expected pairs of step and length, "
                 f"such as [[1024, 4096]] ({error})"
             ) from error
 
@@ -294,6 +307,32 @@ class Run:
             return []
         now = package_versions()
         return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
+
+
+class RecordedRun(Run):
+    """A run of a table of runs, which is read as a run folder is; it has no checkpoints.
+
+    Args:
+        records: the table.
+        run: the run's name in it.
+
+    Raises:
+        ValueError: if its recipe cannot be read.
+
+    Example:
+        >>> RecordedRun(Records("docs/results/hopper"), "mlp/seed-0").recipe.env
+        'Hopper-v5'
+    """
+
+    def __init__(self, records: Records, run: str) -> None:
+        folder = records.folder / run
+        recipe = records.read(run, "recipe.json") or b""
+        super().__init__(folder, recipe_from_json(recipe, folder / "recipe.json"))
+        self._records, self._run = records, run
+
+    def read(self, name: str) -> bytes | None:
+        """Reads a file of the run, as far as the table holds it."""
+        return self._records.read(self._run, name)
 
 
 def _import_hint(folder: Path) -> str:

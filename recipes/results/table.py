@@ -42,8 +42,7 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
     runs, notes = [], []
     for run in find_runs(folders):
         try:
-            text = (run.folder / "evaluation.json").read_text(encoding="utf-8")
-            evaluation = json.loads(text)
+            evaluation = json.loads(run.read("evaluation.json") or b"")
             _value(evaluation), evaluation["returns"], evaluation["steps"]
         except (OSError, ValueError, LookupError, TypeError):
             notes.append(f"{run.folder} is left out: it has no evaluation yet")

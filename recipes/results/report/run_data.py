@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...metrics import read_metrics
+from ...metrics import parse_metrics
 from ...recipe import Recipe
 from ...run import Run
 from ..experiments import Experiment, check_together, find_runs, group_runs
@@ -98,7 +98,7 @@ def _by_seed(runs: Iterable[Run]) -> list[Run]:
 
 
 def _read(run: Run) -> RunData:
-    rows = read_metrics(run.folder / "metrics.csv")
+    rows = parse_metrics(run.read("metrics.csv"), run.folder / "metrics.csv")
     if not rows:
         raise ValueError(
             f"{run.folder} has no metrics yet: train it first, or leave it out of the report"
@@ -111,28 +111,30 @@ def _read(run: Run) -> RunData:
         metrics["steps_per_second"] = np.diff(metrics["step"], prepend=np.nan) / np.diff(
             metrics.get("time", metrics["step"]), prepend=np.nan
         )
-    return RunData(run, metrics, _evaluation(run.folder / "evaluation.json"), _versions(run.folder))
+    return RunData(run, metrics, _evaluation(run), _versions(run))
 
 
-def _evaluation(path: Path) -> dict[str, Any] | None:
-    if not path.exists():
+def _evaluation(run: Run) -> dict[str, Any] | None:
+    content = run.read("evaluation.json")
+    if content is None:
         return None
     try:
-        found = json.loads(path.read_bytes())
+        found = json.loads(content)
         returns = [float(value) for value in found["returns"]]
         numbers = [float(found[name]) for name in ("mean", "std", "steps")]
         if not returns or not np.isfinite([*returns, *numbers]).all():
             raise ValueError("its numbers are not finite")
     except (ValueError, LookupError, TypeError) as error:
         raise ValueError(
-            f"{path} is damaged: `evaluate {path.parent}` writes it again ({error})"
+            f"{run.folder / 'evaluation.json'} is damaged: `evaluate {run.folder}` writes it again "
+            f"({error})"
         ) from error
     return {"episodes": len(returns), **found, "returns": returns}
 
 
-def _versions(folder: Path) -> dict[str, Any]:
+def _versions(run: Run) -> dict[str, Any]:
     try:
-        found = json.loads((folder / "versions.json").read_bytes())
+        found = json.loads(run.read("versions.json") or b"")
     except (OSError, ValueError):  # missing or damaged: the report says that they are unknown
         return {}
     return found if isinstance(found, dict) else {}
