@@ -80,7 +80,7 @@ versions/%: $(VENV)/installed-versions
 RUNS ?= runs/reliability
 MINUTES ?= 120
 
-kill: $(VENV)/installed-test  ## Kill runs at random moments and resume them, bit for bit (45 minutes)
+kill: $(VENV)/installed-test  ## Kill runs at random moments and resume them (45 minutes)
 	$(ONE_THREAD) $(BIN)/python -m tests.reliability.kill --runs $(RUNS)/kill $(ARGS)
 
 fuzz: $(VENV)/installed-test  ## Give 1,000 wrong inputs to recipes, networks, data sets and commands

@@ -122,7 +122,10 @@ class Algorithm(ABC, Generic[RecipeT]):
 
     @abstractmethod
     def state(self) -> Mapping[str, Stateful]:
-        """Returns what a checkpoint stores besides the networks, to resume a run bit for bit."""
+        """Returns what a checkpoint stores besides the networks, so that a resume loses nothing.
+
+        Collectors and environments are not part of it: a resumed run begins new episodes.
+        """
 
     def returns(self, batch: Any) -> Tensor | None:
         """Gets the returns of episodes that ended in a batch, float [episodes]; None if offline."""

@@ -27,8 +27,8 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
         random.hdf5, random-v0/   a data set in D4RL's layout, and the same as a Minari data set
         mixed.hdf5, mixed-v0/ ...
 
-    Work that a killed process finished is not repeated, and the data are the same as without the
-    interruption (except for games, whose state cannot be saved).
+    Work that a killed process finished is not repeated. A training that it cut off goes on from its
+    newest checkpoint with new episodes.
 
     Args:
         settings: what to make.

@@ -55,8 +55,7 @@ class Collection:
     num_envs: Copies = 8
     """Number of environments for medium, expert and random sets."""
     checkpoint_interval: Steps = 10_000
-    """Environment steps between checkpoints of the training. It should be large for games and other
-    tasks that cannot be saved, which begin new episodes at each checkpoint."""
+    """Environment steps between checkpoints of the training."""
     seed: Seed = 0
     """Seed of agent, environments and sets."""
     threads: Threads = 1

@@ -49,8 +49,6 @@ def _named() -> list[DQN]:
         exploration_fraction=0.1,
         target_interval=250,
         clip_rewards=True,
-        # Games cannot be saved, so new ones begin at each checkpoint (docs/environments.md).
-        checkpoint_interval=500_000,
     )
     return [
         cartpole,

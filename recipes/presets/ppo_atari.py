@@ -69,8 +69,6 @@ def _named(game: str) -> list[PPO]:
         decay_clip_epsilon=True,
         entropy_coeff=0.01,
         clip_rewards=True,
-        # Games cannot be saved, so new ones begin at each checkpoint (docs/environments.md).
-        checkpoint_interval=500_000,
     )
     recipes = {name: replace(base, backbone=network) for name, network in _BASELINES.items()}
     # The techniques of the baselines' own papers (for CoBERL arXiv 2107.05431). arXiv 2212.14538
