@@ -21,7 +21,6 @@ from ..recipe import Recipe
 from ..recipe_json import recipe_from_json, recipe_to_json
 from ..run import Run
 from ..runner import load_trained
-from .named_parts import check_named_parts
 
 Device = Literal["cpu", "cuda", "auto"]
 
@@ -39,7 +38,6 @@ def agent_from_files(files: AgentFiles, name: str, device: Device) -> TrainedAge
         ValueError: if the recipe cannot be read, or its task or networks cannot be built.
     """
     recipe = recipe_from_json(files.recipe, files.folder / RECIPE)
-    check_named_parts(recipe)
     try:
         algorithm = make_algorithm(_acting(recipe, files.evaluation, device))
     except (MemoryError, RuntimeError) as error:  # networks larger than the memory
@@ -71,7 +69,6 @@ def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
         ValueError: as in :func:`agent_from_files`.
     """
     run = Run.open(folder)
-    check_named_parts(run.recipe)
     evaluation = read_evaluation(folder, latest_step(run.checkpoints))
     recipe = _acting(run.recipe, evaluation, device)
     # Loading sets the number of PyTorch's threads, which is up to the caller here.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import gymnasium
 from torch import Tensor
 
 from torchrl_tit.datasets import (
@@ -19,6 +18,7 @@ from torchrl_tit.datasets import (
 from torchrl_tit.datasets.sources import HDF5_SUFFIXES
 
 from ..collect.collect import collect
+from ..trust import may_name_task
 
 __all__ = ["collect", "convert_episodes", "describe", "run"]
 
@@ -125,7 +125,7 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
         write_hdf5(episodes, target)
     else:
         recorded = episodes.attributes.get("env_id")
-        known = recorded if recorded in gymnasium.registry else None
+        known = str(recorded) if may_name_task(recorded) else None
         write_minari(episodes, target, env_name or known)
     text = (
         f"{episodes.num_transitions} transitions in {len(episodes.lengths)} episodes written to "

@@ -30,9 +30,9 @@ def evaluate(arguments: list[str]) -> None:
     add_machine_options(parser)
     options = parser.parse_args(arguments)
     from .. import runner  # not at the top: help needs no PyTorch
-    from .opening import open_run
+    from ..run import Run
 
-    run = open_run(options.run)
+    run = Run.open(options.run)
     recipe = override(
         run.recipe,
         evaluation_episodes=options.episodes,
@@ -81,9 +81,9 @@ def render(arguments: list[str]) -> None:
     )
     options = parser.parse_args(arguments)
     from ..results.film import film  # not at the top: help needs no PyTorch
-    from .opening import open_run
+    from ..run import Run
 
-    run = open_run(options.run)
+    run = Run.open(options.run)
     recipe = override(run.recipe, evaluation_seed=options.seed)
     returns = film(recipe, run, options.out, options.episodes)
     print(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")

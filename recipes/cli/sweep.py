@@ -9,6 +9,7 @@ from pathlib import Path
 from ..algorithm import make_algorithm
 from ..registry import find_recipe
 from ..sweeps.sweep import make_jobs, run_jobs
+from ..trust import allow_names
 from ..wandb_metrics import check_wandb
 from .arguments import Parser, fail, program
 
@@ -90,6 +91,7 @@ def tune(arguments: list[str]) -> None:
     except ModuleNotFoundError as error:
         raise ValueError("tune needs Optuna: pip install 'torchrl-tit[tune]'") from error
     recipe = find_recipe(options.name)
+    allow_names(recipe)
     make_algorithm(recipe).check()
     settings = Settings(
         recipe,

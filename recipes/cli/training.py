@@ -22,7 +22,6 @@ from ..run import Run
 from ..wandb_metrics import WandbMetrics, check_wandb
 from .arguments import option, override, program
 from .evaluate import one_line
-from .opening import open_run
 from .unused_frames import UnusedFrames
 
 
@@ -71,7 +70,7 @@ def resume(
     """
     if wandb is not None:
         check_wandb(wandb)
-    with open_run(folder) as run:
+    with Run.open(folder) as run:
         if lengths:
             _lengthen(run, lengths)
         run.recipe = override(run.recipe, device=device, threads=threads)
