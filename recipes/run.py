@@ -16,6 +16,7 @@ from typing import Any
 import filelock
 import msgspec
 
+from torchrl_tit.agents.folder import read_evaluation
 from torchrl_tit.checkpoint import (
     CheckpointError,
     checkpoint_steps,
@@ -273,10 +274,10 @@ class Run:
     def is_complete(self) -> bool:
         """Whether the run is trained and evaluated and its learning curve is drawn."""
         try:
-            evaluation = json.loads((self.folder / "evaluation.json").read_text(encoding="utf-8"))
-            evaluated = evaluation["steps"] >= self.recipe.final_step
-        except (OSError, ValueError, LookupError, TypeError):
+            evaluation = read_evaluation(self.folder)
+        except (OSError, ValueError):  # it is written again
             return False
+        evaluated = evaluation is not None and evaluation["steps"] >= self.recipe.final_step
         return evaluated and self.curve.is_file()
 
     @property

@@ -164,7 +164,7 @@ def _home(name: str) -> str | None:
 
 def _registry() -> Mapping[str, Any]:
     # By name, because commands that read no file start without Gymnasium.
-    return import_module("gymnasium").registry  # type: ignore[no-any-return]
+    return import_module("gymnasium").registry
 
 
 def _of_values(value: Any, module: str) -> Iterator[tuple[str, str]]:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 
 from torchrl_tit.agents import AgentError, TrainedAgent
-from torchrl_tit.agents.folder import EVALUATION, RECIPE, AgentFiles, check_evaluation
+from torchrl_tit.agents.folder import RECIPE, AgentFiles, read_evaluation
 from torchrl_tit.checkpoint import latest_step
 
 from ..algorithm import Algorithm, load_weights, make_algorithm
@@ -69,7 +69,7 @@ def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
         ValueError: as in :func:`agent_from_files`.
     """
     run = Run.open(folder)
-    evaluation = read_evaluation(folder, latest_step(run.checkpoints))
+    evaluation = evaluation_of(folder, latest_step(run.checkpoints))
     recipe = _acting(run.recipe, evaluation, device)
     # Loading sets the number of PyTorch's threads, which is up to the caller here.
     steps, algorithm, _ = load_trained(run, replace(recipe, threads=torch.get_num_threads()))
@@ -77,12 +77,11 @@ def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
     return _agent(str(folder), run.recipe, algorithm, steps, evaluation, versions)
 
 
-def read_evaluation(folder: Path, steps: int | None) -> dict[str, Any]:
+def evaluation_of(folder: Path, steps: int | None) -> dict[str, Any]:
     """Reads a run's evaluation of the checkpoint of a step; empty if there is none."""
-    evaluation = read_json(folder / EVALUATION)
-    with suppress(ValueError):
-        check_evaluation(evaluation)
-        if evaluation.get("steps") == steps:
+    with suppress(OSError, ValueError):
+        evaluation = read_evaluation(folder)
+        if evaluation is not None and evaluation["steps"] == steps:
             return evaluation
     return {}
 

@@ -16,6 +16,7 @@ from torchrl_tit.datasets import (
     write_minari,
 )
 from torchrl_tit.datasets.sources import HDF5_SUFFIXES
+from torchrl_tit.settings.checks import printable
 
 from ..collect.collect import collect
 from ..trust import may_name_task
@@ -92,7 +93,7 @@ def describe(episodes: Episodes) -> str:
     if episodes.left_out:
         lines["not read"] = ", ".join(episodes.left_out)
     lines.update({name: str(value) for name, value in episodes.attributes.items()})
-    return "\n".join(f"{name:<13} {text}" for name, text in lines.items())
+    return "\n".join(f"{printable(name):<13} {printable(text)}" for name, text in lines.items())
 
 
 def convert_episodes(episodes: Episodes, target: str, env_name: str | None = None) -> str:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_tit.settings.checks import printable
+
 from ..recipe import Recipe, experiment_of
 from ..recipe_json import recipe_to_json
 from ..registry import RECIPES
@@ -133,7 +135,7 @@ def changed_fields(before: Recipe, after: Recipe) -> str:
         for field, value in new.items()
         if value != {} and (field not in old or old[field] != value)
     ]
-    return ", ".join(f"{field} {new[field]}" for field in changed)
+    return ", ".join(printable(f"{field} {new[field]}") for field in changed)
 
 
 def fields_of(recipe: Recipe) -> dict[str, Any]:

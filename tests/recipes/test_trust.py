@@ -149,7 +149,7 @@ def test_wrappers_on_the_list_exist():
 @pytest.mark.parametrize("what", HOSTILE)
 def test_what_the_user_says_is_allowed(what):
     changes, _ = HOSTILE[what]
-    fields = {key: tuple(v) if isinstance(v, list) else v for key, v in changes.items()}
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in changes.items()}
     recipe = replace(get_recipe(NAME), **fields)
     allow_names(recipe)  # as if it had been typed
     check_names(recipe, "recipe.json")
@@ -185,7 +185,7 @@ def test_what_was_typed_is_asked_for_again(folder, capsys):
 
 def test_names_that_the_running_program_has_registered(monkeypatch):
     monkeypatch.setattr(gymnasium.envs.registration, "registry", dict(gymnasium.registry))
-    gymnasium.register("Own-v0", lambda **_: None)  # type: ignore[arg-type, return-value]
+    gymnasium.register("Own-v0", lambda **_: None)  # type: ignore[arg-type]
     gymnasium.register("Lazy-v0", "not_loaded:Task")
     registry = gymnasium.envs.registration.registry
     monkeypatch.setattr(gymnasium, "registry", registry)

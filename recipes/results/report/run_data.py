@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from torchrl_tit.agents.folder import read_evaluation
+
 from ...metrics import read_metrics
 from ...recipe import Recipe
 from ...run import Run
@@ -111,23 +113,7 @@ def _read(run: Run) -> RunData:
         metrics["steps_per_second"] = np.diff(metrics["step"], prepend=np.nan) / np.diff(
             metrics.get("time", metrics["step"]), prepend=np.nan
         )
-    return RunData(run, metrics, _evaluation(run.folder / "evaluation.json"), _versions(run.folder))
-
-
-def _evaluation(path: Path) -> dict[str, Any] | None:
-    if not path.exists():
-        return None
-    try:
-        found = json.loads(path.read_bytes())
-        returns = [float(value) for value in found["returns"]]
-        numbers = [float(found[name]) for name in ("mean", "std", "steps")]
-        if not returns or not np.isfinite([*returns, *numbers]).all():
-            raise ValueError("its numbers are not finite")
-    except (ValueError, LookupError, TypeError) as error:
-        raise ValueError(
-            f"{path} is damaged: `evaluate {path.parent}` writes it again ({error})"
-        ) from error
-    return {"episodes": len(returns), **found, "returns": returns}
+    return RunData(run, metrics, read_evaluation(run.folder), _versions(run.folder))
 
 
 def _versions(folder: Path) -> dict[str, Any]:
