@@ -13,6 +13,7 @@ from typing import Any
 
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
+from torchrl_tit.agents.folder import MOST_STEPS, is_number
 from torchrl_tit.files import naming, write_text_atomic
 
 
@@ -123,10 +124,14 @@ def parse_metrics(content: bytes | None, path: Path) -> list[dict[str, float]]:
         lines = (content or b"").decode().splitlines(keepends=True)
         for cells in csv.DictReader(line for line in lines if line.endswith("\n")):
             row = {name: float(value) for name, value in cells.items()}
-            if not row["step"].is_integer():
-                raise ValueError("its step is not a whole number")
+            before = rows[-1]["step"] if rows else -1
+            if not (row["step"].is_integer() and before < row["step"] <= MOST_STEPS):
+                raise ValueError("its step is not a whole number above that of the row before")
+            # NaN and infinity stand for numbers that do not exist, and are not drawn.
+            if wrong := [name for name, x in row.items() if math.isfinite(x) and not is_number(x)]:
+                raise ValueError(f"its {wrong[0]} is {row[wrong[0]]}")
             rows.append(row)
     except (csv.Error, LookupError, TypeError, ValueError) as error:
         last = f"step {rows[-1]['step']:.0f}" if rows else "its beginning"
-        raise ValueError(f"{path} has a damaged row after {last}") from error
+        raise ValueError(f"{path} has a damaged row after {last} ({error})") from error
     return rows

@@ -13,6 +13,7 @@ from torchrl_tit.settings.checks import nearest
 from torchrl_tit.settings.fields import checked, field_types
 
 from .recipe import Recipe, get_recipe_class
+from .trust import check_names
 
 T = TypeVar("T")
 
@@ -47,15 +48,18 @@ def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
         source: the file it came from, for messages.
 
     Raises:
-        ValueError: if it is not JSON, a field is unknown or has the wrong type or value.
+        ValueError: if it is not JSON, a field is unknown or has the wrong type or value, or it
+            names what a file may not name (:mod:`recipes.trust`).
     """
     try:
         fields = json.loads(text)
         if not isinstance(fields, dict):
             raise ValueError("expected an object with the recipe's fields")
-        return _convert(get_recipe_class(fields.pop("algorithm", None)), fields)
+        recipe = _convert(get_recipe_class(fields.pop("algorithm", None)), fields)
     except (RecursionError, ValueError) as error:  # json.JSONDecodeError is one
         raise ValueError(f"{source} cannot be read as a recipe: {error}") from error
+    check_names(recipe, source)
+    return recipe
 
 
 def _convert(kind: type[T], fields: Any, prefix: str = "") -> T:

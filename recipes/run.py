@@ -16,6 +16,7 @@ from typing import Any
 import filelock
 import msgspec
 
+from torchrl_tit.agents.folder import parse_evaluation, read_evaluation
 from torchrl_tit.checkpoint import (
     CheckpointError,
     checkpoint_steps,
@@ -152,6 +153,14 @@ class Run:
         path = self.folder / name
         return path.read_bytes() if path.is_file() else None
 
+    def read_evaluation(self) -> dict[str, Any] | None:
+        """Reads and checks the run's evaluation; None if there is none.
+
+        Raises:
+            ValueError: if it is damaged; the message names the file.
+        """
+        return read_evaluation(self.folder)
+
     def lengthen(self, length: int) -> None:
         """Changes the length of an open run; training then continues to the new end.
 
@@ -286,10 +295,10 @@ class Run:
     def is_complete(self) -> bool:
         """Whether the run is trained and evaluated and its learning curve is drawn."""
         try:
-            evaluation = json.loads((self.folder / "evaluation.json").read_text(encoding="utf-8"))
-            evaluated = evaluation["steps"] >= self.recipe.final_step
-        except (OSError, ValueError, LookupError, TypeError):
+            evaluation = read_evaluation(self.folder)
+        except (OSError, ValueError):  # it is written again
             return False
+        evaluated = evaluation is not None and evaluation["steps"] >= self.recipe.final_step
         return evaluated and self.curve.is_file()
 
     @property
@@ -333,6 +342,11 @@ class RecordedRun(Run):
     def read(self, name: str) -> bytes | None:
         """Reads a file of the run, as far as the table holds it."""
         return self._records.read(self._run, name)
+
+    def read_evaluation(self) -> dict[str, Any] | None:
+        """Reads and checks the run's evaluation; None if there is none."""
+        content = self.read("evaluation.json")
+        return None if content is None else parse_evaluation(content, self.folder)
 
 
 def _import_hint(folder: Path) -> str:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 
 from torchrl_tit.agents import AgentError, TrainedAgent
-from torchrl_tit.agents.folder import EVALUATION, RECIPE, AgentFiles, check_evaluation
+from torchrl_tit.agents.folder import RECIPE, AgentFiles, read_evaluation
 from torchrl_tit.checkpoint import latest_step
 
 from ..algorithm import Algorithm, load_weights, make_algorithm
@@ -21,7 +21,6 @@ from ..recipe import Recipe
 from ..recipe_json import recipe_from_json, recipe_to_json
 from ..run import Run
 from ..runner import load_trained
-from .named_parts import check_named_parts
 
 Device = Literal["cpu", "cuda", "auto"]
 
@@ -39,7 +38,6 @@ def agent_from_files(files: AgentFiles, name: str, device: Device) -> TrainedAge
         ValueError: if the recipe cannot be read, or its task or networks cannot be built.
     """
     recipe = recipe_from_json(files.recipe, files.folder / RECIPE)
-    check_named_parts(recipe)
     try:
         algorithm = make_algorithm(_acting(recipe, files.evaluation, device))
     except (MemoryError, RuntimeError) as error:  # networks larger than the memory
@@ -71,8 +69,7 @@ def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
         ValueError: as in :func:`agent_from_files`.
     """
     run = Run.open(folder)
-    check_named_parts(run.recipe)
-    evaluation = read_evaluation(folder, latest_step(run.checkpoints))
+    evaluation = evaluation_of(folder, latest_step(run.checkpoints))
     recipe = _acting(run.recipe, evaluation, device)
     # Loading sets the number of PyTorch's threads, which is up to the caller here.
     steps, algorithm, _ = load_trained(run, replace(recipe, threads=torch.get_num_threads()))
@@ -80,12 +77,11 @@ def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
     return _agent(str(folder), run.recipe, algorithm, steps, evaluation, versions)
 
 
-def read_evaluation(folder: Path, steps: int | None) -> dict[str, Any]:
+def evaluation_of(folder: Path, steps: int | None) -> dict[str, Any]:
     """Reads a run's evaluation of the checkpoint of a step; empty if there is none."""
-    evaluation = read_json(folder / EVALUATION)
-    with suppress(ValueError):
-        check_evaluation(evaluation)
-        if evaluation.get("steps") == steps:
+    with suppress(OSError, ValueError):
+        evaluation = read_evaluation(folder)
+        if evaluation is not None and evaluation["steps"] == steps:
             return evaluation
     return {}
 

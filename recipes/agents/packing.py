@@ -20,7 +20,7 @@ from ..recipe import Recipe
 from ..recipe_json import recipe_to_json
 from ..run import Run
 from ..runner import load_trained
-from .building import read_evaluation, read_json
+from .building import evaluation_of, read_json
 from .card import Facts, make_card
 
 
@@ -54,7 +54,7 @@ def pack(
         _check_words("license", license)
     run = Run.open(folder)
     steps, algorithm, _ = load_trained(run)
-    evaluation = read_evaluation(folder, steps)
+    evaluation = evaluation_of(folder, steps)
     if not evaluation:
         raise AgentError(
             f"{folder} has no evaluation of its newest checkpoint, that of step {steps}: run "

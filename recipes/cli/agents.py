@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from .arguments import Parser, check_seed, fail, program
+from .arguments import Parser, check_seed, fail, program, say
 
 _EPISODES = 10
 _MOST = 1_000_000
@@ -62,12 +62,12 @@ def play(arguments: list[str]) -> None:
         if known
         else ""
     )
-    print(
+    say(
         f"{agent.name}: return {returns.mean():.1f} ± {returns.std(correction=0):.1f} over "
         f"{len(returns)} episode{'s' * (len(returns) > 1)} of {agent.recipe['env']}{before}"
     )
     if options.out is not None:
-        print(f"written to {options.out}")
+        say(f"written to {options.out}")
 
 
 def share(arguments: list[str]) -> None:
@@ -109,7 +109,7 @@ def share(arguments: list[str]) -> None:
         write_agent(folder, files, steps)
         if options.out is not None:
             size = sum(map(len, files.values()))
-            print(f"written to {folder}: {size / 1e6:.2f} MB")
+            say(f"written to {folder}: {size / 1e6:.2f} MB")
         if repository is not None:
             _upload(folder, repository, options.private)
 
@@ -120,7 +120,7 @@ def _upload(folder: Path, repository: str, private: bool) -> None:
 
     read_agent(folder)  # only complete, unmodified agents are uploaded
     address = upload(folder, repository, private=private)
-    print(f"uploaded to {address}\nload_agent({PREFIX + repository!r}) loads it")
+    say(f"uploaded to {address}\nload_agent({PREFIX + repository!r}) loads it")
 
 
 def _list() -> None:
@@ -133,7 +133,7 @@ def _list() -> None:
         fail("no agents come with this copy of torchrl-tit: name a folder or hf:user/name")
     for name in names:
         evaluation = read_agent(find_agent(name)).evaluation
-        print(
+        say(
             f"{name}: {evaluation['env']}, return {evaluation['mean']:.1f} ± "
             f"{evaluation['std']:.1f} over {evaluation['episodes']} episodes"
         )

@@ -12,6 +12,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
+from torchrl_tit.settings.checks import printable
 from torchrl_tit.settings.numbers import MAX_SEED
 
 from ..recipe import Recipe
@@ -105,7 +106,17 @@ def program() -> str:
     return "python -m recipes" if name == "__main__.py" else name
 
 
+def say(text: str) -> None:
+    """Prints lines; all text of a command passes here, or below, as it may come from files."""
+    print("\n".join(map(printable, text.split("\n"))))
+
+
+def note(text: str, kind: str = "note: ") -> None:
+    """Prints a line to standard error."""
+    print(f"{kind}{printable(' '.join(text.split()))}", file=sys.stderr)
+
+
 def fail(message: str) -> NoReturn:
     """Exits with a one-line error message."""
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    note(message, "error: ")
     sys.exit(2)

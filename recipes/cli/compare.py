@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from torchrl_tit.files import write_text_atomic
@@ -10,7 +9,7 @@ from torchrl_tit.files import write_text_atomic
 from ..results.experiments import check_together, find_runs, group_runs
 from ..results.plot import plot_comparison, plot_table
 from ..results.table import make_table, to_csv, to_markdown
-from .arguments import Parser, fail, program
+from .arguments import Parser, fail, note, program, say
 
 
 def compare(arguments: list[str]) -> None:
@@ -31,7 +30,7 @@ def compare(arguments: list[str]) -> None:
     curves = {experiment.label: experiment.runs for experiment in experiments}
     offline = experiments[0].settings.offline
     plot_comparison(curves, options.out, title=options.title, offline=offline)
-    print(f"written to {options.out}")
+    say(f"written to {options.out}")
 
 
 def table(arguments: list[str]) -> None:
@@ -42,12 +41,12 @@ def table(arguments: list[str]) -> None:
     parser.add_argument("--out", type=Path, help="folder for table.md, table.csv and table.png")
     options = parser.parse_args(arguments)
     cells, notes = make_table(options.folders)
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
-    print(to_csv(cells) if options.format == "csv" else to_markdown(cells), end="")
+    for line in notes:
+        note(line)
+    say((to_csv(cells) if options.format == "csv" else to_markdown(cells)).rstrip("\n"))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         write_text_atomic(options.out / "table.md", to_markdown(cells))
         write_text_atomic(options.out / "table.csv", to_csv(cells))
         plot_table(cells, options.out / "table.png")
-        print(f"written to {options.out}")
+        say(f"written to {options.out}")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +16,7 @@ from torchrl_tit.settings import resolve
 from torchrl_tit.settings.imports import import_options
 
 from ..collect import Collection
-from .arguments import Parser, parse_fields, program
+from .arguments import Parser, note, parse_fields, program, say
 
 
 def data(arguments: list[str]) -> None:
@@ -26,7 +25,7 @@ def data(arguments: list[str]) -> None:
         return _collect(arguments[1:])
     parser = Parser(f"{program()} data")
     _add_options(parser)
-    print(resolve(f"{__package__}.data_sets:run")(parser.parse_args(arguments)))
+    say(resolve(f"{__package__}.data_sets:run")(parser.parse_args(arguments)))
 
 
 def _collect(arguments: list[str]) -> None:
@@ -45,9 +44,9 @@ def _collect(arguments: list[str]) -> None:
         collect = resolve(f"{__package__}.data_sets:collect")
         lines = collect(parsed.collection, parsed.out, shlex.join(words))
     except KeyboardInterrupt:
-        print("stopped; the same command resumes", file=sys.stderr)
+        note("stopped; the same command resumes", "")
         raise
-    print("\n".join(lines))
+    say("\n".join(lines))
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import gymnasium
 from torch import Tensor
 
 from torchrl_tit.datasets import (
@@ -17,8 +16,10 @@ from torchrl_tit.datasets import (
     write_minari,
 )
 from torchrl_tit.datasets.sources import HDF5_SUFFIXES
+from torchrl_tit.settings.checks import printable
 
 from ..collect.collect import collect
+from ..trust import may_name_task
 
 __all__ = ["collect", "convert_episodes", "describe", "run"]
 
@@ -92,7 +93,7 @@ def describe(episodes: Episodes) -> str:
     if episodes.left_out:
         lines["not read"] = ", ".join(episodes.left_out)
     lines.update({name: str(value) for name, value in episodes.attributes.items()})
-    return "\n".join(f"{name:<13} {text}" for name, text in lines.items())
+    return "\n".join(f"{printable(name):<13} {printable(text)}" for name, text in lines.items())
 
 
 def convert_episodes(episodes: Episodes, target: str, env_name: str | None = None) -> str:
@@ -125,7 +126,7 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
         write_hdf5(episodes, target)
     else:
         recorded = episodes.attributes.get("env_id")
-        known = recorded if recorded in gymnasium.registry else None
+        known = str(recorded) if may_name_task(recorded) else None
         write_minari(episodes, target, env_name or known)
     text = (
         f"{episodes.num_transitions} transitions in {len(episodes.lengths)} episodes written to "

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..recipe import Recipe
-from .arguments import Parser, add_machine_options, fail, override, program
+from .arguments import Parser, add_machine_options, fail, override, program, say
 
 
 def evaluate(arguments: list[str]) -> None:
@@ -30,9 +30,9 @@ def evaluate(arguments: list[str]) -> None:
     add_machine_options(parser)
     options = parser.parse_args(arguments)
     from .. import runner  # not at the top: help needs no PyTorch
-    from .opening import open_run
+    from ..run import Run
 
-    run = open_run(options.run)
+    run = Run.open(options.run)
     recipe = override(
         run.recipe,
         evaluation_episodes=options.episodes,
@@ -48,7 +48,7 @@ def evaluate(arguments: list[str]) -> None:
         evaluation = runner.evaluate(run, recipe, best=options.best)
         out = options.out or run.folder / _file_name(run.recipe, recipe, options.best)
         run.save_evaluation(evaluation, out)
-    print(f"{one_line(recipe, evaluation)}\nwritten to {out}")
+    say(f"{one_line(recipe, evaluation)}\nwritten to {out}")
 
 
 def _file_name(own: Recipe, recipe: Recipe, best: bool) -> str:
@@ -81,9 +81,9 @@ def render(arguments: list[str]) -> None:
     )
     options = parser.parse_args(arguments)
     from ..results.film import film  # not at the top: help needs no PyTorch
-    from .opening import open_run
+    from ..run import Run
 
-    run = open_run(options.run)
+    run = Run.open(options.run)
     recipe = override(run.recipe, evaluation_seed=options.seed)
     returns = film(recipe, run, options.out, options.episodes)
-    print(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")
+    say(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .arguments import Parser, check_seed, program
+from .arguments import Parser, check_seed, program, say
 
 _MAPS = ("grad-cam", "integrated-gradients", "attention")
 
@@ -63,4 +63,4 @@ def explain(arguments: list[str]) -> None:
         layer=options.layer,
     )
     steps = f"{shown} steps" if shown > 1 else "1 step"
-    print(f"{steps} of the episode of seed {seed}\nwritten to {options.out}")
+    say(f"{steps} of the episode of seed {seed}\nwritten to {options.out}")

@@ -7,7 +7,7 @@ from typing import Any
 
 from torchrl_tit.settings.literals import parse_assignments
 
-from .arguments import Parser, program
+from .arguments import Parser, program, say
 
 
 def export(arguments: list[str]) -> None:
@@ -55,7 +55,7 @@ def export(arguments: list[str]) -> None:
         sample=options.sample,
         facts=_facts(agent.recipe, agent.steps),
     )
-    print(
+    say(
         f"{agent.name}: {', '.join(facts['inputs'])} -> {', '.join(facts['outputs'])}; differs by "
         f"{facts['difference']:.0e} at most\nwritten to {options.out}"
     )

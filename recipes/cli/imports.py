@@ -50,5 +50,6 @@ def _named(arguments: list[str]) -> Iterator[str]:
     """Modules in arguments such as ``module:Task-v0``: users who type one want it imported."""
     for argument in arguments:
         found = _MODULE_AND_NAME.fullmatch(argument)
-        if found and not found[1].endswith((".", ".py")):
+        # `hf:user/name` is an agent, whose files are not the user's own word.
+        if found and found[1] != "hf" and not found[1].endswith((".", ".py")):
             yield found[1]

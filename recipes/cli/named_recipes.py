@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from fnmatch import fnmatchcase
 
 from torchrl_tit.settings.plugins import load_plugins
 
 from ..recipe_json import recipe_to_json
 from ..registry import RECIPES, find_recipe
-from .arguments import Parser, fail, program
+from .arguments import Parser, fail, note, program, say
 
 
 def list_recipes(arguments: list[str]) -> None:
@@ -18,15 +17,15 @@ def list_recipes(arguments: list[str]) -> None:
     parser.add_argument("pattern", nargs="?", default="", help="part of a name; * is any text")
     pattern = parser.parse_args(arguments).pattern
     for failure in load_plugins():
-        print(f"note: {failure}", file=sys.stderr)
+        note(failure)
     names = [name for name in RECIPES if fnmatchcase(name, f"*{pattern.lower()}*")]
     if not names:
         fail(f"no recipe's name contains {pattern!r}: `{program()} list` prints all names")
-    print("\n".join(names))
+    say("\n".join(names))
 
 
 def show(arguments: list[str]) -> None:
     """Prints a recipe as JSON."""
     parser = Parser(f"{program()} show")
     parser.add_argument("name", help="name of a recipe, or a JSON or Python file")
-    print(recipe_to_json(find_recipe(parser.parse_args(arguments).name)), end="")
+    say(recipe_to_json(find_recipe(parser.parse_args(arguments).name)).rstrip("\n"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..results.recording import record_runs
-from .arguments import Parser, program
+from .arguments import Parser, program, say
 
 
 def record(arguments: list[str]) -> None:
@@ -29,5 +29,5 @@ def record(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     names = record_runs(options.runs, options.out, under=options.under, commit=options.commit)
     for name in names:
-        print(options.out / name)
-    print(f"{len(names)} recorded in {options.out}")
+        say(str(options.out / name))
+    say(f"{len(names)} recorded in {options.out}")

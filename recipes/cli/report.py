@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .arguments import Parser, program
+from .arguments import Parser, program, say
 
 
 def report(arguments: list[str]) -> None:
@@ -42,7 +42,7 @@ def report(arguments: list[str]) -> None:
         options.out,
         title=options.title,
         pictures=not options.no_pictures,
-        say=print,
+        say=say,
     )
     size = options.out.stat().st_size / 1e6
-    print(f"written to {options.out}: {size:.1f} MB, which needs no network")
+    say(f"written to {options.out}: {size:.1f} MB, which needs no network")

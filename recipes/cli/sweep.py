@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 from ..algorithm import make_algorithm
 from ..registry import find_recipe
 from ..sweeps.sweep import make_jobs, run_jobs
+from ..trust import allow_names
 from ..wandb_metrics import check_wandb
-from .arguments import Parser, fail, program
+from .arguments import Parser, fail, note, program, say
 
 
 def sweep(arguments: list[str]) -> None:
@@ -53,17 +53,17 @@ def sweep(arguments: list[str]) -> None:
             from ..sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
 
             connect(options.ray)
-            for note in find_unmet_needs(jobs):
-                print(f"note: {note}", file=sys.stderr)
+            for line in find_unmet_needs(jobs):
+                note(line)
             failed = run_jobs(jobs, options.workers or len(jobs), RayWorker, count_begun)
     except KeyboardInterrupt:
-        print("stopped; the same command resumes it", file=sys.stderr)
+        note("stopped; the same command resumes it", "")
         raise
     if failed:
         fail(
             f"{len(failed)} of {len(jobs)} runs failed, see {', '.join(str(j.log) for j in failed)}"
         )
-    print(f"{len(jobs)} runs are complete in {options.out}")
+    say(f"{len(jobs)} runs are complete in {options.out}")
 
 
 def tune(arguments: list[str]) -> None:
@@ -90,6 +90,7 @@ def tune(arguments: list[str]) -> None:
     except ModuleNotFoundError as error:
         raise ValueError("tune needs Optuna: pip install 'torchrl-tit[tune]'") from error
     recipe = find_recipe(options.name)
+    allow_names(recipe)
     make_algorithm(recipe).check()
     settings = Settings(
         recipe,
@@ -101,17 +102,17 @@ def tune(arguments: list[str]) -> None:
     try:
         failed = search.run(options.trials, options.workers)
     except KeyboardInterrupt:
-        print("stopped; the same command resumes it", file=sys.stderr)
+        note("stopped; the same command resumes it", "")
         raise
     best = search.best()
     if failed:
-        print(f"note: trials {failed} failed: see trial-N/*.log in {options.out}", file=sys.stderr)
+        note(f"trials {failed} failed: see trial-N/*.log in {options.out}")
     if best is None:
         fail(f"no trial in {options.out} is complete")
     values = ", ".join(f"{field} {value}" for field, value in best.params.items())
-    print(f"best of {len(search.study.trials)} trials: {best.value:.1f} with {values}")
-    print(f"its recipe: {options.out / 'best.json'}")
+    say(f"best of {len(search.study.trials)} trials: {best.value:.1f} with {values}")
+    say(f"its recipe: {options.out / 'best.json'}")
     if shares := importances(search.study):
         named = ", ".join(f"{field} {share:.0%}" for field, share in shares.items())
-        print(f"what mattered: {named}")
-    print(f"all trials: {options.out / 'trials.csv'}")
+        say(f"what mattered: {named}")
+    say(f"all trials: {options.out / 'trials.csv'}")

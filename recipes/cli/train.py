@@ -17,6 +17,7 @@ from torchrl_tit.settings.plugins import load_plugins
 
 from ..recipe import Recipe
 from ..registry import find_recipe
+from ..trust import allow_names
 from .arguments import Parser, add_machine_options, fail, option, parse_fields, program
 from .backbone_options import check_recipe, choose_network, option_fields
 
@@ -63,7 +64,9 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
         f"train {recipe.name}",
         type(recipe),
     )
-    return check_recipe(parsed.recipe), parsed
+    checked = check_recipe(parsed.recipe)
+    allow_names(checked)
+    return checked, parsed
 
 
 def _check_length(recipe: Recipe, arguments: list[str]) -> None:

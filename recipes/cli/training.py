@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
@@ -20,9 +19,8 @@ from ..recipe import Recipe
 from ..results.plot import plot_run
 from ..run import Run
 from ..wandb_metrics import WandbMetrics, check_wandb
-from .arguments import option, override, program
+from .arguments import note, option, override, program, say
 from .evaluate import one_line
-from .opening import open_run
 from .unused_frames import UnusedFrames
 
 
@@ -44,10 +42,10 @@ def start(
     weights = None
     if init_from is not None:
         weights, report = weights_from(init_from, algorithm)
-        print(report)
+        say(report)
     recipe, chosen = with_chosen_frames(recipe, algorithm)
     if chosen:
-        print(f"frames chosen by kind of observation: {chosen}")
+        say(f"frames chosen by kind of observation: {chosen}")
     with Run.create(folder or _make_folder(recipe), recipe, weights) as run:
         _finish(run, wandb)
 
@@ -71,12 +69,12 @@ def resume(
     """
     if wandb is not None:
         check_wandb(wandb)
-    with open_run(folder) as run:
+    with Run.open(folder) as run:
         if lengths:
             _lengthen(run, lengths)
         run.recipe = override(run.recipe, device=device, threads=threads)
         if changes := run.version_changes():
-            print(f"note: versions changed since the start: {'; '.join(changes)}", file=sys.stderr)
+            note(f"versions changed since the start: {'; '.join(changes)}")
         _finish(run, wandb)
 
 
@@ -91,10 +89,9 @@ def _lengthen(run: Run, lengths: Mapping[str, int]) -> None:
     before = getattr(run.recipe, field)
     run.lengthen(lengths[field])
     if run.recipe.schedules and lengths[field] != before:
-        print(
-            f"note: {', '.join(run.recipe.schedules)} depends on {field}: from here on it is that "
-            f"of a run with {field} {lengths[field]}, and before it was that of {before}",
-            file=sys.stderr,
+        note(
+            f"{', '.join(run.recipe.schedules)} depends on {field}: from here on it is that "
+            f"of a run with {field} {lengths[field]}, and before it was that of {before}"
         )
 
 
@@ -102,7 +99,7 @@ def _finish(run: Run, wandb: str | None) -> None:
     """Finishes an open run: trains, evaluates and plots what is left."""
     recipe, folder = run.recipe, run.folder
     if run.is_complete():
-        print(
+        say(
             f"{folder} is complete: trained for {recipe.final_step} {recipe.unit} and evaluated; "
             f"{option(recipe.length)} trains it further"
         )
@@ -117,12 +114,12 @@ def _finish(run: Run, wandb: str | None) -> None:
     except KeyboardInterrupt:
         words = [*program().split(), "train", "--resume", str(folder), *import_options()]
         words += [] if wandb is None else ["--wandb", wandb]
-        print(f"stopped; to resume: {shlex.join(words)}", file=sys.stderr)
+        note(f"stopped; to resume: {shlex.join(words)}", "")
         raise
     run.save_evaluation(evaluation)
     plot_run(run)
-    print(one_line(recipe, evaluation))
-    print(f"run folder: {folder}\nlearning curve: {run.curve}")
+    say(one_line(recipe, evaluation))
+    say(f"run folder: {folder}\nlearning curve: {run.curve}")
 
 
 def _make_folder(recipe: Recipe) -> Path:

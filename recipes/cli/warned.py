@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torchrl_tit
+from torchrl_tit.settings.checks import printable
 
 _OURS = (str(Path(torchrl_tit.__file__).parent), str(Path(__file__).parents[1]))
 
@@ -24,7 +25,7 @@ def one_line_warnings() -> Iterator[None]:
     def write(
         message: Warning | str, category: type, filename: str, lineno: int, line: str | None = None
     ) -> str:
-        text = f"warning: {' '.join(str(message).split())}"
+        text = f"warning: {printable(' '.join(str(message).split()))}"
         if not filename.startswith(_OURS):
             text += f" ({filename}:{lineno})"
         if text in shown:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from torchrl_tit.settings.checks import printable
+
 from ..recipe import Recipe, experiment_of
 from ..recipe_json import recipe_to_json
 from ..records import TABLE, Records, find_records
@@ -139,7 +141,9 @@ def changed_fields(before: Recipe, after: Recipe) -> str:
         >>> changed_fields(recipe, replace(recipe, num_envs=4, seed=7))
         'num_envs 4'
     """
-    return ", ".join(f"{field} {value}" for field, value in changes_of(before, after).items())
+    return ", ".join(
+        printable(f"{field} {value}") for field, value in changes_of(before, after).items()
+    )
 
 
 def changes_of(before: Recipe, after: Recipe) -> dict[str, Any]:

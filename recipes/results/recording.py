@@ -63,7 +63,7 @@ def _record(name: str, run: Run, commit: str) -> Record:
         _read(run, "recipe.json"),
         changes_of(named, run.recipe) if named else {},
         _read(run, "versions.json"),
-        _read(run, "evaluation.json"),
+        run.read_evaluation(),
         run.earlier_lengths(),
         metrics,
         commit,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -42,9 +41,11 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
     runs, notes = [], []
     for run in find_runs(folders):
         try:
-            evaluation = json.loads(run.read("evaluation.json") or b"")
-            _value(evaluation), evaluation["returns"], evaluation["steps"]
-        except (OSError, ValueError, LookupError, TypeError):
+            evaluation = run.read_evaluation()
+        except (OSError, ValueError) as error:
+            notes.append(f"{run.folder} is left out: {error}")
+            continue
+        if evaluation is None:
             notes.append(f"{run.folder} is left out: it has no evaluation yet")
             continue
         if evaluation["steps"] < run.recipe.final_step:
@@ -54,7 +55,7 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
             )
             continue
         asked = run.recipe.evaluation_episodes
-        if (episodes := evaluation.get("episodes", asked)) != asked:  # `evaluate --episodes`
+        if (episodes := evaluation["episodes"]) != asked:  # `evaluate --episodes`
             notes.append(f"{run.folder} was evaluated over {episodes} episodes, not {asked}")
         if lengths := run.earlier_lengths():
             notes.append(_earlier_lengths(run, lengths))

@@ -26,6 +26,7 @@ from ..recipe import Recipe
 from ..recipe_file import is_recipe_file, recipes_from_file
 from ..registry import RECIPES, find_recipe
 from ..run import Run
+from ..trust import allow_names
 
 PROGRAM = str(__package__).rpartition(".")[0]
 """The module that ``python -m`` runs: ``recipes``, or ``torchrl_tit.recipes`` if it is
@@ -123,6 +124,7 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
                 )
     jobs = []
     for recipe, source in found.values():
+        allow_names(recipe)
         algorithm = make_algorithm(recipe)
         algorithm.check()
         recipe, _ = with_chosen_frames(recipe, algorithm)

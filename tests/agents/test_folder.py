@@ -13,7 +13,10 @@ from torchrl_tit.agents.folder import CARD, CONTENTS, MANIFEST, WEIGHTS, read_ag
 from torchrl_tit.agents.loading import find_agent
 
 WEIGHT = torch.tensor([1.0, 2.0])
-EVALUATION = {"env": "CartPole-v1", "episodes": 1, "seed": 1, "returns": [9], "mean": 9, "std": 0}
+EVALUATION = {
+    **{"env": "CartPole-v1", "episodes": 1, "seed": 1, "steps": 5},
+    **{"returns": [9], "mean": 9, "std": 0},
+}
 FILES = {
     "recipe.json": b'{"seed": 1}',
     "versions.json": b'{"torch": 1}',

@@ -61,6 +61,26 @@ def _external_link(file: h5py.File, folder: Path) -> None:
     file["rewards"] = h5py.ExternalLink(str(folder / "other.hdf5"), "rewards")
 
 
+def _external_way(file: h5py.File, folder: Path) -> None:
+    del file["rewards"]
+    file["there"] = h5py.ExternalLink(str(folder / "other.hdf5"), "/")
+    file["rewards"] = h5py.SoftLink("there/rewards")
+
+
+def _circle(file: h5py.File, folder: Path) -> None:
+    del file["rewards"]
+    file["rewards"], file["more"] = h5py.SoftLink("/more"), h5py.SoftLink("/rewards")
+
+
+def _as(name: str, dtype: Any, add: Any = 0) -> Callable[[h5py.File, Path], None]:
+    def change(file: h5py.File, folder: Path) -> None:
+        values = file[name][()].astype(dtype) + np.array(add, dtype)
+        del file[name]
+        file[name] = values
+
+    return change
+
+
 def _endless(file: h5py.File, folder: Path) -> None:
     for name, array in good_arrays().items():
         del file[name]
@@ -138,6 +158,47 @@ def _huge_number(file: h5py.File, folder: Path) -> None:
     file["episode_1"].attrs["total_steps"] = 1e30
 
 
+def _many_texts(file: h5py.File, folder: Path) -> None:
+    file["episode_1"].attrs["names"] = ["walk"] * 1000
+
+
+def _deep_groups(file: h5py.File, folder: Path) -> None:
+    nest(file.create_group("episode_0/infos"))
+
+
+def _doubling_groups(file: h5py.File, folder: Path) -> None:
+    """Groups that each hold the next one twice: 2^40 ways to the last."""
+    group = file.create_group("episode_0/infos")
+    for _ in range(40):
+        inner = group.create_group("a")
+        group["b"], group = inner, inner
+
+
+def nest(group: h5py.Group, depth: int = 2000) -> None:
+    """Creates groups in groups."""
+    for _ in range(depth):
+        group = group.create_group("a")
+
+
+def _one_text_for_all(folder: Path) -> Path:
+    """A thousand long texts, of which one is stored."""
+    offset = 0
+
+    def add(file: h5py.File, folder: Path) -> None:
+        nonlocal offset
+        texts = ["x" * 10**5] + ["y"] * 999
+        made = file.create_dataset("episode_0/infos/texts", data=texts, dtype=h5py.string_dtype())
+        file.flush()
+        offset = made.id.get_offset()
+
+    made = _minari(folder, change=add)
+    path = made / "data" / "main_data.hdf5"
+    content = bytearray(path.read_bytes())
+    content[offset : offset + 16_000] = content[offset : offset + 16] * 1000
+    path.write_bytes(content)
+    return made
+
+
 def _nested(metadata: dict[str, Any]) -> dict[str, Any]:
     depth = 100_000  # Python 3.13 still reads a thousand
     deep = '{"type": "Tuple", "subspaces": [' * depth + "]}" * depth
@@ -147,7 +208,17 @@ def _nested(metadata: dict[str, Any]) -> dict[str, Any]:
 HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "external storage": (lambda f: _hdf5(f, _external), "takes its values from other files"),
     "virtual data set": (lambda f: _hdf5(f, _virtual), "takes its values from other files"),
-    "external link": (lambda f: _hdf5(f, _external_link), "'rewards': is missing"),
+    "external link": (lambda f: _hdf5(f, _external_link), "'rewards': is a link to another place"),
+    "external link on the way": (lambda f: _hdf5(f, _external_way), "'rewards': is a link to anot"),
+    "links in a circle": (lambda f: _hdf5(f, _circle), "'rewards': is a link to another place"),
+    "an integer of 64 bits": (
+        lambda f: _hdf5(f, _as("actions", np.uint64, 2**63 + 5)),
+        "'actions', row 0: is 9223372036854775813, but all values must be at most 9223",
+    ),
+    "long doubles": (
+        lambda f: _hdf5(f, _as("observations", np.longdouble)),
+        "'observations': has the dtype float128, which PyTorch lacks: store it as float64",
+    ),
     "4e8 rows in chunks": (lambda f: _hdf5(f, _endless), "declares 1600000000 bytes"),
     "4e8 rows at once": (lambda f: _hdf5(f, _endless_at_once), "declares 1600000000 bytes"),
     "a chunk of 2.5 GB": (lambda f: _hdf5(f, _one_chunk), "has chunks of 2500000000 bytes"),
@@ -186,6 +257,22 @@ HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a virtual field": (
         lambda f: _minari(f, change=_in_episode(_virtual)),
         "episode 0: field 'rewards': takes its values from other files",
+    ),
+    "a later field of long doubles": (
+        lambda f: _minari(
+            f, change=lambda file, _: _as("rewards", np.longdouble)(file["episode_1"], f)
+        ),
+        "episode 1: field 'rewards': has the dtype float128",
+    ),
+    "many texts in an attribute": (
+        lambda f: _minari(f, change=_many_texts),
+        "'episode_1': the attribute 'names' is neither text nor a few numbers",
+    ),
+    "one text for a thousand": (_one_text_for_all, "'infos/texts': has .* bytes of data in its"),
+    "groups in groups": (lambda f: _minari(f, change=_deep_groups), "more than 1000 fields and gr"),
+    "groups in two places": (
+        lambda f: _minari(f, change=_doubling_groups),
+        "'infos/b': is a group that is also in another place",
     ),
     "1e12 steps": (lambda f: _minari(f, change=_long_episode), "declares .* bytes of data, but"),
     "1e30 steps": (lambda f: _minari(f, change=_huge_number), "its episodes cannot be listed"),

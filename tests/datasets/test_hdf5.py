@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.datasets.hostile import nest
 from tests.datasets.rollouts import Transitions, roll, spans, write
 from torchrl_tit.datasets import (
     DatasetError,
@@ -104,6 +105,43 @@ def test_a_trailing_unfinished_episode_is_separate(tmp_path: Path, arrays: Trans
 def test_other_fields_are_named_but_not_read(tmp_path: Path, rolled: Transitions) -> None:
     path = write(tmp_path / "a.hdf5", {**rolled, "infos/qpos": rolled["rewards"]})
     assert read_hdf5(path).left_out == ("infos/qpos",)
+
+
+def test_fields_are_found_by_name_through_links(tmp_path: Path) -> None:
+    path = tmp_path / "a.hdf5"
+    ends = np.arange(12) % 4 == 3
+    with h5py.File(path, "w") as file:
+        file["data/states"] = np.arange(12.0)[:, None]
+        file["observations"] = file["actions"] = h5py.SoftLink("/data/states")
+        file["rewards"] = file["terminals"] = np.zeros(12)
+        file["elsewhere"] = h5py.SoftLink("data")
+        file["data/ends"] = ends
+        file["timeouts"] = h5py.SoftLink("elsewhere/ends")
+        file["data/more"] = file["next_observations"] = np.arange(1.0, 13)[:, None]
+    with h5py.File(path, "a") as file:  # hard links to one array, of which each name counts
+        del file["terminals"]
+        file["terminals"] = file["rewards"]
+
+    episodes = read_hdf5(path)
+
+    assert episodes.lengths.tolist() == [4, 4, 4]
+    assert episodes.final_known.all()
+    assert episodes.left_out == ("data/ends", "data/more", "data/states", "elsewhere")
+
+
+def test_what_is_large_and_not_needed_is_left_out(tmp_path: Path, rolled: Transitions) -> None:
+    path = write(tmp_path / "a.hdf5", rolled, env_id="Hopper-v5")
+    with h5py.File(path, "a") as file:
+        file.attrs["authors"] = ["A", "B"]
+        file.attrs["names"] = ["walk"] * 1000
+        file.attrs["none"] = h5py.Empty("f")
+        file.attrs["long"] = np.longdouble(0.5)
+        nest(file.create_group("infos"))
+
+    episodes = read_hdf5(path)
+
+    assert episodes.attributes == {"env_id": "Hopper-v5", "authors": ["A", "B"], "long": 0.5}
+    assert episodes.left_out == ("and others",)
 
 
 def test_writing_is_lossless(tmp_path: Path, rolled: Transitions) -> None:

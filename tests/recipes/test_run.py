@@ -143,16 +143,24 @@ def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch,
 def test_is_complete_only_when_trained_evaluated_and_drawn(tmp_path):
     run = trained(tmp_path / "run")
     assert not run.is_complete()
-    run.save_evaluation({"steps": 64})  # of a checkpoint on the way
+    evaluation = {
+        "env": "CartPole-v1",
+        "episodes": 1,
+        "seed": 1,
+        "returns": [9],
+        "mean": 9,
+        "std": 0,
+    }
+    run.save_evaluation(evaluation | {"steps": 64})  # of a checkpoint on the way
     plot_run(run)
     assert not run.is_complete()
-    run.save_evaluation({"steps": 128})
+    run.save_evaluation(evaluation | {"steps": 128})
     assert run.is_complete()
     (run.folder / "evaluation.json").write_text("{")
     assert not run.is_complete()
     (run.folder / "evaluation.json").write_text("[]")
     assert not run.is_complete()
-    run.save_evaluation({"steps": 128})
+    run.save_evaluation(evaluation | {"steps": 128})
     (run.folder / "learning_curve.png").unlink()
     assert not run.is_complete()
 

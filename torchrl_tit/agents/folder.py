@@ -17,10 +17,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import fmean, pstdev
 from typing import Any
 
 from safetensors import SafetensorError
@@ -43,11 +44,24 @@ _EVALUATION: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "env": ("a text", lambda x: isinstance(x, str)),
     "episodes": ("a whole number from 1", lambda x: _is_whole(x) and x >= 1),
     "seed": ("a whole number from 0 to 2147483648", lambda x: _is_whole(x) and x <= 2**31),
-    "returns": ("a list of numbers", lambda x: isinstance(x, list) and all(map(_is_number, x))),
-    "mean": ("a number", lambda x: _is_number(x)),
-    "std": ("a number", lambda x: _is_number(x)),
+    "returns": ("a list of numbers", lambda x: isinstance(x, list) and all(map(is_number, x))),
+    "mean": ("a number", lambda x: is_number(x)),
+    "std": ("a number from 0", lambda x: is_number(x) and x >= 0),
+    "steps": ("a whole number from 0", lambda x: _is_whole(x) and x <= MOST_STEPS),
 }
 """The entries that others rely on, and their checks."""
+_OF_SCORES: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "score": (
+        "'best' and 'last', numbers",
+        lambda x: isinstance(x, dict) and all(is_number(x.get(name)) for name in ("best", "last")),
+    ),
+    "score_std": _EVALUATION["std"],
+}
+"""Entries that only some evaluations have."""
+MOST_STEPS = 2**53
+"""Larger whole numbers are not those of any run, and floats do not hold them exactly."""
+_LARGEST = 3.4e38  # of float32, the dtype of rewards
+_ROUNDING = 1e-5  # of the magnitude of the returns
 
 # Far larger than any agent, so that no file fills the memory before it is checked.
 _MOST_BYTES = {WEIGHTS: 2**32}
@@ -174,10 +188,11 @@ def check_evaluation(evaluation: Mapping[str, Any]) -> None:
     """Raises ValueError if an evaluation lacks an entry that others rely on, or one is invalid.
 
     The entries are the task ``env``, the number of ``episodes``, the ``seed`` of the first, their
-    ``returns``, and the ``mean`` and ``std`` of these. The command ``evaluate`` writes them.
+    ``returns``, the ``mean`` and population ``std`` of these, and the ``steps`` of training before.
+    The command ``evaluate`` writes them.
 
     Example:
-        >>> numbers = {"episodes": 1, "seed": 0, "mean": 9.0, "std": 0.0}
+        >>> numbers = {"episodes": 1, "seed": 0, "mean": 9.0, "std": 0.0, "steps": 100}
         >>> check_evaluation({"env": "CartPole-v1", "returns": [9.0], **numbers})
         >>> check_evaluation({"env": "CartPole-v1", "returns": "many", **numbers})
         Traceback (most recent call last):
@@ -187,8 +202,56 @@ def check_evaluation(evaluation: Mapping[str, Any]) -> None:
     for name, (expected, is_right) in _EVALUATION.items():
         if not is_right(evaluation.get(name)):
             raise ValueError(f"{EVALUATION} has no {name!r} that is {expected}")
-    if len(evaluation["returns"]) != evaluation["episodes"]:
+    for name, (expected, is_right) in _OF_SCORES.items():
+        if name in evaluation and not is_right(evaluation[name]):
+            raise ValueError(f"{EVALUATION} has a {name!r} that is not {expected}")
+    returns = evaluation["returns"]
+    if len(returns) != evaluation["episodes"]:
         raise ValueError(f"{EVALUATION} does not have a return for each of its 'episodes'")
+    tolerance = _ROUNDING * max(1.0, *map(abs, returns))
+    for name, value in (("mean", fmean(returns)), ("std", pstdev(map(float, returns)))):
+        if not abs(evaluation[name] - value) <= tolerance:
+            raise ValueError(
+                f"{EVALUATION} has the {name!r} {evaluation[name]}, but that of its 'returns' is "
+                f"{value}"
+            )
+
+
+def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """Reads and checks the evaluation in the folder of a run or an agent; None if there is none.
+
+    Raises:
+        ValueError: if it is not what :func:`check_evaluation` accepts; the message names the file.
+
+    Example:
+        >>> read_evaluation("nowhere") is None
+        True
+    """
+    path = Path(folder, EVALUATION)
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        return parse_evaluation(file.read(_MOST_BYTES_OF_TEXT + 1), folder)  # one more is refused
+    return None
+
+
+def parse_evaluation(content: bytes, folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Reads and checks the content of an evaluation.
+
+    Args:
+        content: the content of its file.
+        folder: the folder that it is from, for messages.
+
+    Raises:
+        ValueError: as in :func:`read_evaluation`.
+    """
+    try:
+        _check_size(EVALUATION, len(content))
+        evaluation = _parse(content, EVALUATION)
+        check_evaluation(evaluation)
+        return evaluation
+    except (RecursionError, ValueError) as error:
+        raise ValueError(
+            f"{Path(folder, EVALUATION)} is damaged: `evaluate {folder}` writes it again ({error})"
+        ) from error
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:
@@ -265,13 +328,14 @@ def _is_whole(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def _is_number(value: Any) -> bool:
-    """Whether a value is a finite number; JSON allows NaN, and integers that no float can hold."""
-    return (
-        isinstance(value, int | float)
-        and not isinstance(value, bool)
-        and abs(value) <= sys.float_info.max
-    )
+def is_number(value: Any) -> bool:
+    """Whether a value is a finite number of float32's range, which JSON does not ensure.
+
+    Example:
+        >>> is_number(9.0), is_number(float("nan")), is_number(1e300), is_number(True)
+        (True, False, False, False)
+    """
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST
 
 
 def _sha256_of_manifest(manifest: dict[str, Any]) -> str:

@@ -13,6 +13,8 @@ from torchrl_tit.datasets.errors import DatasetError
 
 FLAGS = ("terminals", "timeouts", "terminations", "truncations")  # D4RL's names and Minari's
 
+_LARGEST = np.iinfo(np.int64).max
+
 # Actions of a squashed policy reach the bounds, and rounding moves some slightly beyond them.
 _ACTION_TOLERANCE = 1e-5
 
@@ -24,7 +26,7 @@ def check_finite(
     first_row: int = 0,
     kept_as: torch.dtype = torch.float64,
 ) -> None:
-    """Checks that values are finite, also after conversion.
+    """Checks that values are finite, also after conversion, or integers that fit.
 
     Args:
         source: Where the data came from, for error messages.
@@ -34,7 +36,7 @@ def check_finite(
         kept_as: The dtype that they are converted to, which may have a smaller range.
 
     Raises:
-        DatasetError: If a value is not finite; the message names the first such row.
+        DatasetError: If a value is not finite or too large; the message names the first such row.
 
     Example:
         >>> check_finite("a.hdf5", "rewards", np.array([0.0, np.nan]), first_row=100)
@@ -42,14 +44,19 @@ def check_finite(
         ...
         torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'rewards', row 101: is nan, but...
     """
-    if not np.issubdtype(values.dtype, np.floating):
+    if np.issubdtype(values.dtype, np.floating):
+        wrong = ~plain_tensor(values).to(kept_as).isfinite().numpy()
+    elif values.dtype.itemsize == 8 and values.dtype.kind == "u" and kept_as == torch.int64:
+        wrong = values > _LARGEST
+    else:
         return
-    wrong = ~plain_tensor(values).to(kept_as).isfinite().numpy()
     if wrong.any():
         row = int(wrong.reshape(len(values), -1).any(1).argmax())
         value = values[row][wrong[row]].flat[0] if values.ndim > 1 else values[row]
         kind = str(kept_as).removeprefix("torch.")
-        problem = f"finite as {kind}" if np.isfinite(value) else "finite"
+        problem = f"at most {_LARGEST}, the largest {kind}"
+        if np.issubdtype(values.dtype, np.floating):
+            problem = f"finite as {kind}" if np.isfinite(value) else "finite"
         raise DatasetError(
             source, f"is {value}, but all values must be {problem}.", field, first_row + row
         )
@@ -117,6 +124,10 @@ def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | N
         raise ValueError(f"dtype is that of floats, such as torch.float32, not {floats}")
     if dtype.kind not in "biuf":
         raise DatasetError(source, f"has the dtype {dtype}, but must have a numeric one.", field)
+    if dtype.kind == "f" and dtype.itemsize > 8:
+        raise DatasetError(
+            source, f"has the dtype {dtype}, which PyTorch lacks: store it as float64.", field
+        )
     if field in FLAGS:
         return torch.bool
     if dtype.kind == "f":

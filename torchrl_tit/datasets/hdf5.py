@@ -13,7 +13,14 @@ from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations, rows_per_chunk
 from torchrl_tit.datasets.full_disks import new_hdf5
-from torchrl_tit.datasets.stored import check_stored, damage_named, open_hdf5
+from torchrl_tit.datasets.stored import (
+    array_names,
+    attribute_fits,
+    check_stored,
+    damage_named,
+    find,
+    open_hdf5,
+)
 from torchrl_tit.datasets.transition_reader import FIELDS
 from torchrl_tit.datasets.transitions import episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
@@ -28,7 +35,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     Args:
         path: The file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
             "terminals" [N], and optionally "timeouts" [N] and "next_observations" [N, *obs].
-            Other fields are not read.
+            Hard and soft links to other places in the file are followed. Other fields, and
+            attributes that are neither text nor a few numbers, are not read.
         **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
             which describes how missing fields are replaced.
 
@@ -58,9 +66,9 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     source = str(path)
     with open_hdf5(path) as file:
         with damage_named(source, "cannot be read"):
-            fields, attributes = _datasets(file), _attributes(file)
+            fields, attributes = _datasets(source, file), _attributes(file)
         for name in FIELDS:
-            if name in fields:
+            if fields.get(name) is not None:
                 check_stored(source, name, fields[name])
         return episodes_from_transitions(fields, source=source, attributes=attributes, **settings)
 
@@ -125,19 +133,19 @@ def _write(
         check()
 
 
-def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """All arrays of the file by their full names."""
-    found: dict[str, h5py.Dataset] = {}
-
-    def add(name: str, item: Any) -> None:
-        if isinstance(item, h5py.Dataset):
-            found[name] = item
-
-    file.visititems(add)
-    return found
+def _datasets(source: str, file: h5py.File) -> dict[str, h5py.Dataset | None]:
+    """The arrays of the layout by their names, and the names of others, which are not opened."""
+    others = dict.fromkeys(set(array_names(file)) - set(FIELDS))
+    named = {name: find(source, file, name) for name in FIELDS}
+    return others | {name: array for name, array in named.items() if array is not None}
 
 
 def _attributes(file: h5py.File) -> dict[str, Any]:
     """The attributes of the file, as strings, numbers and lists of them."""
-    values = {name: np.asarray(value) for name, value in file.attrs.items()}
-    return {name: value.tolist() for name, value in values.items() if value.dtype.kind in "OUSbiuf"}
+    values = {
+        name: np.asarray(file.attrs[name]) for name in file.attrs if attribute_fits(file, name)
+    }
+    return {
+        name: (value.astype(float) if value.dtype == np.longdouble else value).tolist()
+        for name, value in values.items()
+    }

@@ -115,11 +115,11 @@ def read_minari(
         episode = _episode(dataset, number, place)
         left_out |= {"infos"} if episode.infos else set()
         fields = _checked(place, episode, stop - start - 1, task)
+        kept = {
+            field: (array.shape[1:], kept_dtype(place, FIELDS[field][0], array.dtype, dtype))
+            for field, array in fields.items()
+        }
         if number == 0:
-            kept = {
-                field: (array.shape[1:], kept_dtype(place, FIELDS[field][0], array.dtype, dtype))
-                for field, array in fields.items()
-            }
             check_rows(source, folder, bounds[-1], _row_bytes(kept))
             rows = memory_mapped_rows(bounds[-1], kept, directory)
         for field, array in fields.items():

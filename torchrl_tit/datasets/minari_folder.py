@@ -12,6 +12,7 @@ import msgspec
 
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.stored import (
+    attribute_fits,
     check_group,
     check_link,
     check_size,
@@ -154,5 +155,10 @@ def _num_entries(source: str, folder: Path, data_format: str) -> int:
         return sum(1 for _ in folder.iterdir())
     with open_hdf5(folder / "main_data.hdf5") as file, damage_named(source, "cannot be read"):
         for name in file:
-            check_link(source, name, file.get(name, getlink=True))
+            check_link(source, file, name)
+            # Minari reads all of them.
+            if large := [key for key in file[name].attrs if not attribute_fits(file[name], key)]:
+                raise DatasetError(
+                    source, f"the attribute {large[0]!r} is neither text nor a few numbers.", name
+                )
         return len(file)

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice
+from math import prod
 
 import h5py
+import numpy as np
 
 from torchrl_tit.datasets.errors import DatasetError
 
@@ -14,6 +19,12 @@ from torchrl_tit.datasets.errors import DatasetError
 _MOST_BYTES_OF_ONE = 1100
 _HARMLESS_BYTES = 64 * 2**20  # may be declared without being stored
 _CHUNK_BYTES = 256 * 2**20  # a chunk is read as a whole, even for one of its rows
+_ATTRIBUTE_BYTES = 2**20
+_MOST_TEXTS = 16  # in an attribute, which can only be read as a whole
+_MOST_ENTRIES = 1000  # fields and groups
+_MOST_LINKS = 16  # from one to the next
+_ROWS = 16  # of values of variable length that are read at a time
+_ELSEWHERE = "is a link to another place, which is not read: copy the data here."
 # Errors that h5py raises on damaged files.
 _FAILURES = (KeyError, OSError, OverflowError, RuntimeError, TypeError, ValueError)
 
@@ -111,6 +122,26 @@ def check_stored(source: str, field: str, dataset: h5py.Dataset) -> None:
             )
         held = min(dataset.id.get_storage_size(), dataset.file.id.get_filesize())
         check_size(source, dataset.dtype.itemsize * int(dataset.size or 0), held, field)
+        if dataset.dtype.kind == "O":
+            _check_lengths(source, field, dataset)
+
+
+def _check_lengths(source: str, field: str, dataset: h5py.Dataset) -> None:
+    """Checks values of variable length, many of which can be the same one, stored once."""
+    kind = h5py.check_vlen_dtype(dataset.dtype)
+    if dataset.ndim != 1 or not (kind in (str, bytes) or np.dtype(kind).kind in "biuf"):
+        raise DatasetError(source, f"has the dtype {dataset.dtype}, which is not read.", field)
+    held = max(_HARMLESS_BYTES, dataset.file.id.get_filesize())
+    total = 0
+    for start in range(0, len(dataset), _ROWS):
+        total += sum(map(len, dataset[start : start + _ROWS]))
+        if total > held:
+            raise DatasetError(
+                source,
+                f"has {total} bytes of data in its first rows, but the file holds {held}: it was "
+                f"made to fill the memory.",
+                field,
+            )
 
 
 def check_size(source: str, declared: int, held: int, field: str | None = None) -> None:
@@ -137,6 +168,83 @@ def check_size(source: str, declared: int, held: int, field: str | None = None) 
         )
 
 
+def find(source: str, file: h5py.File, name: str) -> h5py.Dataset | None:
+    """Finds an array by its name, also through hard and soft links within the file.
+
+    Args:
+        source: The file, for error messages.
+        file: The file.
+        name: The array's name.
+
+    Returns:
+        The array; None if there is no array of that name.
+
+    Raises:
+        DatasetError: If a link leads to another file, or nowhere.
+
+    Example:
+        >>> with h5py.File.in_memory() as file:
+        ...     file["rewards"] = [1.0, 2.0]
+        ...     file["terminals"] = h5py.SoftLink("/rewards")
+        ...     find("a.hdf5", file, "terminals")[:], find("a.hdf5", file, "actions")
+        (array([1., 2.]), None)
+    """
+    place, rest, links = file, [name], 0
+    while rest:
+        part, *rest = rest
+        if not isinstance(place, h5py.Group) or not place.id.links.exists(part.encode()):
+            if links:
+                raise DatasetError(source, "is a link to something that is not there.", name)
+            return None
+        kind = place.id.links.get_info(part.encode()).type
+        if kind == h5py.h5l.TYPE_HARD:
+            place = place[part]
+        elif kind == h5py.h5l.TYPE_SOFT and (links := links + 1) <= _MOST_LINKS:
+            target = os.fsdecode(place.id.links.get_val(part.encode()))
+            place = file if target.startswith("/") else place
+            rest = [part for part in target.split("/") if part not in ("", ".")] + rest
+        else:
+            raise DatasetError(source, _ELSEWHERE, name)
+    return place if isinstance(place, h5py.Dataset) else None
+
+
+def array_names(file: h5py.File) -> list[str]:
+    """The full names of the arrays and links in a file, without reading them.
+
+    Of a file with very many entries, some, and then "and others".
+
+    Example:
+        >>> with h5py.File.in_memory() as file:
+        ...     file["infos/position"] = [1.0, 2.0]
+        ...     array_names(file)
+        ['infos/position']
+    """
+    entries = list(islice(_walk(file), _MOST_ENTRIES + 1))
+    names = [name for name, kind, _ in entries[:_MOST_ENTRIES] if kind in ("array", "link")]
+    return [*names, "and others"] if len(entries) > _MOST_ENTRIES else names
+
+
+def attribute_fits(place: h5py.File | h5py.Group, name: str) -> bool:
+    """Returns whether an attribute is text or numbers that can be read in little memory.
+
+    Values of variable length can all be the same long one, which is stored once.
+
+    Example:
+        >>> with h5py.File.in_memory() as file:
+        ...     file.attrs["names"] = ["walk"] * 1000
+        ...     attribute_fits(file, "names")
+        False
+    """
+    attribute = place.attrs.get_id(name)
+    kind, shape = attribute.dtype, attribute.shape
+    if shape is None:  # it is empty
+        return False
+    text = h5py.check_string_dtype(kind)
+    if text is not None and text.length is None:
+        return prod(shape) <= _MOST_TEXTS
+    return kind.kind in "biufS" and prod(shape) * kind.itemsize <= _ATTRIBUTE_BYTES
+
+
 def check_group(source: str, group: h5py.Group) -> None:
     """Checks all fields of a group with :func:`check_stored`, before they are read.
 
@@ -145,7 +253,8 @@ def check_group(source: str, group: h5py.Group) -> None:
         group: The group.
 
     Raises:
-        DatasetError: If the group links to another place, or a data set in it must not be read.
+        DatasetError: If the group links to another place, holds another group twice or very many
+            fields, or a data set in it must not be read.
 
     Example:
         >>> with h5py.File.in_memory() as file:
@@ -155,31 +264,61 @@ def check_group(source: str, group: h5py.Group) -> None:
         ...
         torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'rewards': is a link to another...
     """
-    links: list[tuple[str, object]] = []
     with damage_named(source, "cannot be read"):
-        group.visititems_links(lambda name, link: links.append((name, link)))
-        for name, link in links:
-            check_link(source, name, link)
-            item = group[name]
-            if isinstance(item, h5py.Dataset):
-                check_stored(source, name, item)
+        for number, (name, kind, item) in enumerate(_walk(group)):
+            if number == _MOST_ENTRIES:
+                raise DatasetError(source, f"has more than {_MOST_ENTRIES} fields and groups.")
+            if kind == "link":
+                raise DatasetError(source, _ELSEWHERE, name)
+            if kind == "group again":
+                raise DatasetError(source, "is a group that is also in another place.", name)
+            if item is not None:
+                check_stored(source, name, item())
 
 
-def check_link(source: str, name: str, link: object) -> None:
-    """Checks that an entry of a group is stored there, not linked from elsewhere.
+def check_link(source: str, file: h5py.File, name: str) -> None:
+    """Checks that an entry of a file is stored there, not linked from elsewhere.
 
     Args:
         source: The file, for error messages.
+        file: The file.
         name: The entry's name.
-        link: The result of ``group.get(name, getlink=True)``.
 
     Raises:
         DatasetError: If it is a link to another place.
 
     Example:
-        >>> check_link("a.hdf5", "rewards", h5py.HardLink())
+        >>> with h5py.File.in_memory() as file:
+        ...     file["rewards"] = [1.0]
+        ...     check_link("a.hdf5", file, "rewards")
     """
-    if not isinstance(link, h5py.HardLink):
-        raise DatasetError(
-            source, "is a link to another place, which is not read: copy the data here.", name
-        )
+    if file.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
+        raise DatasetError(source, _ELSEWHERE, name)
+
+
+def _walk(
+    group: h5py.Group,
+) -> Iterator[tuple[str, str, Callable[[], h5py.Dataset] | None]]:
+    """Yields what is below a group, each group's entries once, without following links.
+
+    Yields:
+        The full name; "array", "link", "group", or "group again"; and what opens an array.
+    """
+    waiting = deque([("", group)])
+    seen = {h5py.h5o.get_info(group.id).addr}
+    while waiting:
+        prefix, place = waiting.popleft()
+        for key in place.id:
+            name = prefix + os.fsdecode(key)
+            if place.id.links.get_info(key).type != h5py.h5l.TYPE_HARD:
+                yield name, "link", None
+                continue
+            info = h5py.h5o.get_info(place.id, key)
+            if info.type == h5py.h5o.TYPE_DATASET:
+                yield name, "array", partial(place.__getitem__, key)
+            elif info.type == h5py.h5o.TYPE_GROUP:
+                again = info.addr in seen
+                yield name, "group again" if again else "group", None
+                if not again:
+                    seen.add(info.addr)
+                    waiting.append((f"{name}/", place[key]))

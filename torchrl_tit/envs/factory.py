@@ -71,10 +71,9 @@ def make_env(
         name: A name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". In
             "module:Name-v0", the module registers the name. In "module:Name", the name is that of a
             class or function in the module that makes a TorchRL `EnvBase`: see
-            :class:`~torchrl_tit.envs.torchrl_tasks.TorchRLTask`. A module is imported only if the
-            user named it on the command line, if it is already loaded, or if it belongs to a
-            trusted library. Names that begin with "ALE/", such as "ALE/Pong-v5", are Atari games
-            with the preprocessing of :class:`~torchrl_tit.envs.AtariGames`.
+            :class:`~torchrl_tit.envs.torchrl_tasks.TorchRLTask`. The module is imported, so pass no
+            names from strangers. Names that begin with "ALE/", such as "ALE/Pong-v5", are Atari
+            games with the preprocessing of :class:`~torchrl_tit.envs.AtariGames`.
         num_envs: N, the number of copies; the batch size is [N], also for N = 1.
         seed: Copy i is seeded with ``seed + i``; without a seed, all differ from run to run.
         num_frames: K, the number of observations in a history.

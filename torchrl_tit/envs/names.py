@@ -3,12 +3,12 @@
 import difflib
 from collections.abc import Callable
 from types import ModuleType
-from typing import Any, get_type_hints
+from typing import Any
 
 import gymnasium
 from torchrl.envs import EnvBase
 
-from torchrl_tit.settings.imports import import_if_allowed, is_named
+from torchrl_tit.settings.imports import import_module
 from torchrl_tit.settings.plugins import load_plugins
 
 # The packages that register names with these prefixes; extras of the same names install them.
@@ -26,14 +26,13 @@ def find_task(name: str) -> str | Callable[..., EnvBase]:
     Args:
         name: A name that Gymnasium has registered; one from a package that this library knows, such
             as "MiniGrid-Empty-5x5-v0"; "module:Name-v0", where the module registers the name; or
-            "module:Name", a class or function in the module that makes a TorchRL environment. A
-            function must be annotated as such (``-> EnvBase``), unless the user named its module.
+            "module:Name", a class or function in the module that makes a TorchRL environment.
 
     Returns:
         The name for `gymnasium.make`, or the class or function.
 
     Raises:
-        ValueError: If there is no such name, module or class, the module may not be imported, or it
+        ValueError: If there is no such name, module or class, the module cannot be imported, or it
             is neither a registered name nor something that makes a TorchRL environment.
 
     Example:
@@ -46,7 +45,7 @@ def find_task(name: str) -> str | Callable[..., EnvBase]:
         return _registered(name)
     module_name, _, own = name.partition(":")
     try:
-        module = import_if_allowed(module_name, name)
+        module = import_module(module_name)
     except ImportError as error:
         raise ValueError(f"Task {name!r} cannot be made: {error}.") from error
     return name if own in gymnasium.registry else _maker(module, own, name)
@@ -88,7 +87,7 @@ def _registered(name: str) -> str:
             return name
         raise ValueError("; ".join([str(unknown(name)), *failures]))
     try:
-        import_if_allowed(package, name)
+        import_module(package)
     except ImportError as error:
         raise ValueError(
             f"Task {name!r} needs {package}: pip install 'torchrl-tit[{package}]' ({error})."
@@ -110,22 +109,9 @@ def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
         if issubclass(made, gymnasium.Env):
             hint = "; a Gymnasium task needs a name, with gymnasium.register in the module"
     elif callable(made):
-        # Any function of a loaded module can be named, even one that starts programs; a file may
-        # only name functions that are annotated to return an environment.
-        if is_named(module.__name__) or _says_that_it_makes_an_env(made):
-            return made
-        found = "has a function of that name, which does not say that it makes an EnvBase"
-        hint = "; annotate the function with `-> EnvBase`"
+        return made
     raise ValueError(
         f"Task {name!r}: Gymnasium knows no {own!r} after importing {module.__name__}, which "
         f"{found}; expected a registered name, or a class or function that makes a TorchRL "
         f"EnvBase{hint}."
     )
-
-
-def _says_that_it_makes_an_env(made: Any) -> bool:
-    try:
-        returned = get_type_hints(made).get("return")
-    except Exception:  # a builtin, or unreadable annotations
-        return False
-    return isinstance(returned, type) and issubclass(returned, EnvBase)

@@ -30,6 +30,16 @@ def check_at_most(settings: object, **maxima: float) -> None:
             raise ValueError(f"{field} must be at most {maximum}, not {value}")
 
 
+def printable(text: str) -> str:
+    r"""Escapes what is no visible character: text of files must not move a terminal's cursor.
+
+    Example:
+        >>> printable("a\x1b[2Jé\n")
+        'a\\x1b[2Jé\\n'
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def nearest(name: str, names: Iterable[str]) -> str:
     """Suggests known names for an unknown one, as the end of an error message.
 

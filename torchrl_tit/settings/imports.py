@@ -1,4 +1,4 @@
-"""Imports by name: only of modules that the user named, never of those that a file names."""
+"""Imports by name, and the modules that users named in their own words."""
 
 from __future__ import annotations
 
@@ -9,17 +9,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-TRUSTED = frozenset(
-    {"ale_py", "gymnasium", "minigrid", "popgym", "recipes", "torchrl", "torchrl_tit"}
-)
-"""Packages whose modules any recipe may name."""
-
 # An environment variable, so that child processes may import the same modules.
 _VARIABLE = "TORCHRL_TIT_IMPORTS"
 
 
 def allow(module: str) -> None:
-    """Allows a module that the user named, and its submodules, to be imported by name.
+    """Allows files to name a module that the user named, and its submodules.
 
     Adds a folder to ``sys.path``: that of a Python file, otherwise the current directory, as
     ``python -m`` does.
@@ -83,49 +78,29 @@ def import_allowed(module: str) -> ModuleType:
 
 
 def import_named(target: str) -> Any:
-    """Imports the object that "module:attribute" names, if the module may be imported.
-
-    It may if the user named it or a parent package (:func:`allow`), if it is already loaded, or if
-    it belongs to a trusted package. Callers check the object before they call it.
+    """Imports the object that "module:attribute" names.
 
     Raises:
-        ValueError: if the target has another form, or the module may not be imported.
+        ValueError: if the target has another form.
         ImportError: if the module does not exist, raises an error, or lacks the attribute.
 
     Example:
-        >>> import_named("this:zen")
-        Traceback (most recent call last):
-            ...
-        ValueError: 'this:zen' names a module that ...: to allow it, add `--import this`
+        >>> import_named("math:pi")
+        3.141592653589793
     """
     module, colon, attribute = target.partition(":")
     if not (module and colon and attribute.isidentifier()):
         raise ValueError(f"{target!r} names nothing to import: expected module:attribute")
     try:
-        return getattr(import_if_allowed(module, target), attribute)
+        return getattr(import_module(module), attribute)
     except AttributeError as error:
         raise ImportError(
             f"module {module} has no {attribute!r}, which {target!r} names"
         ) from error
 
 
-def import_if_allowed(module: str, target: str) -> ModuleType:
-    """Imports the module of a target, such as Gymnasium's "module:Name-v0": see `import_named`.
-
-    Raises:
-        ValueError: if the module may not be imported.
-        ImportError: if the module does not exist or raises an error.
-    """
-    if not _is_allowed(module):
-        raise ValueError(
-            f"{target!r} names a module that runs code of its own when it is imported, and that "
-            f"you did not name yourself: to allow it, add `--import {module}`"
-        )
-    return import_module(module)
-
-
 def import_module(name: str) -> ModuleType:
-    """Imports a module; the caller has checked that this is allowed.
+    """Imports a module.
 
     Raises:
         ImportError: if the module does not exist or raises an error; the message gives the reason
@@ -151,7 +126,3 @@ def _reason(name: str, error: Exception) -> str:
 def _module_name(module: str) -> str:
     """The name under which a module or a file is imported."""
     return Path(module).stem if module.endswith(".py") else module
-
-
-def _is_allowed(module: str) -> bool:
-    return module in sys.modules or module.partition(".")[0] in TRUSTED or is_named(module)

@@ -111,25 +111,7 @@ def _read(run: Run) -> RunData:
         metrics["steps_per_second"] = np.diff(metrics["step"], prepend=np.nan) / np.diff(
             metrics.get("time", metrics["step"]), prepend=np.nan
         )
-    return RunData(run, metrics, _evaluation(run), _versions(run))
-
-
-def _evaluation(run: Run) -> dict[str, Any] | None:
-    content = run.read("evaluation.json")
-    if content is None:
-        return None
-    try:
-        found = json.loads(content)
-        returns = [float(value) for value in found["returns"]]
-        numbers = [float(found[name]) for name in ("mean", "std", "steps")]
-        if not returns or not np.isfinite([*returns, *numbers]).all():
-            raise ValueError("its numbers are not finite")
-    except (ValueError, LookupError, TypeError) as error:
-        raise ValueError(
-            f"{run.folder / 'evaluation.json'} is damaged: `evaluate {run.folder}` writes it again "
-            f"({error})"
-        ) from error
-    return {"episodes": len(returns), **found, "returns": returns}
+    return RunData(run, metrics, run.read_evaluation(), _versions(run))
 
 
 def _versions(run: Run) -> dict[str, Any]:

@@ -160,20 +160,6 @@ def test_an_evaluation_of_ones_own_does_not_replace_the_runs(capsys, tmp_path):
     assert json.loads((run / "evaluation_seed-7.json").read_text())["seed"] == 7
 
 
-def test_a_strangers_run_may_only_name_what_computes(capsys, tmp_path):
-    recipe = replace(
-        get_recipe("ppo/cartpole/mlp"),
-        wrappers=("gymnasium.wrappers:RecordVideo(video_folder='films')",),
-    )
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "recipe.json").write_text(recipe_to_json(recipe))
-    for words in (["evaluate"], ["render", "--out", "film.gif"], ["train", "--resume"]):
-        line = fails(capsys, words[0], *words[1:], str(tmp_path / "run"))
-        assert "RecordVideo" in line
-        assert "add `--import gymnasium.wrappers`" in line
-    assert [path.name for path in (tmp_path / "run").iterdir()] == ["recipe.json"]
-
-
 def test_list_takes_names_as_gymnasium_writes_them(capsys):
     main(["list", "PPO/CartPole/MLP"])
     assert capsys.readouterr().out == "ppo/cartpole/mlp\nppo/cartpole/mlp-protocol\n"

@@ -40,6 +40,14 @@ def test_info(tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture
     assert lines["policy"] == "random"
 
 
+def test_text_of_a_file_does_not_control_the_terminal(
+    tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / "a.hdf5", rolled, policy="a\x1b[2J\nscore  100")
+    main(["data", "info", str(path)])
+    assert "policy        a\\x1b[2J\\nscore  100\n" in capsys.readouterr().out
+
+
 def test_convert_there_and_back(
     tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -221,7 +221,8 @@ def test_names_cannot_be_markup(tmp_path):
     write_run(tmp_path / "a&b <i>", returns=[1.0, 2.0], env_settings=(f"render={evil!r}",))
     versions = tmp_path / "a&b <i>" / "versions.json"
     versions.write_text(json.dumps({evil: evil}))
-    report(tmp_path / "a&b <i>", "--out", tmp_path / "a.html", "--title", evil)
+    words = ["--title", evil, "--import", "gymnasium.envs.classic_control"]
+    report(tmp_path / "a&b <i>", "--out", tmp_path / "a.html", *words)
     page = Page(tmp_path / "a.html")
     assert evil not in page.source
     assert page.text.count(evil) >= 4  # as text
@@ -296,7 +297,11 @@ def test_runs_that_do_not_go_together(runs, tmp_path, capsys):
         ("metrics.csv", "", "has no metrics yet: train it first"),
         ("recipe.json", "{", "cannot be read as a recipe"),
         ("evaluation.json", "[]", "evaluation.json is damaged"),
-        ("evaluation.json", '{"returns": [NaN], "mean": 1, "std": 0, "steps": 1}', "not finite"),
+        ("evaluation.json", '{"returns": [NaN]}', "evaluation.json is damaged"),
+        ("metrics.csv", "step,time,return_mean\n-5,1,2\n", "damaged row after its beginning"),
+        ("metrics.csv", "step,time,return_mean\n5,1,2\n5,2,2\n", "damaged row after step 5"),
+        ("metrics.csv", "step,time,return_mean\n1e300,1,2\n", "damaged row after its beginning"),
+        ("metrics.csv", "step,time,return_mean\n1,1,1e300\n", "its return_mean is 1e+300"),
     ],
 )
 def test_a_damaged_run(name, content, message, tmp_path, capsys):

@@ -25,9 +25,13 @@ def write_run(folder, of, seed, returns, **fields):
     folder.mkdir(parents=True)
     (folder / "recipe.json").write_text(recipe_to_json(recipe))
     if returns is not None:
+        returns = returns * (recipe.evaluation_episodes // len(returns))
         evaluation = {
             "mean": float(np.mean(returns)),
             "std": float(np.std(returns)),
+            "episodes": recipe.evaluation_episodes,
+            "seed": recipe.evaluation_seed,
+            "env": recipe.env,
             "returns": returns,
             "steps": recipe.final_step,
         }
@@ -212,12 +216,51 @@ def test_markdown_and_csv_hold_the_same_recipes(runs):
 def test_fewer_episodes_are_named(tmp_path):
     folder = write_run(tmp_path / "run", "ppo/cartpole/mlp", 0, [20.0, 30.0])
     evaluation = json.loads((folder / "evaluation.json").read_text())
-    for episodes, notes in {
-        100: [],
-        2: [f"{folder} was evaluated over 2 episodes, not 100"],
-    }.items():
-        (folder / "evaluation.json").write_text(json.dumps(evaluation | {"episodes": episodes}))
-        assert make_table([tmp_path])[1] == notes
+    assert make_table([tmp_path])[1] == []
+    fewer = evaluation | {"episodes": 2, "returns": [20.0, 30.0]}
+    (folder / "evaluation.json").write_text(json.dumps(fewer))
+    assert make_table([tmp_path])[1] == [f"{folder} was evaluated over 2 episodes, not 100"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"mean": float("nan")}, "no 'mean' that is a number"),
+        ({"mean": 26.0}, "the 'mean' 26.0, but that of its 'returns' is 25.0"),
+        ({"std": -1.0}, "no 'std' that is a number from 0"),
+        ({"std": 1.0}, "the 'std' 1.0, but that of its 'returns' is 5.0"),
+        ({"returns": [1e300] * 100}, "no 'returns' that is a list of numbers"),
+        ({"returns": [25.0]}, "not have a return for each of its 'episodes'"),
+        ({"steps": -5}, "no 'steps' that is a whole number"),
+        ({"steps": 10**400}, "no 'steps' that is a whole number"),
+        ({"episodes": "100\x1b[2J"}, "no 'episodes' that is a whole number"),
+        ({"score": {"best": float("inf"), "last": 0.0}}, "a 'score' that is not 'best' and 'last'"),
+        ({"score_std": -1.0}, "a 'score_std' that is not a number from 0"),
+    ],
+)
+def test_wrong_evaluations_are_no_results(tmp_path, capsys, changes, reason):
+    write_run(tmp_path / "good", "ppo/cartpole/d2rl", 0, [1.0])
+    folder = write_run(tmp_path / "run", "ppo/cartpole/mlp", 0, [20.0, 30.0])
+    evaluation = json.loads((folder / "evaluation.json").read_text()) | changes
+    (folder / "evaluation.json").write_text(json.dumps(evaluation))
+    main(["table", str(tmp_path)])
+    printed = capsys.readouterr()
+    assert f"run is left out: {folder / 'evaluation.json'} is damaged" in printed.err
+    assert reason in printed.err
+    assert "mlp" not in printed.out
+    assert not Run.open(folder).is_complete()
+
+
+def test_text_of_files_does_not_control_the_terminal(tmp_path, capsys):
+    name = "cql/hopper-medium-replay-v0/mlp"
+    write_run(tmp_path / "run", name, 0, [1.0], dataset="a\x1b[2J\n| fake | 1 |.hdf5")
+    (tmp_path / "no\x1b[31m").mkdir()
+    write_run(tmp_path / "no\x1b[31m" / "run", name, 1, None)
+    main(["table", str(tmp_path)])
+    printed = capsys.readouterr()
+    assert "dataset a\\x1b[2J\\n| fake" in printed.out
+    assert "no\\x1b[31m" in printed.err
+    assert "\x1b" not in printed.out + printed.err
 
 
 def test_runs_whose_schedules_followed_other_lengths_are_named(tmp_path):
