@@ -20,6 +20,7 @@ from recipes.metrics import parse_metrics
 from recipes.results.experiments import find_runs
 from recipes.results.interval import intervals_of
 from recipes.results.plot import new_figure, save_figure
+
 from .memory_tasks import shares
 
 _POINTS = 300

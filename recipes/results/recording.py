@@ -82,12 +82,12 @@ def _metrics(run: Run) -> list[dict[str, float]]:
     """The rows of a run's metrics, with the columns of its other files beside them."""
     rows = parse_metrics(run.read("metrics.csv"), run.folder / "metrics.csv")
     for path in sorted(run.folder.glob("*.csv")):
-        others = {}
+        others: dict[float, dict[str, str]] = {}
         if path.name != "metrics.csv":
-            for row in csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))):
-                if "step" not in row:
+            for other in csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"))):
+                if "step" not in other:
                     break
-                others[float(row["step"])] = row
+                others[float(other["step"])] = other
         for row in rows if others else ():
             for column in next(iter(others.values())):
                 if column not in row:
