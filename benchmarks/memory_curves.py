@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from recipes.metrics import parse_metrics
+from recipes.results.experiments import find_runs
 from recipes.results.interval import intervals_of
 from recipes.results.plot import new_figure, save_figure
-from recipes.run import Run
 
-from .memory_tasks import read_batches, shares
+from .memory_tasks import shares
 
 _POINTS = 300
 _Curve = tuple[np.ndarray, np.ndarray]  # steps and shares
@@ -30,11 +31,15 @@ _Curves = dict[str, dict[str, list[_Curve]]]
 def read_curves(folders: Sequence[Path]) -> _Curves:
     """Returns the curves of all seeds, by task and network."""
     found: _Curves = defaultdict(lambda: defaultdict(list))
-    for folder in folders:
-        task, _, network = Run.open(folder).recipe.name.rpartition("/")
-        points = np.array(list(shares(read_batches(folder / "successes.csv"))))
+    for run in find_runs(folders):
+        task, _, network = run.recipe.name.rpartition("/")
+        # A table of runs has the successes beside the metrics.
+        content = run.read("successes.csv") or run.read("metrics.csv")
+        rows = parse_metrics(content, run.folder / "successes.csv")
+        batches = [(row["step"], row["episodes"], row["successes"]) for row in rows]
+        points = np.array(list(shares((int(a), int(b), int(c)) for a, b, c in batches)))
         if not len(points):
-            raise ValueError(f"{folder} has fewer than a hundred episodes: train it for longer")
+            raise ValueError(f"{run.folder} has fewer than a hundred episodes: train it for longer")
         found[task][network].append((points[:, 0], points[:, 1]))
     return found
 
@@ -65,7 +70,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Reads the runs and writes the picture."""
     parser = argparse.ArgumentParser("python -m benchmarks.memory_curves")
     parser.add_argument(
-        "runs", type=Path, nargs="+", metavar="RUN", help="run folders of benchmarks.memory_tasks"
+        "runs", type=Path, nargs="+", metavar="RUN", help="runs of benchmarks.memory_tasks"
     )
     parser.add_argument("--out", type=Path, required=True, help="PNG file to write")
     options = parser.parse_args(arguments)

@@ -105,12 +105,23 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
     Raises:
         ValueError: if a row is damaged.
     """
-    if not path.exists():
-        return []
+    return parse_metrics(path.read_bytes(), path) if path.exists() else []
+
+
+def parse_metrics(content: bytes | None, path: Path) -> list[dict[str, float]]:
+    """Reads the complete rows of the content of a ``metrics.csv``; none if there is none.
+
+    Args:
+        content: the content.
+        path: where it is from, for messages.
+
+    Raises:
+        ValueError: if a row is damaged.
+    """
     rows: list[dict[str, float]] = []
     try:
         # A row without a line end was left by a killed process and is skipped.
-        lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+        lines = (content or b"").decode().splitlines(keepends=True)
         for cells in csv.DictReader(line for line in lines if line.endswith("\n")):
             row = {name: float(value) for name, value in cells.items()}
             before = rows[-1]["step"] if rows else -1

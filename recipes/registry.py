@@ -20,6 +20,7 @@ from .presets.sac import SAC_RECIPES
 from .recipe import Recipe
 from .recipe_file import is_recipe_file, recipe_from_file
 from .recipe_json import recipe_from_json
+from .records import find_records
 
 RECIPES: Names[Recipe] = Names("recipe")
 """Every named recipe."""
@@ -82,8 +83,8 @@ def find_recipe(name: str) -> Recipe:
     """Looks up a recipe by name, or reads it from a file.
 
     Args:
-        name: the name; a JSON file such as a run's ``recipe.json``; or a Python file, which is
-            run, as ``FILE.py`` or ``FILE.py:NAME``.
+        name: the name; a JSON file such as a run's ``recipe.json``, also of a run that a table of
+            runs holds; or a Python file, which is run, as ``FILE.py`` or ``FILE.py:NAME``.
 
     Raises:
         ValueError: if no recipe has that name, the file holds no recipe or several, or it is a
@@ -102,6 +103,9 @@ def find_recipe(name: str) -> Recipe:
             f"`train --resume {name}`"
         )
     if path.suffix == ".json":
+        if (found := find_records(path.parent)) and found[1] in found[0].rows:
+            records, run = found
+            return recipe_from_json(records.read(run, path.name) or b"", path)
         return recipe_from_json(path.read_bytes(), path)
     if is_recipe_file(name):
         return recipe_from_file(name)

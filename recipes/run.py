@@ -16,7 +16,7 @@ from typing import Any
 import filelock
 import msgspec
 
-from torchrl_tit.agents.folder import read_evaluation
+from torchrl_tit.agents.folder import parse_evaluation, read_evaluation
 from torchrl_tit.checkpoint import (
     CheckpointError,
     checkpoint_steps,
@@ -29,7 +29,8 @@ from torchrl_tit.settings.imports import allowed_modules
 
 from .metrics import Metrics
 from .recipe import Recipe
-from .recipe_json import recipe_to_json
+from .recipe_json import recipe_from_json, recipe_to_json
+from .records import Records
 from .registry import find_recipe
 
 _IMPORTS = "imports.json"
@@ -140,6 +141,26 @@ class Run:
         except ValueError as error:
             raise ValueError(f"{error}{_import_hint(folder)}") from error
 
+    def read(self, name: str) -> bytes | None:
+        """Reads a file of the run.
+
+        Args:
+            name: its name in the folder, such as evaluation.json.
+
+        Returns:
+            Its content; None if there is no such file.
+        """
+        path = self.folder / name
+        return path.read_bytes() if path.is_file() else None
+
+    def read_evaluation(self) -> dict[str, Any] | None:
+        """Reads and checks the run's evaluation; None if there is none.
+
+        Raises:
+            ValueError: if it is damaged; the message names the file.
+        """
+        return read_evaluation(self.folder)
+
     def lengthen(self, length: int) -> None:
         """Changes the length of an open run; training then continues to the new end.
 
@@ -174,14 +195,14 @@ class Run:
         Raises:
             ValueError: if their file is damaged.
         """
-        path = self.folder / _LENGTHS
-        try:
-            return msgspec.json.decode(path.read_bytes(), type=list[tuple[int, int]])
-        except FileNotFoundError:
+        content = self.read(_LENGTHS)
+        if content is None:
             return []
+        try:
+            return msgspec.json.decode(content, type=list[tuple[int, int]])
         except msgspec.MsgspecError as error:
             raise ValueError(
-                f"{path} is damaged: expected pairs of step and length, "
+                f"{self.folder / _LENGTHS} is damaged: expected pairs of step and length, "
                 f"such as [[1024, 4096]] ({error})"
             ) from error
 
@@ -295,6 +316,37 @@ class Run:
             return []
         now = package_versions()
         return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
+
+
+class RecordedRun(Run):
+    """A run of a table of runs, which is read as a run folder is; it has no checkpoints.
+
+    Args:
+        records: the table.
+        run: the run's name in it.
+
+    Raises:
+        ValueError: if its recipe cannot be read.
+
+    Example:
+        >>> RecordedRun(Records("docs/results/hopper"), "mlp/seed-0").recipe.env
+        'Hopper-v5'
+    """
+
+    def __init__(self, records: Records, run: str) -> None:
+        folder = records.folder / run
+        recipe = records.read(run, "recipe.json") or b""
+        super().__init__(folder, recipe_from_json(recipe, folder / "recipe.json"))
+        self._records, self._run = records, run
+
+    def read(self, name: str) -> bytes | None:
+        """Reads a file of the run, as far as the table holds it."""
+        return self._records.read(self._run, name)
+
+    def read_evaluation(self) -> dict[str, Any] | None:
+        """Reads and checks the run's evaluation; None if there is none."""
+        content = self.read("evaluation.json")
+        return None if content is None else parse_evaluation(content, self.folder)
 
 
 def _import_hint(folder: Path) -> str:

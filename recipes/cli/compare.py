@@ -6,17 +6,16 @@ from pathlib import Path
 
 from torchrl_tit.files import write_text_atomic
 
-from ..results.experiments import check_together, group_runs
+from ..results.experiments import check_together, find_runs, group_runs
 from ..results.plot import plot_comparison, plot_table
 from ..results.table import make_table, to_csv, to_markdown
-from ..run import Run
 from .arguments import Parser, fail, note, program, say
 
 
 def compare(arguments: list[str]) -> None:
     """Plots learning curves of several runs."""
     parser = Parser(f"{program()} compare")
-    parser.add_argument("runs", type=Path, nargs="+", help="run folders")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders, or tables of runs")
     parser.add_argument("--out", type=Path, default=Path("comparison.png"), help="PNG to write")
     parser.add_argument("--title", default="", help="title of the figure")
     options = parser.parse_args(arguments)
@@ -26,12 +25,9 @@ def compare(arguments: list[str]) -> None:
     folders = {path.resolve(): path for path in options.runs if path.suffix != ".log"}
     if not folders:
         fail(f"{options.runs[0]} is not a run folder, but a log: name the folder beside it")
-    experiments = group_runs(Run.open(folder) for folder in folders.values())
+    experiments = group_runs(find_runs(folders.values()))
     check_together(experiments)
-    curves = {
-        experiment.label: [run.folder / "metrics.csv" for run in experiment.runs]
-        for experiment in experiments
-    }
+    curves = {experiment.label: experiment.runs for experiment in experiments}
     offline = experiments[0].settings.offline
     plot_comparison(curves, options.out, title=options.title, offline=offline)
     say(f"written to {options.out}")
@@ -40,7 +36,7 @@ def compare(arguments: list[str]) -> None:
 def table(arguments: list[str]) -> None:
     """Prints the paper's tables for the runs in the folders."""
     parser = Parser(f"{program()} table")
-    parser.add_argument("folders", type=Path, nargs="+", help="folders that contain run folders")
+    parser.add_argument("folders", type=Path, nargs="+", help="folders of runs, or tables of runs")
     parser.add_argument("--format", choices=["md", "csv"], default="md", help="format to print")
     parser.add_argument("--out", type=Path, help="folder for table.md, table.csv and table.png")
     options = parser.parse_args(arguments)

@@ -26,6 +26,7 @@ COMMANDS = {
     "export": "export:export",
     "compare": "compare:compare",
     "table": "compare:table",
+    "record": "record:record",
     "report": "report:report",
     "data": "data:data",
 }
@@ -56,6 +57,8 @@ usage: {program} COMMAND ...
   tune NAME --out FOLDER      search for the best values of a recipe's fields, with Optuna
   compare RUN [RUN ...]       plot learning curves of several runs, a recipe's seeds as one band
   table FOLDER [FOLDER ...]   print the paper's tables with all runs in the folders
+  record RUN... --out FOLDER  add finished runs to a table of runs, which lies beside the code;
+                              compare, table and report read it
   report RUN... --out FILE    write everything about runs into one HTML file, to send to a colleague
   data info SOURCE            describe a data set: an HDF5 file, D4RL's or Minari's name
   data convert SOURCE TARGET  convert between HDF5 in D4RL's layout and Minari

@@ -16,7 +16,11 @@ def report(arguments: list[str]) -> None:
         "the agent looks at, settings and versions. Several runs make a comparison.",
     )
     parser.add_argument(
-        "runs", type=Path, nargs="+", metavar="RUN", help="run folders, or folders of run folders"
+        "runs",
+        type=Path,
+        nargs="+",
+        metavar="RUN",
+        help="run folders, or tables of runs",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the .html file")
     parser.add_argument("--title", default="", help="title of the report; default: the recipe's")

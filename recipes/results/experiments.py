@@ -12,8 +12,9 @@ from torchrl_tit.settings.checks import printable
 
 from ..recipe import Recipe, experiment_of
 from ..recipe_json import recipe_to_json
+from ..records import TABLE, Records, find_records
 from ..registry import RECIPES
-from ..run import Run
+from ..run import RecordedRun, Run
 
 
 @dataclass(frozen=True)
@@ -37,20 +38,31 @@ def find_runs(folders: Iterable[Path]) -> list[Run]:
     """Opens all runs in folders, each once.
 
     Args:
-        folders: run folders, or folders with run folders somewhere below.
+        folders: run folders, folders with run folders or tables of runs somewhere below, or paths
+            in a table of runs, such as docs/results/hopper/mlp.
 
     Raises:
         ValueError: if a folder holds none, or the recipe of one cannot be read.
     """
     found: dict[Path, Run] = {}
     for folder in folders:
-        paths = sorted(folder.rglob("recipe.json"))
-        if not paths:
+        if not (runs := _runs_below(folder)):
             raise ValueError(
-                f"{folder} holds no run folder: there is no recipe.json in it or below"
+                f"{folder} holds no run folder and no table of runs: there is no recipe.json and "
+                f"no {TABLE} in it or below"
             )
-        found |= {path.parent.resolve(): Run.open(path.parent) for path in paths}
+        found |= {run.folder.resolve(): run for run in runs}
     return list(found.values())
+
+
+def _runs_below(folder: Path) -> list[Run]:
+    if (found := find_records(folder)) is not None:
+        records, below = found
+        return [RecordedRun(records, run) for run in records.below(below)]
+    runs = [Run.open(path.parent) for path in folder.rglob("recipe.json")]
+    for records in (Records(path.parent) for path in folder.rglob(TABLE)):
+        runs += [RecordedRun(records, run) for run in records.rows]
+    return sorted(runs, key=lambda run: run.folder)
 
 
 def group_runs(runs: Iterable[Run]) -> list[Experiment]:
@@ -129,13 +141,27 @@ def changed_fields(before: Recipe, after: Recipe) -> str:
         >>> changed_fields(recipe, replace(recipe, num_envs=4, seed=7))
         'num_envs 4'
     """
+    return ", ".join(
+        printable(f"{field} {value}") for field, value in changes_of(before, after).items()
+    )
+
+
+def changes_of(before: Recipe, after: Recipe) -> dict[str, Any]:
+    """Returns the fields in which settings differ, ignoring seed and machine, with the new values.
+
+    Example:
+        >>> from recipes.registry import get_recipe
+        >>> from dataclasses import replace
+        >>> recipe = get_recipe("ppo/cartpole/mlp")
+        >>> changes_of(recipe, replace(recipe, num_envs=4, seed=7))
+        {'num_envs': 4}
+    """
     old, new = (fields_of(experiment_of(recipe)) for recipe in (before, after))
-    changed = [
-        field
+    return {
+        field: value
         for field, value in new.items()
         if value != {} and (field not in old or old[field] != value)
-    ]
-    return ", ".join(printable(f"{field} {new[field]}") for field in changed)
+    }
 
 
 def fields_of(recipe: Recipe) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
 from textwrap import wrap
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from torchrl_tit.files import write_bytes_atomic
 
-from ..metrics import read_metrics
+from ..metrics import parse_metrics, read_metrics
 from ..run import Run
 from .cell import Cell
 
@@ -48,7 +48,7 @@ def plot_learning_curve(
         window: batches over which the bold line is averaged.
         offline: whether to draw evaluation episodes over gradient steps instead.
     """
-    steps, returns = _curve(metrics)
+    steps, returns = _curve(read_metrics(metrics))
     smooth = np.array([returns[max(0, i - window + 1) : i + 1].mean() for i in range(len(returns))])
     figure = _figure(title, offline)
     (axes,) = figure.axes
@@ -66,7 +66,7 @@ def plot_learning_curve(
 
 
 def plot_comparison(
-    curves: Mapping[str, Sequence[Path]],
+    curves: Mapping[str, Sequence[Run]],
     picture: Path,
     *,
     title: str,
@@ -76,8 +76,8 @@ def plot_comparison(
     """Draws learning curves of several groups of runs: mean over the runs, band of one deviation.
 
     Args:
-        curves: ``metrics.csv`` files of the runs (seeds) of each group, by the group's name; their
-            common prefix, up to a "/", appears only in the title.
+        curves: the runs (seeds) of each group, by the group's name; the names' common prefix, up to
+            a "/", appears only in the title.
         picture: the PNG file to write.
         title: title of the figure, instead of the common part of the names.
         points: steps at which the runs are compared; between batches, returns are interpolated.
@@ -92,7 +92,8 @@ def plot_comparison(
     figure = _figure(title or common.rstrip("/"), offline)
     (axes,) = figure.axes
     for name, runs in curves.items():
-        known = [(steps, returns) for steps, returns in map(_curve, runs) if len(steps)]
+        rows = (parse_metrics(run.read("metrics.csv"), run.folder / "metrics.csv") for run in runs)
+        known = [(steps, returns) for steps, returns in map(_curve, rows) if len(steps)]
         if not known:
             continue
         grid = np.linspace(
@@ -107,7 +108,7 @@ def plot_comparison(
             grid, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.2, linewidth=0
         )
     if not axes.lines:
-        folders = ", ".join(str(run.parent) for runs in curves.values() for run in runs)
+        folders = ", ".join(str(run.folder) for runs in curves.values() for run in runs)
         raise ValueError(f"there is nothing to draw: no episode has ended in {folders}")
     _write(figure, picture)
 
@@ -164,9 +165,9 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     save_figure(figure, picture)
 
 
-def _curve(metrics: Path) -> tuple[np.ndarray, np.ndarray]:
+def _curve(metrics: Iterable[dict[str, float]]) -> tuple[np.ndarray, np.ndarray]:
     """Steps and returns of the batches in which an episode ended."""
-    rows = [row for row in read_metrics(metrics) if not np.isnan(row["return_mean"])]
+    rows = [row for row in metrics if not np.isnan(row["return_mean"])]
     return np.array([row["step"] for row in rows]), np.array([row["return_mean"] for row in rows])
 
 

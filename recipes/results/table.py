@@ -42,7 +42,7 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
     runs, notes = [], []
     for run in find_runs(folders):
         try:
-            evaluation = read_evaluation(run.folder)
+            evaluation = run.read_evaluation()
         except (OSError, ValueError) as error:
             notes.append(f"{run.folder} is left out: {error}")
             continue

@@ -65,7 +65,7 @@ def test_the_command(make_run, tmp_path, capsys):
     main([str(run), "--out", str(out)])
     assert out.read_bytes().startswith(b"\x89PNG")
     for folder, said in [
-        (tmp_path / "nothing", "is not a run folder"),
+        (tmp_path / "nothing", "holds no run folder"),
         (make_run("ppo/memory-s9/lstm", 1, []), "has fewer than a hundred episodes"),
     ]:
         with pytest.raises(SystemExit):

@@ -339,8 +339,8 @@ def test_a_disk_that_is_full_stops_the_process_with_one_line(tmp_path):
 
 def test_a_run_of_any_algorithm_is_opened_by_a_script_of_its_own():
     script = (
-        "from pathlib import Path; from recipes.run import Run; "
-        "print(Run.open(Path('docs/results/demo')).recipe.env)"
+        "from recipes.records import Records; from recipes.run import RecordedRun; "
+        "print(RecordedRun(Records('docs/results/cartpole'), 'mlp/seed-0').recipe.env)"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False

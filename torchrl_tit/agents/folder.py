@@ -228,17 +228,30 @@ def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
         True
     """
     path = Path(folder, EVALUATION)
-    with suppress(FileNotFoundError):
-        try:
-            _check_size(EVALUATION, path.stat().st_size)
-            evaluation = _parse(path.read_bytes(), EVALUATION)
-            check_evaluation(evaluation)
-            return evaluation
-        except (RecursionError, ValueError) as error:
-            raise ValueError(
-                f"{path} is damaged: `evaluate {path.parent}` writes it again ({error})"
-            ) from error
+    with suppress(FileNotFoundError), path.open("rb") as file:
+        return parse_evaluation(file.read(_MOST_BYTES_OF_TEXT + 1), folder)  # one more is refused
     return None
+
+
+def parse_evaluation(content: bytes, folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Reads and checks the content of an evaluation.
+
+    Args:
+        content: the content of its file.
+        folder: the folder that it is from, for messages.
+
+    Raises:
+        ValueError: as in :func:`read_evaluation`.
+    """
+    try:
+        _check_size(EVALUATION, len(content))
+        evaluation = _parse(content, EVALUATION)
+        check_evaluation(evaluation)
+        return evaluation
+    except (RecursionError, ValueError) as error:
+        raise ValueError(
+            f"{Path(folder, EVALUATION)} is damaged: `evaluate {folder}` writes it again ({error})"
+        ) from error
 
 
 def _read_manifest(folder: Path) -> dict[str, Any]:

@@ -12,9 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from torchrl_tit.agents.folder import read_evaluation
-
-from ...metrics import read_metrics
+from ...metrics import parse_metrics
 from ...recipe import Recipe
 from ...run import Run
 from ..experiments import Experiment, check_together, find_runs, group_runs
@@ -100,7 +98,7 @@ def _by_seed(runs: Iterable[Run]) -> list[Run]:
 
 
 def _read(run: Run) -> RunData:
-    rows = read_metrics(run.folder / "metrics.csv")
+    rows = parse_metrics(run.read("metrics.csv"), run.folder / "metrics.csv")
     if not rows:
         raise ValueError(
             f"{run.folder} has no metrics yet: train it first, or leave it out of the report"
@@ -113,12 +111,12 @@ def _read(run: Run) -> RunData:
         metrics["steps_per_second"] = np.diff(metrics["step"], prepend=np.nan) / np.diff(
             metrics.get("time", metrics["step"]), prepend=np.nan
         )
-    return RunData(run, metrics, read_evaluation(run.folder), _versions(run.folder))
+    return RunData(run, metrics, run.read_evaluation(), _versions(run))
 
 
-def _versions(folder: Path) -> dict[str, Any]:
+def _versions(run: Run) -> dict[str, Any]:
     try:
-        found = json.loads((folder / "versions.json").read_bytes())
+        found = json.loads(run.read("versions.json") or b"")
     except (OSError, ValueError):  # missing or damaged: the report says that they are unknown
         return {}
     return found if isinstance(found, dict) else {}

@@ -36,7 +36,7 @@ def drawn(monkeypatch):
             lambda curves, picture, **options: found.update(curves),
         )
         main(["compare", *folders])
-        return {name: [str(path.parent) for path in paths] for name, paths in found.items()}
+        return {name: [str(run.folder) for run in runs] for name, runs in found.items()}
 
     return compare
 

@@ -6,15 +6,21 @@ from pathlib import Path
 import pytest
 from matplotlib.image import imread
 
+from recipes.registry import get_recipe
 from recipes.results.cell import Cell
 from recipes.results.plot import plot_comparison, plot_learning_curve, plot_table
+from recipes.run import Run
+
+
+def run_in(folder: Path) -> Run:
+    return Run(folder, get_recipe("ppo/cartpole/mlp"))
 
 
 def height(folder: Path, groups: int) -> int:
     """Pixels of the picture of some groups of runs."""
     metrics, picture = folder / "metrics.csv", folder / f"{groups}.png"
     metrics.write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
-    plot_comparison({f"run {i}": [metrics] for i in range(groups)}, picture, title="")
+    plot_comparison({f"run {i}": [run_in(folder)] for i in range(groups)}, picture, title="")
     return len(imread(picture))
 
 
@@ -26,7 +32,8 @@ def test_the_legend_of_many_curves_has_a_place_of_its_own(tmp_path):
 def test_the_legend_is_in_the_picture(length, tmp_path):
     metrics, picture = tmp_path / "metrics.csv", tmp_path / "curves.png"
     metrics.write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
-    plot_comparison({f"{i} {'n' * length}": [metrics] for i in range(4)}, picture, title="")
+    runs = [run_in(tmp_path)]
+    plot_comparison({f"{i} {'n' * length}": runs for i in range(4)}, picture, title="")
     shape = imread(picture)[..., :3]
     assert all(edge.min() == 1 for edge in (shape[:, 0], shape[:, -1], shape[0], shape[-1]))
 
@@ -39,9 +46,10 @@ def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, monkeypat
         "recipes.results.plot._write", lambda figure, picture: figures.append(figure)
     )
     names = ["ppo/cartpole/mlp", "ppo/cartpole/mlp-stack-8", "ppo/cartpole/lstm"]
+    run = run_in(tmp_path)
     for title in ("", "mine"):
-        plot_comparison({name: [metrics] for name in names}, tmp_path / "a.png", title=title)
-    plot_comparison({names[0]: [metrics]}, tmp_path / "a.png", title="")
+        plot_comparison({name: [run] for name in names}, tmp_path / "a.png", title=title)
+    plot_comparison({names[0]: [run_in(tmp_path)]}, tmp_path / "a.png", title="")
     drawn = [
         (axes.get_title(), axes.get_legend_handles_labels()[1])
         for (axes,) in (figure.axes for figure in figures)
@@ -90,5 +98,5 @@ def test_a_run_of_one_batch_is_seen(rows, tmp_path, monkeypatch):
     assert {line.get_marker() for line in axes.lines} == {"o" if point else "None"}
     assert [text.get_text() for text in axes.texts] == ([] if point else ["no episode has ended"])
     if point:
-        plot_comparison({"run": [metrics]}, tmp_path / "curve.png", title="")
+        plot_comparison({"run": [run_in(tmp_path)]}, tmp_path / "curve.png", title="")
         assert figures[1].axes[0].lines[0].get_marker() == "o"

@@ -1,0 +1,384 @@
+"""Writes the tables of pages from the data beside them: ``python -m docs.tools.tables``.
+
+A table stands between two comments. The first says where its numbers are from, below docs/results:
+
+    <!-- table: hopper
+    | recipe | weights | return | each seed |
+    = {1} | {2} | {mean} | {each}
+    mlp: `ppo/hopper/mlp` | 10,119
+    enhanced-tit-tuned: `ppo/hopper/enhanced-tit-tuned` | 55,943
+    -->
+    ...
+    <!-- end -->
+
+The first row is the header. ``=`` gives the form of the rows that follow: each names its runs and,
+after a colon, the cells that are not measured. A line that begins with ``|`` is a row with its own
+form. ``{mean}`` is a measure of :data:`MEASURES`, ``{mean.1}`` the same with one digit, ``{mean @
+hopper/mlp}`` that of the runs of a path below docs/results, ``{median FILE.json / KEY / ...}`` a
+number of a benchmark.
+
+With ``--check``, pages that differ from their data are named, and nothing is written.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from statistics import fmean, median, pstdev
+from typing import Any
+
+import numpy as np
+
+from recipes.records import Records
+from recipes.results.interval import interval_of
+from recipes.results.reported import paper_results, plain_name
+from torchrl_tit.files import write_text_atomic
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "docs" / "results"
+PAGES = ("*.md", "docs/**/*.md")
+
+_TABLE = re.compile(r"(<!-- table: *(\S*)\n(.*?)-->\n)(.*?)(<!-- end -->)", re.DOTALL)
+_MEASURE = re.compile(r"\{([^{}]+)\}")
+
+
+class Runs:
+    """What a row measures: runs, or rows of a CSV file, in the order of their seeds.
+
+    Args:
+        path: a path in a table of runs below docs/results; with a space between, several; or a CSV
+            file and a value of its first column, such as "memory/s7.csv ppo/memory-s7/lstm", or
+            "COLUMN=VALUE".
+    """
+
+    def __init__(self, path: str) -> None:
+        self.rows: list[dict[str, str]] = []
+        self.runs: list[tuple[Records, str]] = []
+        name, _, value = path.partition(" ")
+        if name.endswith(".csv"):
+            with (RESULTS / name).open(newline="", encoding="utf-8") as file:
+                rows = list(csv.DictReader(file))
+            column, _, wanted = value.rpartition("=")
+            self.rows = [row for row in rows if row[column or next(iter(row))] == wanted]
+        else:
+            found = [pair for name in path.split() for pair in _runs_below(name)]
+            self.runs = sorted(found, key=lambda pair: int(pair[0].rows[pair[1]]["seed"]))
+            self.rows = [records.rows[run] for records, run in self.runs]
+        if not self.rows:
+            raise ValueError(f"docs/results has no run {path}")
+
+    def numbers(self, column: str) -> list[float]:
+        """A number of each run's row."""
+        return [float(row[column]) for row in self.rows]
+
+    def evaluations(self) -> list[dict[str, Any]]:
+        """Each run's evaluation."""
+        found = [records.read(run, "evaluation.json") for records, run in self.runs]
+        return [json.loads(content) for content in found if content is not None]
+
+    def curves(self) -> list[dict[str, np.ndarray]]:
+        """Each run's metrics."""
+        return [_curve(records, run) for records, run in self.runs]
+
+
+def _runs_below(path: str) -> Iterator[tuple[Records, str]]:
+    page, _, below = path.partition("/")
+    records = _records(page)
+    for run in records.below(below):
+        yield records, run
+
+
+@cache
+def _records(page: str) -> Records:
+    return Records(RESULTS / page)
+
+
+@cache
+def _curve(records: Records, run: str) -> dict[str, np.ndarray]:
+    rows = list(csv.DictReader(io.StringIO((records.read(run, "metrics.csv") or b"").decode())))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+@cache
+def _json(name: str) -> Any:
+    return json.loads((RESULTS / name).read_bytes())
+
+
+def number(value: float, digits: int = 0) -> str:
+    """Formats a number: nothing for NaN, no minus sign before 0."""
+    if value != value:
+        return ""
+    text = f"{value:.{digits}f}"
+    return text.lstrip("-") if float(text) == 0 else text
+
+
+def _mean_std(values: Sequence[float], digits: int) -> str:
+    if len(values) == 1:
+        return number(values[0], digits)
+    return f"{number(fmean(values), digits)} ± {number(pstdev(values), digits)}"
+
+
+def _list(values: Sequence[float], digits: int) -> str:
+    texts = [number(value, digits) for value in values]
+    return f"{texts[0]} each" if len(texts) > 2 and len({*texts}) == 1 else ", ".join(texts)
+
+
+def _range(values: Sequence[float], digits: int) -> str:
+    low, high = number(min(values), digits), number(max(values), digits)
+    return low if low == high else f"{low} to {high}"
+
+
+def _around(values: Sequence[float], digits: int) -> str:
+    """A mean and its range."""
+    if len({number(value, digits) for value in values}) == 1:
+        return _list(values, digits)
+    return f"{number(fmean(values), digits)} ({_range(values, digits)})"
+
+
+def _seeds(runs: Runs, digits: int) -> str:
+    seeds = sorted(int(row["seed"]) for row in runs.rows)
+    if len(seeds) > 2 and all(after - before == 1 for before, after in pairwise(seeds)):
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(map(str, seeds))
+
+
+def _values(runs: Runs) -> list[float]:
+    """Each run's evaluation: its mean return, or the mean of a CSV file."""
+    return runs.numbers("mean" if runs.runs else "evaluation")
+
+
+def _scores(runs: Runs, which: str) -> list[float]:
+    return [evaluation["score"][which] for evaluation in runs.evaluations()]
+
+
+def _tail(runs: Runs, column: str, begin: float, end: float = np.inf) -> list[float]:
+    """Means of a metric over rows of a run, those between two steps."""
+    means = []
+    for curve in runs.curves():
+        steps, values = curve["step"], curve[column]
+        counts = (steps > begin) & (steps <= end) & np.isfinite(values)
+        means.append(float(values[counts].mean()) if counts.any() else float("nan"))
+    return means
+
+
+def _last(runs: Runs, column: str, share: float) -> list[float]:
+    """Means of a metric over the last share of a run's steps."""
+    means = []
+    for curve in runs.curves():
+        steps, values = curve["step"], curve[column]
+        counts = (steps > (1 - share) * steps[-1]) & np.isfinite(values)
+        means.append(float(values[counts].mean()))
+    return means
+
+
+def _over(runs: Runs, column: str, reduce: Callable[..., Any]) -> list[float]:
+    return [float(reduce(curve[column])) for curve in runs.curves()]
+
+
+def _at(runs: Runs, column: str, step: str) -> list[float]:
+    """A metric at a step of each run; "last" is its last row, "best" its highest value."""
+    found = []
+    for curve in runs.curves():
+        values = curve[column]
+        if step in ("last", "best"):
+            found.append(float(np.nanmax(values) if step == "best" else values[-1]))
+        else:
+            found.append(float(values[curve["step"] == float(step)][0]))
+    return found
+
+
+def _paper(runs: Runs, digits: int) -> str:
+    result = paper_results()[plain_name(runs.rows[0]["recipe"])]
+    return f"{number(result.mean, digits)} ± {number(result.std, digits)}"
+
+
+def _reaches(runs: Runs, column: str, least: float) -> str:
+    """The thousands of steps until a metric's mean over 100 or more episodes is high enough."""
+    found = []
+    for curve in runs.curves():
+        ends, begin, reached = np.nancumsum(curve["episodes"]), 0, ""
+        totals = np.nancumsum(curve[column] * curve["episodes"])
+        for index, step in enumerate(curve["step"]):
+            while begin < index and ends[index] - ends[begin] >= 100:
+                begin += 1
+            since = (ends[begin - 1], totals[begin - 1]) if begin else (0, 0)
+            count = ends[index] - since[0]
+            if count >= 100 and (totals[index] - since[1]) / count >= least:
+                reached = str(step)
+                break
+        found.append(_thousands(reached))
+    return ", ".join(found)
+
+
+def _thousands(steps: str) -> str:
+    return f"{float(steps) / 1000:.0f}" if steps else "not"
+
+
+def _successes(runs: Runs, digits: int) -> str:
+    texts = [f"{value:.2f}" for value in runs.numbers("success")]
+    same = len(texts) > 1 and len({*texts}) == 1
+    return f"{len(texts)} x {texts[0]}" if same else ", ".join(texts)
+
+
+def _reached(runs: Runs, digits: int) -> str:
+    return ", ".join(_thousands(row["steps_to_0.9"]) for row in runs.rows)
+
+
+def _span(runs: Runs, digits: int) -> str:
+    """The least and the most steps, to thousands."""
+    reached = [round(value, -3) for value in runs.numbers("steps_to_0.9")]
+    return f"{min(reached):,.0f} to {max(reached):,.0f}"
+
+
+def _reached_by(runs: Runs, digits: int) -> str:
+    reached = [float(row["steps_to_0.9"]) / 1000 for row in runs.rows if row["steps_to_0.9"]]
+    if not reached:
+        return ""
+    text = f"{interval_of(reached):.0f}"
+    return (
+        text if len(reached) == len(runs.rows) else f"{text}, by {len(reached)} of {len(runs.rows)}"
+    )
+
+
+MEASURES: dict[str, Callable[..., str]] = {
+    "runs": lambda runs, digits: str(len(runs.rows)),
+    "seeds": _seeds,
+    "steps": lambda runs, digits: f"{max(int(c['step'][-1]) for c in runs.curves()):,}",
+    "ksteps": lambda runs, digits: f"{max(int(c['step'][-1]) for c in runs.curves()) / 1000:,.0f}k",
+    # Evaluations: the mean over the seeds, and each seed's
+    "mean": lambda runs, digits: _mean_std(_values(runs), digits),
+    "each": lambda runs, digits: _list(_values(runs), digits),
+    "episodes": lambda runs, digits: number(fmean(runs.numbers("std")), digits),
+    "iqm": lambda runs, digits: f"{interval_of(_values(runs)):.{digits}f}",
+    "paper": _paper,
+    "score": lambda runs, digits, which="last": _mean_std(_scores(runs, which), digits),
+    "scores": lambda runs, digits, which="last": _list(_scores(runs, which), digits),
+    "target": lambda runs, digits, target: _mean_std(
+        [evaluation["targets"][target]["score"] for evaluation in runs.evaluations()], digits
+    ),
+    # Metrics of training: over a share of the end, between steps, at a step, over the whole run
+    "last": lambda runs, digits, column, share: _around(_last(runs, column, float(share)), digits),
+    "lasts": lambda runs, digits, column, share: _list(_last(runs, column, float(share)), digits),
+    "after": lambda runs, digits, column, step: _mean_std(_tail(runs, column, float(step)), digits),
+    "between": lambda runs, digits, column, begin, end: number(
+        fmean(_tail(runs, column, float(begin), float(end))), digits
+    ),
+    "at": lambda runs, digits, column, step: _mean_std(_at(runs, column, step), digits),
+    "ats": lambda runs, digits, column, step: _list(_at(runs, column, step), digits),
+    "averages": lambda runs, digits, column: number(fmean(_over(runs, column, np.nanmean)), digits),
+    "average": lambda runs, digits, column: _range(_over(runs, column, np.nanmean), digits),
+    "middle": lambda runs, digits, column: _range(_over(runs, column, np.nanmedian), digits),
+    "reaches": lambda runs, digits, column, least: _reaches(runs, column, float(least)),
+    # Rows of benchmarks.memory_tasks
+    "weights": lambda runs, digits: f"{int(runs.rows[0]['weights']):,}",
+    "success": _successes,
+    "reached": _reached,
+    "reached_by": _reached_by,
+    "span": _span,
+    "column": lambda runs, digits, column: _list(runs.numbers(column), digits),
+}
+"""What can stand in braces, of the runs of a row."""
+
+
+def _found(path: str) -> list[float]:
+    """The numbers that a path leads to: ``FILE.json / KEY / ...``."""
+    name, *keys = (part.strip() for part in path.split(" / "))
+    value = _json(name)
+    for key in keys:
+        value = value[int(key)] if isinstance(value, list) else value[key]
+    return [float(one) for one in (value if isinstance(value, list) else [value])]
+
+
+def _of_benchmark(kind: str, words: str, digits: int) -> str:
+    if kind == "ratio":  # round by round
+        over, _, under = words.partition(" : ")
+        values = [a / b for a, b in zip(_found(over), _found(under), strict=True)]
+    else:
+        values = _found(words)
+    text = number(median(values), digits)
+    return f"{text} ({_range(values, digits)})" if kind == "spread" else text
+
+
+def measure(text: str, path: str) -> str:
+    """Returns what stands for the text in braces, in a row of the runs of a path.
+
+    Raises:
+        ValueError: if it is no measure, or there is no such run.
+    """
+    words, _, of = text.partition(" @ ")
+    name, _, rest = words.partition(" ")
+    name, _, digits = name.partition(".")
+    if name in ("median", "ratio", "spread"):
+        return _of_benchmark(name, rest, int(digits or 0))
+    if name not in MEASURES:
+        raise ValueError(f"unknown measure {name!r}: choose from {', '.join(MEASURES)}")
+    return MEASURES[name](_runs(of or path), int(digits or 0), *rest.split())
+
+
+@cache
+def _runs(path: str) -> Runs:
+    return Runs(path)
+
+
+def print_table(folder: str, form: str) -> str:
+    """Makes a table.
+
+    Args:
+        folder: the folder below docs/results that the runs of rows are in.
+        form: the lines of its comment.
+    """
+    lines, pattern = [], ""
+    for line in filter(None, map(str.strip, form.splitlines())):
+        if line.startswith("="):
+            pattern = line.removeprefix("=").strip()
+            continue
+        if line.startswith("|"):
+            lines.append(_row(line, "", []))
+        else:
+            name, _, rest = line.partition(": ")
+            path = " ".join(f"{folder}/{part}" if folder else part for part in name.split(" + "))
+            lines.append(_row(f"| {pattern} |", path, rest.split("|")))
+        if len(lines) == 1:
+            lines.append("|" + "---|" * (lines[0].count("|") - 1))
+    return "\n".join(lines) + "\n"
+
+
+def _row(form: str, path: str, cells: Sequence[str]) -> str:
+    """Fills in a row of the runs of a path."""
+
+    for place, cell in enumerate(cells, 1):
+        form = form.replace(f"{{{place}}}", cell.strip())
+    form = _MEASURE.sub(lambda found: measure(found[1], path), form)
+    return re.sub(r"\|  +(?=\|)", "| ", form)
+
+
+def fill(text: str) -> str:
+    """Returns a page with its tables as the data have them."""
+    return _TABLE.sub(lambda m: f"{m[1]}{print_table(m[2], m[3])}{m[5]}", text)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Writes the tables of all pages, or names the pages that differ."""
+    check = "--check" in (sys.argv[1:] if arguments is None else arguments)
+    differ = []
+    for path in sorted(path for pattern in PAGES for path in ROOT.glob(pattern)):
+        text = path.read_text(encoding="utf-8")
+        if fill(text) != text:
+            differ.append(str(path.relative_to(ROOT)))
+            if not check:
+                write_text_atomic(path, fill(text))
+    if differ:
+        print(f"{'differ from their data' if check else 'written'}: {', '.join(differ)}")
+    if differ and check:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,325 @@
+"""Records of runs: a table of many runs in a folder, small enough to lie beside the code.
+
+    records.csv       a row for each run, see :data:`COLUMNS`
+    recipes.json.xz   the runs' recipes without their seeds, each once
+    curves.csv.xz     the rows of the runs' metrics, below one another
+
+What is left out: metrics keep four significant digits and returns of single episodes six, a
+metric that follows from the settings or other metrics (:data:`LEFT_OUT`) is not kept, and neither
+are checkpoints.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import hashlib
+import io
+import json
+import lzma
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import groupby
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from torchrl_tit.files import write_bytes_atomic, write_text_atomic
+
+TABLE, RECIPES, CURVES = "records.csv", "recipes.json.xz", "curves.csv.xz"
+
+COLUMNS = (
+    "run",  # its path below the folder
+    "recipe",
+    "changes",  # the settings that differed from the recipe of that name when it was recorded
+    "seed",
+    "settings",  # the key of its recipe in recipes.json.xz
+    "ended",  # UTC
+    "commit",  # that has its code and its full record
+    "versions",
+    "steps",
+    "mean",
+    "std",
+    "returns",
+    "evaluation",  # the other entries of evaluation.json
+    "earlier_lengths",
+)
+
+LEFT_OUT = ("time", "learning_rate", "loss_objective", "loss_critic", "loss_entropy")
+"""Metrics that are not kept."""
+
+_OF_EVALUATION = ("steps", "mean", "std", "returns")
+
+
+@dataclass(frozen=True)
+class Record:
+    """A run as a table holds it.
+
+    Args:
+        row: its row, by the names of :data:`COLUMNS`.
+        recipe: its recipe without the seed.
+        curve: its rows of ``curves.csv.xz`` as the text of a ``metrics.csv``.
+    """
+
+    row: dict[str, str]
+    recipe: dict[str, Any]
+    curve: str
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What no two runs have in common, whatever their names."""
+        return tuple(self.row[column] for column in ("settings", "seed", "ended", "steps"))
+
+
+class Records:
+    """The table of runs in a folder.
+
+    Args:
+        folder: the folder; without a table in it, there are no runs.
+
+    Raises:
+        ValueError: if the table is damaged.
+
+    Example:
+        >>> records = Records("docs/results/hopper")
+        >>> records.below("tried")[0]
+        'tried/critic-0.02'
+        >>> records.read("tried/critic-0.02", "metrics.csv")[:21]
+        b'step,return_mean,epis'
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self.rows: dict[str, dict[str, str]] = {}
+        path = self.folder / TABLE
+        if path.is_file():
+            with path.open(newline="", encoding="utf-8") as file:
+                rows = list(csv.DictReader(file))
+            if any(set(row) != set(COLUMNS) or None in row.values() for row in rows):
+                raise ValueError(f"{path} is damaged: expected the columns {', '.join(COLUMNS)}")
+            self.rows = {row["run"]: row for row in rows}
+
+    def below(self, path: str) -> list[str]:
+        """Names the run of a path, or all runs below it, in the table's order."""
+        return [run for run in self.rows if PurePosixPath(run).is_relative_to(path)]
+
+    def read(self, run: str, name: str) -> bytes | None:
+        """Returns a file of a run's folder as far as the table holds it.
+
+        Args:
+            run: the run's name.
+            name: recipe.json, versions.json, evaluation.json, earlier_lengths.json or metrics.csv.
+
+        Raises:
+            ValueError: if the table's files are damaged.
+        """
+        row = self.rows[run]
+        if name == "metrics.csv":
+            text = self._curves.get(run, "")
+        elif name == "recipe.json":
+            text = json.dumps({**self._recipe(row), "seed": int(row["seed"])}, indent=2) + "\n"
+        elif name == "evaluation.json":
+            text = _evaluation(row)
+        else:
+            text = row.get(name.removesuffix(".json"), "")
+        return text.encode() if text else None
+
+    def records(self) -> dict[str, Record]:
+        """Returns all runs by name."""
+        return {
+            run: Record(row, self._recipe(row), self._curves.get(run, ""))
+            for run, row in self.rows.items()
+        }
+
+    def add(self, records: Mapping[str, Record]) -> None:
+        """Adds runs and writes the table; a process that is killed leaves the table as it was.
+
+        Args:
+            records: the runs by name.
+
+        Raises:
+            ValueError: if the table holds one of them already.
+        """
+        found = self.records()
+        known = {record.key: run for run, record in found.items()}
+        for run, record in records.items():
+            same = run if run in found else known.setdefault(record.key, run)
+            if run in found or same != run:
+                raise ValueError(
+                    f"{self.folder} holds {run} already, as {same}: leave it out, or give another "
+                    "run another name with --under"
+                )
+            found[run] = record
+        found = {run: found[run] for run in sorted(found, key=PurePosixPath)}
+        self.folder.mkdir(parents=True, exist_ok=True)
+        recipes = {record.row["settings"]: record.recipe for record in found.values()}
+        _write_xz(self.folder / RECIPES, json.dumps(recipes, indent=1) + "\n")
+        _write_xz(self.folder / CURVES, _join({run: one.curve for run, one in found.items()}))
+        # The table comes last: what the other files hold beyond it is not read.
+        rows = [[one.row[column] for column in COLUMNS] for one in found.values()]
+        write_text_atomic(self.folder / TABLE, _to_csv([COLUMNS, *rows]))
+        self.rows = {run: record.row for run, record in found.items()}
+        self.__dict__.pop("_recipes", None)
+        self.__dict__.pop("_curves", None)
+
+    def _recipe(self, row: dict[str, str]) -> dict[str, Any]:
+        try:
+            return dict(self._recipes[row["settings"]])
+        except KeyError as error:
+            raise ValueError(
+                f"{self.folder / RECIPES} is damaged: it lacks the recipe of {row['run']}"
+            ) from error
+
+    @cached_property
+    def _recipes(self) -> dict[str, Any]:
+        path = self.folder / RECIPES
+        try:
+            return dict(json.loads(_read_xz(path)))
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+
+    @cached_property
+    def _curves(self) -> dict[str, str]:
+        rows = csv.reader(io.StringIO(_read_xz(self.folder / CURVES)))
+        header = next(rows, [])
+        curves = {}
+        for run, group in groupby(rows, key=lambda cells: cells[0]):
+            lines = list(group)
+            # Empty is a metric that the run does not have; one without a value at a step is nan.
+            kept = [i for i, cell in enumerate(lines[0]) if i and cell]
+            curves[run] = _to_csv([[line[i] for i in kept] for line in [header, *lines]])
+        return curves
+
+
+def find_records(path: Path) -> tuple[Records, str] | None:
+    """Finds the table of runs that a path leads into.
+
+    Args:
+        path: the path of a run, or of several, below a table's folder, where nothing has that path.
+
+    Returns:
+        The table, and the path below its folder; None if there is no table.
+
+    Example:
+        >>> records, below = find_records(Path("docs/results/hopper/tried"))
+        >>> str(records.folder), below
+        ('docs/results/hopper', 'tried')
+    """
+    if path.exists():
+        return None
+    for folder in path.parents:
+        if (folder / TABLE).is_file():
+            return Records(folder), path.relative_to(folder).as_posix()
+    return None
+
+
+def make_record(
+    run: str,
+    recipe: dict[str, Any],
+    changes: Mapping[str, Any],
+    versions: Mapping[str, Any],
+    evaluation: Mapping[str, Any] | None,
+    earlier_lengths: Iterable[tuple[int, int]],
+    metrics: list[dict[str, float]],
+    commit: str = "",
+) -> Record:
+    """Makes the record of a run from what its folder holds.
+
+    Args:
+        run: its name in the table.
+        recipe: its ``recipe.json``.
+        changes: the fields in which it differs from the recipe of its name.
+        versions: its ``versions.json``.
+        evaluation: its ``evaluation.json``, if it is evaluated.
+        earlier_lengths: its ``earlier_lengths.json``.
+        metrics: the rows of its ``metrics.csv``.
+        commit: the commit that has its code or its full record, if known.
+    """
+    settings = {name: value for name, value in recipe.items() if name != "seed"}
+    key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+    found = dict(evaluation or {})
+    row = {
+        "run": run,
+        "recipe": str(recipe.get("name", "")),
+        "changes": _dumps(changes),
+        "seed": str(recipe.get("seed", 0)),
+        "settings": key,
+        "ended": _ended(metrics),
+        "commit": commit,
+        "versions": _dumps(versions),
+        "earlier_lengths": _dumps(list(earlier_lengths)),
+    }
+    if found:
+        found["returns"] = [float(f"{value:.6g}") for value in found["returns"]]
+        row |= {name: json.dumps(found.pop(name), separators=(",", ":")) for name in _OF_EVALUATION}
+    row["evaluation"] = _dumps(found)
+    return Record({column: row.get(column, "") for column in COLUMNS}, settings, _curve(metrics))
+
+
+def _evaluation(row: dict[str, str]) -> str:
+    if not row["returns"]:
+        return ""
+    known = {name: json.loads(row[name]) for name in _OF_EVALUATION}
+    others = json.loads(row["evaluation"]) if row["evaluation"] else {}
+    return json.dumps({**known, **others})
+
+
+def _ended(metrics: list[dict[str, float]]) -> str:
+    if not metrics or "time" not in metrics[-1]:
+        return ""
+    return datetime.datetime.fromtimestamp(metrics[-1]["time"], datetime.UTC).strftime(
+        "%Y-%m-%dT%H:%M:%S"
+    )
+
+
+def _curve(metrics: list[dict[str, float]]) -> str:
+    """The text of a ``metrics.csv`` without what is left out."""
+    if not metrics:
+        return ""
+    rows = [dict(row) for row in metrics]
+    if "steps_per_second" not in rows[0] and "time" in rows[0]:  # a run from an earlier version
+        before = rows[0]
+        for row in rows:
+            seconds = row["time"] - before["time"]
+            row["steps_per_second"] = (
+                (row["step"] - before["step"]) / seconds if seconds > 0 else math.nan
+            )
+            before = row
+    names = [name for name in rows[0] if name not in LEFT_OUT and name != "step"]
+    lines = [[f"{row['step']:.0f}", *(f"{row[name]:.4g}" for name in names)] for row in rows]
+    return _to_csv([["step", *names], *lines])
+
+
+def _join(curves: Mapping[str, str]) -> str:
+    """Writes curves below one another, with an empty cell where a run lacks a metric."""
+    tables = {run: list(csv.DictReader(io.StringIO(curve))) for run, curve in curves.items()}
+    names = dict.fromkeys(name for rows in tables.values() for row in rows[:1] for name in row)
+    lines = [
+        [run, *(row.get(name, "") for name in names)]
+        for run, rows in tables.items()
+        for row in rows
+    ]
+    return _to_csv([["run", *names], *lines])
+
+
+def _dumps(value: Any) -> str:
+    """Writes JSON; nothing for what is empty."""
+    return json.dumps(value, separators=(",", ":")) if value else ""
+
+
+def _to_csv(rows: Iterable[Iterable[Any]]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    return buffer.getvalue()
+
+
+def _read_xz(path: Path) -> str:
+    try:
+        return lzma.decompress(path.read_bytes()).decode()
+    except (OSError, EOFError, lzma.LZMAError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+
+
+def _write_xz(path: Path, text: str) -> None:
+    write_bytes_atomic(path, lzma.compress(text.encode(), preset=9))

@@ -1,0 +1,123 @@
+"""Tables of runs, which hold what run folders hold."""
+
+import json
+
+import pytest
+
+from recipes import records
+from recipes.cli import main
+from recipes.metrics import parse_metrics
+from recipes.records import Records
+from recipes.registry import find_recipe
+from recipes.results.experiments import find_runs
+from recipes.results.recording import record_runs
+from recipes.results.report.run_data import read_groups
+from recipes.results.table import make_table
+from tests.recipes.results.report_runs import metrics_of, write_run
+
+MLP = "ppo/cartpole/mlp"
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Two seeds of a recipe, one with other settings, and one that was stopped."""
+    folder = tmp_path / "runs"
+    write_run(folder / "mlp" / "seed-2", MLP, 2, returns=[500.0, 1 / 3])
+    write_run(folder / "mlp" / "seed-10", MLP, 10, returns=[480.0, 490.0])
+    write_run(folder / "wide", MLP, 2, returns=[9.0], num_envs=4)
+    own = {"step": [1, 2], "time": [1.7e9, 1.7e9 + 4], "return_mean": [1.0, 2.0], "mine": [0, 5]}
+    write_run(folder / "stopped", "ppo/cartpole/lstm", metrics=own)
+    return folder
+
+
+def test_a_table_is_read_as_the_folders_are(runs, tmp_path):
+    out = tmp_path / "page"
+    names = record_runs([runs], out)
+    assert str(make_table([out])[0]) == str(make_table([runs])[0])  # NaN is not itself
+    assert {run.recipe for run in find_runs([out])} == {run.recipe for run in find_runs([runs])}
+    for old, new in zip(read_groups([runs]), read_groups([out]), strict=True):
+        for before, after in zip(old.runs, new.runs, strict=True):
+            assert after.versions == before.versions
+            assert after.run.folder.relative_to(out) == before.run.folder.relative_to(runs)
+            for column, values in after.metrics.items():
+                kept = before.metrics[column]
+                assert values == pytest.approx(kept, rel=5e-4, nan_ok=True), column
+    assert names == ["mlp/seed-10", "mlp/seed-2", "stopped", "wide"]
+    ((mlp,), _) = make_table([out / "mlp"])
+    assert (mlp.runs, mlp.changes) == (2, "")
+    row = Records(out).rows["wide"]
+    assert (row["recipe"], json.loads(row["changes"])) == (MLP, {"num_envs": 4})
+    assert find_recipe(str(out / "wide" / "recipe.json")) == find_runs([runs / "wide"])[0].recipe
+    with pytest.raises(ValueError, match="holds no run folder and no table of runs"):
+        find_runs([out / "narrow"])
+
+
+def test_each_metric_that_is_kept_has_four_digits(runs, tmp_path):
+    folder = runs / "stopped"
+    (folder / "successes.csv").write_text("step,episodes,successes\n2,7,3\n")
+    record_runs([folder], tmp_path / "page", under="trials")
+    (run,) = find_runs([tmp_path / "page"])
+    assert run.folder == tmp_path / "page" / "trials" / "stopped"
+    rows = parse_metrics(run.read("metrics.csv"), run.folder)
+    kept = {"step": 2, "return_mean": 2, "mine": 5, "steps_per_second": 0.25}
+    assert rows[1] == {**kept, "episodes": 7, "successes": 3}
+    assert run.read("evaluation.json") is None
+
+
+def test_runs_are_added_in_any_order_and_once(runs, tmp_path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    record_runs([runs], one)
+    record_runs([runs / "wide"], two)
+    record_runs([runs / "mlp"], two, under="mlp")
+    record_runs([runs / "stopped"], two)
+    files = (records.TABLE, records.RECIPES, records.CURVES)
+    assert [(one / name).read_bytes() for name in files] == [
+        (two / name).read_bytes() for name in files
+    ]
+    for under in ("", "again"):
+        with pytest.raises(ValueError, match=rf"holds {under}.*wide already, as wide"):
+            record_runs([runs / "wide"], one, under=under)
+    with pytest.raises(ValueError, match="two of the runs would be named wide"):
+        record_runs([runs / "wide", runs], tmp_path / "three")
+
+
+def test_a_table_is_whole_when_recording_is_interrupted(runs, tmp_path, monkeypatch):
+    out = tmp_path / "page"
+    record_runs([runs / "mlp"], out)
+    before = str(make_table([out]))
+
+    def fail(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(records, "write_text_atomic", fail)
+    with pytest.raises(KeyboardInterrupt):
+        record_runs([runs / "wide"], out)
+    assert str(make_table([out])) == before
+
+
+def test_commands_take_tables(runs, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    main(["record", "runs/mlp", "--out", "page", "--commit", "abc"])
+    assert capsys.readouterr().out.endswith("page/seed-2\n2 recorded in page\n")
+    assert Records("page").rows["seed-2"]["commit"] == "abc"
+    main(["table", "page"])
+    assert f"| {MLP} | 2 | 368 ± 117 |" in capsys.readouterr().out
+    main(["compare", "page/seed-2", "page/seed-10", "--out", "a.png"])
+    capsys.readouterr()
+    main(["show", "page/seed-2/recipe.json"])
+    assert json.loads(capsys.readouterr().out)["seed"] == 2
+
+
+@pytest.mark.parametrize("name", [records.RECIPES, records.CURVES])
+def test_damaged_tables_are_refused(runs, tmp_path, name):
+    out = tmp_path / "page"
+    record_runs([runs / "mlp"], out)
+    (out / name).write_bytes((out / name).read_bytes()[:-20])
+    with pytest.raises(ValueError, match=name):
+        read_groups([out])
+
+
+def test_runs_without_metrics_are_not_recorded(tmp_path):
+    write_run(tmp_path / "run", metrics={name: [] for name in metrics_of(0)})
+    with pytest.raises(ValueError, match="has no metrics yet"):
+        record_runs([tmp_path / "run"], tmp_path / "page")
