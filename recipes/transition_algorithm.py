@@ -48,7 +48,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
-        task = self.make_env(1)
+        task = make_task(recipe, 1, clip_actions=False)  # whose spec has the bounds
         self.action_spec = task.action_spec_unbatched.to(self.device)
         observation = observation_specs(task)
         task.close()

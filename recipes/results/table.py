@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_tit.agents.folder import read_evaluation
 from torchrl_tit.datasets import has_reference
 
 from ..recipe import Recipe
