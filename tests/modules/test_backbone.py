@@ -9,12 +9,14 @@ from tensordict import TensorDict
 from tensordict.nn import set_skip_existing
 from torch import nn
 from torchrl.data import Categorical
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss
 
 from tests.modules.frames import SMALL, CountedFrames
 from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT, VanillaTIT
 from torchrl_tit.modules import make_actor, make_value
+from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.networks import MLP, HistoryNetwork, TwoTrunks, build_network
 from torchrl_tit.settings import NETWORKS, Flat, Inner, Linear, Outer, PairedOuter
 
@@ -62,6 +64,10 @@ def test_is_called_as_any_tensordict_module(acts):
         assert backbone(td, tensordict_out=other) is other
         assert_near(other["features"], expected)
         assert_near(backbone(history), expected)
+        assert_near(backbone(history=history), expected)
+        backbone.inplace = False
+        assert set(backbone(td.exclude("features")).keys()) == {"features"}
+        backbone.inplace = True
         td["features"] = torch.zeros(5)
         with set_skip_existing(True):
             assert not backbone(td)["features"].any()
@@ -69,6 +75,100 @@ def test_is_called_as_any_tensordict_module(acts):
         locked = TensorDict({"history": history, "features": torch.zeros(5, 64)}, [5]).lock_()
         with pytest.raises(RuntimeError, match="lock"):
             backbone(locked)
+
+
+@torch.no_grad()
+def test_entries_by_keyword_and_by_position():
+    pair = build_network(NETWORKS["mlp"](2), (4,), trunks="separate")
+    backbone = Backbone(pair, [("agent", "history")], ["policy", ("agent", "value")])
+    history = torch.randn(5, 2, 4)
+    assert_near(backbone(agent_history=history), pair(history))
+    backbone.select_out_keys("policy")
+    assert_near(backbone(history), pair(history)[0])
+    assert set(backbone(TensorDict(agent={"history": history})).keys()) == {"agent", "policy"}
+    backbone.reset_out_keys()
+    assert backbone.out_keys == ["policy", ("agent", "value")]
+
+    backbone = Backbone(build_network(NETWORKS["lstm"](1), (4,)))
+    entries = {key: torch.randn(5, *shape) for key, shape in backbone.state_shapes.items()}
+    entries |= {"history": history[:, 1:], "is_init": torch.zeros(5, 1, dtype=torch.bool)}
+    td = backbone(TensorDict(entries, [5]))
+    assert_near(backbone(**entries), tuple(td[key] for key in backbone.out_keys))
+
+
+@pytest.mark.parametrize("in_recurrent_mode", [True, False])
+@torch.no_grad()
+def test_sequences_by_keyword_and_out_of_place(in_recurrent_mode):
+    network = EnhancedTIT((4,), 2)
+    backbone = Backbone(network, padding="same")
+    frames = torch.randn(3, 7, 4)
+    entries = {
+        "history": frames.unfold(1, 2, 1).transpose(-1, -2).clone(),
+        "observation": frames[:, 1:],
+        "is_init": torch.zeros(3, 6, 1, dtype=torch.bool),
+    }
+    out = TensorDict(batch_size=[3, 6])
+    with set_recurrent_mode(in_recurrent_mode):
+        features = backbone(**entries)
+        assert backbone(TensorDict(entries, [3, 6]), tensordict_out=out) is out
+    assert_near(features, network(entries["history"]))
+    assert_near(out["features"], features)
+    assert set(out.keys()) == {"features"}
+
+
+def test_keys_are_fixed():
+    backbone = Backbone(EnhancedTIT((4,)))
+    backbone.in_keys, backbone.out_keys = ["history"], ["features"]
+    for name in ("in_keys", "out_keys"):
+        with pytest.raises(AttributeError, match=f"^{name} of a backbone cannot .* build another"):
+            setattr(backbone, name, ["other"])
+    assert (backbone.in_keys, backbone.out_keys) == (["history"], ["features"])
+
+
+@pytest.mark.parametrize("strict", [False, True])
+@torch.no_grad()
+def test_export_of_a_bare_backbone(strict):
+    network = EnhancedTIT((4,), 2)
+    history, other = torch.randn(2, 5, 2, 4)
+    for args, kwargs in [((history,), {}), ((), {"history": history})]:
+        program = torch.export.export(Backbone(network), args, kwargs, strict=strict).module()
+        assert_near(program(other) if args else program(history=other), network(other))
+
+
+@pytest.mark.parametrize(("name", "num_frames"), [("enhanced-tit", 3), ("lstm", 3), ("lstm", 1)])
+@pytest.mark.parametrize("trunks", ["shared", "separate"])
+@torch.no_grad()
+def test_hooks_on_the_network_are_called_while_acting(name, num_frames, trunks):
+    network = build_network(NETWORKS[name](num_frames), (4,), trunks=trunks)
+    backbone = Backbone(network, out_keys=["a"] if trunks == "shared" else ["a", "b"])
+    each = trunks_of(network).values()
+    whole = {network, *each}
+    parts = {part for trunk in each for part in (*trunk.children(), *trunk.frames)}
+    called = []
+    for module in whole | parts:
+        module.register_forward_pre_hook(lambda module, x: called.append((module, x)))
+        module.register_forward_hook(lambda module, x, y: called.append((module, y)))
+    stream = torch.randn(5, 8, 4)
+    td = TensorDict(
+        {key: torch.zeros(5, *size) for key, size in backbone.state_shapes.items()}, [5]
+    )
+    td["is_init"] = torch.zeros(5, 1, dtype=torch.bool)
+
+    def calls(start):
+        called.clear()
+        backbone(td.set("history", stream[:, start : start + num_frames]))
+        return list(called)
+
+    expected = [calls(start) for start in range(4)]
+    with backbone.acting():
+        for start in range(4):
+            acted = calls(start)
+            modules = {module for module, _ in acted}
+            assert modules >= whole
+            assert modules == {module for module, _ in expected[start]}
+            assert_near(
+                [x for m, x in acted if m in whole], [x for m, x in expected[start] if m in whole]
+            )
 
 
 def test_two_trunks_write_two_keys():

@@ -1,6 +1,7 @@
 """TensorDict's ``reset_parameters_recursive`` repeats the initialisation of the constructors."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -29,7 +30,7 @@ def build(history, frame=None, shape=(6,)):
 
 
 MODULES = {
-    **{f"history {name}": (lambda s=s: build(s)) for name, s in HISTORIES.items()},
+    **{f"history {name}": partial(build, history) for name, history in HISTORIES.items()},
     "gates": lambda: build(settings.GTrXL(num_heads=2, gate_bias=2.0)),
     "own patches": lambda: build(settings.Outer(), settings.Inner(patch_weights="own")),
     "images": lambda: build(settings.Outer(), settings.NatureCNNFrames(), IMAGE),

@@ -30,6 +30,7 @@ def test_other_kinds_of_actions():
 
 def test_a_spec_recreates_it():
     env = FirstActions(gymnasium.make("Taxi-v4"), 4)
+    assert env.spec is not None
     again = gymnasium.make(env.spec)
     assert again.action_space == Discrete(4)
     assert again.spec == env.spec

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModule, skip_existing
+from tensordict import NestedKey, TensorDictBase, unravel_key_list
+from tensordict.nn import dispatch, skip_existing
 from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, Transform
@@ -16,11 +16,12 @@ from torchrl.envs import Compose, InitTracker, TensorDictPrimer, Transform
 from torchrl_tit.histories.encoder import RecurrentEncoder
 from torchrl_tit.modules.acting_network import ActingNetwork
 from torchrl_tit.modules.sequences import SequenceKeys, default_observation_keys
+from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import HistoryNetwork, TwoTrunks
 from torchrl_tit.windows import Padding, Windows
 
 
-class Backbone(TensorDictModule):
+class Backbone(TensorModule):
     """Reads histories and writes features, for any TorchRL head, loss or collector.
 
     Put one backbone in front of all heads. They read its features, so the network runs once per
@@ -158,24 +159,61 @@ class Backbone(TensorDictModule):
         self._acting: list[ActingNetwork] | None = None  # one per trunk, in acting mode
         self._compiled: list[ActingNetwork] | None = None  # what acting mode runs, if compiled
 
+    @dispatch(auto_batch_size=False)
     def forward(
-        self, tensordict: TensorDictBase, *args: object, **kwargs: object
+        self,
+        tensordict: TensorDictBase,
+        *,
+        tensordict_out: TensorDictBase | None = None,
+        **unknown: Any,  # torch.export looks for it before it passes entries by keyword
     ) -> TensorDictBase:
-        """Writes the features of the histories into the tensordict and returns it."""
-        if args or kwargs or not isinstance(tensordict, TensorDictBase):
-            return super().forward(tensordict, *args, **kwargs)
+        """Writes the features of the histories into the tensordict and returns it.
+
+        As with every TensorDictModule, the entries can also be given by position or by keyword,
+        instead of a tensordict; the outputs are then returned as tensors.
+        """
+        if unknown:
+            raise TypeError(f"a backbone reads {self.in_keys}, but was given {sorted(unknown)}")
         if skip_existing() and all(key in tensordict.keys(True) for key in self.out_keys):
             return tensordict
         # A recurrent network reads sequences itself.
         if not self.is_recurrent and self.sequence_keys.in_sequence(tensordict):
-            return self._read_sequences(tensordict)
-        # Skips the 0.1 ms overhead of TensorDictModule, which matters when acting step by step.
-        self._check_entries(tensordict)
-        outputs = self._call_module([tensordict.get(key) for key in self._step_keys])
-        outputs = (outputs,) if isinstance(outputs, Tensor) else outputs
-        for key, output in zip(self.out_keys_source, outputs, strict=True):
-            tensordict.set(key, output)
-        return tensordict
+            keys, written = self._read_sequences(tensordict)
+        else:
+            self._check_entries(tensordict)
+            keys = self.out_keys_source
+            outputs = self._call_module([tensordict.get(key) for key in self._step_keys])
+            written = [outputs] if isinstance(outputs, Tensor) else list(outputs)
+        return self._write_to_tensordict(tensordict, written, tensordict_out, keys)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of all entries that it reads; fixed, because other attributes follow from them."""
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: Sequence[NestedKey]) -> None:
+        self._in_keys = self._fixed("in_keys", keys)
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Keys of all entries that it writes, or those of ``select_out_keys``; fixed, too."""
+        return self._out_keys_apparent
+
+    @out_keys.setter
+    def out_keys(self, keys: Sequence[NestedKey]) -> None:
+        self._out_keys = self._out_keys_apparent = self._fixed("out_keys", keys)
+
+    def _fixed(self, name: str, keys: Sequence[NestedKey]) -> list[NestedKey]:
+        """Returns keys; raises AttributeError if they would replace others."""
+        given: list[NestedKey] = unravel_key_list(list(keys))
+        present = self.__dict__.get(f"_{name}", given)
+        if given != present:
+            raise AttributeError(
+                f"{name} of a backbone cannot be changed from {present} to {given}: build another "
+                "one of the same network, Backbone(backbone.module, in_keys, out_keys)"
+            )
+        return given
 
     @property
     def features_dim(self) -> int:
@@ -327,53 +365,67 @@ class Backbone(TensorDictModule):
         # Heads and losses need full precision.
         return tuple(x.float() if self.autocast is not None else x for x in outputs)
 
-    def _read_sequences(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the features of sequences into the tensordict and returns it."""
+    def _read_sequences(self, tensordict: TensorDictBase) -> tuple[list[NestedKey], list[Tensor]]:
+        """Returns the keys and the values of what it writes into sequences."""
         trunks = list(trunks_of(self.module).values())
         table, context = self.sequence_keys.lay_out(tensordict, trunks)
         outputs = self.encode_windows(table.frames, table.windows, *context)
-        shape = tensordict.batch_size
-        for key, output in zip(self.features_keys, outputs, strict=True):
-            tensordict.set(key, output.reshape(*shape, *output.shape[2:]))
+        shape = self.sequence_keys.shape_of(tensordict)
+        keys = list(self.features_keys)
+        values = [output.reshape(*shape, *output.shape[2:]) for output in outputs]
         if table.valid is not None:
-            tensordict.set("features_valid", table.valid.reshape(*shape, 1))
-        return tensordict
+            keys.append("features_valid")
+            values.append(table.valid.reshape(*shape, 1))
+        return keys, values
 
     def _call_module(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
-        """Calls the network; overrides TensorDictModule's method."""
-        tensors = tensors[: len(self._step_keys)]
+        """Calls the network on single steps; overrides TensorDictModule's method."""
         if self.autocast is None:
-            return self._encode(tensors, **kwargs)
+            return self._encode(tensors)
         with self.computing(tensors[0].device):
-            outputs = self._encode(tensors, **kwargs)
+            outputs = self._encode(tensors)
         # Heads and losses need full precision.
         if isinstance(outputs, Tensor):
             return outputs.float()
         return tuple(output.float() for output in outputs)
 
-    def _encode(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
+    def _encode(self, tensors: Sequence[Tensor]) -> Any:
         if self.every_frame:
             return self.module.every_frame(*tensors)
         if self.is_recurrent:
             return self._step(tensors)
         if torch.compiler.is_compiling() or self._acting is None:
-            return super()._call_module(tensors, **kwargs)
-        outputs = tuple(network(*tensors) for network in self._acting)
-        return outputs[0] if len(outputs) == 1 else outputs
+            return self.module(*tensors)
+        return self._call_trunks(tensors, self._acting)
+
+    def _call_trunks(self, inputs: Sequence[Tensor], compute: Sequence[Callable[..., Any]]) -> Any:
+        """Calls the network, each of whose trunks computes its output in another way."""
+        if len(compute) == 1:
+            return self.module(*inputs, compute=compute[0])
+        return self.module(*inputs, compute=compute)
 
     def _step(self, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Histories, state and is_init -> features and the next state."""
         count = len(self.history_keys)
         histories, is_init = tensors[:count], tensors[-1]
         before = dict(zip(self.state_shapes, tensors[count:-1], strict=True))
-        features: list[Tensor] = []
-        after: dict[str, Tensor] = {}
-        for prefix, trunk in trunks_of(self.module).items():
-            own = {key: before[prefix + key] for key in _state_shapes(trunk)}
-            outputs, own = trunk.step(histories, own, is_init)
-            features.append(outputs)
-            after |= {prefix + key: value for key, value in own.items()}
-        return (*features, *(after[key] for key in self.state_shapes))
+        trunks = trunks_of(self.module)
+        states = [
+            {key: before[prefix + key] for key in _state_shapes(trunk)}
+            for prefix, trunk in trunks.items()
+        ]
+        compute = [
+            lambda *histories, trunk=trunk, state=state: trunk.step(histories, state, is_init)
+            for trunk, state in zip(trunks.values(), states, strict=True)
+        ]
+        outputs = self._call_trunks(histories, compute)
+        outputs = [outputs] if len(trunks) == 1 else outputs
+        after = {
+            prefix + key: value
+            for prefix, (_, state) in zip(trunks, outputs, strict=True)
+            for key, value in state.items()
+        }
+        return (*(features for features, _ in outputs), *(after[key] for key in self.state_shapes))
 
     def _check_entries(self, tensordict: TensorDictBase) -> None:
         for key in self._step_keys:

@@ -57,6 +57,13 @@ class SequenceKeys:
         entries = tensordict.keys(True)
         return "is_init" in entries or self.histories[0] not in entries
 
+    def shape_of(self, tensordict: TensorDictBase) -> torch.Size:
+        """The shape [*B, T] of sequences; that of "is_init" if they have no batch dimensions.
+
+        TensorDict's ``dispatch`` gives none to the entries of a call by keyword.
+        """
+        return tensordict.batch_size or tensordict.get("is_init").shape[:-1]
+
     def lay_out(
         self, tensordict: TensorDictBase, trunks: Sequence[HistoryNetwork]
     ) -> tuple[FrameTable, list[Tensor]]:
@@ -75,8 +82,8 @@ class SequenceKeys:
                 observation of a step is not that of the step after it.
         """
         self._check(tensordict, trunks)
-        time = tensordict.ndim - 1
-        count, steps = math.prod(tensordict.batch_size[:-1]), tensordict.batch_size[-1]
+        *batch, steps = self.shape_of(tensordict)
+        count, time = math.prod(batch), len(batch)
 
         def flat(entry: Tensor) -> Tensor:
             return entry.reshape(count, steps, *entry.shape[time + 1 :])
@@ -119,14 +126,14 @@ class SequenceKeys:
         present = [key for key in self.histories if key in entries]
         if len(present) < len(self.histories) and (present or not trunks):
             raise KeyError(f"of the histories {self.histories}, some are missing: found {named}")
-        if not tensordict.ndim:
+        if not (shape := self.shape_of(tensordict)):
             raise ValueError(
                 "in recurrent mode the last batch dimension is time, but this tensordict has none: "
                 "read a single step within set_recurrent_mode(False)"
             )
         for trunk in trunks:
             observations = (tensordict.get(key) for key in self.observations)
-            trunk.check_frames(*(x.flatten(0, tensordict.ndim - 1) for x in observations))
+            trunk.check_frames(*(x.flatten(0, len(shape) - 1) for x in observations))
             if present:
                 trunk.check(*(tensordict.get(key) for key in present))
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -129,7 +130,7 @@ class HistoryNetwork(nn.Module):
         if self.initialization == "normal":
             init_normal_(self)
 
-    def forward(self, *inputs: Tensor) -> Tensor:
+    def forward(self, *inputs: Tensor, compute: Callable[..., Any] | None = None) -> Any:
         """Maps histories to features.
 
         Args:
@@ -137,10 +138,14 @@ class HistoryNetwork(nn.Module):
                 first; uint8 (scaled to 0..1) or the network's own float type (used as is), and
                 integers of categories. Then the other inputs of the history encoder
                 (``history_encoder.context``).
+            compute: maps these inputs to the output in another way, such as with tokens that it has
+                kept. The hooks of this network are called as ever.
 
         Returns:
-            float [..., F].
+            float [..., F], or what ``compute`` returns.
         """
+        if compute is not None:
+            return compute(*inputs)
         count = len(self.frame_encoders)
         return self.encode_history(self.encode_frames(*inputs[:count]), *inputs[count:])
 
@@ -334,9 +339,17 @@ class TwoTrunks(nn.Module):
         self.value = value
         self.features_dim = policy.features_dim
 
-    def forward(self, *histories: Tensor) -> tuple[Tensor, Tensor]:
-        """Maps histories to features for the policy and for the value, float [..., F] each."""
-        return self.policy(*histories), self.value(*histories)
+    def forward(
+        self, *histories: Tensor, compute: Sequence[Callable[..., Any] | None] = (None, None)
+    ) -> tuple[Any, Any]:
+        """Maps histories to features for the policy and for the value, float [..., F] each.
+
+        Args:
+            *histories: as in :meth:`HistoryNetwork.forward`.
+            compute: that of the policy's network and that of the value's.
+        """
+        policy, value = compute
+        return self.policy(*histories, compute=policy), self.value(*histories, compute=value)
 
 
 def build_network(
