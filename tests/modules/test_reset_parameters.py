@@ -1,6 +1,7 @@
 """TensorDict's ``reset_parameters_recursive`` repeats the initialisation of the constructors."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -29,7 +30,7 @@ def build(history, frame=None, shape=(6,)):
     return build_network(network, IMAGE if history.name == "stacked-cnn" else shape, action_dim=2)
 
 
-MODULES = {
+MODULES: dict[str, Callable[[], nn.Module]] = {
     **{f"history {name}": partial(build, history) for name, history in HISTORIES.items()},
     "gates": lambda: build(settings.GTrXL(num_heads=2, gate_bias=2.0)),
     "own patches": lambda: build(settings.Outer(), settings.Inner(patch_weights="own")),
