@@ -118,11 +118,10 @@ def test_a_game_trains_with_signs_and_counts_points(seen_rewards, tmp_path):
     recipe = replace(
         ATARI_RECIPES["ppo/mspacman/nature-cnn"],
         num_envs=2,
-        total_steps=128,
-        steps_per_batch=64,
-        minibatch_size=64,
+        total_steps=512,
+        steps_per_batch=512,
+        minibatch_size=512,
         epochs=1,
-        checkpoint_interval=10**6,
     )
     with Run.create(tmp_path / "run", recipe) as run:
         train(recipe, run)
