@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -168,6 +169,26 @@ def test_episodes_side_by_side_are_whole_and_differ(tmp_path):
     assert len(set(episodes.returns.tolist())) == 4
     starts = episodes.rows["observation"][episodes.last_rows - episodes.lengths + 1]
     assert (starts[:, 0] > 1.2).all()  # each upright, as an episode begins
+
+
+class Paying(gymnasium.Wrapper):
+    """Pays NaN in its third step."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        observation, reward, *others = super().step(action)
+        return observation, math.nan if self.steps == 3 else reward, *others
+
+
+def test_a_reward_that_is_not_finite_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", __name__)
+    algorithm = make_algorithm(make_odt(tmp_path, wrappers=(f"{__name__}:Paying",)))
+    with pytest.raises(FloatingPointError, match=r"^the reward of copy 0 is nan$"):
+        algorithm.explore(0)
 
 
 def test_noise_is_scaled(tmp_path):
