@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -219,3 +219,20 @@ def check_finite(names: Sequence[str], values: Tensor) -> None:
     if not finite.all():
         index = int(finite.logical_not().nonzero()[0])
         raise NotFiniteError(f"{names[index]} became {values[index].item()}")
+
+
+@contextmanager
+def naming(where: str) -> Iterator[None]:
+    """Adds a place to the message of a FloatingPointError.
+
+    Example:
+        >>> with naming("in CartPole-v1"):
+        ...     raise FloatingPointError("the reward of copy 0 is nan")
+        Traceback (most recent call last):
+            ...
+        recipes.algorithm.NotFiniteError: the reward of copy 0 is nan in CartPole-v1
+    """
+    try:
+        yield
+    except FloatingPointError as error:
+        raise NotFiniteError(f"{error} {where}") from error

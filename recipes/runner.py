@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated, Any
 
@@ -20,11 +20,11 @@ from torchrl_tit.evaluation import watching_episodes
 
 from .algorithm import (
     Algorithm,
-    NotFiniteError,
     Stateful,
     check_finite,
     load_weights,
     make_algorithm,
+    naming,
 )
 from .best import EPISODES, Best
 from .callback import Callback
@@ -316,6 +316,7 @@ def evaluate(
     Raises:
         FileNotFoundError: if there is no checkpoint.
         ValueError: if the checkpoint has no best weights yet.
+        FloatingPointError: if a reward is NaN or infinite.
     """
     recipe = recipe or run.recipe
     step, state = run.load_trained()
@@ -341,6 +342,7 @@ def evaluate(
         with (
             tqdm(total=episodes, unit=" episodes", desc="evaluation", delay=1) as progress,
             watching_episodes(progress.update),
+            naming(f"in {recipe.env}"),
         ):
             now = algorithm.play(step)
     for callback in callbacks:
@@ -360,14 +362,10 @@ def _fresh_seed(recipe: Recipe, record: _RecordState) -> int:
     return end if overlaps else first
 
 
-@contextmanager
-def _naming(where: str, saved_step: int) -> Iterator[None]:
+def _naming(where: str, saved_step: int) -> AbstractContextManager[None]:
     """Adds the place and the last good checkpoint to the message of a FloatingPointError."""
-    try:
-        yield
-    except FloatingPointError as error:
-        saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
-        raise NotFiniteError(f"{error} {where}; {saved}") from error
+    saved = f"the checkpoint of step {saved_step} is good" if saved_step else "none was saved"
+    return naming(f"{where}; {saved}")
 
 
 def _save(run: Run, step: int, parts: Mapping[str, Stateful]) -> None:

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from torchrl_tit.evaluation import evaluate
 
-from ..algorithm import Algorithm
+from ..algorithm import Algorithm, naming
 from ..recipe import Recipe
 from ..run import Run
 from ..runner import load_trained
@@ -66,13 +66,14 @@ class Agent(ABC):
 
     def score(self, policy: TensorDictModuleBase, step: int) -> Score:
         """Evaluates a policy that was trained for a number of environment steps."""
-        returns = evaluate(
-            self.algorithm.make_env,
-            policy,
-            self.settings.evaluation_episodes,
-            seed=_EVALUATION_SEED,
-            deterministic=self.settings.deterministic,
-        )
+        with naming(f"in {self.recipe.env}, in the evaluation at step {step}"):
+            returns = evaluate(
+                self.algorithm.make_env,
+                policy,
+                self.settings.evaluation_episodes,
+                seed=_EVALUATION_SEED,
+                deterministic=self.settings.deterministic,
+            )
         return Score(step, returns.mean().item(), returns.std(correction=0).item())
 
 

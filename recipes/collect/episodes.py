@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from torchrl_tit.datasets import TransitionParts
+from torchrl_tit.evaluation import check_rewards
 from torchrl_tit.modules import acting
 
 Transitions = dict[str, NDArray]
@@ -46,6 +47,9 @@ def play_episodes(
             clipped to it.
         seed: seed of all episodes.
         deterministic: whether the policy's most likely action is taken instead of a sampled one.
+
+    Raises:
+        FloatingPointError: if a reward of these episodes is NaN or infinite.
     """
     parts.drop_after(max(parts.numbers(), default=-1))  # removes half-written files only
     number, rows = len(parts.numbers()), parts.num_rows()
@@ -96,6 +100,9 @@ def _play(
 
     Returns:
         The transitions of each environment.
+
+    Raises:
+        FloatingPointError: if a reward in them is NaN or infinite.
     """
     tensordict = env.reset(seed=seed)
     playing = torch.ones(env.batch_size.numel(), dtype=torch.bool)
@@ -104,6 +111,7 @@ def _play(
     while playing.any() and len(steps) < max_steps:
         step, tensordict = env.step_and_maybe_reset(policy(tensordict))
         steps.append(as_fields(step, action_space))
+        check_rewards(steps[-1]["rewards"].masked_fill(~playing, 0))
         lengths += playing
         outcome = step["next"]
         over = outcome.get("game_over", None)

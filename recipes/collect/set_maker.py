@@ -24,6 +24,7 @@ from torchrl_tit.datasets import (
 )
 from torchrl_tit.envs import make_env
 
+from ..algorithm import naming
 from .agent import Agent, Score
 from .agent_in_training import AgentInTraining
 from .episodes import play_episodes
@@ -109,7 +110,7 @@ class SetMaker:
         """Plays episodes of a policy that no longer learns; closes the environment."""
         settings, parts = self._settings, TransitionParts(folder)
         seed = np.random.SeedSequence([settings.seed, KINDS.index(kind)]).generate_state(1)
-        with closing(env):
+        with closing(env), naming(f"in {settings.env}"):
             play_episodes(
                 parts,
                 env,

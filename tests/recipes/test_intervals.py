@@ -25,7 +25,7 @@ from recipes.ppo import PPO
 from recipes.recipe import Recipe
 from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.run import Run
-from recipes.runner import train
+from recipes.runner import evaluate, train
 from recipes.sac import SAC
 from recipes.task import make_task, seed_copies
 from tests.envs import tasks
@@ -246,6 +246,17 @@ def test_a_reward_that_is_not_finite_is_named_in_training(
     message = rf"^the reward of copy \d is {said} in {recipe.env} after step \d+; none was saved$"
     with pytest.raises(NotFiniteError, match=message):
         train_in(tmp_path / "run", recipe)
+
+
+def test_a_reward_that_is_not_finite_is_named_in_an_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", __name__)
+    train_in(tmp_path / "run", PPO_RECIPE)
+    with Run(tmp_path / "run", PPO_RECIPE) as run:
+        paying = replace(PPO_RECIPE, wrappers=(f"{__name__}:Paying(reward='nan')",))
+        with pytest.raises(NotFiniteError, match=r"^the reward of copy 0 is nan in CartPole-v1$"):
+            evaluate(run, paying)
 
 
 def test_the_command_line_names_it_in_one_line(

@@ -11,9 +11,11 @@ import minari
 import numpy as np
 import pytest
 import torch
+from gymnasium.envs.classic_control import CartPoleEnv
+from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict
 
-from recipes.algorithm import make_algorithm
+from recipes.algorithm import NotFiniteError, make_algorithm
 from recipes.callback import Callback
 from recipes.collect import Collection
 from recipes.collect.collect import collect
@@ -296,3 +298,24 @@ def test_rewards_are_the_tasks_own(tmp_path: Path) -> None:
     assert not data["terminals"].any()
     assert np.flatnonzero(data["timeouts"]).tolist() == [199, 399, 599, 799]
     assert np.abs(data["actions"]).max() == 2  # a Gaussian's, clipped as the task does
+
+
+class Paying(CartPoleEnv):
+    """CartPole that pays infinity in every fifth step."""
+
+    paid = 0
+
+    def step(self, action: Any) -> Any:
+        self.paid += 1
+        observation, reward, *others = super().step(action)
+        return observation, np.inf if self.paid % 5 == 0 else reward, *others
+
+
+def test_rewards_that_are_not_finite_are_named_before_they_are_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(gymnasium.registry, "Paying-v0", EnvSpec("Paying-v0", Paying))
+    settings = Collection(env="Paying-v0", sets=("random",), num_envs=2, transitions=40)
+    with pytest.raises(NotFiniteError, match=r"^the reward of copy \d is inf in Paying-v0$"):
+        collect(settings, tmp_path / "data")
+    assert not list((tmp_path / "data").rglob("*.hdf5"))
