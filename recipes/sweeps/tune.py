@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import filelock
@@ -23,6 +24,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 from tqdm import tqdm
 
+from torchrl_tit.agents.folder import read_evaluation
 from torchrl_tit.files import remove_leftovers, write_bytes_atomic, write_text_atomic
 
 from ..algorithm import make_algorithm
@@ -175,8 +177,7 @@ class Search:
         Raises:
             KeyboardInterrupt: after Ctrl-C, once all workers have saved a checkpoint.
             RuntimeError: if another process is using the search.
-            ValueError: if a trial's folder holds a run with other settings, or an evaluation
-                without a mean return.
+            ValueError: if a trial's folder holds a run with other settings.
         """
         with self._locked():
             remove_leftovers(self.folder)
@@ -264,6 +265,7 @@ class _Trial:
         self.file = search.folder / f"trial-{trial.number}.json"
         self.folder = search.folder / f"trial-{trial.number}"
         self.process: subprocess.Popen[bytes] | None = None
+        self.started: Job | None = None  # the process's
         self.reported = -1
         self.jobs: list[Job] | None = None
         space = search.settings.space
@@ -298,15 +300,14 @@ class _Trial:
             return None
         if self.process is not None and self.process.returncode:
             return self._end(TrialState.FAIL)
+        if self.started is not None and not self.started.is_complete():
+            self._explain(f"the process ended, but the run {self.started.folder} is not complete")
+            return self._end(TrialState.FAIL)
         job = next((job for job in self.jobs if not job.is_complete()), None)
         if job is None:
-            value = sum(map(_read_mean, self.jobs)) / len(self.jobs)
-            if not math.isfinite(value):
-                self._explain(f"the mean return is {value}")
-                return self._end(TrialState.FAIL)
-            return self._end(TrialState.COMPLETE, value)
+            return self._end(TrialState.COMPLETE, fmean(map(_read_mean, self.jobs)))
         if not job.is_in_use():  # by a process that a killed search left behind
-            self.process = start(job)
+            self.process, self.started = start(job), job
         return None
 
     def stop(self) -> None:
@@ -375,14 +376,9 @@ def _check_trial(trial: FrozenTrial, space: SearchSpace) -> None:
 
 def _read_mean(job: Job) -> float:
     """Reads the mean return of a complete run."""
-    path = job.folder / "evaluation.json"
-    try:
-        return float(json.loads(path.read_bytes())["mean"])
-    except (LookupError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path} has no mean return ({type(error).__name__}: {error}): delete it, and the same "
-            "command evaluates the run again"
-        ) from error
+    evaluation = read_evaluation(job.folder)
+    assert evaluation is not None  # the run is complete
+    return float(evaluation["mean"])
 
 
 def _to_json(settings: Settings) -> str:

@@ -340,7 +340,8 @@ def complete(job, mean=None):
     """Completes a run; its return is its learning rate."""
     run = Run.create(job.folder, job.recipe)
     mean = job.recipe.learning_rate if mean is None else mean
-    run.save_evaluation({"mean": mean, "steps": job.recipe.final_step})
+    numbers = {"episodes": 1, "seed": 0, "returns": [mean], "mean": mean, "std": 0.0}
+    run.save_evaluation({"env": job.recipe.env, "steps": job.recipe.final_step, **numbers})
     run.curve.touch()
     return DoneWorker()
 
@@ -380,12 +381,14 @@ def test_a_search_without_its_settings_is_refused(tmp_path):
         Search(tmp_path, settings)
 
 
-def test_a_return_that_is_not_a_number_fails_the_trial(tmp_path, monkeypatch):
-    monkeypatch.setattr("recipes.sweeps.tune.start", partial(complete, mean=math.nan))
-    monkeypatch.setattr(time, "sleep", lambda _: None)
+@pytest.mark.parametrize("mean", [math.nan, 1e300, "high"])
+def test_an_evaluation_that_cannot_be_read_fails_the_trial(mean, tmp_path, monkeypatch):
+    naps = iter(range(20))  # a trial that is started again and again runs out of them
+    monkeypatch.setattr("recipes.sweeps.tune.start", partial(complete, mean=mean))
+    monkeypatch.setattr(time, "sleep", lambda _: next(naps))
     search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
     assert search.run(1, workers=1) == [0]
-    assert "mean return is nan" in (tmp_path / "trial-0" / "error.log").read_text()
+    assert "seed-0 is not complete" in (tmp_path / "trial-0" / "error.log").read_text()
 
 
 def test_one_process_at_a_time(tmp_path):
