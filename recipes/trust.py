@@ -152,12 +152,16 @@ def _of_task(env: str, settings: Mapping[str, Any]) -> Iterator[tuple[str, str]]
 
 
 def _home(name: str) -> str | None:
-    """The module of the class that Gymnasium has registered for a name; None if it has none."""
+    """The module of the class that Gymnasium makes for a name; None if it knows no such name."""
     if name not in _registry() and not any(map(name.startswith, filter(None, TASKS))):
         load_plugins()  # as whoever makes the task would
-    if name not in _registry():
+    # Without a version, Gymnasium makes the newest.
+    fitting = [
+        spec for known, spec in _registry().items() if name in (known, known.rpartition("-v")[0])
+    ]
+    if not fitting:
         return None
-    made_by = _registry()[name].entry_point
+    made_by = max(fitting, key=lambda spec: spec.version or 0).entry_point
     module = made_by.partition(":")[0] if isinstance(made_by, str) else made_by.__module__
     return str(module)
 

@@ -38,6 +38,7 @@ HOSTILE: dict[str, tuple[dict[str, Any], str]] = {
         "gymnasium.envs",
     ),
     "an older task for Gym": ({"env": "GymV21Environment-v0"}, "gymnasium.envs"),
+    "a task without its version": ({"env": "GymV26Environment"}, "gymnasium.envs"),
     "a setting": ({"env_settings": ["task=evilmod:Mine-v0"]}, "evilmod"),
     "a nested setting": ({"env_settings": ["of={'a': ['evilmod:Mine-v0']}"]}, "evilmod"),
     "the name of a setting": ({"env_settings": ["of={'evilmod:Mine-v0': 1}"]}, "evilmod"),
