@@ -18,7 +18,8 @@ import io
 import json
 import lzma
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -48,6 +49,19 @@ COLUMNS = (
 
 LEFT_OUT = ("time", "learning_rate", "loss_objective", "loss_critic", "loss_entropy")
 """Metrics that are not kept."""
+
+_DAMAGE = (
+    csv.Error,
+    EOFError,
+    LookupError,
+    OSError,
+    RecursionError,
+    TypeError,
+    ValueError,
+    lzma.LZMAError,
+)
+"""How reading a file of others can fail."""
+_MOST_BYTES = 2**26  # far more than any table unpacks to
 
 _OF_EVALUATION = ("steps", "mean", "std", "returns")
 
@@ -94,10 +108,10 @@ class Records:
         self.rows: dict[str, dict[str, str]] = {}
         path = self.folder / TABLE
         if path.is_file():
-            with path.open(newline="", encoding="utf-8") as file:
+            with _reading(path), path.open(newline="", encoding="utf-8") as file:
                 rows = list(csv.DictReader(file))
-            if any(set(row) != set(COLUMNS) or None in row.values() for row in rows):
-                raise ValueError(f"{path} is damaged: expected the columns {', '.join(COLUMNS)}")
+                if any(set(row) != set(COLUMNS) or None in row.values() for row in rows):
+                    raise ValueError(f"expected the columns {', '.join(COLUMNS)}")
             self.rows = {row["run"]: row for row in rows}
 
     def below(self, path: str) -> list[str]:
@@ -118,9 +132,12 @@ class Records:
         if name == "metrics.csv":
             text = self._curves.get(run, "")
         elif name == "recipe.json":
-            text = json.dumps({**self._recipe(row), "seed": int(row["seed"])}, indent=2) + "\n"
+            recipe = self._recipe(row)
+            with _reading(self.folder / TABLE):
+                text = json.dumps({**recipe, "seed": int(row["seed"])}, indent=2) + "\n"
         elif name == "evaluation.json":
-            text = _evaluation(row)
+            with _reading(self.folder / TABLE):
+                text = _evaluation(row)
         else:
             text = row.get(name.removesuffix(".json"), "")
         return text.encode() if text else None
@@ -164,32 +181,29 @@ class Records:
         self.__dict__.pop("_curves", None)
 
     def _recipe(self, row: dict[str, str]) -> dict[str, Any]:
-        try:
+        with _reading(self.folder / RECIPES):
+            if row["settings"] not in self._recipes:
+                raise ValueError(f"it lacks the recipe of {row['run']}")
             return dict(self._recipes[row["settings"]])
-        except KeyError as error:
-            raise ValueError(
-                f"{self.folder / RECIPES} is damaged: it lacks the recipe of {row['run']}"
-            ) from error
 
     @cached_property
     def _recipes(self) -> dict[str, Any]:
-        path = self.folder / RECIPES
-        try:
-            return dict(json.loads(_read_xz(path)))
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is damaged: {error}") from error
+        return dict(json.loads(_read_xz(self.folder / RECIPES)))
 
     @cached_property
     def _curves(self) -> dict[str, str]:
-        rows = csv.reader(io.StringIO(_read_xz(self.folder / CURVES)))
-        header = next(rows, [])
-        curves = {}
-        for run, group in groupby(rows, key=lambda cells: cells[0]):
-            lines = list(group)
-            # Empty is a metric that the run does not have; one without a value at a step is nan.
-            kept = [i for i, cell in enumerate(lines[0]) if i and cell]
-            curves[run] = _to_csv([[line[i] for i in kept] for line in [header, *lines]])
-        return curves
+        path = self.folder / CURVES
+        with _reading(path):
+            rows = csv.reader(io.StringIO(_read_xz(path)))
+            header = next(rows, [])
+            curves = {}
+            for run, group in groupby(rows, key=lambda cells: cells[0]):
+                lines = list(group)
+                # Empty is a metric that the run does not have; one without a value at a step is
+                # nan.
+                kept = [i for i, cell in enumerate(lines[0]) if i and cell]
+                curves[run] = _to_csv([[line[i] for i in kept] for line in [header, *lines]])
+            return curves
 
 
 def find_records(path: Path) -> tuple[Records, str] | None:
@@ -314,11 +328,21 @@ def _to_csv(rows: Iterable[Iterable[Any]]) -> str:
     return buffer.getvalue()
 
 
-def _read_xz(path: Path) -> str:
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Raises ValueError, which names the file, whatever is wrong with its content."""
     try:
-        return lzma.decompress(path.read_bytes()).decode()
-    except (OSError, EOFError, lzma.LZMAError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
+        yield
+    except _DAMAGE as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _read_xz(path: Path) -> str:
+    with lzma.open(path) as file:
+        content = file.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        raise ValueError(f"it unpacks to more than the {_MOST_BYTES} bytes that it may have")
+    return content.decode()
 
 
 def _write_xz(path: Path, text: str) -> None:

@@ -1,6 +1,8 @@
 """Tables of runs, which hold what run folders hold."""
 
+import csv
 import json
+import lzma
 
 import pytest
 
@@ -115,6 +117,42 @@ def test_damaged_tables_are_refused(runs, tmp_path, name):
     (out / name).write_bytes((out / name).read_bytes()[:-20])
     with pytest.raises(ValueError, match=name):
         read_groups([out])
+
+
+DAMAGE = {
+    "larger than a table": (records.CURVES, b"run,step\n" + bytes(2**26), "more than the 67108864"),
+    "a cell that is too large": (records.CURVES, b"run,step\nseed-2," + b"0" * 200_000, "limit"),
+    "a row that is too short": (records.CURVES, b"run,step,return_mean\nseed-2,1,2\nseed-2\n", ""),
+    "a row without cells": (records.CURVES, b"run,step\n\n", ""),
+    "nested too deeply": (records.RECIPES, b"[" * 100_000, "recursion"),
+    "no object": (records.RECIPES, b"[1, 2]", ""),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGE)
+def test_packed_files_of_others_are_refused(what, runs, tmp_path):
+    name, content, message = DAMAGE[what]
+    out = tmp_path / "page"
+    record_runs([runs / "mlp"], out)
+    (out / name).write_bytes(lzma.compress(content, preset=0))
+    with pytest.raises(ValueError, match=rf"{name} is damaged: .*{message}"):
+        read_groups([out])
+
+
+@pytest.mark.parametrize(
+    ("column", "value"), [("seed", "two"), ("mean", "{"), ("evaluation", "[1]")]
+)
+def test_rows_of_others_are_refused(column, value, runs, tmp_path):
+    out = tmp_path / "page"
+    record_runs([runs / "mlp" / "seed-2"], out)
+    with (out / records.TABLE).open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    with (out / records.TABLE).open("w", newline="") as file:
+        writer = csv.DictWriter(file, records.COLUMNS)
+        writer.writeheader()
+        writer.writerow(row | {column: value})
+    with pytest.raises(ValueError, match=str(out)):
+        make_table([out])
 
 
 def test_runs_without_metrics_are_not_recorded(tmp_path):
