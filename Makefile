@@ -32,10 +32,10 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-demo: $(VENV)/installed-run  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 5 minutes) into runs/
+demo: $(VENV)/installed-recipes  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 5 minutes) into runs/
 	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit --out $(OUT) $(ARGS)
 
-demo-memory: $(VENV)/installed-run  ## Train four frames and TIT on a maze that only memory solves (about 3 minutes)
+demo-memory: $(VENV)/installed-recipes  ## Train four frames and TIT on a maze that only memory solves (about 3 minutes)
 	$(BIN)/python -m recipes sweep ppo/tmaze-10/frames-4 ppo/tmaze-10/enhanced-tit \
 	  --workers 2 --out $(OUT) $(ARGS)
 	$(BIN)/python -m recipes compare $(OUT)/ppo/tmaze-10/*/seed-* --out $(OUT)/memory.png
@@ -98,7 +98,7 @@ bench: $(VENV)/installed-bench  ## Measure speed against other libraries
 	$(ONE_THREAD) $(BIN)/python -m benchmarks $(ARGS)
 
 # The commands and fields are read from the code; the site is built beside it, with packages of its own.
-docs: $(VENV)/installed-run $(VENV)-docs/installed  ## Build the documentation site: build/site/index.html
+docs: $(VENV)/installed-recipes $(VENV)-docs/installed  ## Build the documentation site: build/site/index.html
 	rm -rf build/docs
 	$(ONE_THREAD) $(BIN)/python -m docs.tools.reference build/docs/reference
 	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict --quiet
@@ -126,7 +126,7 @@ $(VENV)-docs/installed: docs/requirements.txt $(VENV)/created
 	$(VENV)-docs/bin/python -m pip install -r docs/requirements.txt
 	@touch $@
 
-# The extra to install is the end of the stamp's name; 'run' stands for none.
+# The extra to install is the end of the stamp's name.
 $(VENV)/installed-%: pyproject.toml setup.py constraints.txt $(VENV)/created
-	$(BIN)/python -m pip install -c constraints.txt -e '.$(patsubst [run],,[$*])'
+	$(BIN)/python -m pip install -c constraints.txt -e '.[$*]'
 	@touch $@

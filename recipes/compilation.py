@@ -11,8 +11,8 @@ from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import torch
-from tqdm import tqdm
 
+from .optional import tqdm
 from .recipe import Compile, Precision
 
 P = ParamSpec("P")
@@ -88,7 +88,7 @@ def compile_and_time(function: Callable[P, T], name: str) -> Callable[P, T]:
         first = False
         start = time.perf_counter()
         result = fast(*args, **kwargs)
-        tqdm.write(f"compiled {name} in {time.perf_counter() - start:.0f} s", file=sys.stderr)
+        tqdm.tqdm.write(f"compiled {name} in {time.perf_counter() - start:.0f} s", file=sys.stderr)
         return result
 
     return timed

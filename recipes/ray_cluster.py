@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from torchrl_tit.extras import missing
 from torchrl_tit.settings.imports import allowed_modules
 
 _MODE, _LOOPBACK = "RAY_AUTH_MODE", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
@@ -37,7 +38,7 @@ def ask_for_machines(address: str) -> list[dict[str, float]]:
         ValueError: if Ray is missing, or no cluster answers there.
     """
     if find_spec("ray") is None:
-        raise ValueError("Ray is not installed: pip install 'torchrl-tit[ray]'")
+        raise ValueError(missing("ray"))
     # Ray itself waits for ten minutes or more if no cluster answers.
     try:
         answer = subprocess.run(

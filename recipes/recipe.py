@@ -6,13 +6,16 @@ import re
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
-import tyro
-
 from torchrl_tit.settings import Network, PerKey
 from torchrl_tit.settings.fields import check_fields
 from torchrl_tit.settings.literals import parse_assignments, parse_call
 from torchrl_tit.settings.names import Names
 from torchrl_tit.settings.numbers import Episodes, Seed, Steps, Threads
+
+try:
+    from tyro.conf import Suppress
+except ModuleNotFoundError:  # an extra: only the command line reads this mark
+    Suppress = None  # type: ignore[misc, assignment]
 
 Compile = Literal["auto", "on", "off"]
 Precision = Literal["auto", "float32", "bfloat16"]
@@ -42,7 +45,7 @@ class Recipe:
     length: ClassVar[str] = "total_steps"
     """The field that sets the length of a run, which ``train --resume RUN`` can raise."""
 
-    name: Annotated[str, tyro.conf.Suppress] = ""
+    name: Annotated[str, Suppress] = ""
     """The recipe's name, such as ppo/cartpole/enhanced-tit."""
     backbone: Network
     """The network: its frame encoder, its history encoder, and the number of frames it reads."""

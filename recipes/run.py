@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import filelock
 import msgspec
 
 from torchrl_tit.agents.folder import parse_evaluation, read_evaluation
@@ -28,6 +27,7 @@ from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.settings.imports import allowed_modules
 
 from .metrics import Metrics
+from .optional import filelock
 from .recipe import Recipe
 from .recipe_json import recipe_from_json, recipe_to_json
 from .records import Records
@@ -71,7 +71,6 @@ class Run:
     def __init__(self, folder: str | os.PathLike[str], recipe: Recipe) -> None:
         self.folder = Path(folder)
         self.recipe = recipe
-        self._lock = filelock.FileLock(self.folder / ".lock", timeout=0)
 
     @classmethod
     def create(
@@ -207,6 +206,7 @@ class Run:
             ) from error
 
     def __enter__(self) -> Run:
+        self._lock = filelock.FileLock(self.folder / ".lock", timeout=0)
         try:
             self._lock.acquire()
         except filelock.Timeout as error:

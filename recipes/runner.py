@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from torchrl_tit.checkpoint import checkpoint_steps, global_rng_state, set_global_rng_state
 from torchrl_tit.evaluation import watching_episodes
@@ -30,6 +29,7 @@ from .best import EPISODES, Best
 from .callback import Callback
 from .free_memory import return_free_memory
 from .interrupt import Interrupt
+from .optional import tqdm
 from .outcomes import Outcome, summarize
 from .recipe import Recipe
 from .run import Run
@@ -77,7 +77,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
         _load(run, parts)
         metrics = stack.enter_context(closing(run.metrics(record.columns, last_step=step)))
         progress = stack.enter_context(
-            tqdm(
+            tqdm.tqdm(
                 total=min([recipe.final_step, *(c.last_step for c in callbacks if c.last_step)]),
                 initial=step,
                 unit=f" {recipe.unit}",
@@ -340,7 +340,7 @@ def evaluate(
     if len(now) < len(targets):
         episodes = len(targets) * recipe.evaluation_episodes
         with (
-            tqdm(total=episodes, unit=" episodes", desc="evaluation", delay=1) as progress,
+            tqdm.tqdm(total=episodes, unit=" episodes", desc="evaluation", delay=1) as progress,
             watching_episodes(progress.update),
             naming(f"in {recipe.env}"),
         ):

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from torchrl.record.loggers.wandb import WandbLogger
 
+from torchrl_tit.extras import install
 from torchrl_tit.files import write_text_atomic
 
 from .callback import Callback
@@ -95,7 +96,7 @@ class WandbMetrics(Callback):
 def check_wandb(project: str) -> None:
     """Raises ValueError if metrics cannot be sent to a project, before anything starts."""
     if importlib.util.find_spec("wandb") is None:
-        raise ValueError("--wandb needs wandb: pip install 'torchrl-tit[wandb]'")
+        raise ValueError(f"--wandb needs wandb: {install('wandb')}")
     if not project or any(letter in project for letter in "/\\#?%:"):
         raise ValueError(
             f"--wandb needs the name of a project, without / \\ # ? % and :, not {project!r}"

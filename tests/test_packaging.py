@@ -16,6 +16,8 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import NormalizedName, canonicalize_name
 
+from torchrl_tit.extras import EXTRAS
+
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
@@ -140,6 +142,27 @@ def test_no_module_imports_recipes_by_its_name_in_a_clone(folder: str) -> None:
     names = re.compile(r"(torchrl_tit\.)?recipes\b")
 
     assert [(p, name) for p, name in _absolute_imports(folder) if names.match(name)] == []
+
+
+def test_the_library_requires_no_more_than_it_needs() -> None:
+    assert {Requirement(r).name for r in PROJECT["dependencies"]} == {
+        *("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "imageio", "numpy"),
+        *("safetensors", "msgspec"),
+    }
+
+
+def test_every_package_of_an_extra_is_known_by_it() -> None:
+    extras = {
+        name: {canonicalize_name(Requirement(r).name) for r in requirements}
+        for name, requirements in PROJECT["optional-dependencies"].items()
+    }
+    assert {p: e for p, e in EXTRAS.items() if canonicalize_name(p) not in extras[e]} == {}
+
+    required = {canonicalize_name(Requirement(r).name) for r in PROJECT["dependencies"]}
+    imports = [*_absolute_imports("recipes"), *_absolute_imports("torchrl_tit")]
+    imported = {name.partition(".")[0] for _, name in imports} - sys.stdlib_module_names
+    optional = {p for p in imported if canonicalize_name(p) not in {*required, "torchrl-tit"}}
+    assert optional - EXTRAS.keys() == set()
 
 
 def _direct_dependencies() -> dict[NormalizedName, Requirement]:

@@ -6,6 +6,7 @@ import os
 import sys
 
 import torchrl_tit
+from torchrl_tit.extras import EXTRAS, missing
 from torchrl_tit.settings import resolve
 
 from .arguments import fail, program
@@ -91,6 +92,9 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _describe(error: Exception) -> str:
+    package = (error.name or "").partition(".")[0] if isinstance(error, ImportError) else ""
+    if package in EXTRAS:
+        return missing(package)
     text = str(error) or type(error).__name__
     # PyTorch raises RuntimeErrors when a CPU or a GPU runs out of memory.
     if isinstance(error, MemoryError) or "allocate memory" in text or "out of memory" in text:

@@ -30,13 +30,9 @@ def report(arguments: list[str]) -> None:
         help="leave out the film and what the agent looks at, which take most of the time",
     )
     options = parser.parse_args(arguments)
-    try:
-        # Not at the top: they are an extra, and help needs no PyTorch.
-        from ..results.report import report as write
-    except ModuleNotFoundError as error:
-        if str(error.name).partition(".")[0] not in ("jinja2", "plotly"):
-            raise
-        raise ValueError("report needs Plotly: pip install 'torchrl-tit[report]'") from error
+    # Not at the top: it needs an extra, and help needs no PyTorch.
+    from ..results.report import report as write
+
     write(
         options.runs,
         options.out,

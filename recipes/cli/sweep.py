@@ -82,13 +82,11 @@ def tune(arguments: list[str]) -> None:
     for name in ("trials", "workers", "startup_trials"):
         if getattr(options, name) < 1:
             fail(f"--{name.replace('_', '-')} must be at least 1, not {getattr(options, name)}")
-    try:
-        # Not at the top: Optuna is an extra.
-        from ..sweeps.search_space import load_space
-        from ..sweeps.trials import importances
-        from ..sweeps.tune import Search, Settings
-    except ModuleNotFoundError as error:
-        raise ValueError("tune needs Optuna: pip install 'torchrl-tit[tune]'") from error
+    # Not at the top: Optuna is an extra.
+    from ..sweeps.search_space import load_space
+    from ..sweeps.trials import importances
+    from ..sweeps.tune import Search, Settings
+
     recipe = find_recipe(options.name)
     allow_names(recipe)
     make_algorithm(recipe).check()

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
-from pytorch_optimizer import Lamb
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import OnlineDTLoss
 
 from torchrl_tit.datasets import Episodes
+from torchrl_tit.extras import Missing
 from torchrl_tit.modules import acting, make_dt_actor
 
 from ..algorithm import Stateful, check_finite
@@ -22,6 +23,11 @@ from .odt_data import OnlineData
 from .odt_exploration import play_episodes, scale_noise
 from .sequence_algorithm import SequenceAlgorithm
 from .settings import ODT
+
+try:
+    import pytorch_optimizer
+except ModuleNotFoundError:
+    pytorch_optimizer = Missing("pytorch_optimizer")  # type: ignore[assignment]
 
 _TERMS = ("loss_log_likelihood", "loss_entropy", "entropy", "alpha")
 
@@ -122,14 +128,14 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
         return episodes
 
 
-def make_lamb(parameters: list[nn.Parameter], learning_rate: float, weight_decay: float) -> Lamb:
+def make_lamb(parameters: list[nn.Parameter], learning_rate: float, weight_decay: float) -> Any:
     """Builds LAMB (arXiv 1904.00962) as in the release of Online Decision Transformer.
 
     Weight decay is part of the update whose norm is compared with the norm of the weights. The
     latter is not clipped at 10, which wide layers reach. The step is not divided by a bias
     correction, because the norms would cancel it.
     """
-    optimizer = Lamb(
+    optimizer = pytorch_optimizer.Lamb(
         parameters,
         lr=learning_rate,
         weight_decay=weight_decay,

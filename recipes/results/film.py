@@ -14,6 +14,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from torchrl_tit.evaluation import evaluate
+from torchrl_tit.extras import install
 from torchrl_tit.files import whole_or_not_at_all
 
 from ..recipe import Recipe
@@ -133,6 +134,6 @@ def open_film(video: Path, fps: float) -> Any:
     if video.suffix == ".gif":
         return imageio.get_writer(video, format="GIF", mode="I", duration=1000 / fps, loop=0)
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise ValueError("MP4 needs imageio-ffmpeg: pip install 'torchrl-tit[render]'; or use .gif")
+        raise ValueError(f"MP4 needs imageio-ffmpeg: {install('imageio_ffmpeg')}; or use .gif")
     # The codec needs even sizes, not multiples of 16.
     return imageio.get_writer(video, format="FFMPEG", mode="I", fps=fps, macro_block_size=2)

@@ -115,5 +115,5 @@ def test_what_the_hub_refuses(hub, run, capsys):
 def test_without_huggingface_hub(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "huggingface_hub.errors", None)
     for words in (["play", "hf:me/small"], ["share", run, "--out", tmp_path / "agent"]):
-        assert 'pip install "torchrl-tit[share]"' in failure(capsys, *words)
+        assert "pip install 'torchrl-tit[share]'" in failure(capsys, *words)
     assert not any(tmp_path.iterdir())

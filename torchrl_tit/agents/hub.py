@@ -9,6 +9,7 @@ from pathlib import Path
 from types import ModuleType
 
 from torchrl_tit.agents.folder import CONTENTS, MANIFEST, AgentError, is_agent
+from torchrl_tit.extras import install
 
 PREFIX = "hf:"
 """Prefix of the names of agents on the Hub."""
@@ -100,7 +101,7 @@ def import_hub() -> ModuleType:
     except ImportError as error:
         raise AgentError(
             "model cards and the Hugging Face Hub need huggingface_hub: "
-            'pip install "torchrl-tit[share]"'
+            f"{install('huggingface_hub')}"
         ) from error
     return huggingface_hub
 

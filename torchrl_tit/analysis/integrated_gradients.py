@@ -20,6 +20,7 @@ from torchrl_tit.analysis.targets import (
     find_network,
     run_policy,
 )
+from torchrl_tit.extras import install
 from torchrl_tit.layers.images import bytes_to_floats
 
 
@@ -115,7 +116,5 @@ def _captum() -> type[Any]:
     try:
         from captum.attr import IntegratedGradients  # an optional extra
     except ImportError as error:
-        raise ValueError(
-            "integrated gradients need captum: pip install 'torchrl-tit[explain]'"
-        ) from error
+        raise ValueError(f"integrated gradients need captum: {install('captum')}") from error
     return IntegratedGradients

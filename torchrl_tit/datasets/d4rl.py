@@ -10,11 +10,11 @@ from pathlib import Path
 from urllib.error import URLError
 from urllib.parse import urlsplit
 
-import h5py
 import msgspec
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.optional import h5py
 from torchrl_tit.datasets.stored import damage_named
 from torchrl_tit.files import whole_or_not_at_all, write_text_atomic
 
@@ -95,6 +95,7 @@ def _cache_folder() -> Path:
 
 
 def _download(url: str, path: Path) -> None:
+    open_file = h5py.File  # first: without h5py, nothing is downloaded
     try:
         with urllib.request.urlopen(url, timeout=_TIMEOUT) as answer, path.open("wb") as file:
             if urlsplit(url).scheme == "https" != urlsplit(answer.url).scheme:
@@ -107,7 +108,7 @@ def _download(url: str, path: Path) -> None:
     if expected is not None and path.stat().st_size != int(expected):
         raise OSError(f"{url}: received only {path.stat().st_size} of {expected} bytes; try again.")
     with damage_named(url, "is not a whole HDF5 file"):
-        h5py.File(path, "r").close()
+        open_file(path, "r").close()
 
 
 class _Facts(msgspec.Struct):

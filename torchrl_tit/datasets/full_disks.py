@@ -8,7 +8,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import h5py
+from torchrl_tit.datasets.optional import h5py
 
 
 @contextlib.contextmanager

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations, rows_per_chunk
 from torchrl_tit.datasets.full_disks import new_hdf5
+from torchrl_tit.datasets.optional import h5py
 from torchrl_tit.datasets.stored import (
     array_names,
     attribute_fits,

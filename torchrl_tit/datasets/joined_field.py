@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from itertools import accumulate, pairwise
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
+
+from torchrl_tit.datasets.optional import h5py
 
 
 class JoinedField:

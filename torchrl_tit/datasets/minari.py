@@ -8,11 +8,8 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-import minari
 import numpy as np
 import torch
-from minari.dataset.minari_dataset import parse_dataset_id
-from minari.storage.datasets_root_dir import get_dataset_path
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
@@ -27,6 +24,7 @@ from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
 from torchrl_tit.datasets.minari_folder import check_folder, check_rows, episodes_checked
+from torchrl_tit.datasets.optional import minari
 from torchrl_tit.datasets.tasks import TaskSpaces, check_shape, check_task_name
 
 # What Minari raises if a data set is damaged or cannot be downloaded.
@@ -147,7 +145,7 @@ def is_minari_name(name: str) -> bool:
         (True, False)
     """
     try:
-        parse_dataset_id(name)
+        minari.dataset.minari_dataset.parse_dataset_id(name)
     except (TypeError, ValueError):  # no version, or another form
         return False
     return True
@@ -158,7 +156,7 @@ def _folder(name: str | os.PathLike[str]) -> Path:
     folder = Path(name).absolute()  # Minari cannot handle relative paths
     if folder.is_dir():
         return folder / "data" if (folder / "data").is_dir() else folder
-    data = get_dataset_path(str(name)) / "data"
+    data = minari.storage.datasets_root_dir.get_dataset_path(str(name)) / "data"
     if not data.is_dir():
         try:
             minari.download_dataset(str(name))

@@ -8,18 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
-import minari
 import numpy as np
 import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Discrete
-from minari.dataset.minari_storage import MinariStorage
-from minari.storage.datasets_root_dir import get_dataset_path
 from numpy.typing import NDArray
 
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
 from torchrl_tit.datasets.full_disks import errors_named, new_hdf5
 from torchrl_tit.datasets.minari import ATTRIBUTES, FIELDS, METADATA_FIELDS, is_minari_name
+from torchrl_tit.datasets.optional import minari
 from torchrl_tit.datasets.tasks import task_spaces
 from torchrl_tit.envs import is_atari
 from torchrl_tit.files import whole_or_not_at_all
@@ -63,7 +61,7 @@ def write_minari(
     folder.parent.mkdir(parents=True, exist_ok=True)
     with whole_or_not_at_all(folder) as hidden, errors_named(folder):
         hidden.mkdir()
-        storage = MinariStorage.new(
+        storage = minari.dataset.minari_storage.MinariStorage.new(
             hidden / "data",
             observation_space=_box(episodes.rows["observation"]),
             action_space=action_space,
@@ -98,7 +96,8 @@ def _target(name: str | os.PathLike[str]) -> tuple[Path, str]:
     if path.is_absolute() or str(name).startswith("."):
         folder, dataset_id = path.absolute(), path.name  # Minari cannot handle relative paths
     else:
-        folder, dataset_id = get_dataset_path(str(name)), str(name)
+        folder = minari.storage.datasets_root_dir.get_dataset_path(str(name))
+        dataset_id = str(name)
     if not is_minari_name(dataset_id):
         raise ValueError(
             f"{dataset_id!r} is not a valid name of a Minari data set: it must end in a version, "

@@ -6,7 +6,6 @@ import difflib
 import os
 from pathlib import Path
 
-import minari
 import torch
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
@@ -14,6 +13,7 @@ from torchrl_tit.datasets.d4rl import download_d4rl
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.hdf5 import read_hdf5
 from torchrl_tit.datasets.minari import is_minari_name, read_minari
+from torchrl_tit.datasets.optional import minari
 from torchrl_tit.datasets.scores import has_reference
 from torchrl_tit.datasets.tasks import TaskSpaces, check_task_name, task_spaces
 from torchrl_tit.datasets.transitions import Gaps

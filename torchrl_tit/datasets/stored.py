@@ -10,10 +10,10 @@ from functools import partial
 from itertools import islice
 from math import prod
 
-import h5py
 import numpy as np
 
 from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.optional import h5py
 
 # zlib's deflate, h5py's strongest built-in compression, expands one byte to at most 1032.
 _MOST_BYTES_OF_ONE = 1100

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +14,7 @@ from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.datasets.full_disks import new_hdf5
 from torchrl_tit.datasets.joined_field import JoinedField
+from torchrl_tit.datasets.optional import h5py
 from torchrl_tit.datasets.stored import check_group, damage_named, open_hdf5
 from torchrl_tit.datasets.transition_reader import FIELDS
 from torchrl_tit.datasets.transitions import episodes_from_transitions

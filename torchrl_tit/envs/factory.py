@@ -18,6 +18,7 @@ from torchrl_tit.envs.torchrl_tasks import make_torchrl_tasks
 from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.envs.wrappers import load_wrappers
+from torchrl_tit.extras import install
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Copies, Seed
 from torchrl_tit.transforms.hide_velocities import HideVelocities
@@ -247,9 +248,7 @@ def _rom(name: str) -> str:
     try:
         import ale_py  # an optional extra
     except ImportError as error:
-        raise ValueError(
-            f"Task {name!r} needs ale-py: pip install 'torchrl-tit[atari]'."
-        ) from error
+        raise ValueError(f"Task {name!r} needs ale-py: {install('ale_py')}.") from error
     gymnasium.register_envs(ale_py)
     if name not in gymnasium.registry:
         raise unknown(name)

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 from torchrl.envs import EnvBase
 
+from torchrl_tit.extras import install
 from torchrl_tit.settings.imports import import_module
 from torchrl_tit.settings.plugins import load_plugins
 
@@ -89,9 +90,7 @@ def _registered(name: str) -> str:
     try:
         import_module(package)
     except ImportError as error:
-        raise ValueError(
-            f"Task {name!r} needs {package}: pip install 'torchrl-tit[{package}]' ({error})."
-        ) from error
+        raise ValueError(f"Task {name!r} needs {package}: {install(package)} ({error}).") from error
     if name not in gymnasium.registry:
         raise unknown(name)
     return f"{package}:{name}"  # so that other processes also import it

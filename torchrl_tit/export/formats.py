@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_tit.export.program import Program
+from torchrl_tit.extras import install
 
 FACTS = "torchrl_tit.json"
 """Name under which a .pt2 file stores the facts about its policy."""
@@ -87,8 +88,7 @@ class ONNX(Format):
         missing = [name for name in packages if importlib.util.find_spec(name) is None]
         if missing:
             raise ValueError(
-                f"ONNX needs {', '.join(missing)}: pip install 'torchrl-tit[onnx]', or export to "
-                ".pt2"
+                f"ONNX needs {', '.join(missing)}: {install('onnx')}, or export to .pt2"
             )
 
     def write(

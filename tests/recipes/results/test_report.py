@@ -350,4 +350,4 @@ def test_plotly_is_an_extra(runs, tmp_path, capsys, monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
     line = error(capsys, runs / "mlp", "--out", tmp_path / "a.html")
-    assert line == "error: report needs Plotly: pip install 'torchrl-tit[report]'"
+    assert line == "error: plotly is not installed: pip install 'torchrl-tit[report]'"
