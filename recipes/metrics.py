@@ -8,12 +8,14 @@ import math
 import os
 import shutil
 import time
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from torchrl_tit.agents.folder import MOST_STEPS, is_number
+from torchrl_tit.extras import missing
 from torchrl_tit.files import naming, write_text_atomic
 
 
@@ -29,9 +31,14 @@ class Metrics:
         folder: the run folder.
         columns: names of the numbers, in the CSV's order.
         last_step: rows past this step are dropped.
+
+    Raises:
+        ModuleNotFoundError: if TensorBoard is not installed.
     """
 
     def __init__(self, folder: Path, columns: list[str], last_step: int) -> None:
+        if find_spec("tensorboard") is None:  # an extra
+            raise ModuleNotFoundError(missing("tensorboard"), name="tensorboard")
         self.path = folder / "metrics.csv"
         self._columns = ["step", "time", "steps_per_second", *columns]
         self._last = (last_step, time.monotonic())

@@ -1,4 +1,7 @@
-"""Packages of the extra "recipes" that training needs and acting does not; see :mod:`extras`."""
+"""filelock and tqdm, which the extra "recipes" installs; without it, their first use says so.
+
+Training needs them; loading a trained agent, which imports the same modules, does not.
+"""
 
 from torchrl_tit.extras import Missing
 

@@ -15,7 +15,7 @@ from torchrl_tit.settings.numbers import Episodes, Seed, Steps, Threads
 try:
     from tyro.conf import Suppress
 except ModuleNotFoundError:  # an extra: only the command line reads this mark
-    Suppress = None  # type: ignore[misc, assignment]
+    Suppress = None  # type: ignore[misc]
 
 Compile = Literal["auto", "on", "off"]
 Precision = Literal["auto", "float32", "bfloat16"]

@@ -22,6 +22,8 @@ main(["play", "cartpole", "--episodes", "1"])
 import torchrl_tit.datasets
 import recipes.decision_transformer.odt  # and with it, all that plays its agents
 from recipes import Run, get_recipe
+from recipes.metrics import Metrics
+from pathlib import Path
 
 def create():
     with Run(folder, get_recipe("ppo/cartpole/mlp")):
@@ -37,6 +39,7 @@ for use in (
     lambda: torchrl_tit.datasets.load_episodes("mujoco/hopper/medium-v0"),
     lambda: recipes.decision_transformer.odt.make_lamb([], 1.0, 0.0),
     create,
+    lambda: Metrics(Path(folder), [], 0),
 ):
     try:
         use()
@@ -62,7 +65,7 @@ def test_networks_and_trained_agents_need_no_extra(tmp_path: Path) -> None:
     assert "tensor(500.)" in lines
     assert "ppo/cartpole/enhanced-tit" in lines
     assert any(line.startswith("cartpole: return 500.0") for line in lines)
-    assert lines[-7:] == [
+    assert lines[-8:] == [
         "exit: 2",
         "exit: 2",
         "exit: 2",
@@ -70,6 +73,7 @@ def test_networks_and_trained_agents_need_no_extra(tmp_path: Path) -> None:
         "missing: minari is not installed: pip install 'torchrl-tit[offline]'",
         "missing: pytorch_optimizer is not installed: pip install 'torchrl-tit[offline]'",
         "missing: filelock is not installed: pip install 'torchrl-tit[recipes]'",
+        "missing: tensorboard is not installed: pip install 'torchrl-tit[recipes]'",
     ]
     assert [line for line in result.stderr.splitlines() if line.startswith("error: ")] == [
         "error: tyro is not installed: pip install 'torchrl-tit[recipes]'",
