@@ -35,8 +35,6 @@ RECIPES: dict[str, PPO] = {
         _variant(f"{_S7}/frames-4", "frames-1", {"num_frames": 1}),
         _variant(f"{_S7}/frames-4", "frames-32", {"num_frames": 32}),
         _variant(f"{_S7}/enhanced-tit", "shuffled-windows", sequence_length=None),
-        _variant(f"{_S7}/enhanced-tit", "next-frame", next_frame_coeff=1.0),
-        _variant(f"{_S7}/enhanced-tit", "reconstruction", reconstruction_coeff=0.1),
         _variant(
             f"{_S7}/enhanced-tit",
             "tiles-of-28-pixels",

@@ -21,7 +21,7 @@ from torchrl_tit.envs import observation_specs
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.frames.normalized import NormalizedFrames
-from torchrl_tit.layers import init_orthogonal_, scale_residual_branches_, standardize
+from torchrl_tit.layers import init_orthogonal_, standardize
 from torchrl_tit.modules import Backbone, history_keys, make_actor, make_value
 from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.networks import build_network, masked_predictions
@@ -39,12 +39,11 @@ from ..outcomes import Outcome
 from ..policies import normalize_frames
 from ..ray_collector import check_cluster
 from ..task import make_task
-from .auxiliary import AuxiliaryLosses
 from .collectors import make_collector, with_state
 from .flat_parameters import FlatParameters
 from .learning_rate import KLAdaptiveRate
 from .rollout import Rollout
-from .scaling import AdvantageScale, ReturnScale, ValueHead, normalize_advantages
+from .scaling import AdvantageScale, ReturnScale, normalize_advantages
 from .settings import PPO
 
 TERMS = ["loss_objective", "loss_critic", "loss_entropy", "entropy", "kl_approx", "clip_fraction"]
@@ -74,7 +73,6 @@ class Agent(nn.Module):
         )
         if recipe.initialization == "orthogonal":
             init_orthogonal_(self.backbone)
-        scale_residual_branches_(self.backbone, recipe.residual_gain)
         if recipe.normalize_observations:
             normalize_frames(network)
         features_dim = self.backbone.features_dim
@@ -85,12 +83,8 @@ class Agent(nn.Module):
             in_key=keys[0],
             mask_key=self.mask_key,
             batch_dims=0,
-            gain=recipe.policy_gain,
         )
         self.critic = make_value(features_dim, in_key=keys[-1])
-        if recipe.value_gradient != 1:
-            self.critic.module = ValueHead(self.critic.module, recipe.value_gradient)
-        self.auxiliary = AuxiliaryLosses(recipe, self.backbone, env.action_spec_unbatched)
 
     def encode(self, samples: TensorDictBase) -> TensorDictBase:
         """Writes the features of single steps [N], or of sequences [N, time]."""
@@ -148,8 +142,7 @@ class PPOAlgorithm(Algorithm[PPO]):
         task.close()
         self.agent.backbone.autocast = autocast_type(recipe.precision, self.device)
         contrastive = ["loss_contrastive"] if recipe.contrastive_coeff else []
-        auxiliary = self.agent.auxiliary.weights
-        self.terms = [*TERMS, *contrastive, *auxiliary, "gradient_norm"]
+        self.terms = [*TERMS, *contrastive, "gradient_norm"]
         self.columns = [
             "learning_rate",
             "feature_spread",
@@ -319,7 +312,6 @@ class PPOAlgorithm(Algorithm[PPO]):
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.recipe.max_grad_norm)
         self.optimizer.step()
-        self.agent.auxiliary.update_targets(self.agent.backbone)
         return torch.cat([values, norm.unsqueeze(0)])
 
     def _set_learning_rate(self, learning_rate: float) -> None:
@@ -352,10 +344,6 @@ class PPOAlgorithm(Algorithm[PPO]):
             contrast = self._contrastive_loss(minibatch.flatten(0, minibatch.ndim - 1))
             total = total + self.recipe.contrastive_coeff * contrast
             values.append(contrast.detach())
-        if self.agent.auxiliary.weights:
-            loss, losses = self.agent.auxiliary(minibatch, self.agent.backbone)
-            total = total + loss
-            values += losses
         return total, torch.stack(values)
 
     def _contrastive_loss(self, steps: TensorDict) -> Tensor:

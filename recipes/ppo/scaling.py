@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchrl_tit.layers import standardize
 
@@ -114,21 +114,3 @@ def normalize_advantages(advantage: Tensor, floor: float) -> Tensor:
     if advantage.numel() == 1:
         return advantage
     return standardize(advantage, advantage.mean(), advantage.std().clamp(min=floor), eps=1e-8)
-
-
-class ValueHead(nn.Module):
-    """A value head that scales the gradient on the features it reads.
-
-    Args:
-        linear: the value head, [..., F] -> [..., 1].
-        gradient: factor on the gradient that reaches the features; 0 stops it.
-    """
-
-    def __init__(self, linear: nn.Linear, gradient: float) -> None:
-        super().__init__()
-        self.linear = linear
-        self.gradient = gradient
-
-    def forward(self, features: Tensor) -> Tensor:
-        """[..., F] -> values, float [..., 1]."""
-        return self.linear(torch.lerp(features.detach(), features, self.gradient))

@@ -37,7 +37,15 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     The defaults are those of the paper's runs on arrays (arXiv 2212.14538, appendix).
     """
 
-    removed: ClassVar[dict[str, Any]] = {"async_collection": False, "normalize_values": False}
+    removed: ClassVar[dict[str, Any]] = {
+        "async_collection": False,
+        "next_frame_coeff": 0.0,
+        "normalize_values": False,
+        "policy_gain": 0.01,
+        "reconstruction_coeff": 0.0,
+        "residual_gain": 1.0,
+        "value_gradient": 1.0,
+    }
 
     padding: Padding = "same"
     """What fills a history before the first observation: that observation, or zeros."""
@@ -87,11 +95,6 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     """Weight of CoBERL's contrastive loss (arXiv 2107.05431 uses 1); 0 for other networks."""
     masked_fraction: Fraction = 0.15
     """Share of the steps that the contrastive loss masks."""
-    next_frame_coeff: Weight = 0.0
-    """Weight of predicting the next observation's tokens from features and action (arXiv
-    2007.05929), for networks that train on sequences."""
-    reconstruction_coeff: Weight = 0.0
-    """Weight of reconstructing the observation from the features, for the same networks."""
     clip_rewards: bool = False
     """Whether to train on the signs of rewards; reported returns are always unclipped."""
     reward_scale: Weight = 1.0
@@ -109,9 +112,6 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     running_advantage_floor: Weight = 0.0
     """The same, as a fraction of the running standard deviation of the advantages of all batches so
     far, for tasks whose advantages differ in scale. The larger of the two floors applies."""
-    value_gradient: Weight = 1.0
-    """Factor on the gradient of the value loss where it enters a backbone that policy and value
-    share; 0 trains the backbone on the policy's loss alone (compared in arXiv 2009.04416)."""
     normalize_observations: bool = False
     """Whether the network reads observations normalised to a running mean of 0 and standard
     deviation of 1, per entry of an array and per channel of an image (as in VecNormalize; arXiv
@@ -123,9 +123,6 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     at_target_kl: Literal["stop", "adapt"] = "stop"
     """With a target_kl: "stop" ends an update after the epoch that exceeds it (as in OpenAI's
     Spinning Up), "adapt" adjusts the learning rate to approach it (as in rl_games and skrl)."""
-    residual_gain: Weight = 1.0
-    """Factor on the initial output weights of attention and FFN in each block; 0 makes every block
-    the identity at the start (arXiv 1901.09321, 2003.04887)."""
     gamma: Fraction = 0.99
     """Discount factor."""
     gae_lambda: Fraction = 0.95
@@ -136,8 +133,6 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     initialization: Literal["orthogonal", "own"] = "orthogonal"
     """Initialisation of the backbone: orthogonal, as in Stable-Baselines3 and so in the paper's
     online runs, or the network's own (TIT: normal with a standard deviation of 0.02)."""
-    policy_gain: Weight = 0.01
-    """Gain of the initial weights of the policy's last layer."""
     checkpoint_interval: Steps = 10_240
     """Environment steps between checkpoints."""
     collectors: Copies = 1
@@ -166,12 +161,6 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
                 "contrastive_coeff is the weight of a loss that only coberl has: set it to 0 for "
                 "other history encoders"
             )
-        for name in ("next_frame_coeff", "reconstruction_coeff"):
-            if getattr(self, name) and not self.reads_sequences:
-                raise ValueError(
-                    f"{name} is the weight of a loss on sequences, which this network does not "
-                    "train on: set it to 0, or num_frames above 1"
-                )
         if self.reads_sequences and self.sequence_length is not None:
             steps = self.steps_per_batch // self.num_envs
             _check_divides(self, "sequence_length", "minibatch_size", self.minibatch_size)

@@ -14,8 +14,6 @@ from recipes.registry import find_recipe, get_recipe
 LARGER = ("frames-32", "tiles-of-28-pixels")
 FIELDS = {
     "shuffled-windows": {"sequence_length"},
-    "next-frame": {"next_frame_coeff"},
-    "reconstruction": {"reconstruction_coeff"},
     "tiles-of-28-pixels": {"backbone", "wrappers"},
     "own-limit-seven-actions": {"env_settings", "wrappers"},
 }

@@ -16,7 +16,6 @@ from torchrl_tit.layers import (
     TransformerBlock,
     init_normal_,
     init_orthogonal_,
-    scale_residual_branches_,
 )
 from torchrl_tit.networks import EnhancedTIT, VanillaTIT
 
@@ -154,12 +153,3 @@ def test_a_block_starts_with_pytorchs_defaults() -> None:
     block = TransformerBlock(64, num_heads=4)
     assert_uniform(block.ffn.get_parameter("0.weight"), 1 / math.sqrt(64))
     assert_uniform(block.attention.out_proj.weight, 1 / math.sqrt(64))
-
-
-def test_blocks_without_branches_are_the_identity() -> None:
-    block = TransformerBlock(embed_dim=8, num_heads=2)
-    init_orthogonal_(block)
-    tokens = torch.randn(4, 3, 8)
-    assert not torch.allclose(block(tokens), tokens)
-    scale_residual_branches_(block, 0.0)
-    torch.testing.assert_close(block(tokens), tokens)

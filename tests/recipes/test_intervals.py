@@ -273,8 +273,10 @@ def test_the_command_line_names_it_in_one_line(
     assert "Traceback" not in errors
 
 
-def test_a_field_that_was_removed_is_read_where_it_did_nothing() -> None:
+@pytest.mark.parametrize("field", PPO.removed)
+def test_a_field_that_was_removed_is_read_where_it_did_nothing(field) -> None:
     fields = json.loads(recipe_to_json(PPO_RECIPE))
-    assert recipe_from_json(json.dumps({**fields, "async_collection": False}), "f") == PPO_RECIPE
-    with pytest.raises(ValueError, match="'async_collection' no longer exists, and only False"):
-        recipe_from_json(json.dumps({**fields, "async_collection": True}), "f")
+    value = PPO.removed[field]
+    assert recipe_from_json(json.dumps({**fields, field: value}), "f") == PPO_RECIPE
+    with pytest.raises(ValueError, match=f"^f .*{field!r} no longer exists, and only {value}.*$"):
+        recipe_from_json(json.dumps({**fields, field: 0.5}), "f")

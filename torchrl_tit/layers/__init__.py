@@ -10,7 +10,6 @@ from torchrl_tit.layers.gpt2_block import GPT2Block
 from torchrl_tit.layers.initialization import (
     init_normal_,
     init_orthogonal_,
-    scale_residual_branches_,
 )
 from torchrl_tit.layers.patches import ArrayPatchEmbedding, ImagePatchEmbedding
 from torchrl_tit.layers.positions import RelativeBias, Rotary
@@ -35,6 +34,5 @@ __all__ = [
     "TransformerBlock",
     "init_normal_",
     "init_orthogonal_",
-    "scale_residual_branches_",
     "standardize",
 ]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from torch import nn
 
-from torchrl_tit.layers.block import TransformerBlock
 from torchrl_tit.layers.patches import ImagePatchEmbedding
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Weight
@@ -62,20 +61,3 @@ def init_orthogonal_(module: nn.Module, gain: Weight = 2**0.5) -> None:
             bias = getattr(child, "bias", None)
             if bias is not None:
                 nn.init.zeros_(bias)
-
-
-@checked_arguments
-def scale_residual_branches_(module: nn.Module, factor: Weight) -> None:
-    """Scales the last weights of attention and FFN in all transformer blocks.
-
-    With 0, every block is the identity at the start (arXiv 1901.09321, 2003.04887).
-
-    Args:
-        module: the network, changed in place.
-        factor: factor on the weights.
-    """
-    for child in module.modules():
-        if isinstance(child, TransformerBlock):
-            for layer in (child.attention.out_proj, child.ffn[2]):
-                assert isinstance(layer, nn.Linear)
-                layer.weight.data.mul_(factor)

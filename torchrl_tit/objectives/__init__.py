@@ -6,7 +6,6 @@ from torchrl_tit.objectives.cql import ContinuousCQLLoss
 from torchrl_tit.objectives.cql_terms import PolicySamples
 from torchrl_tit.objectives.decision_transformer import MaskedDTLoss
 from torchrl_tit.objectives.discrete_cql import DelayedDiscreteCQLLoss
-from torchrl_tit.objectives.next_frame import NextFrameLoss, ReconstructionLoss
 from torchrl_tit.objectives.pairs import encode_pairs
 
 __all__ = [
@@ -14,9 +13,7 @@ __all__ = [
     "DelayedDiscreteCQLLoss",
     "LikelihoodBCLoss",
     "MaskedDTLoss",
-    "NextFrameLoss",
     "PolicySamples",
-    "ReconstructionLoss",
     "contrastive_prediction_loss",
     "encode_pairs",
 ]

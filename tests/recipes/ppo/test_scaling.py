@@ -6,13 +6,12 @@ from typing import Any
 
 import pytest
 import torch
-from torch import nn
 
 from recipes.algorithm import make_algorithm
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO, algorithm
 from recipes.ppo.learning_rate import KLAdaptiveRate
-from recipes.ppo.scaling import ReturnScale, ValueHead
+from recipes.ppo.scaling import ReturnScale
 from recipes.run import Run
 from recipes.runner import load_trained, train
 from tests.recipes.ppo import tasks
@@ -61,19 +60,6 @@ def test_return_scale_is_the_deviation_of_discounted_returns():
         found = scale.update(rewards[:, start:stop], done[:, start:stop])
         seen = torch.tensor([value for t, value in expected if t < stop], dtype=torch.float64)
         assert found.item() == pytest.approx(seen.std(unbiased=False).item(), rel=1e-5)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-def test_value_head_passes_a_share_of_its_gradient(share):
-    linear = nn.Linear(8, 1)
-    features = torch.randn(4, 8, requires_grad=True)
-    whole, weight = torch.autograd.grad(linear(features).sum(), [features, linear.weight])
-    head = ValueHead(linear, share)
-    value = head(features)
-    torch.testing.assert_close(value, linear(features))
-    passed, head_weight = torch.autograd.grad(value.sum(), [features, linear.weight])
-    torch.testing.assert_close(passed, share * whole)
-    torch.testing.assert_close(head_weight, weight)
 
 
 def test_learning_rate_follows_the_divergence():
@@ -331,7 +317,6 @@ def test_two_resumes_of_a_run_with_all_of_them_are_equal(tmp_path):
         RECIPE,
         normalize_rewards=True,
         running_advantage_floor=0.5,
-        value_gradient=0.5,
         normalize_observations=True,
         target_kl=0.01,
         at_target_kl="adapt",
@@ -369,14 +354,3 @@ def test_collectors_of_other_processes_get_the_statistics(tmp_path, monkeypatch)
     run_of(recipe, tmp_path / "run")
     assert len(differences) == 4
     assert max(differences) < 1e-4
-
-
-@pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
-def test_the_policy_starts_with_its_gain(env):
-    for gain in (0.01, 0.5):
-        agent = make_algorithm(replace(RECIPE, env=env, policy_gain=gain)).networks()
-        assert isinstance(agent, algorithm.Agent)
-        actor = agent.actor
-        (weight,) = (p for p in actor.parameters() if p.ndim == 2)
-        size = weight.norm(dim=1)
-        torch.testing.assert_close(size, torch.full_like(size, gain))
