@@ -33,7 +33,8 @@ class Callback:
         Args:
             step: number of steps at the end of the batch.
             batch: what the algorithm's ``batches`` yielded; do not modify it. An online batch is a
-                tensordict [envs, time] with unclipped rewards.
+                tensordict [envs, time] with unclipped rewards; PPO's update scales these, and adds
+                ``advantage`` and ``value_target``.
         """
 
     def updated(self, step: int, policy: TensorDictModuleBase) -> bool | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -67,20 +67,19 @@ def to_markdown(algorithm: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def limit(formula: str, recipe: Recipe, values: Mapping[str, float]) -> float | None:
-    """Reads a limit: a number, or a number times a field of the recipe or another metric.
+def limit(formula: str, recipe: Recipe) -> float | None:
+    """Reads a limit: a number, or a number times a field of the recipe.
 
     Args:
-        formula: such as "0.02", "10 * max_grad_norm" or "10 * policy_gradient".
+        formula: such as "0.02" or "10 * max_grad_norm".
         recipe: the settings of the run.
-        values: other metrics of the same row, by column.
 
     Returns:
         The limit; None if there is none here.
 
     Example:
         >>> from recipes.registry import get_recipe
-        >>> limit("10 * max_grad_norm", get_recipe("ppo/cartpole/mlp"), {})
+        >>> limit("10 * max_grad_norm", get_recipe("ppo/cartpole/mlp"))
         5.0
     """
     if not formula:
@@ -88,7 +87,7 @@ def limit(formula: str, recipe: Recipe, values: Mapping[str, float]) -> float | 
     factor, _, name = formula.partition(_TIMES)
     if not name:
         return float(factor)
-    value = values.get(name, getattr(recipe, name, None))
+    value = getattr(recipe, name, None)
     return None if value is None else float(factor) * float(value)
 
 

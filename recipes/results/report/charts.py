@@ -362,7 +362,7 @@ def _draw_limits(figure: go.Figure, groups: Sequence[Group], words: MetricWords)
     """Draws a dashed line at each limit that all groups share; returns these limits."""
     drawn = []
     for formula in (words.low, words.high):
-        limits = {limit(formula, group.recipe, {}) for group in groups}
+        limits = {limit(formula, group.recipe) for group in groups}
         if len(limits) == 1 and (value := limits.pop()) is not None:
             line = {"color": "#5b6770", "width": 1.2, "dash": "6px,4px"}
             figure.add_shape(

@@ -76,10 +76,12 @@ def findings(groups: Sequence[Group]) -> list[Finding]:
         for column in group.columns:
             words = words_of(group.recipe.algorithm, column)
             for formula, sign, side in ((words.low, -1, "below"), (words.high, 1, "above")):
-                shares = [_share_outside(run, words, formula, sign) for run in group.runs]
+                if (bound := limit(formula, group.recipe)) is None:
+                    continue
+                shares = [_share_outside(run, words, bound, sign) for run in group.runs]
                 known = [share for share in shares if share is not None]
                 if known and np.mean(known) >= _OFTEN:
-                    beyond = f"{side} {_bound(formula, group.recipe)}"
+                    beyond = f"{side} {number(bound)}"
                     _, texts = found.setdefault((column, beyond), (words, []))
                     texts.append(f"{whose}in {np.mean(known):.0%} of the batches")
     return [
@@ -150,29 +152,16 @@ def duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
-def _share_outside(run: RunData, words: MetricWords, formula: str, sign: int) -> float | None:
-    """The share of rows in which a metric is beyond a limit; None if there is no limit."""
+def _share_outside(run: RunData, words: MetricWords, bound: float, sign: int) -> float | None:
+    """The share of rows in which a metric is beyond a limit; None if it was not measured."""
     values = run.metrics.get(words.column)
-    if not formula or values is None:
+    if values is None:
         return None
     counts = np.isfinite(values)
     if words.needs in run.metrics:
         counts &= np.diff(run.metrics[words.needs], prepend=np.nan) != 0
-    outside = []
-    for index in np.flatnonzero(counts):
-        row = {name: column[index] for name, column in run.metrics.items()}
-        bound = limit(formula, run.run.recipe, row)
-        if bound is not None and np.isfinite(bound):
-            outside.append(sign * (values[index] - bound) > 0)
-    return sum(outside) / len(values) if outside else None
-
-
-def _bound(formula: str, recipe: Recipe) -> str:
-    value = limit(formula, recipe, {})
-    if value is not None:
-        return number(value)
-    factor, _, name = formula.partition(" * ")
-    return f"{factor} times `{name}`"
+    outside = sign * (values[counts] - bound) > 0
+    return float(outside.sum() / len(values)) if counts.any() else None
 
 
 def _text(value: Any) -> str:

@@ -38,11 +38,10 @@ def test_the_documents_have_the_same_words(algorithm):
 
 def test_limits():
     recipe = get_recipe("ppo/cartpole/mlp")
-    high = words_of("ppo", "value_gradient").high
-    assert limit(high, recipe, {"policy_gradient": 0.2}) == pytest.approx(2)
-    assert limit(high, recipe, {}) is None
-    assert limit(words_of("ppo", "kl_approx").high, recipe, {}) == 0.02
-    assert limit(words_of("ppo", "entropy").high, recipe, {}) is None
+    assert limit(words_of("ppo", "gradient_norm").high, recipe) == pytest.approx(5)
+    assert limit(words_of("ppo", "kl_approx").high, recipe) == 0.02
+    assert limit(words_of("ppo", "entropy").high, recipe) is None
+    assert limit("10 * no_field", recipe) is None
 
 
 def test_columns_that_are_not_known():
