@@ -72,7 +72,9 @@ def test_nothing_left() -> None:
 
 @BOTH
 def test_unknown_hyperparameter_is_named(kind: type[Any]) -> None:
-    with pytest.raises(TypeError, match=rf"{kind.__name__}\(\) got an unexpected .* argument 'embed_dims'"):
+    with pytest.raises(
+        TypeError, match=rf"{kind.__name__}\(\) got an unexpected .* argument 'embed_dims'"
+    ):
         kind((4,), embed_dims=64)
 
 

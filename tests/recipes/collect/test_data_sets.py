@@ -314,7 +314,9 @@ class Paying(CartPoleEnv):
 def test_rewards_that_are_not_finite_are_named_before_they_are_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(gymnasium.registry, "Paying-v0", EnvSpec("Paying-v0", Paying))
+    monkeypatch.setitem(
+        gymnasium.registry, "Paying-v0", EnvSpec("Paying-v0", lambda **settings: Paying(**settings))
+    )
     settings = Collection(env="Paying-v0", sets=("random",), num_envs=2, transitions=40)
     with pytest.raises(NotFiniteError, match=r"^the reward of copy \d is inf in Paying-v0$"):
         collect(settings, tmp_path / "data")
