@@ -155,10 +155,19 @@ class Stop(Callback):
         return step == self.step
 
 
+def starts_of(batch: Any) -> list[tuple[float, ...]]:
+    """The first observation of each copy."""
+    observation = batch["observation"]
+    if not isinstance(observation, torch.Tensor):
+        observation = torch.cat([*observation.values()], -1)
+    return [tuple(start.tolist()) for start in observation[:, 0]]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path: Path) -> None:
     recipe = recipe_of(kind)
-    train_in(tmp_path / "first", recipe, Stop(96))
+    begun = Stop(96)
+    train_in(tmp_path / "first", recipe, begun)
     shutil.copytree(tmp_path / "first", tmp_path / "second")
     stopped = rows_of(tmp_path / "first")
     states, seen = [], []
@@ -178,6 +187,7 @@ def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path
     batch = seen[0][0]
     if kind not in ("ale_py", "minigrid"):
         assert (batch["next", "episode_reward"] - batch["next", "reward"])[:, 0].abs().max() == 0
+        assert not set(starts_of(batch)) & set(starts_of(begun.batches[0]))  # with other seeds
     if "is_init" in batch.keys():  # noqa: SIM118 (a tensordict)
         assert batch["is_init"][:, 0].all()
 
@@ -189,11 +199,8 @@ def test_neighbouring_seeds_share_no_environment(kind: str, tmp_path: Path) -> N
     for seed in (20, 21, 22):
         algorithm = make_algorithm(replace(RECIPES[kind], seed=seed))
         algorithm.prepare(0, tmp_path)
-        observation = next(iter(algorithm.batches()))["observation"]
+        starts += starts_of(next(iter(algorithm.batches())))
         algorithm.close()
-        if not isinstance(observation, torch.Tensor):
-            observation = torch.cat([*observation.values()], -1)
-        starts += [tuple(start.tolist()) for start in observation[:, 0]]
     assert len(set(starts)) == len(starts) == 6
 
 
