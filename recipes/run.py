@@ -312,7 +312,7 @@ class Run:
         try:
             before = json.loads(path.read_text(encoding="utf-8"))
             before.items()
-        except (AttributeError, OSError, ValueError):  # lost or damaged: nothing to compare with
+        except (AttributeError, OSError, RecursionError, ValueError):  # lost or damaged
             return []
         now = package_versions()
         return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
@@ -357,7 +357,7 @@ def _import_hint(folder: Path) -> str:
     try:
         began_with = json.loads((folder / _IMPORTS).read_text(encoding="utf-8"))
         missing = [str(module) for module in began_with if module not in allowed_modules()]
-    except (OSError, ValueError, TypeError):
+    except (OSError, RecursionError, TypeError, ValueError):
         return ""
     options = " ".join(f"--import {shlex.quote(module)}" for module in missing)
     return f"; the run began with `{options}`" if options else ""

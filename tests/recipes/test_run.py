@@ -219,9 +219,17 @@ def test_version_changes(tmp_path):
     assert run.version_changes() == []
     edit(run.folder / "versions.json", torch="1.0")
     assert run.version_changes() == [f"torch 1.0 -> {version('torch')}"]
-    for text in ("{", "[]"):
+    for text in ("{", "[]", "[" * 100_000):
         (run.folder / "versions.json").write_text(text)
         assert run.version_changes() == []
+
+
+def test_a_damaged_list_of_imports_does_not_hide_the_reason(tmp_path):
+    run = Run.create(tmp_path / "run", SMALL)
+    edit(run.folder / "recipe.json", env="evilmod:Mine-v0")
+    (run.folder / "imports.json").write_text("[" * 100_000)
+    with pytest.raises(ValueError, match="names 'evilmod:Mine-v0'"):
+        Run.open(run.folder)
 
 
 def test_an_edited_recipe_takes_effect(tmp_path):
