@@ -219,6 +219,7 @@ class Record:
         return {
             "outcomes": [asdict(outcome) for outcome in self.outcomes],
             "evaluation_seed": self._recipe.evaluation_seed,
+            "num_frames": self._recipe.backbone.num_frames,
             "sums": [] if self._sums is None else self._sums.tolist(),
             "count": self._count,
             "returns": self._returns,
@@ -226,7 +227,7 @@ class Record:
 
     def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
         """Restores a state."""
-        state = msgspec.convert(state_dict, _RecordState)
+        state = _record_state(state_dict, self._recipe)
         if len(state.sums) != (len(self._names) if state.count else 0):
             raise ValueError(f"the record has {len(state.sums)} sums of {state.count} updates")
         self.outcomes = state.outcomes
@@ -244,6 +245,19 @@ class _RecordState:
     sums: list[float]
     count: Annotated[int, msgspec.Meta(ge=0)]
     returns: list[float]
+    num_frames: int | None = None  # which the weights do not always determine
+
+
+def _record_state(state: Mapping[str, Any], recipe: Recipe) -> _RecordState:
+    """Reads the state of a record.
+
+    Raises:
+        ValueError: if it is not one, or the recipe's network now reads another number of frames.
+    """
+    record, num_frames = msgspec.convert(state, _RecordState), recipe.backbone.num_frames
+    if record.num_frames not in (None, num_frames):
+        raise ValueError(f"num_frames is {num_frames}, but it was trained with {record.num_frames}")
+    return record
 
 
 def load_trained(
@@ -321,7 +335,7 @@ def evaluate(
     recipe = recipe or run.recipe
     step, state = run.load_trained()
     with run.restoring(step):
-        record = msgspec.convert(state["record"], _RecordState)
+        record = _record_state(state["record"], recipe)
     outcomes = record.outcomes
     if best:
         recipe = replace(recipe, evaluation_seed=_fresh_seed(recipe, record))

@@ -250,6 +250,7 @@ def test_an_edited_recipe_takes_effect(tmp_path):
         {"backbone": {**BACKBONE, "frame": {"encoder": "inner", "embed_dim": 16}}},
         {"backbone": {**BACKBONE, "frame": {"encoder": "linear", "embed_dim": 8}}},
         {"backbone": {**BACKBONE, "trunks": "separate"}},
+        {"backbone": {**BACKBONE, "num_frames": 2}},  # whose weights would fit
     ],
     ids=str,
 )
