@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict, dataclass, replace
@@ -63,6 +64,9 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
         with run.restoring(step):
             networks = algorithm.networks()
             load_weights(networks, {**networks.state_dict(), **weights})
+    if not recipe.offline and 0 < step < recipe.final_step:
+        line = f"note: resuming at step {step} with new episodes: environments are not saved"
+        print(line, file=sys.stderr)
     algorithm.prepare(step, run.folder)
     with ExitStack() as stack:
         stack.enter_context(closing(algorithm))

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
 
-from torchrl_tit.checkpoint import latest_step
 from torchrl_tit.settings.imports import import_options
 
 from .. import runner
@@ -105,9 +104,6 @@ def _finish(run: Run, wandb: str | None) -> None:
             f"{option(recipe.length)} trains it further"
         )
         return
-    step = latest_step(run.checkpoints) or 0
-    if not recipe.offline and 0 < step < recipe.final_step:
-        note(f"resuming at step {step} with new episodes: environments are not saved")
     try:
         with ExitStack() as stack:
             callbacks: list[Callback] = [] if recipe.offline else [UnusedFrames(recipe)]
