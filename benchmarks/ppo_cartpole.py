@@ -167,7 +167,7 @@ def run_ours(
         start, _ = lap()
         runner.train(recipe, run, [laps])
         last = read_metrics(run.folder / "metrics.csv")[-1]
-    networks = make_algorithm(recipe).networks()
+    networks = make_algorithm(recipe).model
     assert isinstance(networks, nn.Module)
     parameters = sum(parameter.numel() for parameter in networks.parameters())
     return Outcome(laps.laps, laps.laps[0][0] - start, last["return_mean"], parameters)

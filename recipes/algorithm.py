@@ -10,10 +10,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import torch
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
-
-from torchrl_tit.settings import resolve
 
 from .outcomes import Outcome
 from .recipe import Recipe
@@ -50,6 +48,8 @@ class Algorithm(ABC, Generic[RecipeT]):
         ValueError: if the networks cannot be built with these settings.
     """
 
+    model: nn.Module
+    """All networks: what a checkpoint stores, and evaluation loads."""
     columns: Sequence[str]
     """Names of the numbers that an update returns: columns of the metrics."""
     optional_columns: Sequence[str] = ()
@@ -77,10 +77,6 @@ class Algorithm(ABC, Generic[RecipeT]):
             seed: seed of the first environment; environment i has seed + i.
             **settings: further settings of the task, such as ``render_mode="rgb_array"``.
         """
-
-    @abstractmethod
-    def networks(self) -> Stateful:
-        """Returns the networks with all weights, for evaluation and checkpoints."""
 
     @abstractmethod
     def prepare(self, step: int, folder: Path) -> None:
@@ -156,7 +152,7 @@ def make_algorithm(recipe: Recipe) -> Algorithm[Any]:
         ValueError: if its networks cannot be built with these settings.
     """
     try:
-        return resolve(recipe.builds)(recipe)
+        return recipe.build()
     except TypeError as error:  # for example, no network here reads this kind of observation
         raise ValueError(str(error)) from error
 

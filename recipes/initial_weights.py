@@ -30,7 +30,7 @@ def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Ten
         algorithm: the algorithm that is to start with them.
 
     Returns:
-        The weights by their names in ``algorithm.networks()``, and a line that says which were
+        The weights by their names in ``algorithm.model``, and a line that says which were
         taken, and names those that were not.
 
     Raises:
@@ -41,8 +41,8 @@ def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Ten
     step, checkpoint = run.load_trained()
     with run.restoring(step):
         theirs = _tensors(checkpoint["networks"])
-    own = _tensors(algorithm.networks().state_dict())
-    names = {name: name for name in own.keys() - _hyperparameters(algorithm.networks())}
+    own = _tensors(algorithm.model.state_dict())
+    names = {name: name for name in own.keys() - _hyperparameters(algorithm.model)}
     if run.recipe.algorithm == algorithm.recipe.algorithm:
         unexpected = theirs.keys() - own.keys()
     else:

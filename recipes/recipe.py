@@ -27,13 +27,11 @@ ImageLayout = Literal["auto", "HWC", "CHW"]
 class Recipe:
     """Settings that every experiment has.
 
-    Each algorithm has a subclass, which is registered when it is defined: ``algorithm`` is the name
-    that JSON and the command line use, ``builds`` the :class:`~recipes.algorithm.Algorithm` that
-    its recipes configure, as "module:Class".
+    Each algorithm has a subclass, which is registered when it is defined, by the name of its
+    ``algorithm`` in JSON and on the command line. Its :meth:`build` makes the algorithm.
     """
 
     algorithm: ClassVar[str]
-    builds: ClassVar[str]
     registered: ClassVar[Names[type[Recipe]]] = Names("algorithm")
     """Recipes by the name of their algorithm."""
     offline: ClassVar[bool] = False
@@ -76,11 +74,19 @@ class Recipe:
     evaluation_seed: Seed = 1_000_000
     """Seed of the first evaluation episode; episode i has this seed + i."""
 
-    def __init_subclass__(cls, *, algorithm: str | None = None, builds: str | None = None) -> None:
+    def __init_subclass__(cls, *, algorithm: str | None = None) -> None:
         super().__init_subclass__()
-        if algorithm is not None and builds is not None:  # skips base classes of several algorithms
+        if algorithm is not None:  # base classes of several algorithms have none
             Recipe.registered.add(algorithm, cls, f"{cls.__module__}.{cls.__qualname__}")
-            cls.algorithm, cls.builds = algorithm, builds
+            cls.algorithm = algorithm
+
+    def build(self) -> Any:
+        """Builds the :class:`~recipes.algorithm.Algorithm` with these settings.
+
+        Raises:
+            ValueError: if its networks cannot be built with them.
+        """
+        raise NotImplementedError
 
     def __post_init__(self) -> None:
         if not isinstance(self.backbone, Network):

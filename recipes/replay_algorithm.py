@@ -76,7 +76,8 @@ class ReplayAlgorithm(Algorithm[RecipeT]):
         """The policy that the collector runs; by default, :attr:`policy`."""
         return self._policy
 
-    def networks(self) -> nn.Module:
+    @property
+    def model(self) -> nn.Module:  # type: ignore[override]
         """All networks and their targets."""
         return self.loss
 

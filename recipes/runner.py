@@ -62,7 +62,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     step = saved_step = max(checkpoint_steps(run.checkpoints), default=0)
     if step == 0 and (weights := run.load_initial_weights()):
         with run.restoring(step):
-            networks = algorithm.networks()
+            networks = algorithm.model
             load_weights(networks, {**networks.state_dict(), **weights})
     if not recipe.offline and 0 < step < recipe.final_step:
         line = f"note: resuming at step {step} with new episodes: environments are not saved"
@@ -71,9 +71,9 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     with ExitStack() as stack:
         stack.enter_context(closing(algorithm))
         record = Record(recipe, algorithm)
-        best = Best(algorithm.networks())
+        best = Best(algorithm.model)
         parts = {
-            "networks": algorithm.networks(),
+            "networks": algorithm.model,
             **algorithm.state(),
             "record": record,
             "best": best,
@@ -303,7 +303,7 @@ def _load_networks(
             "or none was evaluated; evaluate the last ones (without --best)"
         )
     with run.restoring(step):
-        load_weights(algorithm.networks(), weights)
+        load_weights(algorithm.model, weights)
     algorithm.policy.eval()  # without dropout
     return step, algorithm
 

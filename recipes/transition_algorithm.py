@@ -77,7 +77,8 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
         """The policy, from histories to actions; its weights are among those of the loss."""
         return self._policy
 
-    def networks(self) -> nn.Module:
+    @property
+    def model(self) -> nn.Module:  # type: ignore[override]
         """All networks and their targets."""
         return self.loss
 

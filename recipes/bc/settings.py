@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from torchrl_tit.settings.numbers import Rate, Steps
 
@@ -11,7 +11,7 @@ from ..transition_recipe import TransitionRecipe
 
 
 @dataclass(frozen=True, kw_only=True)
-class BC(TransitionRecipe, algorithm="bc", builds=f"{__package__}.algorithm:BCAlgorithm"):
+class BC(TransitionRecipe, algorithm="bc"):
     """Behaviour cloning: maximises the likelihood of a data set's actions, of any kind."""
 
     learning_rate: Rate = 3e-4
@@ -22,3 +22,9 @@ class BC(TransitionRecipe, algorithm="bc", builds=f"{__package__}.algorithm:BCAl
     """Whether to keep the last episode if the data stop before it ends."""
     evaluation_interval: Steps = 5000
     """Gradient steps between evaluations."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .algorithm import BCAlgorithm
+
+        return BCAlgorithm(self)

@@ -46,7 +46,7 @@ class QRecipe(TransitionRecipe):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CQL(QRecipe, algorithm="cql", builds=f"{__package__}.algorithm:CQLAlgorithm"):
+class CQL(QRecipe, algorithm="cql"):
     """Conservative Q-learning (arXiv 2006.04779) on a data set with continuous actions.
 
     The defaults are those of d3rlpy 1.1.1, with which arXiv 2212.14538 trained CQL_TIT.
@@ -71,11 +71,15 @@ class CQL(QRecipe, algorithm="cql", builds=f"{__package__}.algorithm:CQLAlgorith
     critic_hidden: Widths = (256, 256, 256)
     """Widths of the critics' hidden layers."""
 
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .algorithm import CQLAlgorithm
+
+        return CQLAlgorithm(self)
+
 
 @dataclass(frozen=True, kw_only=True)
-class DiscreteCQL(
-    QRecipe, algorithm="discrete-cql", builds=f"{__package__}.discrete:DiscreteCQLAlgorithm"
-):
+class DiscreteCQL(QRecipe, algorithm="discrete-cql"):
     """Conservative Q-learning (arXiv 2006.04779) with a value for each action, and TorchRL's loss.
 
     The squared error is halved, as in TorchRL. The paper ran no discrete task offline.
@@ -85,3 +89,9 @@ class DiscreteCQL(
     """Weight of the conservative term."""
     learning_rate: Rate = 3e-4
     """Learning rate of Adam."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .discrete import DiscreteCQLAlgorithm
+
+        return DiscreteCQLAlgorithm(self)

@@ -76,17 +76,13 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         assert isinstance(encoder, DecisionTransformer)
         encoder.return_scale.fill_(recipe.return_scale)
         head = DTHead(network.features_dim, self.action_dim, recipe.action_space)
-        self.agent = Agent(network, head).to(self.device).eval()
+        self.model = self.agent = Agent(network, head).to(self.device).eval()
         self._policy = make_dt_actor(network, head)
 
     @property
     def policy(self) -> TensorDictModuleBase:
         """A window of the last steps in, the newest step's action out."""
         return self._policy
-
-    def networks(self) -> nn.Module:
-        """Network and head."""
-        return self.agent
 
     def make_env(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from torchrl_tit.settings import DecisionTransformer, Network
 from torchrl_tit.settings.checks import check_at_most
@@ -92,7 +92,7 @@ class SequenceRecipe(DatasetRecipe):
 
 
 @dataclass(frozen=True, kw_only=True)
-class DT(SequenceRecipe, algorithm="dt", builds=f"{__package__}.dt:DTAlgorithm"):
+class DT(SequenceRecipe, algorithm="dt"):
     """Decision Transformer (arXiv 2106.01345) on a data set.
 
     The defaults are those of its paper's MuJoCo runs, which arXiv 2212.14538 repeats with DT_TIT.
@@ -104,6 +104,12 @@ class DT(SequenceRecipe, algorithm="dt", builds=f"{__package__}.dt:DTAlgorithm")
     """Number of iterations; each ends with an evaluation."""
     updates_per_iteration: Steps = 10_000
     """Gradient steps in an iteration."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .dt import DTAlgorithm
+
+        return DTAlgorithm(self)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,7 +130,7 @@ class DT(SequenceRecipe, algorithm="dt", builds=f"{__package__}.dt:DTAlgorithm")
 
 
 @dataclass(frozen=True, kw_only=True)
-class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorithm"):
+class ODT(SequenceRecipe, algorithm="odt"):
     """Online Decision Transformer (arXiv 2202.05607).
 
     The defaults are those of its authors' release.
@@ -177,6 +183,12 @@ class ODT(SequenceRecipe, algorithm="odt", builds=f"{__package__}.odt:ODTAlgorit
     last."""
     evaluation_episodes: Episodes = 10
     """Episodes for each target return, in every evaluation."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .odt import ODTAlgorithm
+
+        return ODTAlgorithm(self)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from torchrl_tit.settings.numbers import Batch, Fraction, Rate, Steps, Weight
 
@@ -11,7 +11,7 @@ from ..replay_recipe import ReplayRecipe
 
 
 @dataclass(frozen=True, kw_only=True)
-class DQN(ReplayRecipe, algorithm="dqn", builds=f"{__package__}.algorithm:DQNAlgorithm"):
+class DQN(ReplayRecipe, algorithm="dqn"):
     """Deep Q-networks (Mnih et al., Nature 518, 2015), with double Q-learning (arXiv 1509.06461).
 
     The defaults are those of CleanRL for classic control.
@@ -50,6 +50,12 @@ class DQN(ReplayRecipe, algorithm="dqn", builds=f"{__package__}.algorithm:DQNAlg
     """Whether to mask actions that the task does not allow; see docs/environments.md."""
     clip_rewards: bool = False
     """Whether the network learns from the signs of rewards, as is usual for Atari."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .algorithm import DQNAlgorithm
+
+        return DQNAlgorithm(self)
 
     @property
     def schedules(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from torchrl_tit.settings.numbers import Inside, Rate, Weight
 
@@ -10,7 +11,7 @@ from ..transition_recipe import ActorCriticRecipe
 
 
 @dataclass(frozen=True, kw_only=True)
-class IQL(ActorCriticRecipe, algorithm="iql", builds=f"{__package__}.algorithm:IQLAlgorithm"):
+class IQL(ActorCriticRecipe, algorithm="iql"):
     """Implicit Q-learning (arXiv 2110.06169), with continuous or discrete actions.
 
     The defaults are those of the paper for MuJoCo.
@@ -27,6 +28,12 @@ class IQL(ActorCriticRecipe, algorithm="iql", builds=f"{__package__}.algorithm:I
     normalize_rewards: bool = False
     """Whether rewards are divided by the range of the episodes' returns and multiplied by 1000, as
     in the paper for MuJoCo."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .algorithm import IQLAlgorithm
+
+        return IQLAlgorithm(self)
 
     @property
     def schedules(self) -> tuple[str, ...]:

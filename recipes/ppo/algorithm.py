@@ -138,7 +138,7 @@ class PPOAlgorithm(Algorithm[PPO]):
     def __init__(self, recipe: PPO) -> None:
         super().__init__(recipe)
         task = make_task(recipe, 1)
-        self.agent = Agent(recipe, task).to(self.device)
+        self.model = self.agent = Agent(recipe, task).to(self.device)
         task.close()
         self.agent.backbone.autocast = autocast_type(recipe.precision, self.device)
         contrastive = ["loss_contrastive"] if recipe.contrastive_coeff else []
@@ -158,10 +158,6 @@ class PPOAlgorithm(Algorithm[PPO]):
     def policy(self) -> TensorDictModuleBase:
         """See :attr:`Agent.policy`."""
         return self.agent.policy
-
-    def networks(self) -> nn.Module:
-        """Backbone, actor and critic."""
-        return self.agent
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories, and with the state of a recurrent network."""

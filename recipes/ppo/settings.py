@@ -31,7 +31,7 @@ _LONGEST = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlgorithm"):
+class PPO(OnlineRecipe, algorithm="ppo"):
     """Proximal policy optimisation (arXiv 1707.06347) with Stable-Baselines3's settings.
 
     The defaults are those of the paper's runs on arrays (arXiv 2212.14538, appendix).
@@ -148,6 +148,12 @@ class PPO(OnlineRecipe, algorithm="ppo", builds=f"{__package__}.algorithm:PPOAlg
     precision: Precision = "auto"
     """Dtype of the backbone's matrix products. "auto" is bfloat16 on a GPU that supports it, else
     float32. Weights, heads and losses are float32."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .algorithm import PPOAlgorithm
+
+        return PPOAlgorithm(self)
 
     def __post_init__(self) -> None:
         super().__post_init__()

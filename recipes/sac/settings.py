@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.numbers import Fraction, Rate, Widths
@@ -12,7 +12,7 @@ from ..replay_recipe import ReplayRecipe
 
 
 @dataclass(frozen=True, kw_only=True)
-class SAC(ReplayRecipe, algorithm="sac", builds=f"{__package__}.algorithm:SACAlgorithm"):
+class SAC(ReplayRecipe, algorithm="sac"):
     """Soft actor-critic (arXiv 1812.05905) with two critics and a learned temperature."""
 
     learning_rate: Rate = 3e-4
@@ -25,6 +25,12 @@ class SAC(ReplayRecipe, algorithm="sac", builds=f"{__package__}.algorithm:SACAlg
     one observation is then not enough, else the newest observation."""
     critic_hidden: Widths = (256, 256)
     """Widths of the critics' hidden layers."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .algorithm import SACAlgorithm
+
+        return SACAlgorithm(self)
 
     @property
     def critic_backbone(self) -> Network | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from torchrl_tit.settings.numbers import Rate, Steps, Weight
 
@@ -10,7 +11,7 @@ from ..transition_recipe import ActorCriticRecipe
 
 
 @dataclass(frozen=True, kw_only=True)
-class TD3BC(ActorCriticRecipe, algorithm="td3bc", builds=f"{__package__}.algorithm:TD3BCAlgorithm"):
+class TD3BC(ActorCriticRecipe, algorithm="td3bc"):
     """TD3 with a behaviour cloning term (arXiv 2106.06860), with the paper's defaults."""
 
     normalize_observations: bool = True
@@ -28,3 +29,9 @@ class TD3BC(ActorCriticRecipe, algorithm="td3bc", builds=f"{__package__}.algorit
     """Standard deviation of the noise on the target's actions; 1 is half the range of actions."""
     noise_clip: Weight = 0.5
     """Largest absolute value of that noise; 1 is half the range of actions."""
+
+    def build(self) -> Any:
+        """Builds the algorithm."""
+        from .algorithm import TD3BCAlgorithm
+
+        return TD3BCAlgorithm(self)

@@ -26,7 +26,7 @@ def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
     algorithm = make_algorithm(recipe)
     state = {
         name: torch.rand_like(value) - 0.5 if name.endswith(("bias", "mean")) else value
-        for name, value in algorithm.networks().state_dict().items()
+        for name, value in algorithm.model.state_dict().items()
     }
     run = Run.create(folder, recipe)
     record = runner.Record(recipe, algorithm).state_dict()

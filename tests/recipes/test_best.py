@@ -90,7 +90,7 @@ def test_the_best_weights_are_evaluated(tmp_path, capsys):
         assert_same(state["best"]["networks"], then["networks"])
     loaded_step, algorithm, _ = load_trained(run, best=True)
     assert loaded_step == step
-    assert_same(dict(algorithm.networks().state_dict()), dict(state["best"]["networks"]))
+    assert_same(dict(algorithm.model.state_dict()), dict(state["best"]["networks"]))
 
     last, best = evaluate(run), evaluate(run, best=True)
     assert (last["weights"], last["steps"]) == ("last", 1024)

@@ -34,7 +34,7 @@ LAYERS = [f"history_encoder.layers.{i}.{kind}" for i in (0, 2) for kind in ("wei
 def begin(folder, recipe):
     """A run with a checkpoint, as if it had been trained for 64 steps; returns its weights."""
     torch.manual_seed(7)
-    weights = make_algorithm(recipe).networks().state_dict()
+    weights = make_algorithm(recipe).model.state_dict()
     Run.create(folder, recipe).save(64, {"networks": weights})
     return weights
 

@@ -86,7 +86,9 @@ def test_every_number_of_every_recipe_and_part_is_bounded():
     """Each field that takes numbers has a smallest and a largest one."""
     networks = [Network, Head, *FrameSettings.registered.values()]
     networks += HistorySettings.registered.values()
-    recipes = [kind for kind in Recipe.registered.values() if kind.builds.startswith("recipes.")]
+    recipes = [
+        kind for kind in Recipe.registered.values() if kind.__module__.startswith("recipes.")
+    ]
     for kind in [*networks, *recipes]:
         if kind.__module__.startswith("tests"):
             continue

@@ -34,7 +34,6 @@ from torchrl_tit.settings.networks import mlp
 @dataclass(frozen=True, kw_only=True)
 class Toy(Recipe):
     algorithm: ClassVar[str] = "toy"
-    builds: ClassVar[str] = f"{__name__}:ToyAlgorithm"
 
     total_steps: int = 24
     batch: int = 1
@@ -42,6 +41,9 @@ class Toy(Recipe):
     bad_step: int = 0
     bad_value: str = "nan"
     evaluation_interval: int = 10
+
+    def build(self) -> ToyAlgorithm:
+        return ToyAlgorithm(self)
 
     @property
     def final_step(self) -> int:
@@ -60,7 +62,7 @@ class ToyAlgorithm(Algorithm[Toy]):
 
     def __init__(self, recipe: Toy) -> None:
         super().__init__(recipe)
-        self.weight = nn.Linear(1, 1, bias=False)
+        self.model = self.weight = nn.Linear(1, 1, bias=False)
 
     @property
     def policy(self) -> Any:
@@ -68,9 +70,6 @@ class ToyAlgorithm(Algorithm[Toy]):
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> Any:
         raise NotImplementedError
-
-    def networks(self) -> nn.Module:
-        return self.weight
 
     def prepare(self, step: int, folder: Path) -> None:
         self.optimizer = torch.optim.Adam(self.weight.parameters(), lr=self.recipe.learning_rate)
@@ -239,7 +238,7 @@ def test_a_run_that_was_killed_resumes_from_its_newest_checkpoint(tmp_path):
     run = start(recipe, tmp_path / "run")
     assert load_checkpoint(run.checkpoints)[0] == 24
     assert steps_of(run) == steps_of(whole)
-    assert_same(*(load_trained(r)[1].networks().state_dict() for r in (run, whole)))
+    assert_same(*(load_trained(r)[1].model.state_dict() for r in (run, whole)))
 
 
 def test_a_run_that_is_trained_is_not_trained_further(tmp_path):

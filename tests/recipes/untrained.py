@@ -12,5 +12,5 @@ from recipes.run import Run
 def untrained(folder: Path, recipe: Recipe) -> Run:
     """Makes a run whose checkpoint has the weights that training would start from."""
     run = Run.create(folder, recipe)
-    run.save(0, {"networks": make_algorithm(recipe).networks().state_dict()})
+    run.save(0, {"networks": make_algorithm(recipe).model.state_dict()})
     return run

@@ -133,7 +133,7 @@ gymnasium.register("Line-v0", entry_point=f"{__name__}:Line", max_episode_steps=
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reinforce(Recipe, algorithm="reinforce", builds=f"{__name__}:ReinforceAlgorithm"):
+class Reinforce(Recipe, algorithm="reinforce"):
     """REINFORCE (Williams, 1992), with normalised returns to go."""
 
     total_steps: int = 100_000
@@ -146,6 +146,9 @@ class Reinforce(Recipe, algorithm="reinforce", builds=f"{__name__}:ReinforceAlgo
     """Adam's learning rate."""
     gamma: float = 0.99
     """Discount."""
+
+    def build(self) -> ReinforceAlgorithm:
+        return ReinforceAlgorithm(self)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -172,13 +175,10 @@ class ReinforceAlgorithm(Algorithm[Reinforce]):
             self.backbone = Backbone(network, in_keys=history_keys(observation))
             features, actions = self.backbone.features_dim, task.action_spec_unbatched
             self.actor = make_actor(features, actions, batch_dims=0)
-        self.agent = TensorDictSequential(self.backbone, self.actor).to(self.device)
+        self.model = self.agent = TensorDictSequential(self.backbone, self.actor).to(self.device)
 
     @property
     def policy(self) -> TensorDictSequential:
-        return self.agent
-
-    def networks(self) -> nn.Module:
         return self.agent
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:

@@ -76,7 +76,7 @@ def test_an_agent_plays_as_its_run_did(kind, tmp_path):
 
     saved = load_file(tmp_path / "agent" / WEIGHTS)
     _, algorithm, _ = load_trained(Run.open(run))
-    everything = {tuple(x.flatten().tolist()) for x in algorithm.networks().state_dict().values()}
+    everything = {tuple(x.flatten().tolist()) for x in algorithm.model.state_dict().values()}
     assert all(tuple(weight.flatten().tolist()) in everything for weight in saved.values())
     assert len(saved) == len(algorithm.policy.state_dict())
 

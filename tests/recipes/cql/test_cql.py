@@ -48,7 +48,7 @@ def assert_trains(recipe, folder, terms):
     step, state = load_checkpoint(run.checkpoints)
     assert step == 18
     # Everything that is trained is in there.
-    make_algorithm(recipe).networks().load_state_dict(state["networks"])
+    make_algorithm(recipe).model.load_state_dict(state["networks"])
     return rows, state["networks"]
 
 
@@ -70,7 +70,7 @@ def test_continuous_actions(tmp_path, settings):
     rows, weights = assert_trains(recipe, tmp_path, CQL_TERMS)
     assert rows[-1]["alpha"] != 1.0
     torch.manual_seed(recipe.seed)
-    untrained = make_algorithm(recipe).networks().state_dict()
+    untrained = make_algorithm(recipe).model.state_dict()
     trained = {n for n, w in weights.items() if not torch.equal(w, untrained[n])}
     networks = {name.partition("_params")[0] for name in trained}
     assert networks == {"actor_network", "qvalue_network", "target_qvalue_network", "log_alpha"}

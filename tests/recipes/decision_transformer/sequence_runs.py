@@ -9,7 +9,6 @@ from recipes.decision_transformer import DT, ODT
 from recipes.decision_transformer.sequence_algorithm import SequenceAlgorithm
 from recipes.decision_transformer.settings import SequenceRecipe
 from tests.recipes.dataset_runs import make_data
-from torchrl_tit.settings import resolve
 from torchrl_tit.settings.networks import dt_tit
 
 SMALL: dict[str, Any] = {"num_frames": 6, "embed_dim": 16, "num_blocks": 2}
@@ -54,6 +53,6 @@ def make_odt(folder: Path, **settings: Any) -> ODT:
 
 def make_algorithm(recipe: SequenceRecipe) -> Any:
     """The algorithm, with its own methods and not only those of all."""
-    algorithm = resolve(recipe.builds)(recipe)
+    algorithm = recipe.build()
     assert isinstance(algorithm, SequenceAlgorithm)
     return algorithm

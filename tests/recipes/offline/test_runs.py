@@ -66,7 +66,7 @@ def test_all_networks_normalize_observations(tmp_path, critic):
     for statistic, expected in {"mean": rows.mean(0), "variance": rows.var(0)}.items():
         buffers = [
             buffer
-            for name, buffer in algorithm.networks().named_buffers()
+            for name, buffer in algorithm.model.named_buffers()
             if name.endswith(f"observation.{statistic}" if critic == "backbone" else statistic)
         ]
         assert len(buffers) == 4  # of actor, critics and their targets

@@ -189,7 +189,7 @@ def test_each_observation_counts_once(frames, padding, tmp_path, monkeypatch):
         seen.append(batch["observation"].flatten())
         algorithm.update(batch, step * 16)
     algorithm.close()
-    encoders = normalized_frames(algorithm.networks())
+    encoders = normalized_frames(algorithm.model)
     assert len(encoders) == 2
     for key, encoder in zip(["cart", "pole"], encoders, strict=True):
         expected = torch.cat([batch[key] for batch in seen])
@@ -247,7 +247,7 @@ def test_acting_and_updating_read_the_same_statistics(backbone, tmp_path, monkey
         trained.close()
     finally:
         torch.set_default_dtype(torch.float32)
-    (*_, normalized) = normalized_frames(trained.networks())
+    (*_, normalized) = normalized_frames(trained.model)
     assert normalized.variance.max() > 2 * normalized.variance.min()
     assert torch.stack(before).shape == (3, 2)
     assert torch.stack(before).max() < 1e-9
@@ -266,12 +266,12 @@ def test_images_are_normalized_by_channel_and_categories_are_not(tmp_path):
         backbone=enhanced_tit(2, patch_size=2, embed_dim=8, features_dim=8),
     )
     _, trained, _ = load_trained(run_of(images, tmp_path / "run"))
-    (frames,) = normalized_frames(trained.networks())
+    (frames,) = normalized_frames(trained.model)
     assert frames.mean.shape == (3, 1, 1)
     assert (frames.mean > 0.05).all()
     assert (frames.variance < 0.2).all()
     categories = replace(images, env="Taxi-v4", wrappers=(), backbone=mlp())
-    assert not normalized_frames(make_algorithm(categories).networks())
+    assert not normalized_frames(make_algorithm(categories).model)
 
 
 def test_the_divergence_is_never_negative(tmp_path, monkeypatch):

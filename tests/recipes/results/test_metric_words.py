@@ -9,7 +9,6 @@ from recipes.algorithm import make_algorithm
 from recipes.recipe import Recipe
 from recipes.registry import get_recipe
 from recipes.results.metric_words import known_columns, limit, to_markdown, words_of
-from torchrl_tit.settings import resolve
 
 ROOT = Path(__file__).parents[3]
 assert registry.RECIPES  # every algorithm is registered
@@ -20,10 +19,10 @@ ALGORITHMS = sorted(
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_column_is_described(algorithm):
-    kind = Recipe.registered[algorithm]
-    columns = getattr(resolve(kind.builds), "columns", None)
-    if columns is None:  # PPO's depend on the recipe
-        columns = [*make_algorithm(get_recipe("ppo/cartpole/mlp")).columns, "loss_contrastive"]
+    recipe = next(r for r in registry.RECIPES.values() if r.algorithm == algorithm)
+    columns = [*make_algorithm(recipe).columns]
+    if algorithm == "ppo":  # which depend on the recipe
+        columns.append("loss_contrastive")
     for column in ("steps_per_second", "return_mean", *columns):
         assert words_of(algorithm, column).what, f"{column} of {algorithm} in metrics.csv"
         assert column in known_columns(algorithm)
