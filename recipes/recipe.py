@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
@@ -171,10 +172,27 @@ def _check_all(settings: object) -> None:
                 _check_all(part)
 
 
+_MODULES = {
+    "bc": "bc",
+    "cql": "cql",
+    "discrete-cql": "cql",
+    "dqn": "dqn",
+    "dt": "decision_transformer",
+    "iql": "iql",
+    "odt": "decision_transformer",
+    "ppo": "ppo",
+    "sac": "sac",
+    "td3bc": "td3bc",
+}
+"""The modules of this package's algorithms, which are imported when one of them is looked up."""
+
+
 def get_recipe_class(algorithm: str) -> type[Recipe]:
     """Looks up the recipe class of an algorithm, including those of installed plugins.
 
     Raises:
         ValueError: if there is no such algorithm, or more than one.
     """
+    if algorithm in _MODULES:
+        importlib.import_module(f".{_MODULES[algorithm]}", __package__)
     return Recipe.registered.find(algorithm)

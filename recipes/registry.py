@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from torchrl_tit.settings.names import Names
@@ -16,13 +17,48 @@ from .presets.ppo_arrays import ARRAY_RECIPES
 from .presets.ppo_atari import ATARI_RECIPES
 from .presets.ppo_memory import MEMORY_RECIPES
 from .presets.ppo_no_velocity import NO_VELOCITY_RECIPES
+from .presets.preset import Preset
 from .presets.sac import SAC_RECIPES
-from .recipe import Recipe
+from .recipe import Recipe, get_recipe_class
 from .recipe_file import is_recipe_file, recipe_from_file
 from .recipe_json import recipe_from_json
 from .records import find_records
 
-RECIPES: Names[Recipe] = Names("recipe")
+
+class NamedRecipes(Mapping[str, Recipe]):
+    """Recipes by name; those of this package are made, and PyTorch imported, when they are taken.
+
+    Example:
+        >>> RECIPES["ppo/cartpole/enhanced-tit"].env
+        'CartPole-v1'
+    """
+
+    def __init__(self) -> None:
+        self._names: Names[Recipe | Preset] = Names("recipe")
+
+    def add(self, recipe: Recipe | Preset, home: str) -> None:
+        """Adds a recipe; see :meth:`Names.add`."""
+        self._names.add(recipe.name, recipe, home)
+
+    def find(self, name: str) -> Recipe:
+        """Looks up a recipe, also in plugins; see :meth:`Names.find`."""
+        self._names.find(name)
+        return self[name]
+
+    def __getitem__(self, name: str) -> Recipe:
+        recipe = self._names[name]
+        if isinstance(recipe, Preset):
+            recipe = self._names[name] = get_recipe_class(recipe.algorithm)(**recipe.fields)
+        return recipe
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
+RECIPES = NamedRecipes()
 """Every named recipe."""
 
 
@@ -47,7 +83,7 @@ def register_recipes(*recipes: Recipe) -> None:
                 "a recipe needs a name to be registered: set its field 'name', such as "
                 "ppo/cartpole/mine"
             )
-        RECIPES.add(recipe.name, recipe, home)
+        RECIPES.add(recipe, home)
 
 
 for _named in (
@@ -62,7 +98,8 @@ for _named in (
     OFFLINE_RECIPES,
     DT_RECIPES,
 ):
-    register_recipes(*_named.values())
+    for _preset in _named.values():
+        RECIPES.add(_preset, __name__)
 
 
 def get_recipe(name: str) -> Recipe:

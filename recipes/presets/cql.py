@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.frames import Activation
 from torchrl_tit.settings.networks import enhanced_tit, mlp, nature_cnn
 
-from ..cql import CQL, DiscreteCQL
-from ..cql.settings import QRecipe
 from .ppo_atari import ATARI_RECIPES
+from .preset import CQL, DiscreteCQL, Preset
 
 # Task name: environment and entries of an observation. The paper evaluated in D4RL's own
 # environments, MuJoCo's v2; v4 is closest to it.
@@ -50,7 +47,7 @@ def _tit(dataset: str, observation_dim: int) -> Network:
     )
 
 
-def _continuous() -> list[CQL]:
+def _continuous() -> list[Preset]:
     recipes = []
     for task, (env, observation_dim) in _TASKS.items():
         for data in (f"{task}-medium", f"{task}-medium-replay"):
@@ -71,7 +68,7 @@ def _continuous() -> list[CQL]:
     return recipes
 
 
-def _discrete() -> list[DiscreteCQL]:
+def _discrete() -> list[Preset]:
     """The paper ran no discrete task offline; the data are those of docs/datasets.md."""
     cartpole = DiscreteCQL(
         name="discrete-cql/cartpole-mixed/mlp",
@@ -94,19 +91,18 @@ def _discrete() -> list[DiscreteCQL]:
         evaluation_interval=4_000,
         evaluation_episodes=5,
     )
-    images = ATARI_RECIPES["ppo/pong/enhanced-tit"].backbone
+    images = ATARI_RECIPES["ppo/pong/enhanced-tit"].fields["backbone"]
     return [
         cartpole,
-        replace(
-            cartpole,
+        cartpole.replace(
             name="discrete-cql/cartpole-mixed/enhanced-tit",
             backbone=enhanced_tit(patch_size=2),
         ),
         pong,
-        replace(pong, name="discrete-cql/pong-mixed/enhanced-tit", backbone=images),
+        pong.replace(name="discrete-cql/pong-mixed/enhanced-tit", backbone=images),
     ]
 
 
-CQL_RECIPES: dict[str, QRecipe] = {recipe.name: recipe for recipe in (*_discrete(), *_continuous())}
+CQL_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in (*_discrete(), *_continuous())}
 """``cql/DATASET/mlp`` and ``cql/DATASET/enhanced-tit`` for D4RL's data of version 0, and
 ``discrete-cql/...`` for collected data."""

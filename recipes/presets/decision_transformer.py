@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from torchrl_tit.settings.networks import decision_transformer, dt_tit
 
-from ..decision_transformer import DT, ODT
-from ..recipe import Recipe
+from .preset import DT, ODT, Preset
 
 # Task name: environment and target returns (arXiv 2106.01345, appendix). D4RL's data are from v2 of
 # the tasks; v4 is closer to it than v5.
@@ -16,7 +15,7 @@ _TASKS = {
 }
 
 
-def _offline() -> list[DT]:
+def _offline() -> list[Preset]:
     return [
         DT(
             name=f"dt/{task}-{kind}-v2/{network}",
@@ -31,7 +30,7 @@ def _offline() -> list[DT]:
     ]
 
 
-def _online() -> list[ODT]:
+def _online() -> list[Preset]:
     recipes = []
     for dataset in ("hopper-medium-v2", "hopper-medium-replay-v2"):
         for network, make_network in (("odt", decision_transformer), ("odt-tit", dt_tit)):
@@ -72,5 +71,5 @@ def _online() -> list[ODT]:
     return recipes
 
 
-DT_RECIPES: dict[str, Recipe] = {recipe.name: recipe for recipe in [*_offline(), *_online()]}
+DT_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in [*_offline(), *_online()]}
 """``dt/DATASET/dt`` and ``dt/DATASET/dt-tit`` for D4RL's sets of version 2, and ``odt/...``."""

@@ -6,15 +6,13 @@ environments and TIT's learning rate on CartPole.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from torchrl_tit.settings.networks import enhanced_tit, mlp, nature_cnn
 
-from ..dqn import DQN
 from .ppo_atari import ATARI_RECIPES
+from .preset import DQN, Preset
 
 
-def _named() -> list[DQN]:
+def _named() -> list[Preset]:
     cartpole = DQN(
         name="dqn/cartpole/mlp",
         env="CartPole-v1",
@@ -52,20 +50,18 @@ def _named() -> list[DQN]:
     )
     return [
         cartpole,
-        replace(
-            cartpole,
+        cartpole.replace(
             name="dqn/cartpole/enhanced-tit",
             backbone=enhanced_tit(patch_size=2),
             learning_rate=5e-4,
         ),
         pong,
-        replace(
-            pong,
+        pong.replace(
             name="dqn/pong/enhanced-tit",
-            backbone=ATARI_RECIPES["ppo/pong/enhanced-tit"].backbone,
+            backbone=ATARI_RECIPES["ppo/pong/enhanced-tit"].fields["backbone"],
         ),
     ]
 
 
-DQN_RECIPES: dict[str, DQN] = {recipe.name: recipe for recipe in _named()}
+DQN_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in _named()}
 """``dqn/TASK/NETWORK``."""

@@ -8,10 +8,7 @@ from typing import Any
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import enhanced_tit, mlp, vanilla_tit
 
-from ..bc import BC
-from ..iql import IQL
-from ..td3bc import TD3BC
-from ..transition_recipe import TransitionRecipe
+from .preset import BC, IQL, TD3BC, Preset
 
 # D4RL's data are from v2 of the tasks; v4 is closer to it than v5.
 _TASKS = {"halfcheetah": "HalfCheetah-v4", "hopper": "Hopper-v4", "walker2d": "Walker2d-v4"}
@@ -35,7 +32,7 @@ _NETWORKS: dict[str, Network] = {
 }
 
 
-def _named() -> Iterator[TransitionRecipe]:
+def _named() -> Iterator[Preset]:
     for task, env in _TASKS.items():
         for data in (f"{task}-{kind}-v2" for kind in _KINDS):
             for network, backbone in _NETWORKS.items():
@@ -46,5 +43,5 @@ def _named() -> Iterator[TransitionRecipe]:
                 yield TD3BC(name=f"td3bc/{name}", **fields)
 
 
-OFFLINE_RECIPES: dict[str, TransitionRecipe] = {recipe.name: recipe for recipe in _named()}
+OFFLINE_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in _named()}
 """``bc/DATASET/NETWORK``, ``iql/DATASET/NETWORK`` and ``td3bc/DATASET/NETWORK``."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import lstm, mlp
 
-from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
+from .preset import PPO, Preset
 
 # The task determines the patches, and the encoders of several observations.
 _NETWORKS: dict[str, Network] = {
@@ -16,7 +16,7 @@ _NETWORKS: dict[str, Network] = {
     "lstm": lstm(),
 }
 
-ANY_TASK_RECIPES: dict[str, PPO] = {
+ANY_TASK_RECIPES: dict[str, Preset] = {
     f"ppo/{network}": PPO(
         name=f"ppo/{network}", env="CartPole-v1", backbone=backbone, **PPO_SETTINGS
     )

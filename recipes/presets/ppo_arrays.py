@@ -6,13 +6,11 @@ of the paper and its release instead.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import d2rl, enhanced_tit, lstm, mlp, ofenet, vanilla_tit
 
-from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
+from .preset import PPO, Preset
 
 # Task name: environment and steps (arXiv 2212.14538, appendix). The paper ran MuJoCo's v3.
 _TASKS = {
@@ -47,19 +45,19 @@ _MOUNTAINCAR_PROTOCOL: dict[str, Network] = {
 }
 
 
-def _named() -> list[PPO]:
+def _named() -> list[Preset]:
     recipes = []
     for task, (env, total_steps) in _TASKS.items():
         published = _MOUNTAINCAR_PROTOCOL if task == "mountaincar" else {}
         for network, backbone in _NETWORKS.items():
             name = f"ppo/{task}/{network}"
             recipe = PPO(name=name, env=env, total_steps=total_steps, backbone=backbone)
-            recipes.append(replace(recipe, **PPO_SETTINGS))
+            recipes.append(recipe.replace(**PPO_SETTINGS))
             if network in _PROTOCOL:
                 backbone = (_PROTOCOL | published)[network]
-                recipes.append(replace(recipe, name=f"{name}-protocol", backbone=backbone))
+                recipes.append(recipe.replace(name=f"{name}-protocol", backbone=backbone))
     return recipes
 
 
-ARRAY_RECIPES: dict[str, PPO] = {recipe.name: recipe for recipe in _named()}
+ARRAY_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in _named()}
 """The recipes by name."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from torchrl_tit.settings import Network
@@ -15,7 +14,7 @@ from torchrl_tit.settings.networks import (
     vanilla_tit,
 )
 
-from ..ppo import PPO
+from .preset import PPO, Preset
 
 _GAMES = {
     "breakout": "ALE/Breakout-v5",
@@ -52,7 +51,7 @@ _BASELINES: dict[str, Network] = {
 }
 
 
-def _named(game: str) -> list[PPO]:
+def _named(game: str) -> list[Preset]:
     """All recipes of a game, with the settings of rl-baselines3-zoo."""
     base = PPO(
         env=_GAMES[game],
@@ -70,20 +69,22 @@ def _named(game: str) -> list[PPO]:
         entropy_coeff=0.01,
         clip_rewards=True,
     )
-    recipes = {name: replace(base, backbone=network) for name, network in _BASELINES.items()}
+    recipes = {name: base.replace(backbone=network) for name, network in _BASELINES.items()}
     # The techniques of the baselines' own papers (for CoBERL arXiv 2107.05431). arXiv 2212.14538
     # does not say how long the warm-up is, or which of their other techniques "+tuned" had.
-    tuned = replace(base, warmup_steps=200_000, initialization="own")
+    tuned = base.replace(warmup_steps=200_000, initialization="own")
     recipes |= {
-        "catformer-tuned": replace(
-            tuned, backbone=catformer(4, attention_expansion=2, ffn_expansion=4)
+        "catformer-tuned": tuned.replace(
+            backbone=catformer(4, attention_expansion=2, ffn_expansion=4)
         ),
-        "coberl-tuned": replace(tuned, backbone=coberl(4, gate_bias=2.0), contrastive_coeff=1.0),
+        "coberl-tuned": tuned.replace(backbone=coberl(4, gate_bias=2.0), contrastive_coeff=1.0),
     }
-    tit = replace(base, minibatch_size=64)
-    recipes |= {name: replace(tit, backbone=network) for name, network in _TIT.items()}
-    return [replace(recipe, name=f"ppo/{game}/{name}") for name, recipe in recipes.items()]
+    tit = base.replace(minibatch_size=64)
+    recipes |= {name: tit.replace(backbone=network) for name, network in _TIT.items()}
+    return [recipe.replace(name=f"ppo/{game}/{name}") for name, recipe in recipes.items()]
 
 
-ATARI_RECIPES: dict[str, PPO] = {recipe.name: recipe for game in _GAMES for recipe in _named(game)}
+ATARI_RECIPES: dict[str, Preset] = {
+    recipe.name: recipe for game in _GAMES for recipe in _named(game)
+}
 """The recipes by name."""

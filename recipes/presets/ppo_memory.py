@@ -14,8 +14,8 @@ from typing import Any
 
 from torchrl_tit.settings import LSTM, MLP, GTrXL, Inner, Network
 
-from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
+from .preset import PPO, Preset
 
 MEMORY_SETTINGS: dict[str, Any] = PPO_SETTINGS | {
     "num_envs": 16,
@@ -85,7 +85,7 @@ def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[s
     }
 
 
-MEMORY_RECIPES: dict[str, PPO] = (
+MEMORY_RECIPES: dict[str, Preset] = (
     {
         f"ppo/tmaze-{length}/{network}": PPO(
             name=f"ppo/tmaze-{length}/{network}",

@@ -8,8 +8,8 @@ from __future__ import annotations
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
-from ..ppo import PPO
 from .ppo_settings import PPO_SETTINGS, reliable_tit
+from .preset import PPO, Preset
 
 _TASKS = {
     "cartpole": ("CartPole-v1", 100_000),
@@ -26,7 +26,7 @@ _NETWORKS: dict[str, Network] = {
     "enhanced-tit-wo-outer-k8": enhanced_tit(8, outer=False, patch_size=None),
 }
 
-NO_VELOCITY_RECIPES: dict[str, PPO] = {
+NO_VELOCITY_RECIPES: dict[str, Preset] = {
     f"ppo/{task}-no-velocity/{network}": PPO(
         name=f"ppo/{task}-no-velocity/{network}",
         env=env,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
-from ..sac import SAC
+from .preset import SAC, Preset
 
 # The whole observation is one patch, as docs/results/hopper.md found for PPO.
-SAC_RECIPES: dict[str, SAC] = {
+SAC_RECIPES: dict[str, Preset] = {
     recipe.name: recipe
     for recipe in (
         SAC(

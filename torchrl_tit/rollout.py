@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchrl_tit.modules import ActingCollector
+from torchrl_tit.modules.frame_tables import table_of_first
 from torchrl_tit.windows import Padding, Windows, find_windows
 
 
@@ -127,15 +128,27 @@ class Rollout:
         for part in (batch, batch["next"]):
             part.del_("observation")
 
-    def observations(self, steps: Tensor) -> list[Tensor]:
-        """The observations of steps, int64 [...] -> [..., *observation_shape] of each."""
-        rows = Windows(self.newest[steps], None)
-        return [rows.gather(frames) for frames in self.frames]
-
     def histories(self, steps: Tensor) -> list[Tensor]:
         """The windows of steps, int64 [...] -> [..., K, *observation_shape] of each observation."""
         windows = self._windows(self.newest[steps], self.oldest[steps])
         return [windows.gather(frames) for frames in self.frames]
+
+    def sequences(self, steps: Tensor) -> tuple[list[Tensor], Windows]:
+        """The frames of sequences of consecutive steps, each once, and the windows of the steps.
+
+        All shapes are static.
+
+        Args:
+            steps: int64 [N, T].
+
+        Returns:
+            Frames, [N * (K - 1 + T), *observation_shape] of each observation, and windows on them,
+            [N, T, K].
+        """
+        newest = Windows(self.newest[steps], None)
+        observations = [newest.gather(frames) for frames in self.frames]
+        first = self.histories(steps[:, 0])
+        return table_of_first(first, observations, self.is_init[steps], self.padding)[:2]
 
     def next_windows(
         self, steps: Tensor, max_frames: int = 1024
