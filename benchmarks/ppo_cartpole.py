@@ -36,8 +36,7 @@ from recipes import ppo, runner
 from recipes.algorithm import make_algorithm
 from recipes.callback import Callback
 from recipes.metrics import read_metrics
-from recipes.ppo import algorithm
-from recipes.ppo.algorithm import PPOAlgorithm
+from recipes.ppo import PPOAlgorithm, algorithm
 from recipes.recipe import Compile
 from recipes.registry import get_recipe
 from recipes.results.plot import save_figure

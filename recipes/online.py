@@ -130,7 +130,9 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
     def check(self) -> None:
         """Lets the policy act once in the task; a cluster must have room for the collectors."""
         check_cluster(self.recipe.ray, self.recipe.collectors, self.recipe.threads)
-        with closing(self.make_env(1, self.recipe.seed)) as env, torch.no_grad():
+        mode = getattr(self.recipe, "vectorization_mode", "sync")  # PPO's
+        env = self.make_env(1, self.recipe.seed, vectorization_mode=mode)
+        with closing(env), torch.no_grad():
             self.policy(env.reset())
 
     def close(self) -> None:

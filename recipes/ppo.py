@@ -311,7 +311,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories, and with the state of a recurrent network."""
-        env = super().make_env(num_envs, seed, **settings)
+        env = make_task(self.recipe, num_envs, seed, **settings)
         return _with_state(self.model.backbone.make_transforms(), env)
 
     def prepare(self, step: int, folder: Path) -> None:
@@ -374,12 +374,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         recipe, model = self.recipe, self.model
         learning_rate = self._set_schedules(step)
         batch = self.collected(batch)
-        rollout = Rollout(
-            batch,
-            recipe.backbone.num_frames,
-            recipe.padding,
-            model.backbone.sequence_keys.observations,
-        )
+        rollout = self.rollout(batch)
         with torch.no_grad():
             self.advantages(batch, rollout)
         floor = recipe.advantage_floor
@@ -421,6 +416,11 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
             "epochs": len(steps) / per_epoch,
             **dict(zip([*self.terms, "gradient_norm"], torch.stack(steps).mean(0), strict=True)),
         }
+
+    def rollout(self, batch: TensorDictBase) -> Rollout:
+        """Arranges the frames of a collected batch, each once, and removes them from it."""
+        recipe, keys = self.recipe, self.model.backbone.sequence_keys.observations
+        return Rollout(batch, recipe.backbone.num_frames, recipe.padding, keys)
 
     def collected(self, batch: TensorDictBase) -> TensorDictBase:
         """Receives each collected batch, [envs, time], and returns it with the rewards to train on.
@@ -508,7 +508,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         return terms
 
     def check(self) -> None:
-        """Lets the policy act once in the task; a compiler must be there if it is required."""
+        """As :meth:`OnlineAlgorithm.check`; a compiler must be there if it is required."""
         check_compiler(self.recipe.compile)
         super().check()
 

@@ -34,28 +34,28 @@ class NamedRecipes(Mapping[str, Recipe]):
     """
 
     def __init__(self) -> None:
-        self._names: Names[Recipe | Preset] = Names("recipe")
+        self.names: Names[Recipe | Preset] = Names("recipe")
 
     def add(self, recipe: Recipe | Preset, home: str) -> None:
         """Adds a recipe; see :meth:`Names.add`."""
-        self._names.add(recipe.name, recipe, home)
+        self.names.add(recipe.name, recipe, home)
 
     def find(self, name: str) -> Recipe:
         """Looks up a recipe, also in plugins; see :meth:`Names.find`."""
-        self._names.find(name)
+        self.names.find(name)
         return self[name]
 
     def __getitem__(self, name: str) -> Recipe:
-        recipe = self._names[name]
+        recipe = self.names[name]
         if isinstance(recipe, Preset):
-            recipe = self._names[name] = get_recipe_class(recipe.algorithm)(**recipe.fields)
+            recipe = self.names[name] = get_recipe_class(recipe.algorithm)(**recipe.fields)
         return recipe
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
+        return iter(self.names)
 
     def __len__(self) -> int:
-        return len(self._names)
+        return len(self.names)
 
 
 RECIPES = NamedRecipes()

@@ -102,7 +102,7 @@ def own_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     monkeypatch.setattr(sys, "path", sys.path[:])
     monkeypatch.setattr(plugins, "_failures", None)
     tables: list[Names[Any]] = [FrameSettings.registered, HistorySettings.registered]
-    tables += [Recipe.registered, RECIPES]
+    tables += [Recipe.registered, RECIPES.names]
     before = [(dict(table), deepcopy(vars(table))) for table in tables]
     tasks, modules = set(gymnasium.registry), set(sys.modules)
     yield tmp_path

@@ -22,7 +22,7 @@ PRELOADED = [
     "matplotlib.pyplot",
     "pytest",
     "recipes.cli.main",
-    "recipes.ppo.algorithm",
+    "recipes.ppo",
     "recipes.results.plot",
     "recipes.runner",
     "torch.utils.tensorboard",

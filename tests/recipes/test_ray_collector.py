@@ -15,7 +15,6 @@ from tensordict.nn import TensorDictModuleBase
 from recipes.algorithm import make_algorithm
 from recipes.callback import Callback
 from recipes.ppo import PPO
-from recipes.ppo.rollout import FrameCollector, Rollout
 from recipes.ray_collector import _check_own_name
 from recipes.run import Run
 from recipes.runner import evaluate, train
@@ -24,6 +23,7 @@ from recipes.sac.algorithm import SACAlgorithm
 from recipes.task import seed_copies
 from tests.numerics import assert_near
 from torchrl_tit.checkpoint import checkpoint_steps
+from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings.imports import import_allowed
 from torchrl_tit.settings.networks import enhanced_tit
 

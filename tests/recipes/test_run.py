@@ -196,7 +196,7 @@ def test_a_second_ctrl_c_stops_at_once(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("recipes.ppo.algorithm.add_advantages", twice)
+    monkeypatch.setattr("recipes.ppo.PPOAlgorithm.advantages", twice)
     with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
         runner.train(SMALL, run)
     assert checkpoint_steps(run.checkpoints) == []
@@ -209,7 +209,7 @@ def test_an_error_that_ctrl_c_brings_about_is_a_stop(tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
         raise RuntimeError("C++ compile error")
 
-    monkeypatch.setattr("recipes.ppo.algorithm.add_advantages", compiler_stopped)
+    monkeypatch.setattr("recipes.ppo.PPOAlgorithm.advantages", compiler_stopped)
     with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
         runner.train(SMALL, run)
 

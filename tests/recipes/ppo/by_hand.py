@@ -3,28 +3,12 @@
 import torch
 
 
-def windows_of(minibatch, padding="same"):
-    """The windows [N, K, *obs] of single steps, or [N, T, K, *obs] of sequences.
-
-    Of a sequence's histories only the first is read.
-    """
-    if minibatch.ndim == 1:
-        return minibatch["history"]
-    rows = []
-    for sequence in minibatch:
-        window = sequence["history"][0]
-        windows = [window]
-        for observation, is_init in zip(
-            sequence["observation"][1:], sequence["is_init"][1:], strict=True
-        ):
-            if is_init:
-                first = observation if padding == "same" else torch.zeros_like(observation)
-                window = torch.stack([first] * (len(window) - 1) + [observation])
-            else:
-                window = torch.cat([window[1:], observation.unsqueeze(0)])
-            windows.append(window)
-        rows.append(torch.stack(windows))
-    return torch.stack(rows)
+def numbers_of(minibatch, rollout):
+    """The numbers of a minibatch's steps in the batch, [N, T], found by their newest frame."""
+    newest = minibatch.windows.gather(minibatch.frames[0])[..., -1, :].unsqueeze(-2)
+    same = (newest == rollout.frames[0][rollout.newest]).all(-1)  # [N, T, steps]
+    assert (same.sum(-1) == 1).all()
+    return same.int().argmax(-1)
 
 
 def advantages(reward, value, next_value, done, stops, gamma, lmbda):

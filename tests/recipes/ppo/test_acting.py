@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from recipes.ppo import PPO
-from recipes.ppo.algorithm import Agent
+from recipes.ppo import PPO, ActorCritic
 from recipes.run import Run
 from recipes.runner import evaluate, train
 from tests.modules.frames import CountedFrames
@@ -31,15 +30,15 @@ RECIPE = PPO(
 def frames(monkeypatch):
     """Counts the frames that are encoded without gradients."""
     counted = []
-    init = Agent.__init__
+    init = ActorCritic.__init__
 
-    def counting(agent, *args):
-        init(agent, *args)
-        frames = CountedFrames(agent.backbone.module)
+    def counting(model, *args):
+        init(model, *args)
+        frames = CountedFrames(model.backbone.module)
         frames.only_without_gradients = True
         counted.append(frames)
 
-    monkeypatch.setattr(Agent, "__init__", counting)
+    monkeypatch.setattr(ActorCritic, "__init__", counting)
     return counted
 
 

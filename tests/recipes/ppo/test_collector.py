@@ -10,8 +10,7 @@ import torch
 from torch import multiprocessing
 
 from recipes.metrics import Metrics
-from recipes.ppo import PPO
-from recipes.ppo.algorithm import PPOAlgorithm
+from recipes.ppo import PPO, PPOAlgorithm
 from recipes.run import Run
 from recipes.runner import evaluate, train
 from recipes.task import seed_copies
@@ -42,22 +41,22 @@ def test_batches_are_those_of_the_policy(tmp_path, monkeypatch):
     recipe = replace(RECIPE, reward_scale=1.0, wrappers=wrappers)
     algorithm = PPOAlgorithm(recipe)
     algorithm.prepare(0, tmp_path)
-    agent, collector = algorithm.agent, algorithm.collector
+    model, collector = algorithm.model, algorithm.collector
     envs = 4
     starts, continued, count = [], 0, 0
     for batch in algorithm.batches():
         count += 1
         assert batch.shape == (envs, 64 // envs)
         features, first = batch["features"], batch["observation", "pole"][:, 0].tolist()
-        histories = agent.rollout(batch).histories(torch.arange(64))
+        histories = algorithm.rollout(batch).histories(torch.arange(64))
         windows = [history.view(*batch.shape, 2, 2) for history in histories]
         poles = windows[1][:, 0]
         continued += int((poles[:, 0] != poles[:, 1]).any(-1).sum())
         with torch.no_grad():
-            expected = agent.backbone.module(*windows)
+            expected = model.backbone.module(*windows)
         assert_near(features, expected)
         starts += first
-        for parameter in agent.parameters():
+        for parameter in model.parameters():
             parameter.data.add_(0.01)
         collector.update_policy_weights_()
     assert continued >= envs  # windows at the start of a batch know the end of the one before

@@ -15,29 +15,23 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from recipes.compilation import should_compile
-from recipes.ppo import PPO
-from recipes.ppo.algorithm import Agent, PPOAlgorithm, add_advantages, minibatches
-from recipes.ppo.rollout import Rollout
+from recipes.ppo import PPO, ActorCritic, Minibatch, PPOAlgorithm
 from recipes.registry import get_recipe
 from recipes.run import Run
 from recipes.runner import train
-from recipes.task import make_task
 from tests.numerics import assert_near
 from tests.recipes.ppo import by_hand
+from tests.recipes.ppo.algorithms import prepared
+from torchrl_tit.rollout import Rollout
+from torchrl_tit.windows import Windows
 
 RECIPE = get_recipe("ppo/cartpole/enhanced-tit")
 assert isinstance(RECIPE, PPO)
 SMALL = replace(RECIPE, total_steps=64, steps_per_batch=32, num_envs=2, epochs=2, minibatch_size=16)
 
 
-def build(recipe=SMALL):
-    env = make_task(recipe, recipe.num_envs, recipe.seed)
-    return env, Agent(recipe, env)
-
-
-def fake_batch(agent, env, time=7):
+def fake_batch(model, envs=2, time=7):
     """Two streams with a termination and a time limit inside, and random observations."""
-    envs = env.batch_size[0]
     observation = torch.randn(envs, time + 1, 4)
     terminated = torch.zeros(envs, time, 1, dtype=torch.bool)
     truncated = terminated.clone()
@@ -49,7 +43,7 @@ def fake_batch(agent, env, time=7):
     return TensorDict(
         {
             "observation": observation[:, :-1],
-            "state_value": value_of(agent, observation[:, :-1]),
+            "state_value": value_of(model, observation[:, :-1]),
             "next": {
                 "observation": following,
                 "reward": torch.randn(envs, time, 1),
@@ -63,21 +57,20 @@ def fake_batch(agent, env, time=7):
 
 
 @torch.no_grad()
-def value_of(agent, observation):
+def value_of(model, observation):
     history = TensorDict({"history": observation.unsqueeze(2)}, observation.shape[:2])
-    return agent.critic(agent.backbone(history))["state_value"]
+    return model.critic(model.backbone(history))["state_value"]
 
 
 @pytest.mark.numerics
 @pytest.mark.parametrize("bootstrap", [True, False])
 def test_advantages_follow_the_recursion(bootstrap):
-    env, agent = build()
-    batch = fake_batch(agent, env)
-    next_value = value_of(agent, batch["next", "observation"])
-    gae = GAE(gamma=0.9, lmbda=0.8, value_network=None)
-    rollout = Rollout(batch, 1, "same")
+    algorithm = PPOAlgorithm(replace(SMALL, bootstrap_time_limit=bootstrap))
+    algorithm.gae = GAE(gamma=0.9, lmbda=0.8, value_network=None)
+    batch = fake_batch(algorithm.model)
+    next_value = value_of(algorithm.model, batch["next", "observation"])
     with torch.no_grad():
-        add_advantages(batch, rollout, agent, gae, bootstrap)
+        algorithm.advantages(batch, Rollout(batch, 1, "same"))
     value, reward, done = batch["state_value"], batch["next", "reward"], batch["next", "done"]
     stops = done & ~batch["next", "truncated"] if bootstrap else done
     expected = by_hand.advantages(reward, value, next_value, done, stops, 0.9, 0.8)
@@ -85,11 +78,11 @@ def test_advantages_follow_the_recursion(bootstrap):
     torch.testing.assert_close(batch["value_target"], expected + value, atol=1e-5, rtol=1e-5)
 
 
-def sb3_style_loss(agent, minibatch, recipe):
+def sb3_style_loss(model, observation, minibatch, recipe):
     """The loss as Stable-Baselines3 writes it, from the layers' weights alone."""
-    features = agent.backbone.module(minibatch["history"])
-    logits = agent.actor[0].module(features)
-    value = agent.critic.module(features).squeeze(-1)
+    features = model.backbone.module(observation.unsqueeze(1))
+    logits = model.actor[0].module(features)
+    value = model.critic.module(features).squeeze(-1)
     log_probs = logits - logits.logsumexp(-1, keepdim=True)
     log_prob = log_probs.gather(-1, minibatch["action"].unsqueeze(-1)).squeeze(-1)
     advantage = minibatch["advantage"].squeeze(-1)
@@ -103,13 +96,13 @@ def sb3_style_loss(agent, minibatch, recipe):
 
 
 @pytest.mark.numerics
-def test_loss_and_gradient_are_those_of_the_formulas():
-    recipe = replace(SMALL, entropy_coeff=0.01)
-    _, agent = build(recipe)
-    n = 64
-    minibatch = TensorDict(
+def test_loss_and_gradient_are_those_of_the_formulas(tmp_path):
+    recipe = replace(SMALL, entropy_coeff=0.01, running_advantage_floor=0.0)
+    algorithm = prepared(recipe, tmp_path)
+    model, n = algorithm.model, 64
+    observation = torch.randn(n, 4)
+    steps = TensorDict(
         {
-            "history": torch.randn(n, 1, 4),
             "action": torch.randint(0, 2, (n,)),
             "action_log_prob": -torch.rand(n) * 1.5,  # far enough off for clipping to act
             "advantage": torch.randn(n, 1) * 3 + 1,
@@ -117,24 +110,13 @@ def test_loss_and_gradient_are_those_of_the_formulas():
         },
         [n],
     )
-    expected = sb3_style_loss(agent, minibatch, recipe)
-    expected_grads = torch.autograd.grad(expected, list(agent.parameters()))
-
-    loss = ClipPPOLoss(
-        agent.actor,
-        agent.critic,
-        clip_epsilon=recipe.clip_epsilon,
-        entropy_coeff=recipe.entropy_coeff,
-        critic_coeff=recipe.critic_coeff,
-        loss_critic_type="l2",
-        normalize_advantage=True,
-        functional=False,
-    )
-    agent.backbone(minibatch)
-    terms = loss(minibatch)
-    total = terms["loss_objective"] + terms["loss_critic"] + terms["loss_entropy"]
-    grads = torch.autograd.grad(total, list(agent.parameters()))
-    assert terms["clip_fraction"] > 0.1
+    expected = sb3_style_loss(model, observation, steps, recipe)
+    expected_grads = torch.autograd.grad(expected, list(model.parameters()))
+    windows = Windows(torch.arange(n).view(n, 1, 1), None)
+    minibatch = Minibatch(steps.unsqueeze(1), [observation], windows)
+    total, terms = algorithm.objective(minibatch)
+    grads = torch.autograd.grad(total, list(model.parameters()))
+    assert terms[algorithm.terms.index("clip_fraction")] > 0.1
     assert_near(total, expected)
     for grad, expected_grad in zip(grads, expected_grads, strict=True):
         assert_near(grad, expected_grad)
@@ -144,10 +126,8 @@ def test_loss_and_gradient_are_those_of_the_formulas():
 def test_the_loss_is_compiled_if_the_recipe_says_so(setting, tmp_path, monkeypatch):
     """What it computes then is in test_rollout.py."""
     monkeypatch.setattr(shutil, "which", lambda name: name)
-    monkeypatch.setattr("recipes.ppo.algorithm.compile_and_time", lambda function, name: name)
-    algorithm = PPOAlgorithm(replace(SMALL, compile=setting))
-    algorithm.prepare(0, tmp_path)
-    algorithm.close()
+    monkeypatch.setattr("recipes.ppo.compile_and_time", lambda function, name: name)
+    algorithm = prepared(replace(SMALL, compile=setting), tmp_path)
     objective: object = algorithm.objective
     assert (objective == "the loss") is (setting == "on")
 
@@ -211,11 +191,11 @@ def test_minibatches_show_every_step_once_an_epoch():
         },
         [2, 20],
     )
-    recipe = replace(SMALL, epochs=3, minibatch_size=16)
-    rollout = Rollout(batch, 1, "same")
-    shown = list(minibatches(batch, rollout, build()[1], recipe))
-    assert all(torch.equal(part["history"].flatten(), part["action"]) for part in shown)
-    parts = [part["action"].tolist() for part in shown]
+    algorithm = PPOAlgorithm(replace(SMALL, epochs=3, minibatch_size=16))
+    shown = list(algorithm.minibatches(batch, Rollout(batch, 1, "same")))
+    for steps, [frames], windows in shown:
+        assert torch.equal(windows.gather(frames).flatten(), steps["action"].flatten())
+    parts = [part.steps["action"].flatten().tolist() for part in shown]
     assert [len(part) for part in parts] == [16, 16, 8] * 3
     epochs = [[*parts[i], *parts[i + 1], *parts[i + 2]] for i in (0, 3, 6)]
     assert all(sorted(epoch) == list(range(n)) for epoch in epochs)
@@ -224,8 +204,8 @@ def test_minibatches_show_every_step_once_an_epoch():
 
 @pytest.mark.numerics
 def test_initialisation_is_that_of_stable_baselines3():
-    _, agent = build()
-    network: nn.Module = agent.backbone.module
+    model = PPOAlgorithm(SMALL).model
+    network: nn.Module = model.backbone.module
     for layer in network.modules():
         if isinstance(layer, nn.Linear):
             weight = layer.weight.flatten(1)
@@ -233,7 +213,7 @@ def test_initialisation_is_that_of_stable_baselines3():
             identity = 2 * torch.eye(len(weight))
             torch.testing.assert_close(weight @ weight.T, identity, atol=1e-4, rtol=0)
             assert not layer.bias.any()
-    heads: list[tuple[Any, float]] = [(agent.actor[0].module, 0.01), (agent.critic.module, 1.0)]
+    heads: list[tuple[Any, float]] = [(model.actor[0].module, 0.01), (model.critic.module, 1.0)]
     for layer, gain in heads:
         norms = layer.weight.norm(dim=1)
         torch.testing.assert_close(norms, torch.full_like(norms, gain))
@@ -245,13 +225,13 @@ class Recorder:
 
     def __init__(self, monkeypatch):
         self.modes = []
-        original = Agent.__init__
+        original = ActorCritic.__init__
 
-        def init(agent, *args):
-            original(agent, *args)
-            agent.backbone.module.head.register_forward_hook(self)
+        def init(model, *args):
+            original(model, *args)
+            model.backbone.module.head.register_forward_hook(self)
 
-        monkeypatch.setattr(Agent, "__init__", init)
+        monkeypatch.setattr(ActorCritic, "__init__", init)
 
     def __call__(self, network, inputs, output):
         kind = "update" if torch.is_grad_enabled() else "act"
@@ -303,14 +283,14 @@ def test_schedules_fall_linearly(decay, tmp_path, monkeypatch):
 
 
 def test_continuous_actions_are_stored_unclipped_and_evaluated_at_the_mean():
-    recipe = replace(SMALL, env="Pendulum-v1")
-    env, agent = build(recipe)
+    algorithm = PPOAlgorithm(replace(SMALL, env="Pendulum-v1"))
+    env, policy = algorithm.make_env(2, seed=0), algorithm.policy
     with torch.no_grad():
-        td = agent.policy(env.reset())
+        td = policy(env.reset())
     assert_near(td["scale"], torch.ones_like(td["scale"]))  # log std 0
     collector = Collector(
         env,
-        agent.policy,
+        policy,
         frames_per_batch=400,
         total_frames=400,
         auto_register_policy_transforms=False,
@@ -320,7 +300,7 @@ def test_continuous_actions_are_stored_unclipped_and_evaluated_at_the_mean():
     dist = torch.distributions.Normal(batch["loc"], batch["scale"])
     assert_near(batch["action_log_prob"], dist.log_prob(batch["action"]).sum(-1))
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        td = agent.policy(env.reset())
+        td = policy(env.reset())
     assert_near(td["action"], td["loc"])
 
 

@@ -6,7 +6,6 @@ import pytest
 from gymnasium.vector import AsyncVectorEnv
 
 from recipes.algorithm import make_algorithm
-from recipes.presets.ppo_no_velocity import NO_VELOCITY_RECIPES
 from recipes.registry import RECIPES
 from recipes.run import Run
 from recipes.runner import evaluate, train
@@ -14,10 +13,9 @@ from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings import StackedInner
 
 
-@pytest.mark.parametrize("name", NO_VELOCITY_RECIPES)
+@pytest.mark.parametrize("name", [name for name in RECIPES if "-no-velocity/" in name])
 def test_recipes_can_be_built_and_hide_the_velocities(name):
-    recipe = NO_VELOCITY_RECIPES[name]
-    assert RECIPES[name] == recipe
+    recipe = RECIPES[name]
     algorithm = make_algorithm(recipe)
     algorithm.check()
     network = name.rpartition("/")[2]
@@ -33,7 +31,7 @@ def test_recipes_can_be_built_and_hide_the_velocities(name):
 
 def test_a_run_in_processes_is_the_run_in_one(tmp_path, monkeypatch):
     recipe = replace(
-        NO_VELOCITY_RECIPES["ppo/cartpole-no-velocity/mlp-stack-8"],
+        RECIPES["ppo/cartpole-no-velocity/mlp-stack-8"],
         num_envs=2,
         steps_per_batch=32,
         total_steps=64,

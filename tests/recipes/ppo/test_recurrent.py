@@ -6,13 +6,12 @@ import pytest
 import torch
 from torchrl.objectives.value import GAE
 
-from recipes.ppo import PPO
-from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
-from recipes.ppo.rollout import FrameCollector, Rollout
+from recipes.ppo import PPO, PPOAlgorithm
 from recipes.results.film import film
 from recipes.run import Run
 from recipes.runner import evaluate, train
 from tests.numerics import assert_near
+from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings.networks import lstm, mlp
 
 RECIPE = PPO(
@@ -33,49 +32,49 @@ RECIPE = PPO(
 
 @pytest.fixture
 def batch():
-    """A batch of 200 steps of 2 environments, and the agent that took them."""
+    """A batch of 200 steps of 2 environments, and the algorithm whose policy took them."""
     torch.manual_seed(0)
-    algorithm = PPOAlgorithm(RECIPE)
-    agent = algorithm.agent.eval()
+    algorithm = PPOAlgorithm(replace(RECIPE, steps_per_batch=400))
+    algorithm.gae = GAE(gamma=0.99, lmbda=0.95, value_network=None)
+    algorithm.model.eval()
     env = algorithm.make_env(2, seed=0, keep_histories=False)
-    torch.nn.init.normal_(agent.critic.module.weight)
+    torch.nn.init.normal_(algorithm.model.critic.module.weight)
     collector = FrameCollector(
         env,
-        agent.policy,
+        algorithm.policy,
         frames_per_batch=400,
         total_frames=400,
         auto_register_policy_transforms=False,
         use_buffers=False,
     )
     with torch.no_grad():
-        yield next(iter(collector)), agent
+        yield next(iter(collector)), algorithm
     collector.shutdown()
 
 
 def test_the_next_values_know_the_state_before_them(batch):
     """At ends of episodes and of the batch too, where the collector computed none."""
-    batch, agent = batch
-    gae = GAE(gamma=0.99, lmbda=0.95, value_network=None)
-    states = batch["next"].select(*agent.state_keys)
+    batch, algorithm = batch
+    model = algorithm.model
+    states = batch["next"].select(*model.backbone.state_shapes, "is_init")
     states["history"] = batch["next", "observation"].unsqueeze(2)
-    following = agent.critic(agent.backbone(states.clone()))
-    rollout = Rollout(batch, 1, "same")
-    add_advantages(batch, rollout, agent, gae, bootstrap_time_limit=True)
+    following = model.critic(model.backbone(states.clone()))
+    algorithm.advantages(batch, Rollout(batch, 1, "same"))
     terminated, next_value = batch["next", "terminated"], batch["next", "state_value"]
     torch.testing.assert_close(next_value, following["state_value"].masked_fill(terminated, 0))
     forgetful = states
     for key in ("recurrent_state_h", "recurrent_state_c"):
         forgetful[key] = torch.zeros_like(forgetful[key])
-    forgetful = agent.critic(agent.backbone(forgetful))["state_value"]
+    forgetful = model.critic(model.backbone(forgetful))["state_value"]
     assert (next_value - forgetful)[~terminated].abs().max() > 1e-3
 
 
 def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
-    batch, agent = batch
+    batch, algorithm = batch
     number = torch.arange(400).view(2, 200, 1)
     batch["advantage"] = batch["value_target"] = number
-    recipe = replace(RECIPE, steps_per_batch=400)
-    parts = list(minibatches(batch, Rollout(batch, 1, "same"), agent, recipe))
+    minibatches = list(algorithm.minibatches(batch, Rollout(batch, 1, "same")))
+    parts = [minibatch.steps for minibatch in minibatches]
     assert [part.shape for part in parts] == [(4, 8)] * 12 + [(2, 8)] + [(4, 8)] * 12 + [(2, 8)]
     for epoch in (parts[:13], parts[13:]):
         steps = torch.cat([part["advantage"] for part in epoch]).squeeze(-1)  # [sequences, 8]
@@ -83,9 +82,10 @@ def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
         assert steps.flatten().sort().values.tolist() == list(range(400))
     assert not torch.equal(parts[0]["advantage"], parts[13]["advantage"])
     # Before the first gradient step the features are those that acted.
-    for part in parts:
-        rows = part["advantage"].flatten()
-        features = agent.encode(part)["features"].flatten(0, 1)
+    for minibatch in minibatches:
+        rows = minibatch.steps["advantage"].flatten()
+        algorithm._encode(*minibatch)
+        features = minibatch.steps["features"].flatten(0, 1)
         assert_near(features, batch["features"].flatten(0, 1)[rows])
 
 
@@ -116,5 +116,5 @@ def test_sequences_that_do_not_fit_are_refused(fields, message):
 
 def test_with_several_frames_it_reads_those_and_carries_no_state():
     recipe = replace(RECIPE, backbone=replace(RECIPE.backbone, num_frames=4))
-    assert not recipe.is_recurrent
+    assert not recipe.backbone.carries_state
     PPOAlgorithm(recipe).check()

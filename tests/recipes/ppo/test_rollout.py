@@ -14,13 +14,13 @@ from torchrl.modules import RandomPolicy
 from torchrl.objectives.value import GAE
 
 from recipes.compilation import compile_and_time
-from recipes.ppo import PPO
-from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
-from recipes.ppo.rollout import FrameCollector, Rollout
+from recipes.ppo import PPO, PPOAlgorithm
 from tests.modules.frames import CountedFrames
 from tests.numerics import assert_near
 from tests.recipes.ppo import by_hand
+from tests.recipes.ppo.algorithms import perturb
 from torchrl_tit.envs import make_env
+from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings import CoBERL, Inner, Network
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp, vanilla_tit
 
@@ -93,7 +93,6 @@ def test_windows_are_those_that_the_policy_read(envs, frames, padding):
         read = seen.take()
         number = torch.arange(13 * envs).view(envs, 13)
         assert torch.equal(rollout.histories(number)[0], read)
-        assert torch.equal(rollout.observations(number)[0], whole["observation"])
         assert torch.equal(read[:, :, -1], whole["observation"])
         done = whole["next", "done"].squeeze(-1)
         is_init = rollout.is_init.view(envs, 13)
@@ -143,20 +142,18 @@ def test_a_rollout_keeps_each_frame_once(frames):
 def collected(recipe, folder):
     """An algorithm in float64, its second batch, and the rollout of that."""
     algorithm = PPOAlgorithm(recipe)
-    with torch.no_grad():  # far from where all actions and values are alike
-        for parameter in algorithm.agent.parameters():
-            parameter.add_(0.2 * torch.randn_like(parameter))
+    perturb(algorithm.model)
     algorithm.prepare(0, folder)
     batches = iter(algorithm.batches())
     with torch.no_grad():
         next(batches)
         batch = next(batches)
     algorithm.close()
-    algorithm.agent.double()
-    algorithm.loss.double()
+    algorithm.model.double()
+    algorithm.ppo_loss.double()
     batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
     outcome = batch["next", "observation"].clone()
-    rollout = algorithm.agent.rollout(batch)
+    rollout = algorithm.rollout(batch)
     assert rollout.is_init.any()
     return algorithm, batch, rollout, outcome
 
@@ -167,8 +164,9 @@ def collected(recipe, folder):
 @pytest.mark.parametrize("name", ["tit", "separate trunks", "lstm on windows"])
 def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstrap, tmp_path):
     recipe = replace(SHORT_EPISODES, backbone=NETWORKS[name], padding=padding)
+    recipe = replace(recipe, bootstrap_time_limit=bootstrap)
     algorithm, batch, rollout, outcome = collected(recipe, tmp_path)
-    agent, gae = algorithm.agent, GAE(gamma=0.875, lmbda=0.75, value_network=None)
+    model, algorithm.gae = algorithm.model, GAE(gamma=0.875, lmbda=0.75, value_network=None)
     done = batch["next", "done"]
     truncated = done & (done.cumsum(1) % 2 == 0)  # every other episode, whatever ended it
     assert truncated.any()
@@ -177,9 +175,9 @@ def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstr
     following = torch.cat([windows[:, :, 1:], outcome.unsqueeze(2)], 2)
     with torch.no_grad():
         states = TensorDict({"history": torch.stack([windows, following])}, [2, 3, 32])
-        value, next_value = agent.critic(agent.backbone(states))["state_value"]
+        value, next_value = model.critic(model.backbone(states))["state_value"]
         batch["state_value"] = value
-        add_advantages(batch, rollout, agent, gae, bootstrap)
+        algorithm.advantages(batch, rollout)
     stops = done & ~truncated if bootstrap else done
     assert_near(batch["next", "state_value"], next_value.masked_fill(stops, 0))
     reward = batch["next", "reward"]
@@ -190,26 +188,28 @@ def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstr
 
 @torch.no_grad()
 def test_no_frame_is_encoded_for_what_follows_a_termination(tmp_path):
-    algorithm, batch, rollout, _ = collected(SHORT_EPISODES, tmp_path)
-    agent, done = algorithm.agent, batch["next", "done"]
+    recipe = replace(SHORT_EPISODES, bootstrap_time_limit=False)
+    algorithm, batch, rollout, _ = collected(recipe, tmp_path)
+    done = batch["next", "done"]
     assert done[:, :-1].sum() >= 6
-    counted = CountedFrames(agent.backbone.module)
-    add_advantages(batch, rollout, agent, algorithm.gae, bootstrap_time_limit=False)
+    counted = CountedFrames(algorithm.model.backbone.module)
+    algorithm.advantages(batch, rollout)
     assert 0 < counted.take() <= 3 * 4  # where the batch cuts episodes off
     done[:, -1] = True
-    add_advantages(batch, rollout, agent, algorithm.gae, bootstrap_time_limit=False)
+    algorithm.advantages(batch, rollout)
     assert counted.take() == 0
     assert batch["advantage"].isfinite().all()
 
 
-def features_by_hand(agent, minibatch, padding):
+def features_by_hand(model, minibatch, histories):
     """Step by step: of whole windows, or with the state that the network carries."""
-    if not agent.backbone.is_recurrent:
-        windows = by_hand.windows_of(minibatch, padding).flatten(0, 1)
-        return agent.backbone(TensorDict({"history": windows}, [len(windows)]))
-    steps, state = [], minibatch[:, 0].select(*agent.backbone.state_shapes)
+    if not model.backbone.is_recurrent:
+        histories = histories.flatten(0, 1)
+        return model.backbone(TensorDict({"history": histories}, [len(histories)]))
+    minibatch = minibatch.steps.copy().update({"history": histories})
+    steps, state = [], minibatch[:, 0].select(*model.backbone.state_shapes)
     for time in range(minibatch.shape[1]):
-        step = agent.backbone(state.update(minibatch[:, time].select("history", "is_init")))
+        step = model.backbone(state.update(minibatch[:, time].select("history", "is_init")))
         steps.append(step.select("features"))
         state = step["next"].copy()
     return torch.stack(steps, 1).flatten(0, 1)
@@ -229,27 +229,27 @@ def test_loss_and_gradient_are_those_of_whole_windows(name, envs, padding, tmp_p
         contrastive_coeff=1.0 if name == "coberl" else 0.0,
     )
     algorithm, batch, rollout, _ = collected(recipe, tmp_path)
-    agent, weights = algorithm.agent, list(algorithm.agent.parameters())
+    model, weights = algorithm.model, list(algorithm.model.parameters())
     with torch.no_grad():
-        add_advantages(batch, rollout, agent, algorithm.gae, True)
+        algorithm.advantages(batch, rollout)
         batch["action_log_prob"] += 0.3 * torch.randn_like(batch["action_log_prob"])  # clips some
     resets = 0
-    for minibatch in minibatches(batch, rollout, agent, recipe):
-        assert minibatch.shape == (2, 16)
-        resets += int(minibatch["is_init"][:, 1:].sum())
+    for minibatch in algorithm.minibatches(batch, rollout):
+        steps, frames, windows = minibatch
+        assert steps.shape == (2, 16)
+        resets += int(steps["is_init"][:, 1:].sum())
+        [histories] = rollout.histories(by_hand.numbers_of(minibatch, rollout))
+        assert torch.equal(windows.gather(frames[0]), histories)
         torch.manual_seed(1)
-        total, terms = algorithm._objective(minibatch.copy())
+        total, terms = algorithm._objective(minibatch._replace(steps=steps.copy()))
         gradients = torch.autograd.grad(total, weights, allow_unused=True)
 
-        steps = minibatch.exclude("history", "observation").flatten(0, 1)
-        steps.update(features_by_hand(agent, minibatch, padding))
-        losses = algorithm.loss(steps)
+        whole = steps.flatten(0, 1).update(features_by_hand(model, minibatch, histories))
+        losses = algorithm.ppo_loss(whole)
         expected = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
         if recipe.contrastive_coeff:
             torch.manual_seed(1)
-            windows = by_hand.windows_of(minibatch, padding).flatten(0, 1)
-            windows = TensorDict({"history": windows}, [len(windows)])
-            expected = expected + algorithm._contrastive_loss(windows)
+            expected = expected + algorithm._contrastive_loss(frames, windows)
         expected_gradients = torch.autograd.grad(expected, weights, allow_unused=True)
         assert 0 < terms[5] < 1  # of the ratios some are clipped, others are not
         assert_near(total, expected)
@@ -262,13 +262,12 @@ def test_loss_and_gradient_are_those_of_whole_windows(name, envs, padding, tmp_p
 
 def test_each_frame_of_a_sequence_is_encoded_once(tmp_path):
     algorithm, batch, rollout, _ = collected(RECIPE, tmp_path)
-    agent = algorithm.agent
     with torch.no_grad():
-        counted = CountedFrames(agent.backbone.module)
-        add_advantages(batch, rollout, agent, algorithm.gae, True)
+        counted = CountedFrames(algorithm.model.backbone.module)
+        algorithm.advantages(batch, rollout)
         assert counted.take() <= len(rollout.frames[0])
-        for minibatch in minibatches(batch, rollout, agent, RECIPE):
-            agent.encode(minibatch)
+        for minibatch in algorithm.minibatches(batch, rollout):
+            algorithm.loss(minibatch)
             assert counted.take() == 2 * (16 + 3)
 
 
@@ -277,15 +276,15 @@ def test_each_frame_of_a_sequence_is_encoded_once(tmp_path):
 def test_the_compiled_objective_is_one_graph_and_the_eager_one(tmp_path):
     recipe = replace(RECIPE, backbone=enhanced_tit(4, num_blocks=1, **SMALL), padding="constant")
     algorithm, batch, rollout, _ = collected(recipe, tmp_path)
-    agent, weights = algorithm.agent, list(algorithm.agent.parameters())
+    weights = list(algorithm.model.parameters())
     with torch.no_grad():
-        add_advantages(batch, rollout, agent, algorithm.gae, True)
+        algorithm.advantages(batch, rollout)
     counters.clear()
     fast = compile_and_time(algorithm._objective, "the loss")
-    for minibatch in minibatches(batch, rollout, agent, recipe):
+    for minibatch in algorithm.minibatches(batch, rollout):
         results = []
         for objective in (algorithm._objective, fast):
-            total, terms = objective(minibatch.copy())
+            total, terms = objective(minibatch._replace(steps=minibatch.steps.copy()))
             results.append([total, terms, *torch.autograd.grad(total, weights)])
         assert_near(*results)
     assert counters["stats"]["unique_graphs"]

@@ -7,14 +7,15 @@ from typing import Any
 import pytest
 import torch
 
+from recipes import ppo
+from recipes.adaptive import KLAdaptiveRate, ReturnScale, normalize_advantages
 from recipes.algorithm import make_algorithm
 from recipes.metrics import read_metrics
-from recipes.ppo import PPO, algorithm
-from recipes.ppo.learning_rate import KLAdaptiveRate
-from recipes.ppo.scaling import ReturnScale
+from recipes.ppo import PPO, PPOAlgorithm
 from recipes.run import Run
 from recipes.runner import load_trained, train
 from tests.recipes.ppo import tasks
+from tests.recipes.ppo.algorithms import trained
 from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.frames.normalized import NormalizedFrames
@@ -77,13 +78,14 @@ def test_learning_rate_follows_the_divergence():
 def test_rewards_are_divided_by_the_deviation_of_returns(tmp_path, monkeypatch):
     """With gamma 0 the value's target is the reward, and CartPole's are all 1."""
     batches = []
-    original = algorithm.add_advantages
+    original = PPOAlgorithm.collected
 
-    def recording(batch, *args):
+    def recording(algorithm, batch):
+        batch = original(algorithm, batch)
         batches.append(batch["next", "reward"].clone())
-        original(batch, *args)
+        return batch
 
-    monkeypatch.setattr(algorithm, "add_advantages", recording)
+    monkeypatch.setattr(PPOAlgorithm, "collected", recording)
     recipe = replace(RECIPE, normalize_rewards=True, reward_scale=100.0)
     run = run_of(recipe, tmp_path / "run")
     _, state = load_checkpoint(run.checkpoints)
@@ -109,13 +111,12 @@ def test_a_resumed_run_begins_with_returns_of_zero():
 def test_advantages_are_divided_by_a_floor_at_least(tmp_path, monkeypatch):
     """A floor below every deviation changes nothing; one above it makes updates smaller."""
     seen = []
-    original = algorithm.normalize_advantages
 
     def recording(advantage, floor):
-        seen.append((advantage, original(advantage, floor)))
+        seen.append((advantage, normalize_advantages(advantage, floor)))
         return seen[-1][1]
 
-    monkeypatch.setattr(algorithm, "normalize_advantages", recording)
+    monkeypatch.setattr(ppo, "normalize_advantages", recording)
     recipe = replace(RECIPE, total_steps=64, epochs=1)
     runs = {
         floor: run_of(replace(recipe, advantage_floor=floor), tmp_path / f"{floor}")
@@ -137,21 +138,20 @@ def test_advantages_are_divided_by_a_floor_at_least(tmp_path, monkeypatch):
 def test_advantages_are_divided_by_a_share_of_their_running_deviation(tmp_path, monkeypatch):
     """Advantages that are a thousandth of earlier ones move the policy far less."""
     seen = []
-    original = algorithm.normalize_advantages
 
     def recording(advantage, floor):
-        seen.append((advantage, floor, original(advantage, floor)))
+        seen.append((advantage, floor, normalize_advantages(advantage, floor)))
         return seen[-1][-1]
 
-    add = algorithm.add_advantages
+    advantages = PPOAlgorithm.advantages
     sizes = iter([1.0, 1e-3, 1.0])
 
-    def shrinking(batch, *args):
-        add(batch, *args)
+    def shrinking(algorithm, batch, rollout):
+        advantages(algorithm, batch, rollout)
         batch["advantage"] *= next(sizes)
 
-    monkeypatch.setattr(algorithm, "normalize_advantages", recording)
-    monkeypatch.setattr(algorithm, "add_advantages", shrinking)
+    monkeypatch.setattr(ppo, "normalize_advantages", recording)
+    monkeypatch.setattr(PPOAlgorithm, "advantages", shrinking)
     recipe = replace(RECIPE, running_advantage_floor=0.5, total_steps=192)
     run = run_of(recipe, tmp_path / "run")
     batches = [seen[start : start + 4] for start in (0, 4, 8)]  # 2 minibatches, 2 epochs
@@ -171,7 +171,7 @@ def test_advantages_are_divided_by_a_share_of_their_running_deviation(tmp_path, 
 
 
 def test_one_number_has_no_deviation():
-    assert algorithm.normalize_advantages(torch.tensor([2.0]), 0.5).tolist() == [2.0]
+    assert normalize_advantages(torch.tensor([2.0]), 0.5).tolist() == [2.0]
 
 
 @pytest.mark.parametrize(("frames", "padding"), [(1, "same"), (8, "same"), (8, "constant")])
@@ -208,6 +208,7 @@ def test_each_observation_counts_once(frames, padding, tmp_path, monkeypatch):
     ],
     ids=["K=1", "K=4", "recurrent", "separate trunks"],
 )
+@pytest.mark.usefixtures("float64")
 def test_acting_and_updating_read_the_same_statistics(backbone, tmp_path, monkeypatch):
     """Before an update's first step all ratios are 1, and all values those that were acted on."""
     monkeypatch.setenv("TORCHRL_TIT_IMPORTS", tasks.__name__)
@@ -221,33 +222,25 @@ def test_acting_and_updating_read_the_same_statistics(backbone, tmp_path, monkey
         normalize_rewards=True,
         compile="off",
     )
-    before, original = [], algorithm.minibatches
+    before, original = [], PPOAlgorithm.minibatches
 
     @torch.no_grad()
-    def recording(batch, rollout, agent, recipe):
+    def recording(algorithm, batch, rollout):
         before.append(torch.zeros(2, dtype=torch.float64))
-        agent.eval()
-        for minibatch in original(batch, rollout, agent, replace(recipe, epochs=1)):
-            agent.encode(minibatch)
-            log_prob = agent.actor.get_dist(minibatch).log_prob(minibatch["action"])
-            value = agent.critic(minibatch)["state_value"]
-            acted = minibatch["value_target"] - minibatch["advantage"]
-            apart = [log_prob - minibatch["action_log_prob"], value - acted]
+        model = algorithm.model.eval()
+        for steps, frames, windows in original(algorithm, batch, rollout):
+            algorithm._encode(steps, frames, windows)
+            log_prob = model.actor.get_dist(steps).log_prob(steps["action"])
+            value = model.critic(steps)["state_value"]
+            acted = steps["value_target"] - steps["advantage"]
+            apart = [log_prob - steps["action_log_prob"], value - acted]
             before[-1] = before[-1].maximum(torch.stack([x.abs().max() for x in apart]))
-        agent.train()
-        yield from original(batch, rollout, agent, recipe)
+        model.train()
+        yield from original(algorithm, batch, rollout)
 
-    monkeypatch.setattr(algorithm, "minibatches", recording)
-    torch.set_default_dtype(torch.float64)
-    try:
-        trained = make_algorithm(recipe)
-        trained.prepare(0, tmp_path)
-        for step, batch in zip((0, 64, 128), trained.batches()):  # noqa: B905
-            assert trained.update(batch, step)["kl_approx"] > 1e-5  # it moves the policy
-        trained.close()
-    finally:
-        torch.set_default_dtype(torch.float32)
-    (*_, normalized) = normalized_frames(trained.model)
+    monkeypatch.setattr(PPOAlgorithm, "minibatches", recording)
+    algorithm = trained(recipe, tmp_path, batches=3)
+    (*_, normalized) = normalized_frames(algorithm.model)
     assert normalized.variance.max() > 2 * normalized.variance.min()
     assert torch.stack(before).shape == (3, 2)
     assert torch.stack(before).max() < 1e-9
@@ -265,8 +258,8 @@ def test_images_are_normalized_by_channel_and_categories_are_not(tmp_path):
         normalize_observations=True,
         backbone=enhanced_tit(2, patch_size=2, embed_dim=8, features_dim=8),
     )
-    _, trained, _ = load_trained(run_of(images, tmp_path / "run"))
-    (frames,) = normalized_frames(trained.model)
+    _, algorithm, _ = load_trained(run_of(images, tmp_path / "run"))
+    (frames,) = normalized_frames(algorithm.model)
     assert frames.mean.shape == (3, 1, 1)
     assert (frames.mean > 0.05).all()
     assert (frames.variance < 0.2).all()
@@ -276,40 +269,90 @@ def test_images_are_normalized_by_channel_and_categories_are_not(tmp_path):
 
 def test_the_divergence_is_never_negative(tmp_path, monkeypatch):
     """It is Schulman's estimate, as in Stable-Baselines3, of the whole minibatch."""
-    found, original = [], algorithm.PPOAlgorithm._objective
+    found, original = [], PPOAlgorithm.loss
 
-    def recording(self, minibatch):
-        total, values = original(self, minibatch)
+    def recording(algorithm, minibatch):
+        terms, steps = original(algorithm, minibatch), minibatch.steps
         with torch.no_grad():
-            log_prob = self.agent.actor.get_dist(minibatch).log_prob(minibatch["action"])
-        log_ratio = (log_prob - minibatch["action_log_prob"]).double()
-        expected = (log_ratio.expm1() - log_ratio).mean().item()
-        found.append((values[algorithm.TERMS.index("kl_approx")].item(), expected))
-        return total, values
+            log_prob = algorithm.model.actor.get_dist(steps).log_prob(steps["action"])
+        log_ratio = (log_prob - steps["action_log_prob"]).double()
+        found.append((terms["kl_approx"].item(), (log_ratio.expm1() - log_ratio).mean().item()))
+        return terms
 
-    monkeypatch.setattr(algorithm.PPOAlgorithm, "_objective", recording)
-    trained = make_algorithm(replace(RECIPE, learning_rate=0.01, epochs=8))
-    trained.prepare(0, tmp_path)
-    for step, batch in zip((0, 64), trained.batches()):  # noqa: B905
-        trained.update(batch, step)
-    trained.close()
+    monkeypatch.setattr(PPOAlgorithm, "loss", recording)
+    trained(replace(RECIPE, learning_rate=0.01, epochs=8), tmp_path, batches=2)
     assert min(expected for _, expected in found[2:16]) > 1e-5
     for mine, expected in found:
         assert mine == pytest.approx(expected, rel=1e-3, abs=1e-6)
 
 
-def test_an_update_ends_at_the_target_divergence(tmp_path):
-    recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=1e-4)
-    rows = read_metrics(run_of(recipe, tmp_path / "run").folder / "metrics.csv")
-    assert min(row["epochs"] for row in rows) < 8
+@pytest.fixture
+def divergences(monkeypatch):
+    """The mean divergence of each epoch of an update, which has two minibatches an epoch."""
+    found, original = [], PPOAlgorithm.loss
+
+    def recording(algorithm, minibatch):
+        terms = original(algorithm, minibatch)
+        found.append(terms["kl_approx"].item())
+        return terms
+
+    monkeypatch.setattr(PPOAlgorithm, "loss", recording)
+    return lambda: [(one + two) / 2 for one, two in zip(found[::2], found[1::2], strict=True)]
 
 
-def test_the_learning_rate_follows_the_target_divergence(tmp_path):
-    recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=1e-4, at_target_kl="adapt")
+def test_an_update_ends_after_the_first_epoch_beyond_the_target(divergences, tmp_path):
+    """Nothing is clipped here, so it is the divergence that ends it."""
+    recipe = replace(RECIPE, total_steps=64, learning_rate=0.01, epochs=8, clip_epsilon=0.9)
+    run_of(recipe, tmp_path / "free")
+    free = divergences()
+    target = (free[0] + free[1]) / 2
+    assert free[0] < target < free[1] < 3 * target
+    run = run_of(replace(recipe, target_kl=target), tmp_path / "ended")
+    assert divergences()[8:] == pytest.approx(free[:2])
+    assert read_metrics(run.folder / "metrics.csv")[-1]["epochs"] == 2
+
+
+def test_the_learning_rate_follows_the_target_divergence(divergences, tmp_path):
+    recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=1e-3, at_target_kl="adapt")
     rows = read_metrics(run_of(recipe, tmp_path / "run").folder / "metrics.csv")
-    assert rows[0]["learning_rate"] == 0.01
-    assert rows[-1]["learning_rate"] < 0.005
+    expected, factors = KLAdaptiveRate(1e-3), [1.0]
+    for kl in divergences():
+        expected.update(kl)
+        factors.append(expected.factor)
+    assert len(factors) == 4 * 8 + 1
+    assert len(set(factors)) > 2
+    rates = [row["learning_rate"] for row in rows]
+    assert rates == pytest.approx([0.01 * factor for factor in factors[0:32:8]])
     assert all(row["epochs"] == 8 for row in rows)
+
+
+def test_the_larger_of_two_floors_applies(tmp_path, monkeypatch):
+    floors = []
+
+    def recording(advantage, floor):
+        floors.append(floor)
+        return normalize_advantages(advantage, floor)
+
+    monkeypatch.setattr(ppo, "normalize_advantages", recording)
+    recipe = replace(RECIPE, total_steps=64, running_advantage_floor=0.5)
+    for constant in (1e-6, 1e6):
+        run_of(replace(recipe, advantage_floor=constant), tmp_path / f"{constant}")
+    assert min(floors[:4]) > 1e-3
+    assert floors[4:] == [1e6] * 4
+
+
+def test_the_discounted_return_begins_anew_at_time_limits(tmp_path):
+    recipe = replace(RECIPE, normalize_rewards=True, env_settings=("max_episode_steps=5",))
+    algorithm = PPOAlgorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    batch = next(iter(algorithm.batches()))
+    algorithm.close()
+    assert not batch["next", "terminated"].any()
+    returns = [(1 - 0.99**steps) / 0.01 for steps in range(1, 6)] * 12
+    returns += [(1 - 0.99**steps) / 0.01 for steps in (1, 2)] * 2  # 32 steps of both environments
+    expected = 1 / torch.tensor(returns).std(correction=0).item()
+    reward = algorithm.collected(batch)["next", "reward"]
+    assert reward.unique().item() == pytest.approx(expected, rel=1e-3)
 
 
 def test_two_resumes_of_a_run_with_all_of_them_are_equal(tmp_path):
@@ -336,17 +379,15 @@ def test_two_resumes_of_a_run_with_all_of_them_are_equal(tmp_path):
 
 def test_collectors_of_other_processes_get_the_statistics(tmp_path, monkeypatch):
     differences = []
-    original = algorithm.PPOAlgorithm.update
+    original = PPOAlgorithm.update
 
-    def recording(self, batch, step):
-        rollout = algorithm.Rollout(batch.clone(), 1, "same")
-        histories = rollout.histories(torch.arange(batch.numel()))
+    def recording(algorithm, batch, step):
         with torch.no_grad():
-            features = self.agent.backbone.module(*histories)
-        differences.append((features - batch["features"].flatten(0, 1)).abs().max().item())
-        return original(self, batch, step)
+            features = algorithm.model.backbone.module(batch["observation"].unsqueeze(2))
+        differences.append((features - batch["features"]).abs().max().item())
+        return original(algorithm, batch, step)
 
-    monkeypatch.setattr(algorithm.PPOAlgorithm, "update", recording)
+    monkeypatch.setattr(PPOAlgorithm, "update", recording)
     backbone = enhanced_tit(1, embed_dim=8, features_dim=8)
     recipe = replace(
         RECIPE, backbone=backbone, collectors=2, normalize_observations=True, learning_rate=0.0

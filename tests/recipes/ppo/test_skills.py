@@ -8,11 +8,11 @@ from tensordict import TensorDict
 
 from recipes.algorithm import make_algorithm
 from recipes.metrics import read_metrics
-from recipes.ppo import PPO
-from recipes.ppo.algorithm import PPOAlgorithm
-from recipes.presets.ppo_atari import ATARI_RECIPES
+from recipes.ppo import PPO, Minibatch
+from recipes.registry import RECIPES
 from recipes.run import Run
 from recipes.runner import train
+from tests.recipes.ppo.algorithms import prepared
 from torchrl_tit.networks import masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 from torchrl_tit.settings import Network
@@ -23,6 +23,7 @@ from torchrl_tit.settings.networks import (
     mlp,
     nature_cnn,
 )
+from torchrl_tit.windows import Windows
 
 SMALL = PPO(env="CartPole-v1", backbone=mlp(hidden_dim=8), num_envs=2, steps_per_batch=64)
 COBERL = coberl(4, embed_dim=16, num_heads=2, num_blocks=1, features_dim=8, gate_bias=2)
@@ -41,58 +42,47 @@ def test_warm_up_rises_linearly_and_decay_follows(decay, expected, tmp_path):
 
 
 def test_settings_of_the_tuned_baselines():
-    one = ATARI_RECIPES["ppo/pong/catformer-tuned"]
+    one = RECIPES["ppo/pong/catformer-tuned"]
     assert one.backbone == catformer(4, attention_expansion=2, ffn_expansion=4)
-    other = ATARI_RECIPES["ppo/pong/coberl-tuned"]
+    other = RECIPES["ppo/pong/coberl-tuned"]
     assert other.backbone == coberl(4, gate_bias=2.0)
-    assert (other.contrastive_coeff, other.masked_fraction) == (1, 0.15)
+    assert other.contrastive_coeff == 1
     for recipe in (one, other):
-        plain = ATARI_RECIPES[recipe.name.removesuffix("-tuned")]
+        plain = RECIPES[recipe.name.removesuffix("-tuned")]
         assert plain.contrastive_coeff == plain.warmup_steps == 0
         assert (recipe.initialization, plain.initialization) == ("own", "orthogonal")
         assert recipe.warmup_steps > 0
         make_algorithm(recipe).check()
 
 
-@pytest.fixture
-def minibatch():
-    torch.manual_seed(0)
+def test_the_contrastive_loss_is_added_with_its_weight(tmp_path):
+    recipe = replace(RECIPES["ppo/pong/coberl"], backbone=COBERL, num_envs=1, compile="off")
     n = 8
-    return TensorDict(
+    steps = TensorDict(
         {
-            "history": torch.randint(0, 256, (n, 4, 84, 84), dtype=torch.uint8),
-            "action": torch.randint(0, 6, (n,)),
-            "action_log_prob": -torch.rand(n),
-            "advantage": torch.randn(n, 1),
-            "value_target": torch.randn(n, 1),
+            "action": torch.randint(0, 6, (n, 1)),
+            "action_log_prob": -torch.rand(n, 1),
+            "advantage": torch.randn(n, 1, 1),
+            "value_target": torch.randn(n, 1, 1),
         },
-        [n],
+        [n, 1],
     )
-
-
-def prepared(tmp_path, **fields):
-    torch.manual_seed(0)
-    recipe = replace(
-        ATARI_RECIPES["ppo/pong/coberl"], backbone=COBERL, num_envs=1, compile="off", **fields
-    )
-    algorithm = PPOAlgorithm(recipe)
-    algorithm.prepare(0, tmp_path)
-    algorithm.close()
-    return algorithm
-
-
-def test_the_contrastive_loss_is_added_with_its_weight(minibatch, tmp_path):
-    plain, plain_terms = prepared(tmp_path).objective(minibatch.copy())
-    algorithm = prepared(tmp_path, contrastive_coeff=0.3, masked_fraction=0.5)
+    frames = torch.randint(0, 256, (n + 3, 84, 84), dtype=torch.uint8)
+    windows = Windows(torch.arange(n).view(n, 1, 1) + torch.arange(4), None)
+    results = []
+    for coeff in (0.0, 0.3):
+        torch.manual_seed(0)
+        algorithm = prepared(replace(recipe, contrastive_coeff=coeff), tmp_path)
+        torch.manual_seed(1)
+        results.append(algorithm.objective(Minibatch(steps.copy(), [frames], windows)))
+    (plain, plain_terms), (total, terms) = results
     torch.manual_seed(1)
-    total, terms = algorithm.objective(minibatch.copy())
-    torch.manual_seed(1)
-    mask = torch.rand(8, 4) < 0.5
-    network = algorithm.agent.backbone.module
-    encodings, predictions = masked_predictions(network, minibatch["history"], mask)
-    expected = contrastive_prediction_loss(encodings, predictions, mask)
-    assert 0.2 < mask.float().mean() < 0.8
-    torch.testing.assert_close(total, plain + 0.3 * expected, rtol=1e-4, atol=1e-5)
+    mask = torch.rand(n, 4) < 0.15
+    network = algorithm.model.backbone.module
+    predictions = masked_predictions(network, [windows.gather(frames).squeeze(1)], mask)
+    expected = 0.3 * contrastive_prediction_loss(*predictions, mask)
+    assert 0 < mask.sum() < mask.numel()
+    torch.testing.assert_close(total, plain + expected, rtol=1e-4, atol=1e-5)
     expected_terms = torch.cat([plain_terms, expected.detach().unsqueeze(0)])
     torch.testing.assert_close(terms, expected_terms, rtol=1e-4, atol=1e-5)
     gradient = torch.autograd.grad(total, network.history_encoder.mask_token)
@@ -101,7 +91,7 @@ def test_the_contrastive_loss_is_added_with_its_weight(minibatch, tmp_path):
 
 def test_a_run_with_the_contrastive_loss_logs_it(tmp_path):
     recipe = replace(
-        ATARI_RECIPES["ppo/pong/coberl-tuned"],
+        RECIPES["ppo/pong/coberl-tuned"],
         backbone=COBERL,
         num_envs=1,
         total_steps=16,
@@ -121,7 +111,7 @@ def test_other_networks_have_no_contrastive_loss(network):
         replace(SMALL, backbone=network, contrastive_coeff=1.0)
 
 
-PONG = ATARI_RECIPES["ppo/pong/nature-cnn"]
+PONG = RECIPES["ppo/pong/nature-cnn"]
 
 
 @pytest.mark.parametrize(

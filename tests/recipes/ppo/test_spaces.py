@@ -8,12 +8,12 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from recipes.ppo import PPO
-from recipes.ppo.algorithm import PPOAlgorithm, add_advantages, minibatches
+from recipes.ppo import PPO, PPOAlgorithm
 from recipes.run import Run
 from recipes.runner import train
 from tests.numerics import assert_near
 from tests.recipes.ppo import tasks
+from tests.recipes.ppo.algorithms import perturb
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings import Flat
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
@@ -61,10 +61,8 @@ def test_training_sees_what_the_policy_saw(name, tmp_path):
     """
     recipe = replace(RECIPE, **TASKS[name])
     algorithm = PPOAlgorithm(recipe)
-    agent = algorithm.agent
-    with torch.no_grad():  # far from where all actions and values are alike
-        for parameter in agent.parameters():
-            parameter.add_(0.2 * torch.randn_like(parameter))
+    model = algorithm.model
+    perturb(model)
     algorithm.prepare(0, tmp_path)
     with torch.no_grad():
         batches = iter(algorithm.batches())
@@ -73,16 +71,16 @@ def test_training_sees_what_the_policy_saw(name, tmp_path):
         algorithm.close()
         assert not any("history" in str(key) for key in batch.keys(True))
         assert batch["action_log_prob"].isfinite().all()
-        rollout = agent.rollout(batch)
+        rollout = algorithm.rollout(batch)
         assert rollout.is_init.any()
         assert "observation" not in batch
-        add_advantages(batch, rollout, agent, algorithm.gae, True)
+        algorithm.advantages(batch, rollout)
         spread = batch["state_value"].std()
-        for minibatch in minibatches(batch, rollout, agent, recipe):
-            agent.encode(minibatch)
-            value = agent.critic(minibatch)["state_value"]
+        for minibatch, frames, windows in algorithm.minibatches(batch, rollout):
+            algorithm._encode(minibatch, frames, windows)
+            value = model.critic(minibatch)["state_value"]
             assert_near(value, minibatch["value_target"] - minibatch["advantage"])
-            assert_near(agent.actor.log_prob(minibatch), minibatch["action_log_prob"])
+            assert_near(model.actor.log_prob(minibatch), minibatch["action_log_prob"])
             if recipe.mask_actions:
                 sizes = [3, 2, 4] if "Multi" in name else [3]
                 masks = minibatch["action_mask"].split(sizes, -1)

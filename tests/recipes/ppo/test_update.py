@@ -6,14 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from recipes.metrics import read_metrics
-from recipes.ppo import PPO, algorithm
-from recipes.ppo.algorithm import Agent
+from recipes.ppo import PPO, PPOAlgorithm
 from recipes.run import Run
 from recipes.runner import train
-from tests.recipes.ppo import by_hand
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit
 
@@ -37,35 +34,34 @@ RECIPE = PPO(
 
 @pytest.fixture
 def batches(monkeypatch):
-    """For each batch: a copy of the agent before the update, and the minibatches of the update."""
-    recorded: list[tuple[Agent, list[TensorDict]]] = []
-    agents: list[Agent] = []
-    original_init, original_minibatches = Agent.__init__, algorithm.minibatches
+    """For each batch: a copy of the model before the update, and the minibatches of the update.
 
-    def init(agent, *args):
-        original_init(agent, *args)
-        agents.append(agent)
+    These are single steps, with their histories.
+    """
+    recorded = []
+    original = PPOAlgorithm.minibatches
 
-    def recording(*args):
-        recorded.append((deepcopy(agents[0]), []))
-        for minibatch in original_minibatches(*args):
-            recorded[-1][1].append(minibatch.clone())
+    def recording(algorithm, *args):
+        recorded.append((deepcopy(algorithm.model), []))
+        for minibatch in original(algorithm, *args):
+            steps, [frames], windows = minibatch
+            history = windows.gather(frames)
+            recorded[-1][1].append(steps.clone().update({"history": history}).flatten(0, 1))
             yield minibatch
 
-    monkeypatch.setattr(Agent, "__init__", init)
-    monkeypatch.setattr(algorithm, "minibatches", recording)
+    monkeypatch.setattr(PPOAlgorithm, "minibatches", recording)
     return recorded
 
 
-def log_prob_and_entropy(agent, features, action):
+def log_prob_and_entropy(model, features, action):
     """From the head's weights alone, by the formulas of the two distributions."""
     if action.dtype == torch.int64:
-        log_probs = agent.actor[0].module(features).log_softmax(-1)
+        log_probs = model.actor[0].module(features).log_softmax(-1)
         return (
             log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1),
             -(log_probs.exp() * log_probs).sum(-1),
         )
-    linear, scale = agent.actor[0].module
+    linear, scale = model.actor[0].module
     (log_std,) = scale.parameters()
     error = (action - linear(features)) / log_std.exp()
     log_prob = -(error**2) / 2 - log_std - math.log(2 * math.pi) / 2
@@ -73,10 +69,9 @@ def log_prob_and_entropy(agent, features, action):
     return log_prob.sum(-1), entropy.sum(-1).expand(len(features))
 
 
-def loss_by_hand(agent, minibatch, recipe, clip):
-    features = agent.backbone.module(by_hand.windows_of(minibatch).flatten(0, 1))
-    minibatch = minibatch.flatten(0, 1)
-    log_prob, entropy = log_prob_and_entropy(agent, features, minibatch["action"])
+def loss_by_hand(model, minibatch, recipe, clip):
+    features = model.backbone.module(minibatch["history"])
+    log_prob, entropy = log_prob_and_entropy(model, features, minibatch["action"])
     advantage = minibatch["advantage"].squeeze(-1)
     n = len(advantage)
     mean = advantage.sum() / n
@@ -84,7 +79,7 @@ def loss_by_hand(agent, minibatch, recipe, clip):
     advantage = (advantage - mean) / (std + 1e-8)
     ratio = (log_prob - minibatch["action_log_prob"]).exp()
     surrogate = torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
-    error = agent.critic.module(features) - minibatch["value_target"]
+    error = model.critic.module(features) - minibatch["value_target"]
     return (
         -surrogate.mean()
         + recipe.critic_coeff * (error**2).mean()
@@ -94,8 +89,8 @@ def loss_by_hand(agent, minibatch, recipe, clip):
 
 def updates_by_hand(recipe, batches):
     """Weights after all updates, with Adam (arXiv 1412.6980, algorithm 1) written out."""
-    agent = batches[0][0]
-    weights = list(agent.parameters())
+    model = batches[0][0]
+    weights = list(model.parameters())
     first, second = ([torch.zeros_like(w) for w in weights] for _ in range(2))
     t = 0
     for number, (before, minibatches) in enumerate(batches):
@@ -103,7 +98,7 @@ def updates_by_hand(recipe, batches):
             torch.testing.assert_close(weight, recorded, atol=5e-5, rtol=0)
         remaining = 1 - number / len(batches)
         for minibatch in minibatches:
-            loss = loss_by_hand(agent, minibatch, recipe, 0.2 * remaining)
+            loss = loss_by_hand(model, minibatch, recipe, 0.2 * remaining)
             gradients = torch.autograd.grad(loss, weights)
             norm = torch.cat([g.flatten() for g in gradients]).norm()
             t += 1
@@ -114,7 +109,7 @@ def updates_by_hand(recipe, batches):
                     v.mul_(0.999).add_(0.001 * g**2)
                     step = (m / (1 - 0.9**t)) / ((v / (1 - 0.999**t)).sqrt() + 1e-5)
                     w -= recipe.learning_rate * remaining * step
-    return agent
+    return model
 
 
 @pytest.mark.numerics
@@ -150,13 +145,13 @@ def test_rewards_are_scaled_for_training_and_returns_are_not(batches, tmp_path):
 
 def test_metrics_tell_how_far_features_are_spread(tmp_path, monkeypatch):
     batches = []
-    original = algorithm.add_advantages
+    original = PPOAlgorithm.advantages
 
-    def recording(batch, *args):
-        original(batch, *args)
+    def recording(algorithm, batch, rollout):
+        original(algorithm, batch, rollout)
         batches.append(batch.clone())
 
-    monkeypatch.setattr(algorithm, "add_advantages", recording)
+    monkeypatch.setattr(PPOAlgorithm, "advantages", recording)
     with Run.create(tmp_path / "run", RECIPE) as run:
         train(RECIPE, run)
         rows = read_metrics(run.folder / "metrics.csv")

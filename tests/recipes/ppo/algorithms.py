@@ -1,0 +1,32 @@
+"""PPO's algorithm, ready to update, without its environments."""
+
+import torch
+
+from recipes.ppo import PPOAlgorithm
+
+
+def prepared(recipe, folder):
+    """Loss and optimizer are built; the collector, which is closed, is not needed."""
+    algorithm = PPOAlgorithm(recipe)
+    algorithm.prepare(0, folder)
+    algorithm.close()
+    return algorithm
+
+
+def trained(recipe, folder, batches):
+    """An algorithm after updates on a number of batches."""
+    algorithm = PPOAlgorithm(recipe)
+    algorithm.prepare(0, folder)
+    step = 0
+    for batch, _ in zip(algorithm.batches(), range(batches), strict=False):
+        algorithm.update(batch, step)
+        step += recipe.steps_per_batch
+    algorithm.close()
+    return algorithm
+
+
+def perturb(model):
+    """Moves weights to where all actions and values are not alike."""
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.2 * torch.randn_like(parameter))
