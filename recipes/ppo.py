@@ -256,6 +256,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         recipe: the settings.
     """
 
+    model: ActorCritic
     terms: Sequence[str] = (
         "loss_objective",
         "loss_critic",
@@ -344,14 +345,17 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
             model.backbone.compile_parts(**STATIC_SHAPES)
         # The tokens to reuse are chosen between two parts that are compiled separately.
         whole = compiled and not keeps_frames
-        alone = {"return_same_td": True, "compile_policy": STATIC_SHAPES if whole else None}
+        alone: dict[str, Any] = {
+            "return_same_td": True,  # without buffers, each batch has its own memory
+            "compile_policy": STATIC_SHAPES if whole else None,
+        }
         self.collector = self.make_collector(
             self.policy,
             partial(_make_envs, model.backbone.make_transforms()),
             step,
             FrameCollector,
             use_buffers=False,  # they would hold the histories, which steps lack
-            **(alone if self.collects_here else {}),
+            **alone if self.collects_here else {},
         )
 
     def state(self) -> Mapping[str, Stateful]:
@@ -460,14 +464,14 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         terminated = batch["next", "terminated"]
         values = batch["state_value"].roll(-1, dims=1).masked_fill(terminated, 0)
         cut_off = rollout.ends & ~terminated.squeeze(-1)
-        states, evaluated = batch["next"][cut_off].select(*self._state_keys), []
+        states = batch["next"][cut_off].select(*self._state_keys)
+        found: list[Tensor] = []
         for frames, windows in rollout.next_windows(cut_off):
-            count, done = len(windows.rows), sum(map(len, evaluated))
-            samples = states[done : done + count]
+            samples = states[len(found) :][: len(windows.rows)]
             self._encode(samples, frames, windows, sequences=False)
-            evaluated.append(self.model.critic(samples)["state_value"])
-        if evaluated:
-            values[cut_off] = torch.cat(evaluated)
+            found += self.model.critic(samples)["state_value"]
+        if found:
+            values[cut_off] = torch.stack(found)
         return values
 
     def minibatches(self, batch: TensorDictBase, rollout: Rollout) -> Iterator[Minibatch]:

@@ -1,11 +1,21 @@
 """PPO's algorithm, ready to update, without its environments."""
 
+from pathlib import Path
+
 import torch
 
-from recipes.ppo import PPOAlgorithm
+from recipes.ppo import PPO, PPOAlgorithm
+from recipes.registry import get_recipe
 
 
-def prepared(recipe, folder):
+def named(name: str) -> PPO:
+    """A named recipe of PPO."""
+    recipe = get_recipe(name)
+    assert isinstance(recipe, PPO)
+    return recipe
+
+
+def prepared(recipe: PPO, folder: Path) -> PPOAlgorithm:
     """Loss and optimizer are built; the collector, which is closed, is not needed."""
     algorithm = PPOAlgorithm(recipe)
     algorithm.prepare(0, folder)
@@ -13,7 +23,7 @@ def prepared(recipe, folder):
     return algorithm
 
 
-def trained(recipe, folder, batches):
+def trained(recipe: PPO, folder: Path, batches: int) -> PPOAlgorithm:
     """An algorithm after updates on a number of batches."""
     algorithm = PPOAlgorithm(recipe)
     algorithm.prepare(0, folder)

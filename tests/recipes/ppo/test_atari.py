@@ -12,9 +12,9 @@ from recipes.algorithm import make_algorithm
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO, PPOAlgorithm
 from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.registry import RECIPES
 from recipes.run import Run
 from recipes.runner import evaluate, train
+from tests.recipes.ppo.algorithms import named
 from torchrl_tit.settings.networks import enhanced_tit, mlp, vanilla_tit
 
 GAMES = {
@@ -32,8 +32,8 @@ NETWORKS = [
 def test_every_cell_of_the_tables_is_named():
     for game, env in GAMES.items():
         for network in [*NETWORKS, "catformer-tuned", "coberl-tuned"]:
-            recipe = RECIPES[f"ppo/{game}/{network}"]
-            other = RECIPES[f"ppo/pong/{network}"]
+            recipe = named(f"ppo/{game}/{network}")
+            other = named(f"ppo/pong/{network}")
             assert replace(recipe, env=other.env, name=other.name) == other
             assert recipe.env == env
             assert recipe == recipe_from_json(recipe_to_json(recipe), "itself")
@@ -41,7 +41,7 @@ def test_every_cell_of_the_tables_is_named():
 
 @pytest.mark.parametrize("name", [f"ppo/pong/{network}" for network in NETWORKS])
 def test_protocol_settings(name):
-    recipe = RECIPES[name]
+    recipe = named(name)
     expected = {
         "env": "ALE/Pong-v5", "padding": "constant", "num_envs": 8,
         "steps_per_batch": 1024, "minibatch_size": 64 if "tit" in name else 256, "epochs": 4,
@@ -56,7 +56,7 @@ def test_protocol_settings(name):
 
 
 def test_zeros_stand_before_the_first_frame():
-    env = make_algorithm(RECIPES["ppo/pong/nature-cnn"]).make_env(1, seed=0)
+    env = make_algorithm(named("ppo/pong/nature-cnn")).make_env(1, seed=0)
     history = env.reset()["history"]
     assert not history[:, :-1].any()
     assert history[:, -1].any()
@@ -72,9 +72,9 @@ def test_settings_of_tit():
         "activation_inner": "gelu", "activation_outer": "gelu", "position_encoding": True,
         "share_blocks": False,
     }  # fmt: skip
-    enhanced = RECIPES["ppo/pong/enhanced-tit"].backbone
+    enhanced = named("ppo/pong/enhanced-tit").backbone
     assert enhanced == enhanced_tit(4, **hyperparameters)
-    assert RECIPES["ppo/pong/vanilla-tit"].backbone == vanilla_tit(4, **hyperparameters)
+    assert named("ppo/pong/vanilla-tit").backbone == vanilla_tit(4, **hyperparameters)
 
 
 @pytest.fixture
@@ -117,7 +117,7 @@ def test_training_sees_the_signs_and_returns_are_raw(clip, seen_rewards, tmp_pat
 
 def test_a_game_trains_with_signs_and_counts_points(seen_rewards, tmp_path):
     recipe = replace(
-        RECIPES["ppo/mspacman/nature-cnn"],
+        named("ppo/mspacman/nature-cnn"),
         num_envs=2,
         total_steps=512,
         steps_per_batch=512,
@@ -141,6 +141,6 @@ def test_a_game_trains_with_signs_and_counts_points(seen_rewards, tmp_path):
     ],
 )
 def test_what_does_not_fit_is_refused_before_anything_runs(fields, message):
-    recipe = replace(RECIPES["ppo/pong/nature-cnn"], **fields)
+    recipe = replace(named("ppo/pong/nature-cnn"), **fields)
     with pytest.raises(ValueError, match=message):
         make_algorithm(recipe).check()

@@ -9,10 +9,10 @@ pytest.importorskip("popgym")
 
 from recipes.algorithm import make_algorithm
 from recipes.presets import ppo_memory
-from recipes.registry import RECIPES
+from tests.recipes.ppo.algorithms import named
 from torchrl_tit.settings import Inner
 
-MEMORY_RECIPES = {name: RECIPES[name] for name in ppo_memory.MEMORY_RECIPES}
+MEMORY_RECIPES = {name: named(name) for name in ppo_memory.MEMORY_RECIPES}
 TASKS = sorted({name.rpartition("/")[0] for name in MEMORY_RECIPES})
 SHAPES = {"tmaze": (2,), "repeat": (1,), "memory-s": (3, 24, 24)}
 T_MAZES = [task for task in TASKS if "tmaze" in task]
@@ -29,7 +29,7 @@ def test_only_the_memory_differs(task):
         frames.add(replace(recipe.backbone.frame, every_block=False))
     assert len(frames) == 1, "one frame encoder"
     tit = recipes[f"{task}/enhanced-tit"]
-    for name, recipe in recipes.items():
+    for recipe in recipes.values():
         assert replace(recipe, name=tit.name, backbone=tit.backbone) == tit
     sizes = []
     for recipe in recipes.values():

@@ -9,13 +9,14 @@ from recipes.algorithm import make_algorithm
 from recipes.registry import RECIPES
 from recipes.run import Run
 from recipes.runner import evaluate, train
+from tests.recipes.ppo.algorithms import named
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings import StackedInner
 
 
 @pytest.mark.parametrize("name", [name for name in RECIPES if "-no-velocity/" in name])
 def test_recipes_can_be_built_and_hide_the_velocities(name):
-    recipe = RECIPES[name]
+    recipe = named(name)
     algorithm = make_algorithm(recipe)
     algorithm.check()
     network = name.rpartition("/")[2]
@@ -31,7 +32,7 @@ def test_recipes_can_be_built_and_hide_the_velocities(name):
 
 def test_a_run_in_processes_is_the_run_in_one(tmp_path, monkeypatch):
     recipe = replace(
-        RECIPES["ppo/cartpole-no-velocity/mlp-stack-8"],
+        named("ppo/cartpole-no-velocity/mlp-stack-8"),
         num_envs=2,
         steps_per_batch=32,
         total_steps=64,

@@ -9,10 +9,9 @@ from tensordict import TensorDict
 from recipes.algorithm import make_algorithm
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO, Minibatch
-from recipes.registry import RECIPES
 from recipes.run import Run
 from recipes.runner import train
-from tests.recipes.ppo.algorithms import prepared
+from tests.recipes.ppo.algorithms import named, prepared
 from torchrl_tit.networks import masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 from torchrl_tit.settings import Network
@@ -42,13 +41,13 @@ def test_warm_up_rises_linearly_and_decay_follows(decay, expected, tmp_path):
 
 
 def test_settings_of_the_tuned_baselines():
-    one = RECIPES["ppo/pong/catformer-tuned"]
+    one = named("ppo/pong/catformer-tuned")
     assert one.backbone == catformer(4, attention_expansion=2, ffn_expansion=4)
-    other = RECIPES["ppo/pong/coberl-tuned"]
+    other = named("ppo/pong/coberl-tuned")
     assert other.backbone == coberl(4, gate_bias=2.0)
     assert other.contrastive_coeff == 1
     for recipe in (one, other):
-        plain = RECIPES[recipe.name.removesuffix("-tuned")]
+        plain = named(recipe.name.removesuffix("-tuned"))
         assert plain.contrastive_coeff == plain.warmup_steps == 0
         assert (recipe.initialization, plain.initialization) == ("own", "orthogonal")
         assert recipe.warmup_steps > 0
@@ -56,7 +55,7 @@ def test_settings_of_the_tuned_baselines():
 
 
 def test_the_contrastive_loss_is_added_with_its_weight(tmp_path):
-    recipe = replace(RECIPES["ppo/pong/coberl"], backbone=COBERL, num_envs=1, compile="off")
+    recipe = replace(named("ppo/pong/coberl"), backbone=COBERL, num_envs=1, compile="off")
     n = 8
     steps = TensorDict(
         {
@@ -91,7 +90,7 @@ def test_the_contrastive_loss_is_added_with_its_weight(tmp_path):
 
 def test_a_run_with_the_contrastive_loss_logs_it(tmp_path):
     recipe = replace(
-        RECIPES["ppo/pong/coberl-tuned"],
+        named("ppo/pong/coberl-tuned"),
         backbone=COBERL,
         num_envs=1,
         total_steps=16,
@@ -111,7 +110,7 @@ def test_other_networks_have_no_contrastive_loss(network):
         replace(SMALL, backbone=network, contrastive_coeff=1.0)
 
 
-PONG = RECIPES["ppo/pong/nature-cnn"]
+PONG = named("ppo/pong/nature-cnn")
 
 
 @pytest.mark.parametrize(

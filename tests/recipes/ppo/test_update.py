@@ -3,9 +3,11 @@
 import math
 from copy import deepcopy
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDictBase
 
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO, PPOAlgorithm
@@ -25,9 +27,10 @@ RECIPE = PPO(
     # Large steps, so that ratios are clipped, and a small value loss, so that it hides no other.
     learning_rate=1e-2,
     critic_coeff=0.01,
-    entropy_coeff=0.01,
+    entropy_coeff=0.1,
     decay_learning_rate=True,
     decay_clip_epsilon=True,
+    decay_entropy_coeff=True,
     bootstrap_time_limit=False,
 )
 
@@ -38,7 +41,7 @@ def batches(monkeypatch):
 
     These are single steps, with their histories.
     """
-    recorded = []
+    recorded: list[tuple[Any, list[TensorDictBase]]] = []
     original = PPOAlgorithm.minibatches
 
     def recording(algorithm, *args):
@@ -69,7 +72,7 @@ def log_prob_and_entropy(model, features, action):
     return log_prob.sum(-1), entropy.sum(-1).expand(len(features))
 
 
-def loss_by_hand(model, minibatch, recipe, clip):
+def loss_by_hand(model, minibatch, recipe, remaining):
     features = model.backbone.module(minibatch["history"])
     log_prob, entropy = log_prob_and_entropy(model, features, minibatch["action"])
     advantage = minibatch["advantage"].squeeze(-1)
@@ -77,13 +80,14 @@ def loss_by_hand(model, minibatch, recipe, clip):
     mean = advantage.sum() / n
     std = (((advantage - mean) ** 2).sum() / (n - 1)).sqrt()
     advantage = (advantage - mean) / (std + 1e-8)
+    clip = recipe.clip_epsilon * remaining
     ratio = (log_prob - minibatch["action_log_prob"]).exp()
     surrogate = torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage)
     error = model.critic.module(features) - minibatch["value_target"]
     return (
         -surrogate.mean()
         + recipe.critic_coeff * (error**2).mean()
-        - recipe.entropy_coeff * entropy.mean()
+        - recipe.entropy_coeff * remaining * entropy.mean()
     )
 
 
@@ -98,7 +102,7 @@ def updates_by_hand(recipe, batches):
             torch.testing.assert_close(weight, recorded, atol=5e-5, rtol=0)
         remaining = 1 - number / len(batches)
         for minibatch in minibatches:
-            loss = loss_by_hand(model, minibatch, recipe, 0.2 * remaining)
+            loss = loss_by_hand(model, minibatch, recipe, remaining)
             gradients = torch.autograd.grad(loss, weights)
             norm = torch.cat([g.flatten() for g in gradients]).norm()
             t += 1
