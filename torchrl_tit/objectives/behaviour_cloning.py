@@ -54,15 +54,15 @@ class LikelihoodBCLoss(BCLoss):
         *,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
+        name = type(actor_network).__name__
         if not hasattr(actor_network, "get_dist"):
-            raise ValueError(
-                f"actor_network must be a policy with get_dist, not {_name_of(actor_network)}"
-            )
+            given = name if isinstance(actor_network, nn.Module) else repr(actor_network)
+            raise ValueError(f"actor_network must be a policy with get_dist, not {given}")
         if _is_deterministic(actor_network):
             raise ValueError(
                 "actor_network must be a stochastic policy, such as a ProbabilisticActor, not the "
-                f"deterministic {_name_of(actor_network)}, whose actions have no density: train it "
-                "with TorchRL's BCLoss"
+                f"deterministic {name}, whose actions have no density: train it with TorchRL's "
+                "BCLoss"
             )
         super().__init__(actor_network, reduction=reduction)
 
@@ -76,10 +76,12 @@ class LikelihoodBCLoss(BCLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Computes the loss of a batch [*B], which is left unchanged."""
         action, pad_mask = tensordict[self.tensor_keys.action], self.tensor_keys.pad_mask
-        mask = None if pad_mask is None else ~tensordict[pad_mask]
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             dist = self.actor_network.get_dist(tensordict.copy())
-        loss = self._reduce_loss(-dist.log_prob(action), tensordict=tensordict, mask=mask)
+        loss = -dist.log_prob(action)
+        loss = loss if pad_mask is None else loss[~tensordict[pad_mask]]
+        if self.reduction != "none":
+            loss = loss.sum() if self.reduction == "sum" else loss.mean()
         return TensorDict({"loss_bc": loss})
 
 
@@ -87,7 +89,3 @@ def _is_deterministic(policy: nn.Module) -> bool:
     """Whether a policy gives one action a probability of 1, so that all others have none."""
     kinds = [getattr(module, "distribution_class", None) for module in policy.modules()]
     return isinstance(policy, Actor) or Delta in kinds or TanhDelta in kinds
-
-
-def _name_of(value: object) -> str:
-    return type(value).__name__ if isinstance(value, nn.Module) else repr(value)

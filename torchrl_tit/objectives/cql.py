@@ -1,4 +1,4 @@
-"""Conservative Q-learning with continuous actions, as the paper's agents were trained."""
+"""Conservative Q-learning: with continuous actions as the paper trained it, and with discrete."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from torch import Tensor
 from torchrl.data import Bounded
 from torchrl.modules import set_recurrent_mode
 from torchrl.modules.distributions.utils import rsample_and_log_prob
-from torchrl.objectives import CQLLoss, distance_loss
+from torchrl.objectives import CQLLoss, DiscreteCQLLoss, distance_loss
 
 from torchrl_tit.modules.action_specs import check_bounds
 from torchrl_tit.modules.many_actions import ManyActions
-from torchrl_tit.objectives.cql_terms import CriticBatch, PolicySamples
-from torchrl_tit.objectives.pairs import encode_pairs, get_dist
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Count, Positive, Real, Weight
 
 OverCritics = Literal["mean", "sum"]
 Reduction = Literal["none", "mean", "sum"]
 Distance = Literal["l1", "l2", "smooth_l1"]
+
+_SAMPLES = "policy_samples"
 
 
 class ContinuousCQLLoss(CQLLoss):
@@ -49,12 +49,11 @@ class ContinuousCQLLoss(CQLLoss):
 
     A batch is single transitions [B], or slices [N, T] of consecutive ones with "is_init", as
     :class:`~torchrl_tit.datasets.HistoryStorage` makes them: the loss is the same mean over
-    transitions, and backbones encode each frame of a slice once. In either case, the actor encodes
-    the frames that s and s' share once, see :func:`~torchrl_tit.objectives.encode_pairs`.
+    transitions, and backbones encode each frame of a slice once.
 
-    Optimize the terms one after the other, in this order, on the samples of one pass:
-    :meth:`alpha_loss`, :meth:`critic_losses`, :meth:`actor_loss`. Each then sees the weights that
-    the previous optimizers have updated. ``forward`` computes all terms at once.
+    ``forward`` computes all terms with the present weights. Its terms are also methods, to step the
+    networks one after the other: d3rlpy steps the actor on critics that it has just updated. To
+    share one pass of the actor among them, give each the batch that :meth:`sample_policy` returns.
 
     Args:
         actor_network: policy whose distribution has a ``deterministic_sample``, such as that of
@@ -73,8 +72,6 @@ class ContinuousCQLLoss(CQLLoss):
         loss_function: distance to the target; "l2" is the square.
         reduction: how to reduce the losses of a batch; "none" leaves one of each state. None is
             "mean".
-        deactivate_vmap: whether to run the critics one after the other, for networks that vmap
-            does not support.
 
     Raises:
         ValueError: if the actions have no finite bounds, or a setting is invalid.
@@ -120,7 +117,6 @@ class ContinuousCQLLoss(CQLLoss):
         target_entropy: Real | Literal["auto"] = "auto",
         loss_function: Distance = "l2",
         reduction: Reduction | None = "mean",
-        deactivate_vmap: bool = False,
     ) -> None:
         if not isinstance(action_spec, Bounded) or action_spec.ndim != 1:
             raise ValueError(
@@ -140,10 +136,9 @@ class ContinuousCQLLoss(CQLLoss):
             target_entropy=target_entropy,
             min_q_weight=min_q_weight,
             num_random=num_random,
-            deactivate_vmap=deactivate_vmap,
         )
         self.reduction = reduction or "mean"
-        self._action_key = action_key
+        self.action_key = action_key
         self.over_critics = over_critics
         self.register_buffer("_low", action_spec.space.low.clone())
         self.register_buffer("_high", action_spec.space.high.clone())
@@ -176,222 +171,232 @@ class ContinuousCQLLoss(CQLLoss):
         batch_dims = tensordict.get(self.tensor_keys.action).ndim - 1
         if tensordict.ndim > batch_dims:  # dispatch takes all that the entries have in common
             tensordict.auto_batch_size_(batch_dims)
-        samples = self.sample_policy(tensordict)
-        loss_qvalue, loss_cql, td_error = self._critic_terms(tensordict, samples)
-        tensordict.set(self.tensor_keys.priority, td_error.amax(0))
+        batch = self.sample_policy(tensordict)
+        critics = self.critic_loss(batch)
+        tensordict.set(self.tensor_keys.priority, critics["td_error"].amax(0))
         return TensorDict(
             {
-                "loss_actor": self.actor_loss(tensordict, samples)[0],
-                "loss_qvalue": loss_qvalue,
-                "loss_cql": loss_cql,
-                "loss_alpha": self.alpha_loss(samples, tensordict),
-                "alpha": self._alpha,
-                "entropy": -samples.log_prob.detach().mean(),
+                "loss_actor": self.actor_loss(batch)[0],
+                "loss_qvalue": critics["loss_qvalue"],
+                "loss_cql": critics["loss_cql"],
+                "loss_alpha": self.alpha_loss(batch)[0],
+                "alpha": self.log_alpha.detach().exp(),
+                "entropy": -batch[_SAMPLES, "log_prob"].detach().mean(),
             }
         )
 
-    def sample_policy(self, tensordict: TensorDictBase) -> PolicySamples:
-        """Runs the actor once at s and once at s', and samples what the terms need.
-
-        Frames that s and s' share are encoded once (:func:`~torchrl_tit.objectives.encode_pairs`).
+    def sample_policy(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Runs the actor once at s and once at s', and draws the actions of all terms.
 
         Args:
             tensordict: a batch [*B].
+
+        Returns:
+            The batch with "policy_samples": "action", float [*B, A], and its "log_prob", float
+            [*B], drawn at s and differentiable; and, detached, "actions", float [*B, 2m, A], m at
+            s and then m at s', their "log_probs", float [*B, 2m], and "next_action", float [*B, A],
+            the deterministic one at s'.
         """
         network = self.actor_network
         with (
             self.actor_network_params.to_module(network, preserve_module_state=False),
             set_recurrent_mode(True),
         ):
-            here, there = encode_pairs(network, tensordict)
-            dist = get_dist(network, here)
+            dist = network.get_dist(tensordict.select(*network.in_keys, strict=False))
             with torch.no_grad():
-                next_dist = get_dist(network, there)
+                following = tensordict["next"].select(*network.in_keys, strict=False)
+                next_dist = network.get_dist(following)
         action, log_prob = rsample_and_log_prob(dist)
         with torch.no_grad():
             shape = torch.Size([self.num_random])
             drawn = [rsample_and_log_prob(d, shape) for d in (dist, next_dist)]
-            actions = torch.cat([a for a, _ in drawn]).movedim(0, -2)  # [*B, 2m, A]
-            log_probs = torch.cat([p for _, p in drawn]).movedim(0, -1)  # [*B, 2m]
-            next_action = next_dist.deterministic_sample
-        return PolicySamples(action, log_prob, actions, log_probs, next_action)
+            samples = {
+                "action": action,
+                "log_prob": log_prob,
+                "actions": torch.cat([a for a, _ in drawn]).movedim(0, -2),
+                "log_probs": torch.cat([p for _, p in drawn]).movedim(0, -1),
+                "next_action": next_dist.deterministic_sample,
+            }
+        return tensordict.copy().set(_SAMPLES, TensorDict(samples, tensordict.batch_size))
 
-    def alpha_loss(
-        self, samples: PolicySamples, tensordict: TensorDictBase | None = None
-    ) -> Tensor:
-        """The temperature's loss, float [].
+    def alpha_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The temperature's loss of a batch [*B], float []; nothing else gets a gradient."""
+        samples = self._samples(tensordict)
+        excess = samples["log_prob"].detach() + self.target_entropy
+        return self._reduced(-self.log_alpha.exp() * excess), {}
 
-        Args:
-            samples: from :meth:`sample_policy`.
-            tensordict: the batch, which can have a mask (see TorchRL's `loss_mask_key`).
-        """
-        excess = samples.log_prob.detach() + self.target_entropy
-        return self._reduce_loss(-self.log_alpha.exp() * excess, tensordict=tensordict)
-
-    def critic_losses(
-        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """The critics' squared error and weighted conservative term, float [] each.
-
-        Args:
-            tensordict: a batch [*B].
-            samples: from :meth:`sample_policy`; sampled here if not given.
-        """
-        loss_qvalue, loss_cql, _ = self._critic_terms(tensordict, samples)
-        return loss_qvalue, loss_cql
-
-    def critic_gradients(
-        self, tensordict: TensorDictBase, samples: PolicySamples, chunk_size: int
-    ) -> tuple[Tensor, Tensor]:
-        """Adds the gradients of the sum of :meth:`critic_losses` to the critics' weights.
-
-        Runs forward and backward on ``chunk_size`` states at a time. On a CPU this takes about a
-        fifth less time than the whole batch at once, because the backward pass finds the
-        activations of the forward pass still in the cache.
-
-        Args:
-            tensordict: a batch [*B].
-            samples: from :meth:`sample_policy`.
-            chunk_size: number of states at a time, each with its 3m + 1 actions; whole slices of
-                states if the batch is [N, T].
+    def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The critics' terms of a batch [*B]; the actor gets no gradient.
 
         Returns:
-            The values of :meth:`critic_losses`, detached; without a reduction, their sums.
+            "loss_qvalue" and "loss_cql" (weighted), float [], and "td_error", the squared error of
+            each critic in each state, float [critics, *B].
         """
-        batch = self._critic_batch(tensordict, samples)
-        each = self._reduce_loss(torch.ones_like(batch.target), tensordict, reduction="sum")
-        divisor = each.clamp_min(1) if self.reduction == "mean" else 1
-        losses = []
-        for critic in self._critics():
-            with (
-                critic.to_module(self.qvalue_network, preserve_module_state=False),
-                set_recurrent_mode(True),
-            ):
-                for chunk in batch.split(chunk_size):
-                    outputs = self.qvalue_network(chunk.inputs.copy())
-                    values = outputs.get(self.tensor_keys.state_action_value).squeeze(-1)
-                    loss_qvalue, loss_cql = (
-                        self._reduce_loss(loss, chunk.inputs, reduction="sum") / divisor
-                        for loss in self._losses(values, chunk)
-                    )
-                    (loss_qvalue + loss_cql).backward()
-                    losses.append(torch.stack([loss_qvalue, loss_cql]).detach())
-        loss_qvalue, loss_cql = torch.stack(losses).sum(dim=0).unbind()
-        return loss_qvalue, loss_cql
-
-    def q_loss(
-        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
-    ) -> tuple[Tensor, dict[str, Any]]:
-        """The critics' squared error alone; call :meth:`critic_losses` if you need both.
-
-        Returns:
-            The loss, and "td_error", the squared error of each critic in each state, float
-            [critics, *B].
-        """
-        loss_qvalue, _, td_error = self._critic_terms(tensordict, samples)
-        return loss_qvalue, {"td_error": td_error}
-
-    def cql_loss(
-        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
-    ) -> tuple[Tensor, dict[str, Any]]:
-        """The weighted conservative term alone; call :meth:`critic_losses` if you need both."""
-        return self.critic_losses(tensordict, samples)[1], {}
-
-    def actor_loss(
-        self, tensordict: TensorDictBase, samples: PolicySamples | None = None
-    ) -> tuple[Tensor, dict[str, Any]]:
-        """The actor's loss, float []; the critics get no gradient.
-
-        Args:
-            tensordict: a batch [*B].
-            samples: from :meth:`sample_policy`; sampled here if not given.
-
-        Returns:
-            The loss, and the actions' log-probability, float [*B], under
-            ``tensor_keys.log_prob``.
-        """
-        samples = samples or self.sample_policy(tensordict)
-        inputs = self._inputs(tensordict, samples.action.unsqueeze(-2))
-        values = self._values(inputs, self.qvalue_network_params.detach())  # [critics, *B, 1]
-        value = values.squeeze(-1).amin(0)  # [*B]
-        alpha = self.log_alpha.detach().exp()
-        loss = self._reduce_loss(alpha * samples.log_prob - value, tensordict)
-        return loss, {self.tensor_keys.log_prob: samples.log_prob.detach()}
-
-    def _critic_terms(
-        self, tensordict: TensorDictBase, samples: PolicySamples | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The losses of :meth:`critic_losses`, and the squared errors, float [critics, *B]."""
-        batch = self._critic_batch(tensordict, samples or self.sample_policy(tensordict))
-        with set_recurrent_mode(True):
-            values = self._values(batch.inputs, self.qvalue_network_params)
-        errors, gaps = self._losses(values, batch)
-        td_error = (values[..., -1].detach() - batch.target).square()
-        return self._reduce_loss(errors, tensordict), self._reduce_loss(gaps, tensordict), td_error
-
-    def _critic_batch(self, tensordict: TensorDictBase, samples: PolicySamples) -> CriticBatch:
-        """Adds uniform samples to those of the policy, and computes the target."""
-        action = tensordict.get(self.tensor_keys.action)
+        samples, action = self._samples(tensordict), tensordict.get(self.tensor_keys.action)
         *states, size = action.shape
         width = self._high - self._low
         uniform = self._low + width * torch.rand(
             *states, self.num_random, size, dtype=action.dtype, device=action.device
         )
         log_uniform = -width.log().sum().expand(*states, self.num_random)
-        actions = torch.cat([uniform, samples.actions, action.unsqueeze(-2)], dim=-2)
-        return CriticBatch(
-            inputs=self._inputs(tensordict, actions),
-            log_density=torch.cat([log_uniform, samples.log_probs], dim=-1),
-            target=self._target(tensordict, samples.next_action),
-        )
+        log_density = torch.cat([log_uniform, samples["log_probs"]], dim=-1)  # [*B, 3m]
+        actions = torch.cat([uniform, samples["actions"], action.unsqueeze(-2)], dim=-2)
+        values = self._values(tensordict, actions, self.qvalue_network_params)
+        value = values[..., -1]  # of the action taken, [critics, *B]
+        target = self._target(tensordict, samples["next_action"]).expand_as(value)
+        errors = distance_loss(value, target, self.loss_function).sum(0)
+        gaps = torch.logsumexp(values[..., :-1] - log_density, dim=-1) - value
+        gaps = gaps.mean(0) if self.over_critics == "mean" else gaps.sum(0)
+        terms = {
+            "loss_qvalue": self._reduced(errors),
+            "loss_cql": self._reduced(self.min_q_weight * gaps),
+            "td_error": (value.detach() - target).square(),
+        }
+        return TensorDict(terms)
+
+    def q_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Any]]:
+        """The squared error and "td_error" of :meth:`critic_loss`, which computes both terms."""
+        terms = self.critic_loss(tensordict)
+        return terms["loss_qvalue"], {"td_error": terms["td_error"]}
+
+    def cql_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Any]]:
+        """The conservative term of :meth:`critic_loss`, which computes both terms."""
+        return self.critic_loss(tensordict)["loss_cql"], {}
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Any]]:
+        """The actor's loss of a batch [*B], float []; nothing else gets a gradient.
+
+        Returns:
+            The loss, and the actions' log-probability, float [*B], under
+            ``tensor_keys.log_prob``.
+        """
+        samples = self._samples(tensordict)
+        params = self.qvalue_network_params.detach()
+        values = self._values(tensordict, samples["action"].unsqueeze(-2), params)
+        value = values.squeeze(-1).amin(0)  # [*B]
+        log_prob, alpha = samples["log_prob"], self.log_alpha.detach().exp()
+        return self._reduced(alpha * log_prob - value), {
+            self.tensor_keys.log_prob: log_prob.detach()
+        }
+
+    def _samples(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The policy's samples that a batch has, or new ones."""
+        samples = tensordict.get(_SAMPLES, None)
+        return self.sample_policy(tensordict)[_SAMPLES] if samples is None else samples
 
     def _target(self, tensordict: TensorDictBase, next_action: Tensor) -> Tensor:
         """Target of the critics, without gradient; float [*B]."""
-        with torch.no_grad(), set_recurrent_mode(True):
-            inputs = self._inputs(tensordict["next"], next_action.unsqueeze(-2))
-            values = self._values(inputs, self.target_qvalue_network_params)  # [critics, *B, 1]
-            outcome = tensordict["next"].select(
-                self.tensor_keys.reward, self.tensor_keys.terminated, self.tensor_keys.done
-            )
+        following, keys = tensordict["next"], self.tensor_keys
+        with torch.no_grad():
+            params = self.target_qvalue_network_params
+            values = self._values(following, next_action.unsqueeze(-2), params)
+            outcome = following.select(keys.reward, keys.terminated, keys.done)
             outcome.set(self.value_estimator.tensor_keys.value, values.amin(0))
             batch = TensorDict({"next": outcome}, tensordict.batch_size)
             return self.value_estimator.value_estimate(batch).squeeze(-1)
 
-    def _inputs(self, tensordict: TensorDictBase, actions: Tensor) -> TensorDictBase:
-        """The critics' inputs: each state, with m actions, [*B, m, A], and its mask, if any."""
-        keys = {*self.qvalue_network.in_keys, *self._loss_mask_keys()} - {self._action_key}
-        return tensordict.select(*keys, strict=False).set(self._action_key, actions)
+    def _values(
+        self, tensordict: TensorDictBase, actions: Tensor, params: TensorDictBase
+    ) -> Tensor:
+        """Values of m actions in each state, [*B, m, A], by all critics; [critics, *B, m]."""
+        network, keys, values = self.qvalue_network, self.tensor_keys, []
+        states = tensordict.select(*set(network.in_keys) - {self.action_key}, strict=False)
+        # vmap would run both critics at once, but a CPU is faster with two matrix products than
+        # with one batched product, and a slice's number of frames depends on the data.
+        for critic in params.unbind(0):
+            with critic.to_module(network, preserve_module_state=False), set_recurrent_mode(True):
+                outputs = network(states.copy().set(self.action_key, actions))
+            values.append(outputs.get(keys.state_action_value).squeeze(-1))
+        return torch.stack(values)
 
-    def _values(self, inputs: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """Values of m actions in each state by all critics; [critics, *B, m]."""
-        outputs = self._vmap_qvalue_networkN0(inputs, params)
-        return outputs.get(self.tensor_keys.state_action_value).squeeze(-1)
+    def _reduced(self, losses: Tensor) -> Tensor:
+        """Reduces the losses of states, float [*B]."""
+        return losses if self.reduction == "none" else getattr(losses, self.reduction)()
 
-    def _losses(self, values: Tensor, batch: CriticBatch) -> tuple[Tensor, Tensor]:
-        """The two losses of some states of a batch, for one critic or all of them; float [*b] each.
 
-        Args:
-            values: the actions' values, float [*b, 3m + 1] or [critics, *b, 3m + 1].
-            batch: these states, [*b].
-        """
-        value = values[..., -1]  # of the action taken; [*b] or [critics, *b]
-        errors = distance_loss(value, batch.target.expand_as(value), self.loss_function)
-        soft_maximum = torch.logsumexp(values[..., :-1] - batch.log_density, dim=-1)
-        shape = batch.target.shape
-        errors, gaps = (x.reshape(-1, *shape).sum(0) for x in (errors, soft_maximum - value))
-        if self.over_critics == "mean":
-            gaps = gaps / self.num_qvalue_nets
-        return errors, self.min_q_weight * gaps
+class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
+    """Replaces TorchRL's `DiscreteCQLLoss`, which ignores its target network.
 
-    def _critics(self) -> list[TensorDictBase]:
-        """The weights of each critic, as leaves whose gradients are views of the stacked ones."""
-        params = self.qvalue_network_params
-        critics = params.data.unbind(0)
-        for key, stacked in params.items(True, True):
-            if not stacked.requires_grad:
-                continue
-            if stacked.grad is None:
-                stacked.grad = torch.zeros_like(stacked)
-            for critic, gradient in zip(critics, stacked.grad.unbind(0), strict=True):
-                critic.get(key).requires_grad_().grad = gradient
-        return list(critics)
+    Kumar et al., "Conservative Q-Learning for Offline Reinforcement Learning", arXiv 2006.04779,
+    equation 4 (CQL(H)) over the values of all actions::
+
+        loss_qvalue  mean over s of (Q(s, a) - r - gamma max_b Q'(s', b))^2 / 2
+        loss_cql     mean over s of [logsumexp_b Q(s, b) - Q(s, a)]
+
+    `DiscreteCQLLoss` of TorchRL 0.14.1 has target parameters Q', but passes them to its value
+    estimator as ``params``, which the estimator ignores, so its target is computed with Q. In
+    addition to what `DiscreteCQLLoss` writes into the batch, this loss writes the value at s'.
+
+    A batch is single transitions [B], or slices [N, T] of consecutive ones with "is_init", where a
+    backbone encodes each frame once. In single transitions, s and s' share no work, because they
+    are evaluated with different weights.
+
+    Args:
+        value_network: writes "action_value", float [..., n], and "chosen_action_value", float
+            [..., 1].
+        loss_function: distance to the target; "l2" is the square.
+        reduction: how to reduce the losses of a batch; None is "mean".
+        **settings: passed to `DiscreteCQLLoss`: ``action_space``.
+
+    Raises:
+        ValueError: if a setting is invalid.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torch import nn
+        >>> from torchrl.modules import QValueActor
+        >>> actor = QValueActor(nn.Linear(4, 2), action_space="categorical")
+        >>> loss = DelayedDiscreteCQLLoss(actor, action_space="categorical")
+        >>> loss.make_value_estimator(gamma=0.99)
+        >>> batch = TensorDict(
+        ...     {
+        ...         "observation": torch.randn(8, 4),
+        ...         "action": torch.randint(2, (8,)),
+        ...         "next": {
+        ...             "observation": torch.randn(8, 4),
+        ...             "reward": torch.ones(8, 1),
+        ...             "terminated": torch.zeros(8, 1, dtype=torch.bool),
+        ...             "done": torch.zeros(8, 1, dtype=torch.bool),
+        ...         },
+        ...     },
+        ...     [8],
+        ... )
+        >>> losses = loss(batch)
+        >>> (losses["loss_qvalue"] + losses["loss_cql"]).backward()
+    """
+
+    out_keys = ("loss_qvalue", "loss_cql")
+
+    @checked_arguments
+    def __init__(
+        self,
+        value_network: Any,
+        *,
+        loss_function: Literal["l1", "l2", "smooth_l1"] = "l2",
+        reduction: Literal["none", "mean", "sum"] | None = "mean",
+        **settings: Any,
+    ) -> None:
+        super().__init__(
+            value_network,
+            delay_value=True,
+            loss_function=loss_function,
+            reduction=reduction,
+            **settings,
+        )
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
+        """Chooses how targets are computed; see TorchRL's `LossModule.make_value_estimator`."""
+        super().make_value_estimator(value_type, **hyperparams)
+        self.value_estimator.value_network = None  # it would use the trained weights
+
+    def value_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The squared error of a batch [*B], float [], and mean values to log."""
+        next_state = tensordict["next"].select(*self.value_network.in_keys, strict=False)
+        params = self.target_value_network_params
+        with (
+            torch.no_grad(),
+            params.to_module(self.value_network, preserve_module_state=False),
+        ):
+            value = self.value_network(next_state).get(self.tensor_keys.value)
+        tensordict.set(("next", self.tensor_keys.value), value)
+        return super().value_loss(tensordict)

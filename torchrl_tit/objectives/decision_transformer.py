@@ -21,12 +21,12 @@ class MaskedDTLoss(DTLoss):
     entries of all unmasked actions.
 
     Args:
-        actor_network: Reads a batch and replaces "action" with the predicted action of every step:
+        actor_network: reads a batch and replaces "action" with the predicted action of every step:
             see :func:`~torchrl_tit.modules.make_dt_predictor`.
         loss_function: "l2", "l1" or "smooth_l1" between continuous actions [..., K, A], or
             "cross_entropy" between logits and discrete ones, integers [..., K] or one-hot.
-        mask_key: Key of the mask, bool [..., K], False at padding.
-        reduction: How to reduce the losses of the steps; None, as in TorchRL, is "mean".
+        mask_key: key of the mask, bool [..., K], False at padding.
+        reduction: how to reduce the losses of the steps; None, as in TorchRL, is "mean".
 
     Returns:
         In ``forward``, a tensordict with "loss", float [].
@@ -99,8 +99,9 @@ class MaskedDTLoss(DTLoss):
             logits = self.actor_network(tensordict).get(self.tensor_keys.action_pred)
         if target.ndim == logits.ndim:  # one-hot
             target = target.to(torch.int8).argmax(-1)
-        # Padding is negative, which is not a valid class; its replacement is masked below.
-        classes = target.long().clamp(min=0)
-        loss = F.cross_entropy(logits.flatten(0, -2), classes.flatten(), reduction="none")
-        loss = self._reduce_loss(loss.view_as(classes), tensordict=tensordict)
-        return TensorDict({"loss": loss})
+        ignored = ~tensordict[self.loss_mask_key]
+        classes = target.long().masked_fill(ignored, -1).flatten()
+        loss = F.cross_entropy(
+            logits.flatten(0, -2), classes, ignore_index=-1, reduction=self.reduction
+        )
+        return TensorDict({"loss": loss if loss.ndim == 0 else loss.view(target.shape)})
