@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
@@ -199,6 +200,35 @@ def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
         if not weight.isfinite().all() and expected.isfinite().all():
             raise ValueError(f"{name} has entries that are not finite")
     networks.load_state_dict(dict(weights))
+
+
+def total_loss(terms: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
+    """Adds up the terms of a loss, those whose names begin with "loss_"; float []."""
+    return torch.stack([term for name, term in terms.items() if name.startswith("loss_")]).sum()
+
+
+def descend(
+    terms: TensorDictBase | Mapping[str, Tensor], optimizer: torch.optim.Optimizer
+) -> Tensor:
+    """Takes a gradient step on the sum of the terms whose names begin with "loss_".
+
+    Args:
+        terms: the terms of a loss, float [] each, and other numbers.
+        optimizer: of all weights; it leaves those alone on which the sum does not depend.
+
+    Returns:
+        The sum, detached.
+    """
+    total = total_loss(terms)
+    optimizer.zero_grad()
+    total.backward()
+    optimizer.step()
+    return total.detach()
+
+
+def numbers(columns: Sequence[str], terms: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
+    """Selects the numbers that an update returns from the terms of its losses; float [columns]."""
+    return torch.stack([terms[name].detach() for name in columns])
 
 
 def check_finite(names: Sequence[str], values: Tensor) -> None:

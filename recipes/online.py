@@ -77,13 +77,6 @@ class OnlineRecipe(Recipe):
         interval = self.evaluation_interval
         return interval is not None and step // interval > before // interval
 
-    def check_divides(self, field: str, name: str, value: int) -> None:
-        """Raises ValueError if a field does not divide a value."""
-        if value % getattr(self, field):
-            raise ValueError(
-                f"{field} {getattr(self, field)} does not divide {name} {value}: change one of them"
-            )
-
 
 RecipeT = TypeVar("RecipeT", bound=OnlineRecipe)
 

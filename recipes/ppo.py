@@ -57,8 +57,8 @@ from .compilation import (
     should_compile,
 )
 from .flat_parameters import FlatParameters
+from .networks import normalize_frames
 from .online import OnlineAlgorithm, OnlineRecipe
-from .policies import normalize_frames
 from .recipe import Compile, Precision
 from .task import make_task
 

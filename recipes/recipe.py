@@ -143,6 +143,21 @@ class Recipe:
         """
         return False
 
+    def check_divides(self, field: str, name: str, value: int) -> None:
+        """Raises ValueError if a field does not divide a value."""
+        if value % getattr(self, field):
+            raise ValueError(
+                f"{field} {getattr(self, field)} does not divide {name} {value}: change one of them"
+            )
+
+    def check_stateless(self) -> None:
+        """Raises ValueError if the network carries a state from step to step."""
+        if self.backbone.carries_state:
+            raise ValueError(
+                f"{self.algorithm} draws single transitions, so its network cannot carry a state: "
+                "set backbone.num_frames to 2 or more, or use a ppo recipe"
+            )
+
 
 _OF_THE_MACHINE = ("device", "threads", "compile", "checkpoint_interval")
 
@@ -179,7 +194,7 @@ _MODULES = {
     "dqn": "dqn",
     "dt": "decision_transformer",
     "iql": "iql",
-    "odt": "decision_transformer",
+    "odt": "online_decision_transformer",
     "ppo": "ppo",
     "sac": "sac",
     "td3bc": "td3bc",

@@ -16,7 +16,7 @@ from torchrl_tit.agents.folder import RECIPE, AgentFiles, read_evaluation
 from torchrl_tit.checkpoint import latest_step
 
 from ..algorithm import Algorithm, load_weights, make_algorithm
-from ..decision_transformer.settings import SequenceRecipe
+from ..decision_transformer import SequenceRecipe
 from ..recipe import Recipe
 from ..recipe_json import recipe_from_json, recipe_to_json
 from ..run import Run

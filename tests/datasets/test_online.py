@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torchrl.data import ReplayBuffer, SliceSampler
 
-from recipes.stateful import BufferState
+from recipes.replay import BufferState
 from tests.datasets.rollouts import Transitions
 from tests.datasets.several import MOST_FRAMES, newest, play_several
 from torchrl_tit.checkpoint import checkpoint_steps

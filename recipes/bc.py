@@ -1,0 +1,72 @@
+"""Behaviour cloning: settings, then the algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from torchrl_tit.objectives import LikelihoodBCLoss
+from torchrl_tit.settings.numbers import Rate, Steps
+
+from .algorithm import descend
+from .networks import make_cloning_policy
+from .offline import TransitionAlgorithm, TransitionRecipe
+
+
+@dataclass(frozen=True, kw_only=True)
+class BC(TransitionRecipe, algorithm="bc"):
+    """Behaviour cloning: maximizes the likelihood of a data set's actions, of any kind."""
+
+    learning_rate: Rate = 3e-4
+    """Learning rate of Adam."""
+    time_limits: Literal["keep", "drop"] = "keep"
+    """Whether to keep the last transition of an episode that a time limit truncated."""
+    unfinished: Literal["keep", "drop"] = "keep"
+    """Whether to keep the last episode if the data stop before it ends."""
+    evaluation_interval: Steps = 5000
+    """Gradient steps between evaluations."""
+
+    def build(self) -> BCAlgorithm:
+        """Builds the algorithm."""
+        return BCAlgorithm(self)
+
+
+class BCAlgorithm(TransitionAlgorithm[BC]):
+    """A policy on a backbone, with a head for the task's actions.
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if there is no head for the task's actions.
+    """
+
+    clips_actions = True
+    columns = ("loss_bc",)
+
+    def networks(self, env: EnvBase) -> nn.Module:
+        """Builds the loss with the policy."""
+        policy = make_cloning_policy(self.make_backbone(env), self.action_spec)
+        self._policy = policy.to(self.device)
+        return LikelihoodBCLoss(self._policy)
+
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds optimizer and replay buffer."""
+        self.optimizer = self.make_adam({"": self.recipe.learning_rate})
+        self.buffer = self.make_buffer()
+
+    def loss(self, samples: TensorDictBase) -> TensorDictBase:
+        """Returns the terms of the loss; see :meth:`TransitionAlgorithm.loss`."""
+        return self.model(samples)
+
+    def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
+        """Takes a gradient step on transitions [B] or slices [N, T]."""
+        terms = self.loss(batch)
+        descend(terms, self.optimizer)
+        return self.numbers(terms)

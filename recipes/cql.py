@@ -1,0 +1,275 @@
+"""Conservative Q-learning with any network, with continuous and with discrete actions.
+
+For each of the two, settings first, then the algorithm. To change one, subclass both and override
+one of ``networks`` and ``loss``, or ``actor_loss``: docs/how-to/change-sac-dqn-cql.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, TypeVar
+
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.objectives import SoftUpdate
+
+from torchrl_tit.modules import make_squashed_actor
+from torchrl_tit.modules.action_specs import has_bounds
+from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
+from torchrl_tit.settings.numbers import Count, Fraction, Rate, Weight, Widths
+
+from .algorithm import descend
+from .compilation import check_compiler, compile_and_time, should_compile
+from .networks import describe, is_discrete, make_value_policy
+from .offline import TransitionAlgorithm, TransitionRecipe
+from .recipe import Compile
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConservativeRecipe(TransitionRecipe):
+    """Settings of conservative Q-learning with continuous and with discrete actions."""
+
+    removed: ClassVar[dict[str, Any]] = {
+        "adam_eps": 1e-8,
+        "temperature_init": 1.0,
+        "terminal_observations": "zero",
+    }
+
+    gamma: Fraction = 0.99
+    """Discount factor."""
+    tau: Fraction = 0.005
+    """Coefficient of the soft update of the target networks at each gradient step, from 0 to 1."""
+    conservative_weight: Weight = 5.0
+    """Weight of the conservative term."""
+    compile: Compile = "auto"
+    """Whether the losses run through torch.compile, which needs a C++ compiler and about a minute
+    at the start. "auto" compiles on a GPU, if the run is long enough to be worth it: on a CPU,
+    compiling does not speed up the critics' matrix products. Slices of several transitions are
+    never compiled."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.compile == "on" and self.slice_length > 1:
+            raise ValueError(
+                f"compile is on, but slices of {self.slice_length} are not compiled, because their "
+                "number of frames varies: set compile to off, or slice_length to 1"
+            )
+
+
+RecipeT = TypeVar("RecipeT", bound=ConservativeRecipe)
+Terms = TensorDictBase | dict[str, Tensor]
+
+
+class ConservativeAlgorithm(TransitionAlgorithm[RecipeT]):
+    """An algorithm whose losses may run through ``torch.compile``.
+
+    Args:
+        recipe: the settings.
+    """
+
+    terminal_observations: ClassVar[Literal["keep", "zero"]] = "zero"  # as in d3rlpy 1.1.1
+
+    def compiled(self, function: Callable[..., Any], name: str) -> Callable[..., Any]:
+        """Compiles a function of a batch if the recipe says so, which ``name`` names."""
+        setting, recipe = self.recipe.compile, self.recipe
+        pays = setting == "on" or (self.device.type == "cuda" and recipe.slice_length == 1)
+        if pays and should_compile(setting, recipe.total_updates):
+            return compile_and_time(function, name)
+        return function
+
+    def check(self) -> None:
+        """As :meth:`DatasetAlgorithm.check`; also checks that there is a compiler if requested."""
+        check_compiler(self.recipe.compile)
+        super().check()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CQL(ConservativeRecipe, algorithm="cql"):
+    """Conservative Q-learning (arXiv 2006.04779) on a data set with continuous actions.
+
+    The defaults are those of d3rlpy 1.1.1, with which arXiv 2212.14538 trained CQL_TIT.
+    """
+
+    actor_learning_rate: Rate = 1e-4
+    """Learning rate of Adam for the actor."""
+    critic_learning_rate: Rate = 3e-4
+    """Learning rate of Adam for the critics."""
+    temperature_learning_rate: Rate = 1e-4
+    """Learning rate of Adam for the temperature."""
+    action_samples: Count = 10
+    """Actions sampled in each state from each of: uniform, the policy at s, the policy at s'."""
+    over_critics: Literal["mean", "sum"] = "mean"
+    """Whether the conservative term is the mean over the two critics, as in d3rlpy 1.1.1, or their
+    sum, as in d3rlpy since 2.5."""
+    critic: Literal["mlp", "backbone"] = "mlp"
+    """Whether the critics read the newest observation, or each has a backbone with the actor's
+    settings."""
+    critic_hidden: Widths = (256, 256, 256)
+    """Widths of the critics' hidden layers."""
+
+    def build(self) -> CQLAlgorithm:
+        """Builds the algorithm."""
+        return CQLAlgorithm(self)
+
+
+class CQLAlgorithm(ConservativeAlgorithm[CQL]):
+    """Actor on a backbone, two critics and a temperature.
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if the task's actions are not continuous and bounded, or the critics cannot read
+            its observations.
+    """
+
+    # The losses are in the order of the steps: the first that is not finite is the cause.
+    columns = ("loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy")
+    model: ContinuousCQLLoss
+
+    def networks(self, env: EnvBase) -> nn.Module:
+        """Builds the loss with policy, critics, their targets and the temperature."""
+        recipe, spec = self.recipe, self.action_spec
+        if not has_bounds(spec):
+            raise ValueError(
+                f"cql needs continuous actions within bounds, but those of {recipe.env} are "
+                f"{describe(spec)}: use a discrete-cql recipe if they are discrete"
+            )
+        backbone = self.make_backbone(env)
+        head = make_squashed_actor(backbone.features_dim, spec)
+        self._policy = ProbabilisticTensorDictSequential(backbone, *head).to(self.device)
+        loss = ContinuousCQLLoss(
+            self._policy,
+            [self.make_critic(env, spec.shape[0]) for _ in range(2)],
+            action_spec=spec,
+            min_q_weight=recipe.conservative_weight,
+            num_random=recipe.action_samples,
+            over_critics=recipe.over_critics,
+        )
+        loss.make_value_estimator(gamma=recipe.gamma)
+        return loss
+
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds optimizer, target update and replay buffer."""
+        recipe = self.recipe
+        self.optimizer = self.make_adam(
+            {
+                "log_alpha": recipe.temperature_learning_rate,
+                "qvalue_network": recipe.critic_learning_rate,
+                "": recipe.actor_learning_rate,
+            }
+        )
+        self.target = SoftUpdate(self.model, tau=recipe.tau)
+        self.buffer = self.make_buffer()
+        self._sample_policy = self.compiled(self.model.sample_policy, "the policy")
+        self._loss = self.compiled(self.loss, "the critics' loss")
+        self._actor_loss = self.compiled(self.actor_loss, "the actor's loss")
+
+    def loss(self, samples: TensorDictBase) -> Terms:
+        """Returns the terms of critics and temperature; see :meth:`TransitionAlgorithm.loss`.
+
+        Args:
+            samples: transitions [B] or slices [N, T], with the actions that the policy drew: see
+                :meth:`~torchrl_tit.objectives.ContinuousCQLLoss.sample_policy`.
+        """
+        terms = self.model.critic_loss(samples).exclude("td_error")
+        return terms.set("loss_alpha", self.model.alpha_loss(samples)[0])
+
+    def actor_loss(self, samples: TensorDictBase) -> Terms:
+        """Returns the terms of the actor, once the others have taken a step on theirs.
+
+        Whatever trains the actor's weights belongs here.
+
+        Args:
+            samples: as in :meth:`loss`.
+        """
+        log_prob = samples["policy_samples", "log_prob"].detach()
+        return {
+            "loss_actor": self.model.actor_loss(samples)[0],
+            "alpha": self.model.log_alpha.detach().exp(),
+            "entropy": -log_prob.mean(),
+        }
+
+    def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
+        """Updates temperature and critics, then the actor, then the targets.
+
+        The actor runs once for all losses. Its own loss uses the critics and the temperature after
+        their updates, as in d3rlpy.
+        """
+        samples = self._sample_policy(batch)
+        terms = self._loss(samples)
+        descend(terms, self.optimizer)
+        actor_terms = self._actor_loss(samples)
+        descend(actor_terms, self.optimizer)
+        self.target.step()
+        return self.numbers({**dict(terms.items()), **dict(actor_terms.items())})
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiscreteCQL(ConservativeRecipe, algorithm="discrete-cql"):
+    """Conservative Q-learning (arXiv 2006.04779) with a value for each action, and TorchRL's loss.
+
+    The squared error is halved, as in TorchRL. The paper ran no discrete task offline.
+    """
+
+    conservative_weight: Weight = 1.0
+    """Weight of the conservative term."""
+    learning_rate: Rate = 3e-4
+    """Learning rate of Adam."""
+
+    def build(self) -> DiscreteCQLAlgorithm:
+        """Builds the algorithm."""
+        return DiscreteCQLAlgorithm(self)
+
+
+class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
+    """A value for each action, on a backbone.
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if the task's actions are not discrete.
+    """
+
+    columns = ("loss_qvalue", "loss_cql", "value")
+
+    def networks(self, env: EnvBase) -> nn.Module:
+        """Builds the loss with the network of the values, the policy, and its target."""
+        recipe, spec = self.recipe, self.action_spec
+        if not is_discrete(spec):
+            raise ValueError(
+                f"discrete-cql needs a few discrete actions, but those of {recipe.env} are "
+                f"{describe(spec)}: use a cql recipe if they are continuous"
+            )
+        self._policy = make_value_policy(self.make_backbone(env), spec).to(self.device)
+        loss = DelayedDiscreteCQLLoss(self._policy, action_space="categorical")
+        loss.make_value_estimator(gamma=recipe.gamma)
+        return loss
+
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds optimizer, target update and replay buffer."""
+        self.optimizer = self.make_adam({"": self.recipe.learning_rate})
+        self.target = SoftUpdate(self.model, tau=self.recipe.tau)
+        self.buffer = self.make_buffer()
+        self._loss = self.compiled(self.loss, "the loss")
+
+    def loss(self, samples: TensorDictBase) -> Terms:
+        """Returns the terms of the loss; see :meth:`TransitionAlgorithm.loss`."""
+        terms = self.model(samples)
+        return {
+            "loss_qvalue": terms["loss_qvalue"],
+            "loss_cql": self.recipe.conservative_weight * terms["loss_cql"],
+            "value": terms["pred_value"],
+        }
+
+    def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
+        """Updates the values, then the target network, on transitions [B] or slices [N, T]."""
+        terms = self._loss(batch)
+        descend(terms, self.optimizer)
+        self.target.step()
+        return self.numbers(terms)

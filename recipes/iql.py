@@ -1,0 +1,144 @@
+"""Implicit Q-learning: settings, then the algorithm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+from torchrl.objectives import DiscreteIQLLoss, IQLLoss, SoftUpdate
+
+from torchrl_tit.datasets import DatasetError, Episodes
+from torchrl_tit.settings.numbers import Inside, Rate, Weight
+
+from .algorithm import descend
+from .networks import describe, is_continuous, is_discrete, make_cloning_policy
+from .offline import ActorCriticRecipe, TransitionAlgorithm
+
+_RETURN_RANGE = 1000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class IQL(ActorCriticRecipe, algorithm="iql"):
+    """Implicit Q-learning (arXiv 2110.06169), with continuous or discrete actions.
+
+    The defaults are those of the paper for MuJoCo.
+    """
+
+    learning_rate: Rate = 3e-4
+    """Learning rate of Adam for all networks."""
+    decay_learning_rate: bool = True
+    """Whether the actor's learning rate decays to 0 on a cosine schedule."""
+    expectile: Inside = 0.7
+    """Expectile of Q(s, a) over the data's actions that V(s) estimates; 0.5 is the mean."""
+    temperature: Weight = 3.0
+    """Inverse temperature of the weights exp(temperature * advantage) of the actor's loss."""
+    normalize_rewards: bool = False
+    """Whether rewards are divided by the range of the episodes' returns and multiplied by 1000, as
+    in the paper for MuJoCo."""
+
+    def build(self) -> IQLAlgorithm:
+        """Builds the algorithm."""
+        return IQLAlgorithm(self)
+
+    @property
+    def schedules(self) -> tuple[str, ...]:
+        """The actor's learning rate, if it decays to 0."""
+        return ("decay_learning_rate",) if self.decay_learning_rate else ()
+
+
+class IQLAlgorithm(TransitionAlgorithm[IQL]):
+    """TorchRL's IQL losses, with an actor on a backbone, two critics and a state value.
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if the task's actions are neither arrays of floats nor a few discrete ones, or
+            the value networks cannot read its observations.
+    """
+
+    clips_actions = True
+    columns = ("loss_value", "loss_qvalue", "loss_actor", "nll")
+
+    def networks(self, env: EnvBase) -> nn.Module:
+        """Builds the loss with policy, critics, their targets and the state value."""
+        recipe, spec = self.recipe, self.action_spec
+        if not (is_continuous(spec) or is_discrete(spec)):
+            raise ValueError(
+                f"iql needs arrays of continuous actions or a few discrete ones, but those of "
+                f"{recipe.env} are {describe(spec)}: use a bc recipe"
+            )
+        # TorchRL's loss hides keys from the critics that the actor does not declare: "observation".
+        backbone = self.make_backbone(env, slices=True)
+        self._policy = make_cloning_policy(backbone, spec).to(self.device)
+        # A critic values one action, or each discrete one.
+        discrete = is_discrete(spec)
+        size, values = (0, spec.space.n) if discrete else (spec.shape[0], 1)
+        critics = [self.make_critic(env, size, values=values) for _ in range(2)]
+        value = self.make_critic(env, 0, out_key="state_value")
+        settings: dict[str, Any] = {
+            "loss_function": "l2",
+            "temperature": recipe.temperature,
+            "expectile": recipe.expectile,
+        }
+        if discrete:
+            settings["action_space"] = "categorical"
+        else:  # two matrix products are faster than a batched one on a CPU
+            settings["deactivate_vmap"] = self.device.type == "cpu"
+        make_loss = DiscreteIQLLoss if discrete else IQLLoss
+        loss = make_loss(self._policy, critics, value, **settings)
+        loss.make_value_estimator(gamma=recipe.gamma)
+        return loss
+
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds optimizer, target update and replay buffer."""
+        rate = self.recipe.learning_rate
+        self.optimizer = self.make_adam({"actor_network": rate, "": rate})
+        self.target = SoftUpdate(self.model, tau=self.recipe.tau)
+        self.buffer = self.make_buffer()
+
+    def load_data(self) -> Episodes:
+        """As :meth:`TransitionAlgorithm.load_data`, with rewards scaled as in the paper.
+
+        Raises:
+            DatasetError: if rewards are to be scaled, but the returns of all episodes are the same.
+        """
+        episodes = super().load_data()
+        if not self.recipe.normalize_rewards:
+            return episodes
+        returns = episodes.returns[episodes.finished.cpu()]
+        spread = (returns.max() - returns.min()).item() if len(returns) else 0.0
+        if not spread > 0:
+            raise DatasetError(
+                episodes.source,
+                "normalize_rewards is on, but no two finished episodes differ in return: switch it "
+                "off",
+            )
+        rows = episodes.rows.copy()
+        rows["reward"] = rows["reward"] * (_RETURN_RANGE / spread)
+        return replace(episodes, rows=rows)
+
+    def loss(self, samples: TensorDictBase) -> TensorDictBase:
+        """Returns the terms of the loss; see :meth:`TransitionAlgorithm.loss`."""
+        # What TorchRL calls entropy is the data's negative log-likelihood.
+        return self.model(samples).rename_key_("entropy", "nll")
+
+    def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:
+        """Updates value, critics and actor together, then the targets.
+
+        A batch is transitions [B], or slices [N, T].
+        """
+        recipe = self.recipe
+        if recipe.decay_learning_rate:
+            fall = (1 + math.cos(math.pi * step / recipe.total_updates)) / 2
+            self.optimizer.param_groups[0]["lr"] = recipe.learning_rate * fall
+        terms = self.loss(batch)
+        descend(terms, self.optimizer)
+        self.target.step()
+        return self.numbers(terms)

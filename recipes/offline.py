@@ -1,0 +1,325 @@
+"""What algorithms share that learn from a data set: from windows, or from transitions of it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
+from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
+from torchrl.envs import EnvBase
+
+from torchrl_tit.datasets import Episodes, HistoryStorage, load_episodes, make_replay_buffer
+from torchrl_tit.envs import observation_specs
+from torchrl_tit.evaluation import evaluate
+from torchrl_tit.frames import NormalizedFrames
+from torchrl_tit.modules import Backbone
+from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
+from torchrl_tit.settings.numbers import Episodes as EpisodeCount
+
+from .algorithm import Algorithm, Stateful, check_finite, numbers
+from .dataset_recipe import DatasetRecipe
+from .networks import make_backbone, make_critic
+from .outcomes import Outcome
+from .recipe import Padding
+from .task import make_task
+
+
+class Buffer(Stateful, Protocol):
+    """A source of batches, such as a replay buffer."""
+
+    def sample(self) -> TensorDictBase:
+        """Samples a batch."""
+
+
+DatasetRecipeT = TypeVar("DatasetRecipeT", bound=DatasetRecipe)
+
+
+class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
+    """An algorithm that samples its batches from a replay buffer of a data set."""
+
+    buffer: Buffer
+    """The replay buffer, once :meth:`prepare` has made it."""
+
+    @abstractmethod
+    def make_buffer(self) -> Buffer:
+        """Reads the data set into a replay buffer.
+
+        Raises:
+            FileNotFoundError: if there are no such data.
+            DatasetError: if they cannot be used, or belong to another task.
+            ValueError: if they do not fit the networks.
+        """
+
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Yields batches from the replay buffer forever."""
+        while True:
+            yield self.buffer.sample()
+
+    def check(self) -> None:
+        """Lets the policy act once in the task, and reads the data unless they are remote."""
+        super().check()
+        dataset = self.recipe.dataset
+        if dataset not in D4RL_DATASETS or Path(dataset).exists():
+            self.make_buffer()
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransitionRecipe(DatasetRecipe):
+    """Settings of every recipe that learns from transitions of a data set."""
+
+    length: ClassVar[str] = "total_updates"
+
+    padding: Padding = "same"
+    """What fills a history before the first observation: that observation, or zeros."""
+    total_updates: Steps = 500_000
+    """Gradient steps to train for."""
+    batch_size: Batch = 256
+    """Transitions in one gradient step, sampled with replacement."""
+    slice_length: Batch = 1
+    """Number of consecutive transitions that are drawn together, so that a backbone encodes their
+    frames once; must divide batch_size. 1 draws transitions one by one."""
+    normalize_observations: bool = False
+    """Whether to normalize observations by their mean and standard deviation in the data; only for
+    arrays of floats."""
+    time_limits: Literal["keep", "drop"] = "drop"
+    """Whether to keep the last transition of an episode that a time limit truncated. D4RL's own
+    function and d3rlpy 1.1.1, which the paper used, drop it."""
+    unfinished: Literal["keep", "drop"] = "drop"
+    """Whether to keep the last episode if the data stop before it ends."""
+    evaluation_interval: Steps = 1000
+    """Gradient steps between evaluations."""
+    evaluation_episodes: EpisodeCount = 10
+    """Number of episodes in an evaluation, played side by side."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_divides("slice_length", "batch_size", self.batch_size)
+        self.check_stateless()
+
+    @property
+    def final_step(self) -> int:
+        """Gradient steps of the whole run."""
+        return self.total_updates
+
+    def evaluation_due(self, before: int, step: int) -> bool:
+        """Returns whether to evaluate after a number of gradient steps."""
+        return step % self.evaluation_interval == 0 or step == self.total_updates
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticRecipe(TransitionRecipe):
+    """Settings of algorithms with an actor and two critics, IQL and TD3+BC."""
+
+    total_updates: Steps = 1_000_000
+    """Gradient steps to train for."""
+    gamma: Fraction = 0.99
+    """Discount factor."""
+    tau: Fraction = 0.005
+    """Coefficient of the soft update of the target networks, from 0 to 1."""
+    critic: Literal["mlp", "backbone"] = "mlp"
+    """Whether value networks read the newest observation, or each has a backbone with the actor's
+    settings."""
+    critic_hidden: Widths = (256, 256)
+    """Widths of the hidden layers of value networks."""
+    evaluation_interval: Steps = 5000
+    """Gradient steps between evaluations."""
+
+
+RecipeT = TypeVar("RecipeT", bound=TransitionRecipe)
+
+
+class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
+    """An algorithm whose model is a TorchRL loss on all its networks.
+
+    Args:
+        recipe: the settings.
+
+    Raises:
+        ValueError: if the task has several observations, or observations that are to be normalized
+            are not floats.
+    """
+
+    clips_actions: ClassVar[bool] = False
+    """Whether the task clips actions, because the policy may exceed the bounds."""
+    terminal_observations: ClassVar[Literal["keep", "zero"]] = "keep"
+    """Whether observations of terminal states are kept, or replaced by zeros."""
+
+    optimizer: torch.optim.Optimizer
+    """The optimizer of all weights, once :meth:`prepare` has made it."""
+    _policy: TensorDictModuleBase
+
+    def __init__(self, recipe: RecipeT) -> None:
+        super().__init__(recipe)
+        with closing(make_task(recipe, clip_actions=False)) as task:  # its spec has the bounds
+            self.action_spec = task.action_spec_unbatched.to(self.device)
+            observation = observation_specs(task)
+            if isinstance(observation, dict):
+                raise ValueError(
+                    f"data sets hold one observation, but {recipe.env} has several "
+                    f"({', '.join(observation)}): choose one with observation_keys"
+                )
+            if recipe.normalize_observations and not observation.dtype.is_floating_point:
+                raise ValueError(
+                    f"normalize_observations is on, but observations of {recipe.env} are "
+                    f"{observation.dtype}, not floats: switch it off"
+                )
+            self.model = self.networks(task).to(self.device)
+
+    @abstractmethod
+    def networks(self, env: EnvBase) -> nn.Module:
+        """Builds the loss with all networks: the policy, critics, and what a subclass adds to it.
+
+        Args:
+            env: the task, for its observations and actions.
+        """
+
+    @abstractmethod
+    def loss(self, samples: TensorDictBase) -> TensorDictBase | dict[str, Tensor]:
+        """Returns the terms of the loss, float [] each.
+
+        Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
+        add one, override this method and call it first.
+
+        Args:
+            samples: transitions [B], or slices of consecutive ones, [N, T].
+        """
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """The policy, from histories to actions; its weights are among those of the model."""
+        return self._policy
+
+    def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
+        """Builds the task, with histories."""
+        clips = self.clips_actions
+        return make_task(self.recipe, num_envs, seed, clip_actions=clips, **settings)
+
+    def make_backbone(self, env: EnvBase, *, slices: bool = False) -> Backbone:
+        """Builds the policy's backbone.
+
+        Args:
+            env: the task.
+            slices: as in :func:`~recipes.networks.make_backbone`; always on if the recipe draws
+                slices.
+        """
+        recipe, slices = self.recipe, slices or self.recipe.slice_length > 1
+        observation = observation_specs(env)
+        return make_backbone(recipe.backbone, observation, slices=slices, eps=self._eps)
+
+    def make_critic(self, env: EnvBase, action_dim: int, **settings: Any) -> TensorDictModuleBase:
+        """Builds a value network; see :func:`~recipes.networks.make_critic`."""
+        recipe: Any = self.recipe
+        return make_critic(
+            observation_specs(env),
+            action_dim,
+            recipe.critic_hidden,
+            recipe.backbone if recipe.critic == "backbone" else None,
+            slices=recipe.slice_length > 1,
+            eps=self._eps,
+            **settings,
+        ).to(self.device)
+
+    def make_adam(self, rates: Mapping[str, float], **settings: Any) -> torch.optim.Adam:
+        """Builds Adam with one learning rate for each network.
+
+        Args:
+            rates: learning rates by the beginning of the names of a network's weights in
+                :attr:`model`; the last one is that of all other weights.
+            **settings: further settings of Adam.
+        """
+        groups: dict[str, list[nn.Parameter]] = {name: [] for name in rates}
+        *_, last = rates
+        for name, parameter in self.model.named_parameters():
+            groups[next((key for key in rates if name.startswith(key)), last)].append(parameter)
+        return torch.optim.Adam(
+            [{"params": groups[name], "lr": rate} for name, rate in rates.items()],
+            fused=True,
+            **settings,
+        )
+
+    def state(self) -> Mapping[str, Stateful]:
+        """Optimizer, and the sampling state of the replay buffer."""
+        return {"optimizer": self.optimizer, "buffer": self.buffer}
+
+    def load_data(self) -> Episodes:
+        """Loads the data set.
+
+        Raises:
+            ValueError: if its actions are of another kind than those of the task.
+            FileNotFoundError: if there are no such data.
+        """
+        recipe, continuous = self.recipe, self.action_spec.dtype.is_floating_point
+        episodes = load_episodes(recipe.dataset, **recipe.reading())
+        if episodes.rows["action"].is_floating_point() != continuous:
+            found, expected = ("integers", "floats") if continuous else ("floats", "integers")
+            raise ValueError(
+                f"the actions in {recipe.dataset} are {found}, but those of {recipe.env} are "
+                f"{expected}: use other data"
+            )
+        return episodes
+
+    def make_buffer(self) -> ReplayBuffer:
+        """Reads the data set into a replay buffer of transitions with histories.
+
+        The networks then normalize observations by its statistics, if they do.
+        """
+        recipe, episodes = self.recipe, self.load_data()
+        if recipe.normalize_observations:
+            self._set_statistics(*episodes.observation_statistics())
+        storage = HistoryStorage(
+            episodes.to(self.device),
+            recipe.backbone.num_frames,
+            padding=recipe.padding,
+            time_limits=recipe.time_limits,
+            unfinished=recipe.unfinished,
+            terminal_observations=self.terminal_observations,
+            is_init=recipe.slice_length > 1,
+        )
+        length = recipe.slice_length
+        return make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed, slice_length=length)
+
+    def numbers(self, terms: TensorDictBase | Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        """Selects and checks the numbers that an update returns.
+
+        On a GPU, checking would have to wait for it, so the runner checks there instead, less
+        often.
+        """
+        values = numbers(self.columns, terms)
+        if values.device.type == "cpu":
+            check_finite(self.columns, values)
+        return dict(zip(self.columns, values, strict=True))
+
+    def play(self, step: int) -> list[Outcome]:
+        """Plays full episodes side by side, each with its own seed, without dropout."""
+        seed, episodes = self.recipe.evaluation_seed, self.recipe.evaluation_episodes
+        returns = evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=True)
+        return [Outcome(step, returns.tolist())]
+
+    @property
+    def _eps(self) -> float | None:
+        """What is added to the deviations that normalize observations; None if they are not.
+
+        The authors of TD3+BC and d3rlpy use the same.
+        """
+        return 1e-3 if self.recipe.normalize_observations else None
+
+    @torch.no_grad()
+    def _set_statistics(self, mean: Tensor, std: Tensor) -> None:
+        """Sets the statistics of all networks: the policy's, the critics' and the targets'."""
+        (frames,) = (m for m in self.policy.modules() if isinstance(m, NormalizedFrames))
+        frames.set_statistics(mean, std)
+        statistics = dict(frames.named_buffers(recurse=False))
+        buffers = dict(self.model.named_buffers())  # the loss stacks those of the critics
+        for name, buffer in buffers.items():
+            path, _, leaf = name.rpartition(".")
+            if leaf in statistics and all(f"{path}.{own}" in buffers for own in statistics):
+                buffer.copy_(statistics[leaf])

@@ -1,0 +1,256 @@
+"""What algorithms share that collect steps, store them, and learn from samples of them."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
+from torchrl.envs import EnvBase
+
+from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_checkpoint
+from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
+from torchrl_tit.settings.numbers import Batch, Steps, Weight
+
+from .algorithm import Stateful, check_finite, numbers
+from .online import OnlineAlgorithm, OnlineRecipe
+from .task import make_task
+
+_STORED = [
+    "observation",
+    "action",
+    "action_mask",
+    *(("next", name) for name in ("observation", "action_mask", "reward", "terminated", "done")),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayRecipe(OnlineRecipe):
+    """Settings of every recipe that learns online from a replay buffer."""
+
+    total_steps: Steps = 1_000_000
+    """Environment steps to train for, rounded up to whole batches."""
+    random_steps: Steps = 1000
+    """Steps at the start with uniformly random actions, during which nothing is learned; must be a
+    multiple of steps_per_batch."""
+    steps_per_batch: Batch = 50
+    """Environment steps between two rounds of gradient steps; must be a multiple of num_envs."""
+    updates_per_step: Weight = 1.0
+    """Gradient steps for each environment step."""
+    buffer_size: Batch = 1_000_000
+    """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
+    batch_size: Batch = 256
+    """Transitions in one gradient step, sampled with replacement from the buffer."""
+    slice_length: Batch = 1
+    """Number of consecutive steps that are drawn together, so that a backbone encodes their frames
+    once; must divide batch_size. 1 draws transitions one by one."""
+    log_interval: Steps = 1000
+    """Environment steps between rows of metrics."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_divides("steps_per_batch", "random_steps", self.random_steps)
+        self.check_divides("slice_length", "batch_size", self.batch_size)
+        if self.collectors > 1 and self.ray is None:
+            raise ValueError(
+                f"collectors is {self.collectors}, but {self.algorithm} collects in one process, "
+                "or on a Ray cluster: set ray to its address, such as auto, or collectors to 1"
+            )
+        if self.buffer_size < max(self.steps_per_batch, self.slice_length * self.num_envs):
+            raise ValueError(
+                f"buffer_size {self.buffer_size} has no room for a batch of {self.steps_per_batch} "
+                "steps and a slice of each environment: make it larger"
+            )
+        if self.slice_length * self.num_envs > self.random_steps:
+            raise ValueError(
+                f"slice_length {self.slice_length} is longer than the {self.random_steps} "
+                f"random_steps of {self.num_envs} environments: change one of them"
+            )
+        self.check_stateless()
+
+    @property
+    def updates_per_batch(self) -> int:
+        """Gradient steps after each batch."""
+        return max(1, round(self.steps_per_batch * self.updates_per_step))
+
+
+RecipeT = TypeVar("RecipeT", bound=ReplayRecipe)
+
+
+class ReplayAlgorithm(OnlineAlgorithm[RecipeT]):
+    """An algorithm with a replay buffer, whose model is a TorchRL loss on all its networks.
+
+    Args:
+        recipe: the settings.
+    """
+
+    draws_random_steps: ClassVar[bool] = True
+    """Whether the collector, not :attr:`behaviour`, draws the actions of the random steps at the
+    start."""
+
+    optimizer: torch.optim.Optimizer
+    """The optimizer, once :meth:`prepare` has made it."""
+    _policy: TensorDictModuleBase
+
+    def __init__(self, recipe: RecipeT) -> None:
+        super().__init__(recipe)
+        with closing(self.make_env(1)) as task:
+            self.model = self.networks(task).to(self.device)
+
+    @abstractmethod
+    def networks(self, env: EnvBase) -> nn.Module:
+        """Builds the loss with all networks: the policy, critics, and what a subclass adds to it.
+
+        Args:
+            env: the task, for its observations and actions.
+        """
+
+    @abstractmethod
+    def loss(self, samples: TensorDictBase) -> TensorDictBase | dict[str, Tensor]:
+        """Returns the terms of the loss, float [] each.
+
+        Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
+        add one, override this method and call it first.
+
+        Args:
+            samples: transitions [B], or slices of consecutive ones, [N, T].
+        """
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """The policy, from histories to actions; its weights are among those of the model."""
+        return self._policy
+
+    @property
+    def behaviour(self) -> TensorDictModuleBase:
+        """The policy that the collector runs; by default, :attr:`policy`."""
+        return self._policy
+
+    def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
+        """Builds the task, with histories; actions are passed on unchanged."""
+        return make_task(self.recipe, num_envs, seed, clip_actions=False, **settings)
+
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds collector and replay buffer."""
+        recipe = self.recipe
+        self.policy.eval()
+        random_steps = recipe.random_steps if self.draws_random_steps else 0
+        self.collector = self.make_collector(
+            self.behaviour, _make_envs, step, random_steps=max(0, random_steps - step)
+        )
+        storage = OnlineHistoryStorage(
+            recipe.buffer_size,
+            recipe.backbone.num_frames,
+            ndim=2,
+            padding=recipe.padding,
+            is_init=recipe.slice_length > 1,
+            device=self.device,
+        )
+        self.buffer = ReplayBuffer(
+            storage=storage,
+            sampler=make_sampler(recipe.slice_length),
+            batch_size=recipe.batch_size,
+        )
+        self.buffer_state = BufferState(self.buffer, folder / "replay")
+
+    def state(self) -> Mapping[str, Stateful]:
+        """Optimizer and replay buffer."""
+        return {"optimizer": self.optimizer, "buffer": self.buffer_state}
+
+    def batches(self) -> Iterator[TensorDictBase]:
+        """Yields collected batches, [envs, time]; the environments begin new episodes."""
+        self.buffer_state.storage.end_episodes()
+        return iter(self.collector)
+
+    def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
+        """Stores a batch, then takes gradient steps on samples from the buffer."""
+        recipe, count = self.recipe, batch.numel()
+        self.buffer.extend(self.collected(batch).select(*_STORED, strict=False))
+        if step + count <= recipe.random_steps:
+            return dict.fromkeys(self.columns, torch.nan)
+        done = (step - recipe.random_steps) // recipe.steps_per_batch * recipe.updates_per_batch
+        self.policy.train()
+        for number in range(done, done + recipe.updates_per_batch):
+            terms = self.learn(self.buffer.sample(), number)
+        self.policy.eval()
+        values = numbers(self.columns, terms)
+        check_finite(self.columns, values)
+        if not self.collects_here:
+            self.collector.update_policy_weights_()
+        return dict(zip(self.columns, values, strict=True))
+
+    @abstractmethod
+    def learn(self, samples: TensorDictBase, number: int) -> Mapping[str, Tensor]:
+        """Takes a gradient step on :meth:`loss`, and updates the targets.
+
+        Args:
+            samples: transitions [B], or slices of consecutive ones, [N, T].
+            number: number of gradient steps taken before.
+
+        Returns:
+            A number for each of ``columns``, float [], among others.
+        """
+
+
+def _make_envs(recipe: OnlineRecipe, num_envs: int) -> EnvBase:
+    """Builds the environments in which steps are collected."""
+    return make_task(recipe, num_envs, clip_actions=False)
+
+
+class BufferState:
+    """The state of a replay buffer, as parts on the disk.
+
+    Each checkpoint writes the steps since the one before, each frame once, and lists the parts that
+    belong to it. A checkpoint that held all steps itself would be as large as the buffer. Parts
+    whose steps were overwritten are removed, once no checkpoint that is kept needs them.
+
+    Args:
+        buffer: a buffer with an :class:`~torchrl_tit.datasets.OnlineHistoryStorage` and TorchRL's
+            default writer. Its sampler has no state of its own.
+        folder: folder of the parts, each numbered by the total number of steps at its end.
+        checkpoints: how many checkpoints are kept.
+    """
+
+    def __init__(self, buffer: ReplayBuffer, folder: Path, checkpoints: int = 3) -> None:
+        self.buffer = buffer
+        self.storage: OnlineHistoryStorage = buffer.storage
+        self.folder = folder
+        self.checkpoints = checkpoints
+        self._parts: list[int] = []  # on the disk
+
+    def state_dict(self) -> dict[str, Any]:
+        """Writes the new steps, and returns the numbers of the parts."""
+        before, count = max(self._parts, default=0), self.storage.num_written
+        if count > before:
+            save_checkpoint(self.folder, count, self.storage.part(before), keep=count)
+            self._parts.append(count)
+            # The checkpoint of this part is not there yet; the ones before it are.
+            kept = self._needed(self._parts[-self.checkpoints - 1 :][0])
+            for number in set(self._parts) - set(kept):
+                remove_checkpoint(self.folder, number)
+            self._parts = kept
+        needed = self._needed(count)
+        return {
+            "parts": needed,
+            "older_parts": [number for number in self._parts if number not in needed],
+            "writer": self.buffer.writer.state_dict(),
+        }
+
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
+        """Reads a checkpoint's parts. Other parts belong to lost work and will be replaced."""
+        self._parts = [*state_dict["older_parts"], *state_dict["parts"]]
+        for number in state_dict["parts"]:
+            self.storage.add_part(load_checkpoint(self.folder, number)[1])
+        self.buffer.writer.load_state_dict(state_dict["writer"])
+
+    def _needed(self, count: int) -> list[int]:
+        """The parts that the buffer's items need once ``count`` steps are written."""
+        return [number for number in self._parts if number > count - self.storage.reach]
