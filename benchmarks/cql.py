@@ -27,8 +27,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
-from recipes.cql import CQL
-from recipes.cql.algorithm import CQLAlgorithm
+from recipes.cql import CQL, CQLAlgorithm
 from recipes.recipe import Compile
 from recipes.registry import RECIPES
 from torchrl_tit.networks import build_network

@@ -20,7 +20,7 @@ from recipes.cli.main import main
 main(["list", "ppo/cartpole/"])
 main(["play", "cartpole", "--episodes", "1"])
 import torchrl_tit.datasets
-import recipes.decision_transformer.odt  # and with it, all that plays its agents
+import recipes.online_decision_transformer  # and with it, all that plays its agents
 from recipes import Run, get_recipe
 from recipes.metrics import Metrics
 from pathlib import Path
@@ -37,7 +37,7 @@ for use in (
     lambda: main(["data", "info", f"{folder}/data.hdf5"]),
     lambda: torchrl_tit.datasets.load_episodes(f"{folder}/data.hdf5"),
     lambda: torchrl_tit.datasets.load_episodes("mujoco/hopper/medium-v0"),
-    lambda: recipes.decision_transformer.odt.make_lamb([], 1.0, 0.0),
+    lambda: recipes.online_decision_transformer.make_lamb([], 1.0, 0.0),
     create,
     lambda: Metrics(Path(folder), [], 0),
 ):

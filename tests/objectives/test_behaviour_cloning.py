@@ -87,15 +87,3 @@ def test_deterministic_policies_are_refused(kind):
     with pytest.raises(ValueError, match=f"not the deterministic {kind}, .*BCLoss") as error:
         LikelihoodBCLoss(actor)
     assert "\n" not in str(error.value)
-
-
-def test_reductions():
-    actor = make_actor(4, Categorical(3))
-    batch = TensorDict({"features": torch.randn(5, 4), "action": torch.randint(3, (5,))}, [5])
-    each, mean, total, default = (
-        LikelihoodBCLoss(actor, reduction=reduction)(batch)["loss_bc"]
-        for reduction in ("none", "mean", "sum", None)
-    )
-    assert each.shape == (5,)
-    torch.testing.assert_close(torch.stack([mean, total]), torch.stack([each.mean(), each.sum()]))
-    torch.testing.assert_close(default, mean)

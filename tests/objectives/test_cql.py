@@ -1,4 +1,4 @@
-"""The loss of continuous CQL equals its formulas, written as loops in NumPy."""
+"""The losses of CQL equal their formulas, written as loops in NumPy."""
 
 import math
 
@@ -9,13 +9,12 @@ from scipy.stats import norm
 from tensordict import TensorDict
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
 from torch import nn
-from torchrl.data import Bounded, Categorical, Unbounded
-from torchrl.modules import MLP, ValueOperator
-from torchrl.objectives import HardUpdate, SoftUpdate
+from torchrl.data import Bounded, Categorical, OneHot, Unbounded
+from torchrl.modules import MLP, QValueActor, ValueOperator
 
 from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.modules import make_squashed_actor
-from torchrl_tit.objectives import ContinuousCQLLoss, PolicySamples
+from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
 
 pytestmark = pytest.mark.numerics
 
@@ -69,19 +68,21 @@ def make_batch(seed=1):
     )
 
 
-def make_samples(seed=2):
+def with_samples(batch, seed=2):
+    """A batch with random numbers as the policy's samples, and these."""
     generator = np.random.default_rng(seed)
 
     def numbers(*shape):
         return torch.from_numpy(generator.normal(size=shape))
 
-    return PolicySamples(
-        action=numbers(BATCH, ACTION).requires_grad_(),
-        log_prob=numbers(BATCH).requires_grad_(),
-        actions=numbers(BATCH, 2 * SAMPLES, ACTION),
-        log_probs=numbers(BATCH, 2 * SAMPLES),
-        next_action=numbers(BATCH, ACTION),
-    )
+    samples = {
+        "action": numbers(BATCH, ACTION).requires_grad_(),
+        "log_prob": numbers(BATCH).requires_grad_(),
+        "actions": numbers(BATCH, 2 * SAMPLES, ACTION),
+        "log_probs": numbers(BATCH, 2 * SAMPLES),
+        "next_action": numbers(BATCH, ACTION),
+    }
+    return batch.copy().set("policy_samples", TensorDict(samples, [BATCH])), samples
 
 
 def make_loss(critic=None, **settings):
@@ -111,14 +112,15 @@ def uniform_actions(monkeypatch):
 
 @pytest.mark.parametrize("over_critics", ["mean", "sum"])
 def test_critics(monkeypatch, over_critics):
-    loss, batch, samples = make_loss(over_critics=over_critics), make_batch(), make_samples()
+    loss = make_loss(over_critics=over_critics)
+    batch, samples = with_samples(make_batch())
     uniform = uniform_actions(monkeypatch)
     params = weights(loss.qvalue_network_params)
     targets = weights(loss.target_qvalue_network_params)
     errors, gaps = np.zeros(2), np.zeros(2)
     for b in range(BATCH):
         s, a = batch["state"][b].numpy(), batch["action"][b].numpy()
-        s_next, a_next = batch["next", "state"][b].numpy(), samples.next_action[b].numpy()
+        s_next, a_next = batch["next", "state"][b].numpy(), samples["next_action"][b].numpy()
         best = min(value(targets, c, s_next, a_next) for c in range(2))
         # Truncated episodes bootstrap, terminated ones do not. The target has no entropy term.
         future = 0.0 if batch["next", "terminated"][b] else GAMMA * best
@@ -128,85 +130,56 @@ def test_critics(monkeypatch, over_critics):
                 value(params, c, s, u) + math.log(WIDTHS[0] * WIDTHS[1]) for u in uniform[b]
             ]
             for j in range(2 * SAMPLES):  # evaluated at s, even those sampled at s'
-                drawn = samples.actions[b, j].numpy()
-                exponents.append(value(params, c, s, drawn) - samples.log_probs[b, j].item())
+                drawn = samples["actions"][b, j].numpy()
+                exponents.append(value(params, c, s, drawn) - samples["log_probs"][b, j].item())
             q = value(params, c, s, a)
             gaps[c] += (math.log(sum(map(math.exp, exponents))) - q) / BATCH
             errors[c] += (q - target) ** 2 / BATCH
-    loss_qvalue, loss_cql = loss.critic_losses(batch, samples)
+    terms = loss.critic_loss(batch)
     gap = gaps.mean() if over_critics == "mean" else gaps.sum()
-    assert loss_qvalue.item() == pytest.approx(errors.sum(), rel=1e-6)  # gamma is a float32
-    assert loss_cql.item() == pytest.approx(WEIGHT * gap, rel=1e-6)
-    assert loss.q_loss(batch, samples)[0].item() == pytest.approx(loss_qvalue.item())
-    assert loss.cql_loss(batch, samples)[0].item() == pytest.approx(loss_cql.item())
-
-
-@pytest.mark.parametrize("over_critics", ["mean", "sum"])
-@pytest.mark.parametrize("chunk_size", [1, 2, BATCH, BATCH + 1])
-def test_a_few_states_at_a_time_give_the_same_gradients(monkeypatch, over_critics, chunk_size):
-    mlp = MLP(
-        OBSERVATION + ACTION,
-        1,
-        num_cells=[8, 8],
-        activation_class=nn.ReLU,
-        activation_kwargs={"inplace": True},
-    ).double()
-    critic = ValueOperator(mlp, in_keys=["action", "state"])
-    loss, batch = make_loss(critic, over_critics=over_critics), make_batch()
-    samples = make_samples()
-    uniform_actions(monkeypatch)
-    losses = loss.critic_losses(batch, samples)
-    sum(losses).backward()
-    params = dict(loss.qvalue_network_params.items(True, True))
-    whole = {key: weight.grad for key, weight in params.items()}
-    assert all(gradient.abs().sum() > 0 for gradient in whole.values())
-    loss.zero_grad()
-    for times in (1, 2):  # added to what is there
-        in_chunks = loss.critic_gradients(batch, samples, chunk_size)
-        torch.testing.assert_close(in_chunks, tuple(term.detach() for term in losses))
-        for key, weight in params.items():
-            torch.testing.assert_close(weight.grad, times * whole[key])
-    assert samples.action.grad is None
-    assert all(w.grad is None for w in loss.actor_network_params.values(True, True))
+    assert terms["loss_qvalue"].item() == pytest.approx(errors.sum(), rel=1e-6)  # float32 gamma
+    assert terms["loss_cql"].item() == pytest.approx(WEIGHT * gap, rel=1e-6)
+    assert loss.q_loss(batch)[0] == terms["loss_qvalue"]
+    assert loss.cql_loss(batch)[0] == terms["loss_cql"]
+    (terms["loss_qvalue"] + terms["loss_cql"]).backward()
+    assert all(weight.grad.any() for weight in params.values())
+    assert all(weight.grad is None for weight in (samples["action"], *targets.values()))
 
 
 def test_actor():
-    loss, batch, samples = make_loss(), make_batch(), make_samples()
+    loss, (batch, samples) = make_loss(), with_samples(make_batch())
     params = weights(loss.qvalue_network_params)
     expected = 0.0
     for b in range(BATCH):
-        s, a = batch["state"][b].numpy(), samples.action[b].detach().numpy()
+        s, a = batch["state"][b].numpy(), samples["action"][b].detach().numpy()
         worst = min(value(params, c, s, a) for c in range(2))
-        expected += (0.3 * samples.log_prob[b].item() - worst) / BATCH
-    loss_actor, _ = loss.actor_loss(batch, samples)
+        expected += (0.3 * samples["log_prob"][b].item() - worst) / BATCH
+    loss_actor, _ = loss.actor_loss(batch)
     assert loss_actor.item() == pytest.approx(expected, rel=1e-6)  # alpha is a float32
     loss_actor.backward()
-    assert samples.action.grad is not None
-    torch.testing.assert_close(samples.log_prob.grad, torch.full((BATCH,), 0.3 / BATCH).double())
+    assert samples["action"].grad is not None
+    torch.testing.assert_close(samples["log_prob"].grad, torch.full((BATCH,), 0.3 / BATCH).double())
     assert all(w.grad is None for w in params.values())
     assert loss.log_alpha.grad is None
 
 
 def test_temperature():
-    loss, samples = make_loss(), make_samples()
-    excess = samples.log_prob.detach().mean().item() - ACTION  # target entropy: -2
-    loss_alpha = loss.alpha_loss(samples)
+    loss, (batch, samples) = make_loss(), with_samples(make_batch())
+    excess = samples["log_prob"].detach().mean().item() - ACTION  # target entropy: -2
+    loss_alpha, _ = loss.alpha_loss(batch)
     assert loss_alpha.item() == pytest.approx(-0.3 * excess, rel=1e-6)
     loss_alpha.backward()  # with respect to the logarithm: exp(log alpha) again
     assert loss.log_alpha.grad.item() == pytest.approx(-0.3 * excess, rel=1e-6)
-    assert samples.log_prob.grad is None
+    assert samples["log_prob"].grad is None
 
 
 def test_the_policy_is_sampled_where_it_should_be():
     """Differentiably at s, detached at s', and densities have the Jacobian of tanh and bounds."""
     loss, batch = make_loss(), make_batch()
     torch.manual_seed(5)
-    samples = loss.sample_policy(batch)
-    assert samples.actions.shape == (BATCH, 2 * SAMPLES, ACTION)
-    assert not samples.actions.requires_grad
-    assert not samples.log_probs.requires_grad
-    assert samples.action.requires_grad
-    assert samples.log_prob.requires_grad
+    samples = loss.sample_policy(batch)["policy_samples"]
+    assert samples["actions"].shape == (BATCH, 2 * SAMPLES, ACTION)
+    assert {key for key, value in samples.items() if value.requires_grad} == {"action", "log_prob"}
     middle = (SPEC.space.high + SPEC.space.low).numpy() / 2
     half = np.array(WIDTHS) / 2
     head = loss.actor_network_params
@@ -224,69 +197,37 @@ def test_the_policy_is_sampled_where_it_should_be():
 
     for b in range(BATCH):
         here, there = (d["observation"][b].numpy() for d in (batch, batch["next"]))
-        check(here, samples.action[b].detach().numpy(), samples.log_prob[b].item())
+        check(here, samples["action"][b].detach().numpy(), samples["log_prob"][b].item())
         for j in range(2 * SAMPLES):
             state = here if j < SAMPLES else there
-            check(state, samples.actions[b, j].numpy(), samples.log_probs[b, j].item())
-        best = check(there, samples.actions[b, -1].numpy(), samples.log_probs[b, -1].item())
-        np.testing.assert_allclose(samples.next_action[b].numpy(), best, rtol=1e-6)
+            check(state, samples["actions"][b, j].numpy(), samples["log_probs"][b, j].item())
+        best = check(there, samples["actions"][b, -1].numpy(), samples["log_probs"][b, -1].item())
+        np.testing.assert_allclose(samples["next_action"][b].numpy(), best, rtol=1e-6)
 
 
 def test_forward_computes_the_same_terms_and_adds_priorities_to_the_batch(monkeypatch):
-    loss, batch, samples = make_loss(), make_batch(), make_samples()
+    loss, (batch, samples) = make_loss(), with_samples(make_batch())
     uniform_actions(monkeypatch)
-    monkeypatch.setattr(loss, "sample_policy", lambda _: samples)
-    before = batch.clone()
-    terms = loss(batch)
-    assert (batch.exclude("td_error") == before).all()
-    assert batch.keys() == {*before.keys(), "td_error"}
-    loss_qvalue, loss_cql = loss.critic_losses(batch, samples)
-    errors = loss.q_loss(batch, samples)[1]["td_error"]
+    monkeypatch.setattr(loss, "sample_policy", lambda _: batch)
+    given = make_batch()
+    terms, critics = loss(given), loss.critic_loss(batch)
+    assert (given.exclude("td_error") == make_batch()).all()
+    assert given.keys() == {*make_batch().keys(), "td_error"}
+    errors = critics["td_error"]
     assert errors.shape == (2, BATCH)
-    assert not errors.requires_grad
-    torch.testing.assert_close(errors.sum(0).mean(), loss_qvalue)
-    torch.testing.assert_close(batch["td_error"], errors.max(0).values)
-    torch.testing.assert_close(terms["loss_qvalue"], loss_qvalue)
-    torch.testing.assert_close(terms["loss_cql"], loss_cql)
-    torch.testing.assert_close(terms["loss_actor"], loss.actor_loss(batch, samples)[0])
-    torch.testing.assert_close(terms["loss_alpha"], loss.alpha_loss(samples))
-    torch.testing.assert_close(terms["entropy"], -samples.log_prob.detach().mean())
-    assert set(terms.keys()) == set(loss.out_keys)
-
-
-@pytest.mark.parametrize("over_critics", ["mean", "sum"])
-@pytest.mark.parametrize("masked", [False, True])
-def test_reductions(monkeypatch, over_critics, masked):
-    """Each is that of the states' losses, without the states that TorchRL's mask leaves out."""
-    names = ["loss_actor", "loss_qvalue", "loss_cql", "loss_alpha"]
-    batch, samples = make_batch(), make_samples()
-    uniform_actions(monkeypatch)
-    kept = torch.ones(BATCH, dtype=torch.bool)
-    if masked:
-        kept = torch.tensor([True, False, True, True, False])
-        batch["collector", "mask"] = kept.unsqueeze(-1)
-    losses = {}
-    for reduction in ("none", "mean", "sum", None):
-        torch.manual_seed(0)
-        loss = make_loss(over_critics=over_critics, reduction=reduction)
-        monkeypatch.setattr(loss, "sample_policy", lambda _: samples)
-        losses[reduction] = loss(batch).select(*names)
-        total = (losses[reduction]["loss_qvalue"] + losses[reduction]["loss_cql"]).sum()
-        total.backward()
-        params = dict(loss.qvalue_network_params.items(True, True))
-        whole = {key: weight.grad.clone() for key, weight in params.items()}
-        loss.zero_grad()
-        in_chunks = sum(loss.critic_gradients(batch, samples, chunk_size=2))
-        torch.testing.assert_close(in_chunks, total.detach())
-        for key, weight in params.items():
-            torch.testing.assert_close(weight.grad, whole[key])
-    for name in names:
-        each = losses["none"][name]
-        assert each.shape == (BATCH,)
-        assert torch.equal(each != 0, kept)
-        torch.testing.assert_close(losses["sum"][name], each.sum())
-        torch.testing.assert_close(losses["mean"][name], each[kept].mean())
-        torch.testing.assert_close(losses[None][name], losses["mean"][name])
+    torch.testing.assert_close(errors.sum(0).mean(), terms["loss_qvalue"].detach())
+    torch.testing.assert_close(given["td_error"], errors.max(0).values)
+    expected = {
+        "loss_qvalue": critics["loss_qvalue"],
+        "loss_cql": critics["loss_cql"],
+        "loss_actor": loss.actor_loss(batch)[0],
+        "loss_alpha": loss.alpha_loss(batch)[0],
+        "alpha": torch.tensor(0.3),
+        "entropy": -samples["log_prob"].mean(),
+    }
+    assert set(terms.keys()) == set(loss.out_keys) == set(expected)
+    for name, value in expected.items():
+        torch.testing.assert_close(terms[name], value.detach(), msg=name)
 
 
 def test_keys_can_be_set():
@@ -326,24 +267,6 @@ def test_keys_can_be_set():
     assert not metadata["l"].requires_grad
 
 
-@pytest.mark.parametrize("updater", [SoftUpdate, HardUpdate])
-def test_state_and_targets_are_those_of_torchrl_losses(updater):
-    loss, other, batch = make_loss(), make_loss(), make_batch()
-    settings = {"tau": 0.5} if updater is SoftUpdate else {"value_network_update_interval": 0}
-    target = updater(loss, **settings)
-    loss.qvalue_network_params.data.add_(1.0)
-    before = loss.target_qvalue_network_params.clone()
-    target.step()
-    fraction = 0.5 if updater is SoftUpdate else 1.0
-    trained, moved = loss.qvalue_network_params.data, loss.target_qvalue_network_params.data
-    torch.testing.assert_close(moved - before, (trained - before) * fraction)
-    other.load_state_dict(loss.state_dict())
-    torch.manual_seed(0)
-    expected = loss(batch)
-    torch.manual_seed(0)
-    torch.testing.assert_close(other(batch), expected)
-
-
 def test_backbones_run_once_a_state_and_all_of_it_trains():
     """The actor at s and at s'; the critics at s, at s', and at s with the actor's action."""
     calls: dict[str, list[int]] = {"actor": [], "critic": []}  # number of frames in each
@@ -366,7 +289,7 @@ def test_backbones_run_once_a_state_and_all_of_it_trains():
             out_keys=["state_action_value"],
         ),
     )
-    loss = ContinuousCQLLoss(actor, critic, action_spec=SPEC, deactivate_vmap=True)
+    loss = ContinuousCQLLoss(actor, critic, action_spec=SPEC, num_random=SAMPLES)
     loss.make_value_estimator(gamma=GAMMA)
     batch = make_batch().apply(lambda x: x.float() if x.is_floating_point() else x)
     for part in (batch, batch["next"]):
@@ -375,22 +298,10 @@ def test_backbones_run_once_a_state_and_all_of_it_trains():
     for names in calls.values():
         names.clear()
     terms = loss(batch)
-    # Of s', the actor encodes the newest frame only.
-    assert calls == {"actor": [2 * BATCH, BATCH], "critic": [2 * BATCH] * 6}
+    assert calls == {"actor": [2 * BATCH] * 2, "critic": [2 * BATCH] * 6}
     sum(terms[name] for name in ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha")).backward()
     for params in (loss.actor_network_params, loss.qvalue_network_params):
         assert all(w.grad is not None for w in params.values(True, True) if w.requires_grad)
-    calls["critic"].clear()
-    loss.critic_gradients(batch, loss.sample_policy(batch), chunk_size=2)
-    chunks, target = [2, 2, 4, 4, 4, 4], [2 * BATCH, 2 * BATCH]
-    assert sorted(calls["critic"]) == chunks + target
-    updater = SoftUpdate(loss, tau=0.5)
-    before = loss.target_qvalue_network_params.clone()
-    with torch.no_grad():
-        loss.qvalue_network_params.data.add_(1.0)
-    updater.step()
-    moved = loss.target_qvalue_network_params.data - before.data
-    assert all(torch.allclose(w, torch.tensor(0.5)) for w in moved.values(True, True))
 
 
 @pytest.mark.parametrize("spec", [Categorical(3), Unbounded((2,)), Bounded(-1, 1, shape=(4, 2))])
@@ -423,3 +334,36 @@ def test_critics_that_do_not_read_the_action_are_refused():
     blind = ValueOperator(nn.Linear(OBSERVATION, 1), in_keys=["observation"])
     with pytest.raises(ValueError, match=r"must read the action under 'action'.*\['observation'\]"):
         ContinuousCQLLoss(actor, blind, action_spec=SPEC)
+
+
+@pytest.mark.parametrize("spec", [Categorical(3), OneHot(3)])
+def test_discrete_actions(spec):
+    """The target is that of the target network, unlike in TorchRL's `DiscreteCQLLoss`."""
+    linear = nn.Linear(OBSERVATION, 3).double()
+    actor = QValueActor(linear, in_keys=["state"], spec=spec)
+    loss = DelayedDiscreteCQLLoss(actor, action_space=spec)
+    loss.make_value_estimator(gamma=GAMMA)
+    targets = weights(loss.target_value_network_params)
+    for weight in targets.values():
+        weight.data.normal_()
+    batch = make_batch().set("action", spec.rand((BATCH,)))
+
+    def values(params, state):
+        return (params["weight"].detach() @ state + params["bias"].detach()).numpy()
+
+    error = gap = 0.0
+    for b in range(BATCH):
+        action = batch["action"][b]
+        index = int(action.long().argmax() if isinstance(spec, OneHot) else action)
+        q = values(weights(loss.value_network_params), batch["state"][b])
+        best = max(values(targets, batch["next", "state"][b]))
+        # Truncated episodes bootstrap, terminated ones do not.
+        future = 0.0 if batch["next", "terminated"][b] else GAMMA * best
+        error += (q[index] - batch["next", "reward"][b].item() - future) ** 2 / 2 / BATCH
+        gap += (math.log(np.exp(q).sum()) - q[index]) / BATCH
+    losses = loss(batch)
+    assert losses["loss_qvalue"].item() == pytest.approx(error, rel=1e-6)  # gamma is a float32
+    assert losses["loss_cql"].item() == pytest.approx(gap, rel=1e-6)
+    (losses["loss_qvalue"] + losses["loss_cql"]).backward()
+    assert all(w.grad is not None for w in weights(loss.value_network_params).values())
+    assert all(w.grad is None for w in targets.values())

@@ -36,8 +36,8 @@ class Case(NamedTuple):
     """The keys that TorchRL lets a user set, with their defaults."""
 
 
-def backbone(num_frames: int, out_key: str = "features", dropout: float = 0.0) -> Any:
-    network = EnhancedTIT((OBSERVATION,), num_frames, embed_dim=16, ffn_dropout_inner=dropout)
+def backbone(num_frames: int, out_key: str = "features") -> Any:
+    network = EnhancedTIT((OBSERVATION,), num_frames, embed_dim=16)
     return Backbone(network, out_keys=[out_key]), network.features_dim
 
 
@@ -78,18 +78,18 @@ def decision_transformer(**settings: Any) -> Case:
     return Case(MaskedDTLoss(predictor, **settings), batch, keys)
 
 
-def continuous_cql(actions: int = 2, num_frames: int = 3, dropout: float = 0.0) -> Case:
+def continuous_cql(actions: int = 2, num_frames: int = 3, **settings: Any) -> Case:
     spec = Bounded(-1, 1, shape=(actions,))
-    encoder, size = backbone(num_frames, dropout=dropout)
+    encoder, size = backbone(num_frames)
     actor = ProbabilisticTensorDictSequential(encoder, *make_squashed_actor(size, spec))
-    encoder, size = backbone(num_frames, "critic_features", dropout)
+    encoder, size = backbone(num_frames, "critic_features")
     head = ValueOperator(
         MLP(size + actions, 1, num_cells=[8]),
         in_keys=["critic_features", "action"],
         out_keys=["state_action_value"],
     )
     loss = ContinuousCQLLoss(
-        actor, TensorDictSequential(encoder, head), action_spec=spec, num_random=2
+        actor, TensorDictSequential(encoder, head), action_spec=spec, num_random=2, **settings
     )
     loss.make_value_estimator(gamma=0.9)
     keys = {**OUTCOME, "action": "action", "value": "state_value", "priority": "td_error"}
@@ -101,11 +101,11 @@ def continuous_cql_on_single_numbers() -> Case:
     return continuous_cql(actions=1, num_frames=1)
 
 
-def discrete_cql() -> Case:
+def discrete_cql(**settings: Any) -> Case:
     encoder, size = backbone(num_frames=3)
     head = QValueActor(nn.Linear(size, 3), in_keys=["features"], action_space="categorical")
     network = TensorDictSequential(encoder, head)
-    loss = DelayedDiscreteCQLLoss(network, action_space="categorical")
+    loss = DelayedDiscreteCQLLoss(network, action_space="categorical", **settings)
     loss.make_value_estimator(gamma=0.9)
     keys = {**OUTCOME, "action": "action", "action_value": "action_value", "priority": "td_error"}
     return Case(loss, transitions(torch.randint(3, (BATCH,)), num_frames=3), keys)
@@ -214,24 +214,20 @@ def test_what_a_batch_holds_is_left_unchanged(make: Callable[[], Case]) -> None:
     assert_close(batch.select(*before.keys(True, True)), before, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("reduction", [None, "none", "mean", "sum"])
-@pytest.mark.parametrize(
-    "make", [behaviour_cloning, decision_transformer], ids=lambda make: make.__name__
-)
-def test_reductions(make: Callable[..., Case], reduction: str | None) -> None:
-    (mean, *_), (loss, batch, _) = make(), make(reduction=reduction)
-    loss.load_state_dict(mean.state_dict())
-    (result,), (expected,) = (list(compute(each, batch).values()) for each in (loss, mean))
-    assert result.shape[:1] == ((BATCH,) if reduction == "none" else ())
-    count = 3 * batch["mask"].sum() if make is decision_transformer else BATCH
-    total = result.sum() * (count if reduction in (None, "mean") else 1)
-    torch.testing.assert_close(total, expected * count)
-
-
-def test_critics_draw_their_dropout_under_vmap() -> None:
-    loss, batch, _ = continuous_cql(dropout=0.5)
-    assert loss.vmap_randomness == "different"
-    assert not torch.equal(loss(batch)["loss_qvalue"], loss(batch)["loss_qvalue"])
-    loss.set_vmap_randomness("error")
-    with pytest.raises(RuntimeError, match="random"):
-        loss(batch)
+@each_loss
+def test_reductions(make: Callable[..., Case]) -> None:
+    """That of the states or steps, without padding."""
+    torch.manual_seed(0)
+    first, batch, _ = make()
+    losses = {}
+    for reduction in (None, "none", "mean", "sum"):
+        loss, _, _ = make(reduction=reduction)
+        loss.load_state_dict(first.state_dict())
+        losses[reduction] = compute(loss, batch.clone())
+    for name in (key for key in first.out_keys if key.startswith("loss")):
+        each = losses["none"][name]
+        assert each.shape[:1] == (BATCH,)
+        count = 3 * batch["mask"].sum() if make is decision_transformer else each.numel()
+        torch.testing.assert_close(losses["sum"][name], each.sum())
+        torch.testing.assert_close(losses["mean"][name], each.sum() / count)
+        torch.testing.assert_close(losses[None][name], losses["mean"][name])

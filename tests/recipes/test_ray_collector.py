@@ -18,8 +18,7 @@ from recipes.ppo import PPO
 from recipes.ray_collector import _check_own_name
 from recipes.run import Run
 from recipes.runner import evaluate, train
-from recipes.sac import SAC
-from recipes.sac.algorithm import SACAlgorithm
+from recipes.sac import SAC, SACAlgorithm
 from recipes.task import seed_copies
 from tests.numerics import assert_near
 from torchrl_tit.checkpoint import checkpoint_steps
