@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from recipes import runner

@@ -227,14 +227,14 @@ def test_dropout_is_on_in_updates_and_off_in_evaluations(tmp_path, make, monkeyp
 
     def loss():
         if isinstance(recipe, DiscreteCQL):
-            return algorithm.loss(batch.clone())["loss_qvalue"]
-        return algorithm.loss.actor_loss(batch, samples)[0]  # through the critics
+            return algorithm.model(batch.clone())["loss_qvalue"]
+        return algorithm.model.actor_loss(samples)[0]  # through the critics
 
-    samples = algorithm.loss.sample_policy(batch) if make is make_cql else None
+    samples = algorithm.model.sample_policy(batch) if make is make_cql else None
     assert loss() != loss()
     algorithm.policy.eval()
     if make is make_cql:
-        algorithm.loss.qvalue_network.eval()  # which the loss does not list among its modules
+        algorithm.model.qvalue_network.eval()  # which the loss does not list among its modules
     assert loss() == loss()
 
 
@@ -242,7 +242,7 @@ def test_critics_start_as_they_were_built(tmp_path):
     """The loss would draw each entry uniformly between the extremes of its tensor: a wider std."""
     network = enhanced_tit(embed_dim=64, num_blocks=1)
     algorithm = make_algorithm(make_cql(tmp_path, critic="backbone", backbone=network))
-    weights = dict(algorithm.loss.qvalue_network_params.items(True, True))
+    weights = dict(algorithm.model.qvalue_network_params.items(True, True))
     embeddings = [w for key, w in weights.items() if key[-3:] == ("ffn", "0", "weight")]
     assert len(embeddings) == 2
     for first, second in embeddings:
@@ -254,7 +254,7 @@ def test_critics_start_as_they_were_built(tmp_path):
 def test_the_discrete_target_follows_the_trained_network_slowly(tmp_path):
     algorithm = make_algorithm(make_discrete_cql(tmp_path, tau=0.25))
     algorithm.prepare(0, tmp_path)
-    loss = algorithm.loss
+    loss = algorithm.model
     before = loss.target_value_network_params.data.clone()
     algorithm.update(next(algorithm.batches()), 0)
     trained, target = loss.value_network_params.data, loss.target_value_network_params

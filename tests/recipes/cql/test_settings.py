@@ -42,15 +42,13 @@ def test_named_recipes_have_the_papers_settings(data):
         assert recipe.env.lower().startswith(task)
         rates = (recipe.actor_learning_rate, recipe.critic_learning_rate)
         assert (*rates, recipe.temperature_learning_rate) == (1e-4, 3e-4, 1e-4)
-        assert (recipe.temperature_init, recipe.adam_eps) == (1.0, 1e-8)
         # 10 for the medium sets of version 0.
         assert recipe.conservative_weight == (5.0 if data.endswith("replay") else 10.0)
         assert (recipe.batch_size, recipe.action_samples) == (256, 10)
         assert (recipe.gamma, recipe.tau) == (0.99, 0.005)
         assert (recipe.critic, recipe.critic_hidden) == ("mlp", (256, 256, 256))
         assert (recipe.backbone.num_frames, recipe.over_critics) == (1, "mean")
-        assert (recipe.time_limits, recipe.terminal_observations) == ("drop", "zero")
-        assert recipe.unfinished == "drop"
+        assert (recipe.time_limits, recipe.unfinished) == ("drop", "drop")
         assert (recipe.final_step, recipe.evaluation_interval) == (500_000, 1000)
         assert (recipe.log_interval, recipe.checkpoint_interval) == (100, 1000)
         assert recipe.evaluation_episodes == 10
@@ -243,7 +241,6 @@ def test_impossible_settings_of_either(tmp_path, make, settings, message):
     ("settings", "message"),
     [
         ({"action_samples": 0}, "action_samples must be at least 1, not 0"),
-        ({"temperature_init": 0.0}, r"temperature_init must be positive, not 0\.0"),
         ({"critic_hidden": ()}, r"critic_hidden must be at least one width .*, not \(\)"),
         ({"critic_hidden": (8, 0)}, r"critic_hidden must be at least one width .*, not \(8, 0\)"),
         ({"actor_learning_rate": -1.0}, "actor_learning_rate must be at least 0"),

@@ -12,11 +12,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from recipes.cql.algorithm import CQLAlgorithm
+from recipes.cql import CQLAlgorithm
 from tests.recipes.cql.cql_runs import make_algorithm, make_cql
-from torchrl_tit.objectives import PolicySamples
-from torchrl_tit.settings import Network
-from torchrl_tit.settings.networks import enhanced_tit, mlp
+from torchrl_tit.settings.networks import mlp
 
 ORDER = ("temperature", "critic", "actor", "target")
 BATCH, WEIGHT, SAMPLES, GAMMA, TAU = 200, 3.0, 4, 0.97, 0.1
@@ -80,18 +78,18 @@ class ByHand:
             x = F.relu(F.linear(x, *critic[i : i + 2]))
         return F.linear(x, *critic[-2:]).squeeze(-1)
 
-    def step(self, batch: TensorDictBase, drawn: PolicySamples, uniform: Tensor, order) -> None:
+    def step(self, batch: TensorDictBase, drawn: TensorDictBase, uniform: Tensor, order) -> None:
         """Steps everything once; the samples are those of the actor before its step."""
         s, a, after = batch["observation"], batch["action"], batch["next"]
         mean, std = self.policy(s)
         # The noise that the action was drawn with; the gradient flows through mean and std.
-        noise = ((drawn.action.detach().atanh() - mean) / std).detach()
+        noise = ((drawn["action"].detach().atanh() - mean) / std).detach()
         action, log_prob = squash(mean, std, noise)
         with torch.no_grad():
             next_mean, next_std = self.policy(after["observation"])
             next_action = next_mean.tanh()
             densities = [
-                log_density(drawn.actions[:, part], m.unsqueeze(1), d.unsqueeze(1))
+                log_density(drawn["actions"][:, part], m.unsqueeze(1), d.unsqueeze(1))
                 for part, m, d in (
                     (slice(SAMPLES), mean, std),
                     (slice(SAMPLES, None), next_mean, next_std),
@@ -110,7 +108,7 @@ class ByHand:
                 )
                 alive = 1 - after["terminated"].squeeze(-1).double()
                 target = after["reward"].squeeze(-1) + GAMMA * alive * best
-            actions = torch.cat([2 * uniform - 1, drawn.actions], 1)
+            actions = torch.cat([2 * uniform - 1, drawn["actions"]], 1)
             states = s.unsqueeze(1).expand(-1, 3 * SAMPLES, -1)
             flat = torch.full_like(densities[0], ENTRIES * math.log(0.5))
             density = torch.cat([flat, *densities], 1)
@@ -159,20 +157,21 @@ def step(tmp_path_factory):
         batch_size=BATCH,
         gamma=GAMMA,
         tau=TAU,
-        temperature_init=0.4,
         **{f"{name}_learning_rate": rate for name, rate in RATES.items()},
     )
     algorithm = make_algorithm(recipe)
-    loss = algorithm.loss.double()
+    loss = algorithm.model.double()
+    loss.log_alpha.data.fill_(math.log(0.4))
     batch = sample_doubles(algorithm)
     batch["action"] *= 0.9  # off the bounds, where densities are infinite
-    draws: list[tuple[PolicySamples, Tensor]] = []
+    draws: list[tuple[TensorDictBase, Tensor]] = []
     sample_policy = loss.sample_policy
     uniform = torch.rand(BATCH, SAMPLES, ENTRIES, dtype=torch.float64)
 
     def record(tensordict):
-        draws.append((sample_policy(tensordict), uniform))
-        return draws[-1][0]
+        samples = sample_policy(tensordict)
+        draws.append((samples["policy_samples"], uniform))
+        return samples
 
     loss.sample_policy = record
     algorithm.prepare(0, folder)
@@ -213,48 +212,3 @@ def test_the_order_is_temperature_critic_actor_target(step, order):
     same = same and place("target") > place("critic")
     assert (difference(ours, after) < 1e-8) == same
     assert same or difference(ours, after) > 1e-6
-
-
-TIT = enhanced_tit(4, embed_dim=8, features_dim=8, share_blocks=True)
-
-
-@pytest.mark.parametrize(
-    ("backbone", "critic", "slice_length"),
-    [
-        (mlp(hidden_dim=12, num_layers=1, activation="relu"), "mlp", 1),
-        (TIT, "backbone", 1),
-        (TIT, "backbone", 4),
-    ],
-    ids=["mlp", "backbone", "slices"],
-)
-def test_a_whole_batch_through_vmap_is_the_same_as_chunks(
-    tmp_path, backbone: Network, critic: str, slice_length: int
-):
-    """A GPU runs both critics on all states at once, a CPU one after the other on some states."""
-    recipe = make_cql(
-        tmp_path,
-        backbone=backbone,
-        critic=critic,
-        slice_length=slice_length,
-        action_samples=SAMPLES,
-        over_critics="sum",
-        tau=TAU,
-        **{f"{name}_learning_rate": rate for name, rate in RATES.items()},
-    )
-    states, terms = [], []
-    for whole in (False, True):
-        torch.manual_seed(0)
-        algorithm = make_algorithm(recipe)
-        algorithm.loss.double()
-        algorithm.prepare(0, tmp_path)
-        algorithm.chunk_size = None if whole else 3
-        if whole:
-            algorithm.loss.deactivate_vmap = False
-            algorithm.loss._make_vmap()
-        batch = sample_doubles(algorithm)
-        for number in range(3):
-            torch.manual_seed(number)
-            terms.append(torch.stack([*algorithm.update(batch, number).values()]))
-        states.append(algorithm.loss.state_dict())
-    torch.testing.assert_close(terms[3:], terms[:3], rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(states[1], states[0], rtol=1e-9, atol=1e-9)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from recipes.decision_transformer import DT, ODT
-from recipes.decision_transformer.sequence_algorithm import SequenceAlgorithm
-from recipes.decision_transformer.settings import SequenceRecipe
+from recipes.decision_transformer import DT, SequenceAlgorithm, SequenceRecipe
+from recipes.online_decision_transformer import ODT
 from tests.recipes.dataset_runs import make_data
 from torchrl_tit.settings.networks import dt_tit
 

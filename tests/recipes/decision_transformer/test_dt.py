@@ -14,8 +14,7 @@ import torch
 
 from recipes import runner
 from recipes.cli import main
-from recipes.decision_transformer import DT
-from recipes.decision_transformer.sequence_algorithm import check_data
+from recipes.decision_transformer import DT, check_data
 from recipes.metrics import read_metrics
 from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
@@ -82,7 +81,7 @@ def test_a_step_is_the_protocols(tmp_path):
     storage = SequenceStorage(episodes, 6, return_scale=50.0)
     generator = torch.Generator().manual_seed(recipe.seed)
     torch.manual_seed(recipe.seed)
-    agent = make_algorithm(recipe).agent
+    agent = make_algorithm(recipe).model
     agent.network.history_encoder.return_scale.fill_(1.0)
     optimizer = torch.optim.AdamW(agent.parameters(), lr=1.0, weight_decay=10.0)
     for step in range(2):
@@ -111,7 +110,7 @@ def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
         tmp_path, acting_num_frames=4, return_scale=50.0, evaluation_seed=3, **settings
     )
     algorithm = make_algorithm(recipe)
-    agent = deepcopy(algorithm.agent)
+    agent = deepcopy(algorithm.model)
     agent.network.history_encoder.return_scale.fill_(1.0)
     mean, std = algorithm.load_data().observation_statistics()
     env = gymnasium.make("Hopper-v5")

@@ -11,7 +11,7 @@ import pytest
 import torch
 from gymnasium.spaces import Box
 
-from recipes.decision_transformer.sequence_algorithm import check_data
+from recipes.decision_transformer import check_data
 from tests.datasets.rollouts import roll, write
 from tests.recipes.decision_transformer.sequence_runs import (
     SMALL,

@@ -13,11 +13,8 @@ from torch import nn
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
 from recipes import runner
-from recipes.decision_transformer import ODT
-from recipes.decision_transformer.odt import make_lamb
-from recipes.decision_transformer.odt_data import OnlineData
-from recipes.decision_transformer.odt_exploration import scale_noise
 from recipes.metrics import read_metrics
+from recipes.online_decision_transformer import ODT, OnlineData, make_lamb, scale_noise
 from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
 from tests.datasets.rollouts import roll
@@ -86,7 +83,7 @@ def test_a_step_is_the_protocols(tmp_path):
     seed = np.random.SeedSequence([recipe.seed, 0]).generate_state(1).item()
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(recipe.seed)
-    agent = make_algorithm(recipe).agent
+    agent = make_algorithm(recipe).model
     agent.network.history_encoder.return_scale.fill_(1.0)
     optimizer = make_lamb(list(agent.parameters()), 1.0, 1.0)
     log_alpha = torch.tensor(0.1).log().requires_grad_()
@@ -135,7 +132,7 @@ def test_what_a_run_writes(tmp_path):
 
 def test_explores_with_drawn_actions_and_keeps_observations_as_they_are(tmp_path):
     algorithm = make_algorithm(make_odt(tmp_path))
-    algorithm.agent.network.frames[0].mean.fill_(100.0)
+    algorithm.model.network.frames[0].mean.fill_(100.0)
     first, again, other = (algorithm.explore(number) for number in (0, 0, 1))
     assert len(first.lengths) == 1
     assert first.finished.all()
@@ -144,7 +141,7 @@ def test_explores_with_drawn_actions_and_keeps_observations_as_they_are(tmp_path
     assert not torch.equal(first.rows["observation"][0], other.rows["observation"][0])
     actions = [episode.rows["action"][0] for episode in (first, again)]
     assert not torch.equal(*actions)
-    assert algorithm.agent.training
+    assert algorithm.model.training
 
 
 def test_explores_with_its_own_target_and_noise(tmp_path, monkeypatch):

@@ -15,8 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from recipes.algorithm import make_algorithm
 from recipes.callback import Callback
-from recipes.dqn import DQN
-from recipes.dqn.algorithm import DQNAlgorithm
+from recipes.dqn import DQN, DQNAlgorithm
 from recipes.metrics import read_metrics
 from recipes.registry import RECIPES, get_recipe
 from recipes.run import Run
@@ -76,9 +75,9 @@ def double(recipe: DQN, folder: Path) -> tuple[DQNAlgorithm, TensorDict]:
     algorithm = make(recipe)
     algorithm.prepare(0, folder)
     algorithm.close()
-    algorithm.loss.double()
+    algorithm.model.double()
     with torch.no_grad():
-        for name, weight in algorithm.loss.state_dict().items():
+        for name, weight in algorithm.model.state_dict().items():
             if name.startswith("target_value_network_params.module.1."):  # the values' layer
                 weight.neg_()
     size, frames = 16, recipe.backbone.num_frames
@@ -96,7 +95,7 @@ def double(recipe: DQN, folder: Path) -> tuple[DQNAlgorithm, TensorDict]:
 
 def values(algorithm: DQNAlgorithm, states: TensorDictBase, params: str) -> torch.Tensor:
     """The values of all actions with the weights of a network, [B, actions]."""
-    with getattr(algorithm.loss, params).data.to_module(algorithm.policy):
+    with getattr(algorithm.model, params).data.to_module(algorithm.policy):
         return algorithm.policy(states.select("history"))["action_value"].detach()
 
 
@@ -111,22 +110,22 @@ def test_the_target_of_a_gradient_step(doubled: bool, tmp_path: Path) -> None:
     assert (best != other).all()
     alive = 1 - batch["next", "terminated"].double()
     expected = (q - batch["next", "reward"] - 0.9 * alive * following.gather(1, best)).square()
-    loss, epsilon = algorithm._step(batch, 0)
-    torch.testing.assert_close(loss, expected.mean())
-    assert epsilon == 1
+    terms = algorithm.learn(batch, 0)
+    torch.testing.assert_close(terms["loss"], expected.mean())
+    assert terms["epsilon"] == 1
 
 
 def test_target_updates_and_learning(tmp_path: Path) -> None:
     recipe = replace(SMALL, learning_rate=0.05, target_interval=30)
     algorithm, batch = double(recipe, tmp_path)
-    before = {n: w.clone() for n, w in algorithm.loss.state_dict().items()}
-    losses = [algorithm._step(batch.clone(), number)[0] for number in range(29)]
-    state = algorithm.loss.state_dict()
+    before = {n: w.clone() for n, w in algorithm.model.state_dict().items()}
+    losses = [algorithm.learn(batch.clone(), number)["loss"] for number in range(29)]
+    state = algorithm.model.state_dict()
     targets = [n for n in state if n.startswith("target_")]
     assert all(torch.equal(state[n], before[n]) for n in targets)
     assert losses[-1] < 0.7 * losses[0]
-    algorithm._step(batch, 29)
-    state = algorithm.loss.state_dict()
+    algorithm.learn(batch, 29)
+    state = algorithm.model.state_dict()
     assert all(torch.equal(state[n], state[n.removeprefix("target_")]) for n in targets)
 
 
@@ -149,7 +148,7 @@ def test_slices_have_the_loss_of_their_transitions(tmp_path: Path) -> None:
         batch = algorithm.buffer.storage.get(index)
         assert length == 1 or batch["is_init"][:, 1:].any()
         batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
-        losses.append(algorithm._step(batch, 0)[0])
+        losses.append(algorithm.learn(batch, 0)["loss"])
     torch.testing.assert_close(losses[1], losses[0], rtol=1e-9, atol=1e-9)
 
 
@@ -183,7 +182,8 @@ def test_forbidden_actions_are_neither_taken_nor_valued(tmp_path: Path) -> None:
     algorithm = make(replace(recipe, gamma=1.0))
     algorithm.prepare(0, tmp_path / "other")
     algorithm.close()
-    algorithm.buffer.extend(algorithm.stored(batches.batches[0]))
+    stored = ["observation", "action", "action_mask", "next"]
+    algorithm.buffer.extend(batches.batches[0].select(*stored))
     batch = algorithm.buffer.sample()
     # A target of the best allowed action, which is not always the best of all.
     following = values_of_taxi(algorithm, batch["next"])
@@ -191,7 +191,7 @@ def test_forbidden_actions_are_neither_taken_nor_valued(tmp_path: Path) -> None:
     assert (allowed.argmax(1) != following.argmax(1)).any()
     q = values_of_taxi(algorithm, batch).gather(1, batch["action"].unsqueeze(1)).squeeze(1)
     target = batch["next", "reward"].squeeze(1) + allowed.max(1).values
-    loss, _ = algorithm._step(batch, 0)
+    loss = algorithm.learn(batch, 0)["loss"]
     torch.testing.assert_close(loss, (q - target).square().mean())
 
 
@@ -214,7 +214,7 @@ def test_clipped_rewards(tmp_path: Path) -> None:
     algorithm = make(replace(SMALL, clip_rewards=True))
     reward = torch.tensor([[[-3.0], [0.0], [0.2]]])
     batch = TensorDict({"next": {"reward": reward, "observation": torch.zeros(1, 3, 4)}}, [1, 3])
-    assert algorithm.stored(batch)["next", "reward"].flatten().tolist() == [-1, 0, 1]
+    assert algorithm.collected(batch)["next", "reward"].flatten().tolist() == [-1, 0, 1]
     assert batch["next", "reward"] is reward  # what callbacks see
 
 
@@ -232,7 +232,7 @@ def test_clipped_rewards(tmp_path: Path) -> None:
         ({"target_interval": 0}, "target_interval must be at least 1, not 0"),
         ({"tau": 2.0}, "tau must be at most 1"),
         ({"buffer_size": 5}, "buffer_size 5 has no room for a batch of 10 steps"),
-        ({"random_steps": 25}, "random_steps 25 must be a multiple of steps_per_batch 10"),
+        ({"random_steps": 25}, "steps_per_batch 10 does not divide random_steps 25"),
         ({"loss_function": "l1"}, r"field 'loss_function' is 'l1', not one of \('l2', 'smooth_l1'"),
     ],
 )

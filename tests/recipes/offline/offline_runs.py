@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 
 from recipes.bc import BC
 from recipes.iql import IQL
+from recipes.offline import TransitionRecipe
 from recipes.td3bc import TD3BC
-from recipes.transition_recipe import TransitionRecipe
 from tests.recipes.cql.cql_runs import SETTINGS, make_algorithm, make_cartpole_data
 from tests.recipes.dataset_runs import make_data
 from torchrl_tit.settings.networks import mlp
@@ -38,7 +38,7 @@ def double(recipe: TransitionRecipe, folder: Path) -> tuple[Any, TensorDictBase]
     """An algorithm in float64, ready for updates, and a batch."""
     torch.manual_seed(0)
     algorithm = make_algorithm(recipe)
-    algorithm.loss.double()
+    algorithm.model.double()
     algorithm.prepare(0, folder)
     batch = algorithm.buffer.sample()
     return algorithm, batch.apply(lambda x: x.double() if x.is_floating_point() else x)

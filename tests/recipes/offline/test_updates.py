@@ -53,10 +53,10 @@ def assert_follows(before, after, network, tau):
 @pytest.mark.parametrize("env", ["Hopper-v5", "CartPole-v1"])
 def test_behaviour_cloning(tmp_path, env):
     algorithm, batch = double(make(BC, tmp_path, env=env), tmp_path)
-    for name, weight in weights_of(algorithm.loss, keep=True).items():
+    for name, weight in weights_of(algorithm.model, keep=True).items():
         if name.startswith("actor") and tuple(weight.shape) == (3, 8):
             weight.mul_(100)  # means that the tanh keeps within the bounds
-    weights = weights_of(algorithm.loss)
+    weights = weights_of(algorithm.model)
     by_shape = {tuple(w.shape): w for n, w in weights.items() if n.startswith("actor")}
     with torch.no_grad():
         features = algorithm.policy(batch.clone())["features"]
@@ -73,7 +73,7 @@ def test_behaviour_cloning(tmp_path, env):
         torch.testing.assert_close(theirs, expected)
     terms = algorithm.update(batch, 0)
     torch.testing.assert_close(terms["loss_bc"], expected)
-    assert moved(weights, algorithm.loss.state_dict(), "actor")
+    assert moved(weights, algorithm.model.state_dict(), "actor")
 
 
 def bias_of(weights, size):
@@ -87,7 +87,7 @@ def test_iql(tmp_path, env):
     discrete = env == "CartPole-v1"
     recipe = make(IQL, tmp_path, env=env, tau=0.1, gamma=0.9, expectile=0.8, temperature=2.0)
     algorithm, batch = double(recipe, tmp_path)
-    loss = algorithm.loss
+    loss = algorithm.model
     with torch.no_grad():  # targets of their own, and advantages that are not all small
         for name, weight in weights_of(loss, keep=True).items():
             if name.startswith("target_"):
@@ -146,7 +146,7 @@ def test_iql_scales_rewards(tmp_path):
 def test_td3bc(tmp_path):
     recipe = make(TD3BC, tmp_path, tau=0.1, gamma=0.9, policy_noise=0.4)
     algorithm, batch = double(recipe, tmp_path)
-    loss = algorithm.loss
+    loss = algorithm.model
     with torch.no_grad():
         for name, weight in weights_of(loss, keep=True).items():
             if name.startswith("target_"):

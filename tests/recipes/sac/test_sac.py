@@ -21,12 +21,9 @@ from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import RECIPES
 from recipes.run import Run
 from recipes.runner import evaluate, train
-from recipes.sac import SAC
-from recipes.sac import algorithm as sac
-from recipes.sac.algorithm import SACAlgorithm
+from recipes.sac import SAC, SACAlgorithm
 from recipes.td3bc import TD3BC
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
-from torchrl_tit.modules import Backbone
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
 SMALL = SAC(
@@ -153,7 +150,7 @@ def double(recipe: SAC, folder: Path) -> tuple[SACAlgorithm, TensorDict]:
     torch.manual_seed(0)
     algorithm = make(recipe)
     algorithm.prepare(0, folder)
-    algorithm.loss.double()
+    algorithm.model.double()
     frames, size = recipe.backbone.num_frames, 16
     seen = torch.randn(size, frames + 1, 3, dtype=torch.float64)
     here, there = (
@@ -168,30 +165,9 @@ def double(recipe: SAC, folder: Path) -> tuple[SACAlgorithm, TensorDict]:
 def step_of(algorithm: SACAlgorithm, batch: TensorDictBase) -> list[Tensor]:
     """The terms and the gradients of a gradient step."""
     torch.manual_seed(1)
-    terms = algorithm._step(batch.copy(), 0)
-    return [terms, *(w.grad for w in algorithm.loss.parameters() if w.grad is not None)]
-
-
-@pytest.mark.parametrize("critic", ["mlp", "backbone"])
-def test_frames_are_shared_without_changing_the_gradient(
-    critic: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """Against passes of their own for s and s'."""
-    frames: list[int] = []
-    results = []
-    for shared in (False, True):
-        algorithm, batch = double(replace(SMALL, backbone=NO_DROPOUT, critic=critic), tmp_path)
-        module = next(m for m in algorithm.policy.modules() if isinstance(m, Backbone))
-        module.module.frames[0].register_forward_pre_hook(
-            lambda _, inputs: frames.append(inputs[0].numel() // 3)
-        )
-        with monkeypatch.context() as patch:
-            if not shared:
-                patch.setattr(sac, "encode_pairs", lambda _, td: (td.empty(), td.empty()))
-            results.append(step_of(algorithm, batch))
-        algorithm.close()
-    torch.testing.assert_close(results[1], results[0], rtol=1e-9, atol=1e-9)
-    assert sorted(frames) == [16, 64, 64, 64]  # without sharing, and s and the rest of s'
+    terms = algorithm.learn(batch.copy(), 0)
+    losses = [terms[name].detach() for name in algorithm.columns]
+    return [*losses, *(w.grad for w in algorithm.model.parameters() if w.grad is not None)]
 
 
 @pytest.mark.parametrize("critic", ["mlp", "backbone"])
@@ -242,7 +218,7 @@ def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
     algorithm, batch = double(replace(SMALL, backbone=mlp(2, hidden_dim=8)), tmp_path)
     batch["next", "terminated"][:] = True
     batch["next", "done"][:] = True
-    critics = algorithm.loss.qvalue_network_params["module", "0", "module"]
+    critics = algorithm.model.qvalue_network_params["module", "0", "module"]
     x = torch.cat([batch["observation"], batch["action"]], -1)
     expected = torch.zeros((), dtype=torch.float64)
     for critic in critics.unbind(0):
@@ -252,19 +228,19 @@ def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
             hidden = hidden.relu()
         q = nn.functional.linear(hidden, critic["4", "weight"], critic["4", "bias"])
         expected += (q - batch["next", "reward"]).square().mean()
-    terms = dict(zip(algorithm.columns, algorithm._step(batch, 0), strict=True))
+    terms = algorithm.learn(batch, 0)
     algorithm.close()
-    torch.testing.assert_close(terms["loss_qvalue"], expected.detach())
+    torch.testing.assert_close(terms["loss_qvalue"], expected)
     assert terms["alpha"] == 1
 
 
 def test_a_gradient_step_moves_weights_and_targets(tmp_path: Path) -> None:
     recipe = replace(SMALL, learning_rate=1e-3, tau=0.1, gamma=0.5)
     algorithm, batch = double(recipe, tmp_path)
-    before = {name: value.clone() for name, value in algorithm.loss.state_dict().items()}
-    algorithm._step(batch, 0)
+    before = {name: value.clone() for name, value in algorithm.model.state_dict().items()}
+    algorithm.learn(batch, 0)
     algorithm.close()
-    after = algorithm.loss.state_dict()
+    after = algorithm.model.state_dict()
     for name, value in after.items():
         if name.startswith("target_"):
             source = after[name.removeprefix("target_")]
@@ -273,8 +249,8 @@ def test_a_gradient_step_moves_weights_and_targets(tmp_path: Path) -> None:
             # Adam's first step is the learning rate, wherever there is a gradient.
             moved = (value - before[name]).abs()
             assert moved.max() == pytest.approx(1e-3, rel=1e-2)
-    assert algorithm.loss.value_estimator.gamma == 0.5
-    assert algorithm.loss.target_entropy == -1
+    assert algorithm.model.value_estimator.gamma == 0.5
+    assert algorithm.model.target_entropy == -1
 
 
 def test_the_policy_is_a_squashed_gaussian_on_the_backbone() -> None:
@@ -300,7 +276,7 @@ def test_critics_read_the_history_where_velocities_are_hidden(
     fields: dict[str, Any], differ: bool
 ) -> None:
     """Two states with one observation: a pendulum that swings left and one that swings right."""
-    loss = make(replace(SMALL, backbone=mlp(2, hidden_dim=8), **fields)).loss
+    loss = make(replace(SMALL, backbone=mlp(2, hidden_dim=8), **fields)).model
     size = 2 if fields else 3
     newest, before = torch.randn(1, size), torch.randn(2, size)
     states = TensorDict(
@@ -325,8 +301,8 @@ def test_critics_start_as_they_were_built(monkeypatch: pytest.MonkeyPatch) -> No
         built.append({name: weight.clone() for name, weight in network.state_dict().items()})
         return network
 
-    monkeypatch.setattr("recipes.critics.MLP", make_mlp)
-    loss = make(SMALL).loss
+    monkeypatch.setattr("recipes.networks.MLP", make_mlp)
+    loss = make(SMALL).model
     stacked = loss.qvalue_network_params["module", "0", "module"].flatten_keys(".")
     assert len(built) == 2
     for name, weights in stacked.items():
@@ -346,11 +322,11 @@ def test_evaluation_plays_the_most_likely_actions(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"random_steps": 25}, "random_steps 25 must be a multiple of steps_per_batch 10"),
+        ({"random_steps": 25}, "steps_per_batch 10 does not divide random_steps 25"),
         ({"slice_length": 3}, "slice_length 3 does not divide batch_size 8"),
         ({"slice_length": 0}, "slice_length must be at least 1"),
         ({"slice_length": 8, "random_steps": 10, "num_envs": 2}, "slice_length 8 is longer than"),
-        ({"num_envs": 3}, "steps_per_batch 10 must be a multiple of num_envs 3"),
+        ({"num_envs": 3}, "num_envs 3 does not divide steps_per_batch 10"),
         ({"gamma": 1.5}, "gamma must be at most 1"),
         ({"tau": -1.0}, "tau must be at least 0"),
         ({"batch_size": 0}, "batch_size must be at least 1"),
