@@ -84,8 +84,7 @@ def tune(arguments: list[str]) -> None:
             fail(f"--{name.replace('_', '-')} must be at least 1, not {getattr(options, name)}")
     # Not at the top: Optuna is an extra.
     from ..sweeps.search_space import load_space
-    from ..sweeps.trials import importances
-    from ..sweeps.tune import Search, Settings
+    from ..sweeps.tune import Search, Settings, importances
 
     recipe = find_recipe(options.name)
     allow_names(recipe)
@@ -96,13 +95,13 @@ def tune(arguments: list[str]) -> None:
         seeds=tuple(dict.fromkeys(options.seeds)),
         startup_trials=options.startup_trials,
     )
-    search = Search(options.out, settings)
-    try:
-        failed = search.run(options.trials, options.workers)
-    except KeyboardInterrupt:
-        note("stopped; the same command resumes it", "")
-        raise
-    best = search.best()
+    with Search(options.out, settings) as search:
+        try:
+            failed = search.run(options.trials, options.workers)
+        except KeyboardInterrupt:
+            note("stopped; the same command resumes it", "")
+            raise
+        best = search.best()
     if failed:
         note(f"trials {failed} failed: see trial-N/*.log in {options.out}")
     if best is None:

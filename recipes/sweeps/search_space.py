@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, TypeAlias
 
-import msgspec
-import optuna
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
 
 from torchrl_tit.settings import Inner
 from torchrl_tit.settings.checks import nearest
@@ -18,89 +22,25 @@ from torchrl_tit.settings.histories import OuterSettings
 from ..recipe import Recipe
 from ..recipe_json import recipe_from_json, recipe_to_json
 
-Number = float | int
+SearchSpace: TypeAlias = dict[str, dict[str, Any]]
+"""Ranges by the full name of a field, such as "backbone.frame.patch_size": the "type" of an Optuna
+distribution and its arguments, as in ``{"type": "float", "low": 1e-5, "high": 1e-3, "log": true}``.
+"""
 
+_KINDS: dict[str, type[BaseDistribution]] = {
+    "categorical": CategoricalDistribution,
+    "float": FloatDistribution,
+    "int": IntDistribution,
+}
 # Fields that define the search, which therefore cannot vary them. A search has its own seeds.
 _FIXED = {"algorithm", "name", "seed"}
-
-
-class Categorical(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="categorical"):
-    """One of several values."""
-
-    choices: Annotated[list[str | bool | int | float | None], msgspec.Meta(min_length=1)]
-
-    def suggest(self, trial: optuna.Trial, field: str) -> Any:
-        """Asks Optuna for a value."""
-        return trial.suggest_categorical(field, self.choices)
-
-    def contains(self, value: Any) -> bool:
-        """Whether this is one of the values."""
-        return value in self.choices
-
-    def examples(self) -> list[Any]:
-        """All values."""
-        return list(self.choices)
-
-
-class Float(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="float"):
-    """A number between two bounds."""
-
-    low: float
-    high: float
-    log: bool = False
-
-    def __post_init__(self) -> None:
-        _check_bounds(self.low, self.high, self.log)
-
-    def suggest(self, trial: optuna.Trial, field: str) -> Any:
-        """Asks Optuna for a value."""
-        return trial.suggest_float(field, self.low, self.high, log=self.log)
-
-    def contains(self, value: Any) -> bool:
-        """Whether this is a number between the bounds."""
-        return isinstance(value, Number) and self.low <= value <= self.high
-
-    def examples(self) -> list[Any]:
-        """Both bounds."""
-        return [self.low, self.high]
-
-
-class Int(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="int"):
-    """A whole number between two bounds."""
-
-    low: int
-    high: int
-    step: Annotated[int, msgspec.Meta(ge=1)] = 1
-    log: bool = False
-
-    def __post_init__(self) -> None:
-        _check_bounds(self.low, self.high, self.log)
-        if self.log and self.step != 1:
-            raise ValueError("log requires a step of 1")
-
-    def suggest(self, trial: optuna.Trial, field: str) -> Any:
-        """Asks Optuna for a value."""
-        return trial.suggest_int(field, self.low, self.high, step=self.step, log=self.log)
-
-    def contains(self, value: Any) -> bool:
-        """Whether this is one of the whole numbers between the bounds."""
-        return value in range(self.low, self.high + 1, self.step)
-
-    def examples(self) -> list[Any]:
-        """Both bounds."""
-        return [self.low, self.high]
-
-
-SearchSpace = dict[str, Categorical | Float | Int]
-"""Ranges by the full name of a field, such as "backbone.frame.patch_size"."""
 
 
 def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
     """Reads a search space, or chooses the one that comes with the library for a recipe.
 
     Args:
-        source: a JSON file, such as
-            ``{"learning_rate": {"type": "float", "low": 1e-5, "high": 1e-3, "log": true}}``.
+        source: a JSON file with a :data:`SearchSpace`.
         recipe: the recipe whose fields are searched.
 
     Raises:
@@ -108,22 +48,38 @@ def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
             rejects.
     """
     if source is None:
-        text = resources.files(__package__).joinpath("search_spaces.json").read_bytes()
-        spaces = msgspec.json.decode(text, type=dict[str, SearchSpace])
+        spaces = json.loads(resources.files(__package__).joinpath("search_spaces.json").read_text())
         name = _default_space(recipe)
         space = spaces[name] | spaces.get(f"{name}/{recipe.backbone.history.name}", {})
         source = Path(f"the search space {name!r}")
     else:
         try:
-            space = msgspec.json.decode(source.read_bytes(), type=SearchSpace)
-        except msgspec.MsgspecError as error:
+            space = json.loads(source.read_bytes())
+            make_distributions(space)
+        except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{source} is not a search space: {error}") from error
     if not space:
         raise ValueError(f"{source} names no field to search")
-    for field, values in space.items():
-        for value in values.examples():
+    for field, arguments in space.items():
+        for value in arguments.get("choices") or (arguments["low"], arguments["high"]):
             with_values(recipe, {field: value}, source)
     return space
+
+
+def make_distributions(space: SearchSpace) -> dict[str, BaseDistribution]:
+    """Makes Optuna's distributions of a search space, by the names of its fields.
+
+    Example:
+        >>> make_distributions({"epochs": {"type": "int", "low": 2, "high": 8}})
+        {'epochs': IntDistribution(high=8, log=False, low=2, step=1)}
+    """
+    made = {}
+    for field, arguments in space.items():
+        if arguments["type"] not in _KINDS:
+            raise ValueError(f"the type of {field} is none of {', '.join(_KINDS)}")
+        rest = {name: value for name, value in arguments.items() if name != "type"}
+        made[field] = _KINDS[arguments["type"]](**rest)
+    return made
 
 
 def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Recipe:
@@ -146,7 +102,7 @@ def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Reci
     fields = json.loads(recipe_to_json(recipe))
     owners = {
         name: owner
-        for name, owner in _owners(fields).items()
+        for name, owner in _owners(fields)
         if name not in _FIXED and not name.endswith(".encoder")
     }
     for name, value in values.items():
@@ -158,13 +114,13 @@ def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Reci
     return recipe_from_json(json.dumps(fields), source)
 
 
-def _owners(fields: dict[str, Any], prefix: str = "") -> dict[str, dict[str, Any]]:
-    """The dictionary that holds a field, by the field's full name."""
-    owners: dict[str, dict[str, Any]] = {}
+def _owners(fields: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yields each field's full name and the dictionary that holds it."""
     for name, value in fields.items():
-        nested = isinstance(value, dict)
-        owners |= _owners(value, f"{prefix}{name}.") if nested else {prefix + name: fields}
-    return owners
+        if isinstance(value, dict):
+            yield from _owners(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, fields
 
 
 def _default_space(recipe: Recipe) -> str:
@@ -177,10 +133,3 @@ def _default_space(recipe: Recipe) -> str:
     if not (isinstance(network.frame, Inner) and isinstance(network.history, OuterSettings)):
         return "ppo"
     return "tit-images" if recipe.env.startswith("ALE/") else "tit-arrays"
-
-
-def _check_bounds(low: Number, high: Number, log: bool) -> None:
-    if not low < high:
-        raise ValueError(f"low must be below high, not {low} and {high}")
-    if log and low <= 0:
-        raise ValueError(f"low must be above 0 where log is on, not {low}")

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 import signal
 import subprocess
 import time
-import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import filelock
-import msgspec
 import optuna
-from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
-from optuna.study import StudyDirection
-from optuna.trial import FrozenTrial, Trial, TrialState
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
+from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 from tqdm import tqdm
 
 from torchrl_tit.agents.folder import read_evaluation
-from torchrl_tit.files import remove_leftovers, write_bytes_atomic, write_text_atomic
+from torchrl_tit.files import remove_leftovers, write_text_atomic
 
 from ..algorithm import make_algorithm
 from ..chosen_frames import with_chosen_frames
@@ -33,12 +31,11 @@ from ..interrupt import raise_on_signals
 from ..metrics import read_metrics
 from ..recipe import Recipe
 from ..recipe_json import recipe_to_json
-from ..run import Run
-from .search_space import SearchSpace, with_values
+from .search_space import SearchSpace, make_distributions, with_values
 from .sweep import Job, start
-from .trials import write_trials
 
 _WINDOW = 5  # batches over which a trial's return is averaged when trials are compared
+_FEWEST = 4  # complete trials for computing importances
 
 
 @dataclass(frozen=True)
@@ -64,15 +61,17 @@ class Search:
 
         settings.json   recipe, seeds and pruning
         space.json      the search space
-        study.log       Optuna's journal of all trials
+        trials.csv      every trial: its state, value and fields
         trial-N.json    the recipe of a trial, and trial-N/ its run folders
         best.json       the recipe of the best trial, which ``train`` takes
-        trials.csv      every trial: its state, value and fields
         importance.csv  how much each field mattered, from four complete trials on
 
     Trials are drawn by Optuna's tree-structured Parzen estimator and stopped early by its median
     pruner, on returns of training episodes. A trial's value is the mean of its evaluations. Its
     recipe is named after the searched one, followed by ``/trial-N``.
+
+    Optuna's study is made anew from ``trials.csv`` and the trials' run folders, so nothing else has
+    to be kept in step with them. The folder is locked between ``with`` and its end.
 
     Args:
         folder: the folder.
@@ -80,161 +79,164 @@ class Search:
 
     Raises:
         RuntimeError: if another process is using the search.
-        ValueError: if the folder holds another search, ``study.log`` is damaged or holds values
-            that this search cannot have written, or the run of a trial has other values.
+        ValueError: if the folder holds another search, ``trials.csv`` is damaged or holds values
+            that this search cannot have drawn, or the run of a trial has other values.
     """
 
     def __init__(self, folder: Path, settings: Settings) -> None:
         self.folder = folder
         self.settings = settings
-        self.journal = folder / "study.log"
-        folder.mkdir(parents=True, exist_ok=True)
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        with self._locked():
-            _write_or_compare(folder / "settings.json", _to_json(settings))
-            _write_or_compare(folder / "space.json", msgspec.json.encode(settings.space).decode())
-            self.study = self._open_study()
-            self._check_runs()
+        self.space = make_distributions(settings.space)
+        self._lock = filelock.FileLock(folder / ".lock", timeout=0)
 
-    def _open_study(self) -> optuna.Study:
-        settings, path = self.settings, self.journal
-        # The folder is locked: a lock of the journal was left behind by a process that was killed.
-        Path(f"{path}.lock").unlink(missing_ok=True)
-        name = settings.recipe.name or settings.recipe.algorithm
+    def __enter__(self) -> Search:
+        self.folder.mkdir(parents=True, exist_ok=True)
         try:
-            _cut_half_line(path)
-            # Optuna's default lock is a symbolic link, which does not work with a relative path.
-            lock = JournalFileOpenLock(str(path))
-            storage = JournalStorage(JournalFileBackend(str(path), lock))
-            others = set(optuna.get_all_study_names(storage)) - {name}
-            if others:
-                raise ValueError(f"it holds the study {min(others)!r}, not {name!r}")
-            study = optuna.create_study(
-                study_name=name,
-                storage=storage,
-                direction="maximize",
-                load_if_exists=True,
-                pruner=optuna.pruners.MedianPruner(
-                    n_startup_trials=settings.startup_trials,
-                    n_warmup_steps=int(settings.warmup * settings.recipe.final_step),
-                ),
-            )
-            if study.directions != [StudyDirection.MAXIMIZE]:
-                raise ValueError("its study does not maximize one value")
-            for trial in study.trials:
-                _check_trial(trial, settings.space)
-        except OSError:
-            raise
-        except Exception as error:  # a damaged line can fail in any way
-            reason = " ".join(str(error).split())
-            raise ValueError(
-                f"{path} is not an intact journal of this search ({type(error).__name__}: "
-                f"{reason}): remove the damaged line, or name another folder with --out"
-            ) from error
-        study.sampler = optuna.samplers.TPESampler(
-            n_startup_trials=settings.startup_trials,
-            # So that a resumed search does not draw the values of its first trials again.
-            seed=settings.recipe.seed + len(study.trials),
-            constant_liar=True,
-        )
-        return study
-
-    def _check_runs(self) -> None:
-        """Raises ValueError if the run of a complete trial has other values than the trial."""
-        for trial in self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
-            for seed in self.settings.seeds:
-                folder = self.folder / f"trial-{trial.number}" / f"seed-{seed}"
-                path = folder / "recipe.json"
-                if not path.is_file():
-                    continue
-                recipe = Run.open(folder).recipe
-                if with_values(recipe, trial.params, path) != recipe:
-                    raise ValueError(
-                        f"{folder} holds a run with other settings than trial {trial.number} in "
-                        f"{self.journal}: name another folder with --out, or move it away"
-                    )
-
-    @contextmanager
-    def _locked(self) -> Iterator[None]:
-        try:
-            with filelock.FileLock(self.folder / ".lock", timeout=0):
-                yield
+            self._lock.acquire()
         except filelock.Timeout as error:
             raise RuntimeError(
                 f"{self.folder} is in use by another process: wait for it, or stop it"
             ) from error
+        try:
+            remove_leftovers(self.folder)
+            self._load()
+        except BaseException:
+            self._lock.release()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def _load(self) -> None:
+        settings = self.settings
+        self._write_or_compare("settings.json", _to_json(settings))
+        self._write_or_compare("space.json", json.dumps(settings.space))
+        trials = self._read_trials()
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.study = optuna.create_study(
+            direction="maximize",
+            sampler=optuna.samplers.TPESampler(
+                n_startup_trials=settings.startup_trials,
+                # So that a resumed search does not draw the values of its first trials again.
+                seed=settings.recipe.seed + len(trials),
+                constant_liar=True,
+            ),
+            pruner=optuna.pruners.MedianPruner(
+                n_startup_trials=settings.startup_trials,
+                n_warmup_steps=int(settings.warmup * settings.recipe.final_step),
+            ),
+        )
+        self._running: list[_Trial] = []
+        for earlier in trials:
+            if earlier.state in (TrialState.FAIL, TrialState.PRUNED):
+                self.study.add_trial(earlier)
+                continue
+            self.study.enqueue_trial(earlier.params)
+            trial = _Trial(self, self.study.ask(self.space))
+            if trial.is_waiting():
+                self._running.append(trial)
+            else:
+                trial.advance()  # it is complete, or cannot be run
+        self._write_trials()
+
+    def _read_trials(self) -> list[FrozenTrial]:
+        path = self.folder / "trials.csv"
+        if not path.exists():
+            return []
+        try:
+            with path.open(encoding="utf-8", newline="") as file:
+                return [self._parse(number, row) for number, row in enumerate(csv.DictReader(file))]
+        except (AttributeError, LookupError, TypeError, ValueError, csv.Error) as error:
+            raise ValueError(
+                f"{path} is not an intact table of this search's trials ({type(error).__name__}: "
+                f"{' '.join(str(error).split())}): name another folder with --out"
+            ) from error
+
+    def _parse(self, number: int, row: Mapping[str, str]) -> FrozenTrial:
+        """Reads a row of ``trials.csv``; raises an error if this search cannot have written it."""
+        if row["trial"] != str(number):
+            raise ValueError(f"trial {number} is missing")
+        value = float(row["value"] or 0)
+        if not math.isfinite(value):
+            raise ValueError(f"trial {number} has the return {value}, not a finite number")
+        state = TrialState[row["state"].upper()]
+        return create_trial(  # checks that the values are in the search space
+            state=state,
+            value=value if state == TrialState.COMPLETE else None,
+            params={field: _value(row[field], kind) for field, kind in self.space.items()},
+            distributions=self.space,
+            intermediate_values={int(row["step"]): value} if row["step"] else {},
+        )
+
+    def _write_or_compare(self, name: str, text: str) -> None:
+        path, advice = self.folder / name, "name another folder with --out, or move it away"
+        if not path.exists():
+            if (self.folder / "trials.csv").exists():
+                raise ValueError(
+                    f"{path} is missing, so it is not known which search {self.folder} holds: "
+                    f"{advice}"
+                )
+            write_text_atomic(path, text)
+            return
+        try:
+            before = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"{path} cannot be read ({error}): {advice}") from error
+        if before != json.loads(text):
+            raise ValueError(f"{self.folder} holds a search with other settings: {advice}")
 
     def run(self, trials: int, workers: int) -> list[int]:
-        """Runs trials, some at a time, until the given number has ended.
+        """Runs trials until there are so many in all; resumes those that were killed.
 
         Args:
-            trials: number of trials in the whole search, including those of earlier calls.
-            workers: number of trials at a time, each in its own process.
+            trials: number of trials, with those of earlier calls.
+            workers: trials at a time, each in its own process.
 
         Returns:
-            Numbers of the trials that failed; their output is in their logs.
+            The numbers of the trials that failed; their output is in ``trial-N/seed-SEED.log`` and
+            ``trial-N/error.log``.
 
         Raises:
-            KeyboardInterrupt: after Ctrl-C, once all workers have saved a checkpoint.
-            RuntimeError: if another process is using the search.
-            ValueError: if a trial's folder holds a run with other settings.
+            KeyboardInterrupt: after Ctrl-C, once all workers have stopped.
         """
-        with self._locked():
-            remove_leftovers(self.folder)
+        ended = self._count_ended()
+        with raise_on_signals(), tqdm(total=trials, initial=ended, unit=" trials") as progress:
             try:
-                return self._run(trials, workers)
-            finally:
-                self._write_trials()
-
-    def _run(self, trials: int, workers: int) -> list[int]:
-        ended = [trial for trial in self.study.trials if trial.state.is_finished()]
-        # Trials that a killed process left behind are resumed.
-        running = [
-            _Trial(self, Trial(self.study, trial._trial_id))
-            for trial in self.study.trials
-            if trial.state == TrialState.RUNNING
-        ]
-        failed = [t.number for t in ended if t.state == TrialState.FAIL]
-        done = len(ended)  # not progress.n: a disabled progress bar does not count
-        progress = tqdm(total=trials, initial=done, unit=" trials")
-        with raise_on_signals(), progress:
-            try:
-                self._show_best(progress)
-                while done < trials:
-                    room = min(workers, trials - done)
-                    while len(running) < room:
-                        running.append(_Trial(self, self.study.ask()))
+                while ended < trials:
+                    room = min(workers, trials - ended)
+                    while len(self._running) < room:
+                        trial = self.study.ask(self.space)
+                        self._write_trials()  # before anything of it starts
+                        self._running.append(_Trial(self, trial))
                     time.sleep(0.2)
-                    for trial in running[:room]:  # a killed search may have left more
-                        state = trial.advance()
-                        if state is not None:
-                            running.remove(trial)
-                            done += 1
-                            progress.update()
+                    for trial in self._running[:room]:  # a killed search may have left more
+                        if trial.advance():
+                            self._running.remove(trial)
                             self._write_trials()
-                            self._show_best(progress)
-                            if state == TrialState.FAIL:
-                                failed.append(trial.number)
+                    progress.update(self._count_ended() - ended)
+                    ended = self._count_ended()
+                    if best := self.best():
+                        progress.set_postfix_str(f"best {best.value:.1f}, trial {best.number}")
             except BaseException:
-                for trial in running:
+                for trial in self._running:
                     trial.stop()
                 raise
-        return failed
+            finally:
+                self._write_trials()
+        failed = self.study.get_trials(deepcopy=False, states=(TrialState.FAIL,))
+        return [trial.number for trial in failed]
 
-    def _write_trials(self) -> None:
-        write_trials(self.study, list(self.settings.space), self.folder)
-
-    def _show_best(self, progress: tqdm[Any]) -> None:
-        if best := self.best():
-            progress.set_postfix_str(f"best {best.value:.1f}, trial {best.number}")
+    def _count_ended(self) -> int:
+        return sum(trial.state.is_finished() for trial in self.study.get_trials(deepcopy=False))
 
     def best(self) -> FrozenTrial | None:
         """The best trial so far, whose recipe is in ``best.json``; None before the first."""
         if not self.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             return None
         best = self.study.best_trial
-        recipe = self.recipe(best.number, best.params)
-        write_text_atomic(self.folder / "best.json", recipe_to_json(recipe))
+        text = recipe_to_json(self.recipe(best.number, best.params))
+        write_text_atomic(self.folder / "best.json", text)
         return best
 
     def recipe(self, number: int, values: Mapping[str, Any]) -> Recipe:
@@ -248,10 +250,21 @@ class Search:
             ValueError: if the recipe rejects them.
         """
         recipe = with_values(self.settings.recipe, values, self.folder / "space.json")
-        if not recipe.name:
-            return recipe
         # A name belongs to the settings of its recipe.
-        return replace(recipe, name=f"{recipe.name}/trial-{number}")
+        return replace(recipe, name=f"{recipe.name}/trial-{number}") if recipe.name else recipe
+
+    def _write_trials(self) -> None:
+        rows = [["trial", "state", "value", "step", *self.space]]
+        for trial in self.study.get_trials(deepcopy=False):
+            value = trial.value
+            if value is None and trial.intermediate_values:  # it was pruned: its last return
+                value = trial.intermediate_values[max(trial.intermediate_values)]
+            cells = [_cell(trial.params[field]) for field in self.space]
+            rows.append([trial.number, trial.state.name.lower(), value, trial.last_step, *cells])
+        write_text_atomic(self.folder / "trials.csv", _to_csv(rows))
+        if shares := importances(self.study):
+            rows = [["field", "importance"], *map(list, shares.items())]
+            write_text_atomic(self.folder / "importance.csv", _to_csv(rows))
 
 
 class _Trial:
@@ -260,44 +273,41 @@ class _Trial:
     def __init__(self, search: Search, trial: Trial) -> None:
         self.study = search.study
         self.trial = trial
-        self.number = trial.number
-        self.settings = search.settings
-        self.file = search.folder / f"trial-{trial.number}.json"
         self.folder = search.folder / f"trial-{trial.number}"
+        self.jobs: list[Job] | None = None
         self.process: subprocess.Popen[bytes] | None = None
         self.started: Job | None = None  # the process's
-        self.reported = -1
-        self.jobs: list[Job] | None = None
-        space = search.settings.space
         try:
-            values = {field: space[field].suggest(trial, field) for field in space}
-        except ValueError as error:  # of earlier trials with other choices
-            raise ValueError(f"{search.journal} is of another search space: {error}") from error
-        try:
-            recipe = search.recipe(self.number, values)
+            recipe = search.recipe(trial.number, trial.params)
             algorithm = make_algorithm(recipe)
             algorithm.check()
         except ValueError as error:  # values that do not fit together
             self._explain(str(error))
             return
         chosen, _ = with_chosen_frames(recipe, algorithm)
+        file = search.folder / f"trial-{trial.number}.json"
         self.jobs = [
-            Job(replace(chosen, seed=seed), self.folder / f"seed-{seed}", source=str(self.file))
+            Job(replace(chosen, seed=seed), self.folder / f"seed-{seed}", source=str(file))
             for seed in search.settings.seeds
         ]
         for job in self.jobs:
             job.check()  # a run with other settings says nothing about this trial
-        write_text_atomic(self.file, recipe_to_json(recipe))
+        write_text_atomic(file, recipe_to_json(recipe))
+        self._report()
 
-    def advance(self) -> TrialState | None:
-        """Starts, watches or ends the trial; returns its state once it has ended."""
+    def is_waiting(self) -> bool:
+        """Whether any of its runs is to be started or resumed."""
+        return not all(job.is_complete() for job in self.jobs or ())
+
+    def advance(self) -> bool:
+        """Starts, watches or ends the trial; returns whether it has ended."""
         if self.jobs is None:
             return self._end(TrialState.FAIL)
         if self.process is not None and self.process.poll() is None:
-            if self._should_prune():
+            if self._report() and self.trial.should_prune():
                 self.stop()
                 return self._end(TrialState.PRUNED)
-            return None
+            return False
         if self.process is not None and self.process.returncode:
             return self._end(TrialState.FAIL)
         if self.started is not None and not self.started.is_complete():
@@ -305,10 +315,12 @@ class _Trial:
             return self._end(TrialState.FAIL)
         job = next((job for job in self.jobs if not job.is_complete()), None)
         if job is None:
-            return self._end(TrialState.COMPLETE, fmean(map(_read_mean, self.jobs)))
+            self._report()
+            evaluations = [read_evaluation(job.folder) or {} for job in self.jobs]
+            return self._end(TrialState.COMPLETE, fmean(x["mean"] for x in evaluations))
         if not job.is_in_use():  # by a process that a killed search left behind
             self.process, self.started = start(job), job
-        return None
+        return False
 
     def stop(self) -> None:
         """Lets the process save a checkpoint, and waits until it exits."""
@@ -316,69 +328,61 @@ class _Trial:
             self.process.send_signal(signal.SIGINT)
             self.process.wait()
 
-    def _should_prune(self) -> bool:
-        """Whether the first seed's returns are below the median of earlier trials."""
+    def _report(self) -> bool:
+        """Tells Optuna the returns of the first seed's run; returns whether there are new ones."""
         assert self.jobs is not None
         path = self.jobs[0].folder / "metrics.csv"
         if not path.is_file():
             return False
         rows = [row for row in read_metrics(path) if not math.isnan(row["return_mean"])]
-        if not rows or rows[-1]["step"] <= self.reported:
-            return False
-        self.reported = int(rows[-1]["step"])
-        returns = [row["return_mean"] for row in rows[-_WINDOW:]]
-        self.trial.report(sum(returns) / len(returns), self.reported)
-        return self.trial.should_prune()
+        known = self.study.get_trials(deepcopy=False)[self.trial.number].intermediate_values
+        new = [index for index, row in enumerate(rows) if int(row["step"]) not in known]
+        for index in new:
+            window = rows[max(0, index + 1 - _WINDOW) : index + 1]
+            mean = fmean(row["return_mean"] for row in window)
+            self.trial.report(mean, int(rows[index]["step"]))
+        return bool(new)
 
     def _explain(self, reason: str) -> None:
         """Writes why the trial failed."""
         self.folder.mkdir(exist_ok=True)
         write_text_atomic(self.folder / "error.log", f"error: {reason}\n")
 
-    def _end(self, state: TrialState, value: float | None = None) -> TrialState:
-        self.study.tell(self.number, value, state=state)
-        return state
+    def _end(self, state: TrialState, value: float | None = None) -> bool:
+        self.study.tell(self.trial, value, state=state)
+        return True
 
 
-def _cut_half_line(path: Path) -> None:
-    """Removes the last line of a journal if a process was killed while writing it.
+def importances(study: optuna.Study) -> dict[str, float]:
+    """Computes how much each field mattered for the values of complete trials.
 
-    Raises:
-        ValueError: if another line is not JSON.
+    These are the shares of PED-ANOVA (arXiv 2304.10255), which compares the best tenth of the
+    trials with all of them. They add up to 1; the largest comes first.
+
+    Returns:
+        The shares by the fields' names; empty with fewer than four complete trials, or if all of
+        them have the same value.
     """
-    content = path.read_bytes() if path.exists() else b""
-    whole = content[: content.rfind(b"\n") + 1]
-    for number, line in enumerate(whole.splitlines(), start=1):
-        try:
-            json.loads(line)
-        except ValueError as error:
-            raise ValueError(f"line {number}: {error}") from error
-    if whole != content:
-        write_bytes_atomic(path, whole)
-        warnings.warn(
-            f"removed the last line of {path}, which was written only in part", stacklevel=2
-        )
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if len(complete) < _FEWEST or len({trial.value for trial in complete}) < 2:
+        return {}
+    return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
 
 
-def _check_trial(trial: FrozenTrial, space: SearchSpace) -> None:
-    """Raises ValueError if a search in this space cannot have written the trial."""
-    for field, value in (trial.system_attrs.get("fixed_params", {}) | trial.params).items():
-        if field not in space or not space[field].contains(value):
-            raise ValueError(f"trial {trial.number} has {field} {value!r}, not in the search space")
-    values, reported = trial.values or [], trial.intermediate_values
-    for number in [*values, *reported, *reported.values()]:
-        if not isinstance(number, float | int) or not math.isfinite(number):
-            raise ValueError(f"trial {trial.number} has the return {number!r}, not a finite number")
-    complete = len(values) == 1 and trial.params.keys() == space.keys()
-    if len(values) > 1 or (trial.state == TrialState.COMPLETE and not complete):
-        raise ValueError(f"trial {trial.number} lacks a field, or does not have one return")
+def _cell(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
 
 
-def _read_mean(job: Job) -> float:
-    """Reads the mean return of a complete run."""
-    evaluation = read_evaluation(job.folder)
-    assert evaluation is not None  # the run is complete
-    return float(evaluation["mean"])
+def _value(cell: str, distribution: BaseDistribution) -> Any:
+    if isinstance(distribution, CategoricalDistribution):
+        return {_cell(choice): choice for choice in distribution.choices}[cell]
+    return float(cell) if isinstance(distribution, FloatDistribution) else int(cell)
+
+
+def _to_csv(rows: Iterable[list[Any]]) -> str:
+    buffer = io.StringIO()
+    csv.writer(buffer, lineterminator="\n").writerows(rows)
+    return buffer.getvalue()
 
 
 def _to_json(settings: Settings) -> str:
@@ -389,25 +393,3 @@ def _to_json(settings: Settings) -> str:
         "warmup": settings.warmup,
     }
     return json.dumps(fields, indent=2) + "\n"
-
-
-def _write_or_compare(path: Path, text: str) -> None:
-    if not path.exists():
-        if (path.parent / "study.log").exists():
-            raise ValueError(
-                f"{path} is missing, so it is not known which search {path.parent} holds: name "
-                "another folder with --out, or move it away"
-            )
-        write_text_atomic(path, text)
-        return
-    try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(
-            f"{path} cannot be read ({error}): name another folder with --out"
-        ) from error
-    if before != json.loads(text):
-        raise ValueError(
-            f"{path.parent} holds a search with other settings: name another folder with --out, "
-            "or move it away"
-        )

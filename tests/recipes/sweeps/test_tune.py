@@ -1,5 +1,6 @@
 """Hyperparameter search: spaces as data, pruning, and searches that were killed."""
 
+import csv
 import json
 import math
 import signal
@@ -7,22 +8,22 @@ import time
 from functools import partial
 from pathlib import Path
 
-import filelock
 import pytest
-from tqdm import tqdm
 
 from recipes.cli import main
 from recipes.ppo import PPO
 from recipes.recipe_json import recipe_from_json, recipe_to_json
 from recipes.registry import get_recipe
 from recipes.run import Run
-from recipes.sweeps.search_space import load_space, with_values
-from recipes.sweeps.tune import Search, Settings
 from tests.recipes.commands import Command
 from tests.recipes.sweeps.sweep_runs import fork_worker
 from torchrl_tit.settings.networks import mlp
 
 optuna = pytest.importorskip("optuna")
+
+from recipes.sweeps import tune  # noqa: E402
+from recipes.sweeps.search_space import load_space, with_values  # noqa: E402
+from recipes.sweeps.tune import Search, Settings, importances  # noqa: E402
 
 RECIPE = PPO(
     name="ppo/cartpole/mine",
@@ -37,21 +38,69 @@ RECIPE = PPO(
 SPACE = {
     "learning_rate": {"type": "float", "low": 1e-4, "high": 1e-2, "log": True},
     "epochs": {"type": "int", "low": 1, "high": 2},
-    "backbone.history.hidden_dim": {"type": "categorical", "choices": [8, 16]},
+    "backbone.history.activation": {"type": "categorical", "choices": ["tanh", "relu"]},
 }
+SETTINGS = Settings(RECIPE, SPACE)
 
 
 @pytest.fixture
 def files(tmp_path):
     (tmp_path / "recipe.json").write_text(recipe_to_json(RECIPE))
-    space = {k: v for k, v in SPACE.items() if not k.startswith("backbone")}
-    (tmp_path / "space.json").write_text(json.dumps(space))
+    (tmp_path / "space.json").write_text(json.dumps({k: SPACE[k] for k in list(SPACE)[:2]}))
     return tmp_path
 
 
 def words(files, trials):
     paths = [str(files / "recipe.json"), "--space", str(files / "space.json")]
     return ["tune", *paths, "--trials", str(trials), "--out", str(files / "out")]
+
+
+@pytest.fixture
+def naps(monkeypatch):
+    """No waiting; a search without an end runs out of naps."""
+    left = iter(range(30))
+    monkeypatch.setattr(time, "sleep", lambda _: next(left))
+
+
+class Process:
+    """A worker's process that has ended, or that goes on until it is stopped."""
+
+    def __init__(self, returncode=None):
+        self.returncode = returncode
+        self.signals = []
+
+    def poll(self):
+        return self.returncode
+
+    def send_signal(self, number):
+        self.signals.append(number)
+
+    def wait(self):
+        pass
+
+
+def complete(job, mean=None):
+    """Completes a run; its return is its learning rate."""
+    run = Run.create(job.folder, job.recipe)
+    mean = job.recipe.learning_rate if mean is None else mean
+    numbers = {"episodes": 1, "seed": 0, "returns": [mean], "mean": mean, "std": 0.0}
+    run.save_evaluation({"env": job.recipe.env, "steps": job.recipe.final_step, **numbers})
+    run.curve.touch()
+    (job.folder / "metrics.csv").write_text("step,time,return_mean\n64,0,10\n128,0,12\n")
+    return Process(0)
+
+
+def read(file):
+    return list(csv.DictReader(file.open()))
+
+
+@pytest.fixture
+def searched(tmp_path, naps, monkeypatch):
+    """The folder of a search with two complete trials, and its study."""
+    monkeypatch.setattr(tune, "start", complete)
+    with Search(tmp_path / "out", SETTINGS) as search:
+        assert search.run(2, workers=1) == []
+    return tmp_path / "out", search.study
 
 
 @pytest.mark.slow
@@ -70,7 +119,7 @@ def test_a_search_that_was_killed_goes_on(files, capsys, monkeypatch):
         time.sleep(0.1)
     drawn = (out / "trial-0.json").read_text()
 
-    monkeypatch.setattr("recipes.sweeps.tune.start", fork_worker)
+    monkeypatch.setattr(tune, "start", fork_worker)
     main(words(files, 2))
     assert (out / "trial-0.json").read_text() == drawn
     assert sorted(path.name for path in out.glob("trial-*/")) == ["trial-0", "trial-1"]
@@ -78,87 +127,96 @@ def test_a_search_that_was_killed_goes_on(files, capsys, monkeypatch):
     means = [
         json.loads((out / f"trial-{n}/seed-0/evaluation.json").read_text())["mean"] for n in (0, 1)
     ]
-    winner = recipe_from_json((out / f"trial-{means.index(max(means))}.json").read_bytes(), "")
-    assert best == winner
-    assert isinstance(best, PPO)
-    assert best.name == f"ppo/cartpole/mine/trial-{means.index(max(means))}"
-    assert 1e-4 <= best.learning_rate <= 1e-2
+    number = means.index(max(means))
+    assert best == recipe_from_json((out / f"trial-{number}.json").read_bytes(), "")
+    assert best.name == f"ppo/cartpole/mine/trial-{number}"
     assert f"best of 2 trials: {max(means):.1f} with learning_rate" in capsys.readouterr().out
 
     main(["table", str(out)])  # where each trial stands under its name
     assert "| ppo/cartpole/mine/trial-1 | 1 |" in capsys.readouterr().out
-    main(words(files, 2))  # complete: nothing is run again
-    assert len(list(out.glob("trial-*/"))) == 2
     with pytest.raises(SystemExit):
         main([*words(files, 2), "--seeds", "1"])
     assert "holds a search with other settings" in capsys.readouterr().err
 
 
-def test_a_trial_below_the_median_is_pruned(tmp_path, monkeypatch):
+@pytest.mark.parametrize("disable", [False, True])  # as TQDM_DISABLE=1 does
+def test_trials_are_recorded_and_their_study_is_made_again(searched, disable, monkeypatch):
+    folder, study = searched
+    rows = read(folder / "trials.csv")
+    assert [row["state"] for row in rows] == ["complete"] * 2
+    for row, trial in zip(rows, study.trials, strict=True):
+        assert float(row["value"]) == trial.value == trial.params["learning_rate"]
+        assert row["backbone.history.activation"] == trial.params["backbone.history.activation"]
+        assert (int(row["epochs"]), row["step"]) == (trial.params["epochs"], "128")
+    best = json.loads((folder / "best.json").read_text())
+    assert best["learning_rate"] == study.best_value
+
+    monkeypatch.setattr(tune, "tqdm", partial(tune.tqdm, disable=disable))
+    monkeypatch.setattr(tune, "start", lambda job: Process(2))
+    with Search(folder, SETTINGS) as search:
+        for again, before in zip(search.study.trials, study.trials, strict=True):
+            assert (again.params, again.value) == (before.params, before.value)
+            assert again.intermediate_values == before.intermediate_values == {64: 10, 128: 11}
+        assert search.run(3, workers=1) == [2]
+    third = read(folder / "trials.csv")[2]
+    assert (third["state"], third["value"]) == ("fail", "")
+    assert third["learning_rate"] not in [row["learning_rate"] for row in rows]
+    with Search(folder, SETTINGS) as search:  # complete: nothing is run again
+        assert search.run(3, workers=1) == [2]
+    assert not (folder / "importance.csv").exists(), "two complete trials say nothing"
+
+
+def test_a_trial_below_the_median_is_pruned(tmp_path, naps, monkeypatch):
     """Earlier trials are told; the new one's metrics are written by hand."""
-    space = load_space(None, RECIPE)
-    search = Search(tmp_path, Settings(RECIPE, space, startup_trials=2, warmup=0.25))
-    for _ in range(2):
-        trial = ask(search)
-        for step in (64, 128, 192):
-            trial.report(100.0, step)
-        search.study.tell(trial, 100.0)
-        (tmp_path / f"trial-{trial.number}.json").write_text(recipe_to_json(RECIPE))
-
-    stopped = []
-
-    class Process:
-        returncode = None
-
-        def poll(self):
-            return None
-
-        def send_signal(self, number):
-            stopped.append(number)
-
-        def wait(self):
-            pass
+    settings = Settings(RECIPE, SPACE, startup_trials=2, warmup=0.4)
+    process, rows = Process(), ["step,time,return_mean", "64,0,10"]
 
     def start(job):
         job.folder.mkdir(parents=True)
-        rows = "step,time,return_mean\n64,0,10\n"
-        (job.folder / "metrics.csv").write_text(rows)
         monkeypatch.setattr(time, "sleep", lambda _: write_more(job.folder / "metrics.csv"))
-        return Process()
+        return process
 
     def write_more(path: Path):
-        path.write_text("step,time,return_mean\n64,0,10\n128,0,12\n")
+        assert len(rows) < 10
+        path.write_text("\n".join([*rows, ""]))
+        rows.append(f"{64 * len(rows)},0,12")
 
-    monkeypatch.setattr("recipes.sweeps.tune.start", start)
-    search.run(3, workers=1)
-    assert stopped == [signal.SIGINT]
-    last = search.study.trials[-1]
-    assert last.state == optuna.trial.TrialState.PRUNED
-    assert last.intermediate_values == {128: (10 + 12) / 2}
-    rows = (tmp_path / "trials.csv").read_text().splitlines()
-    assert [row.split(",")[:3] for row in rows[1:]] == [
-        ["0", "complete", "100.0"],
-        ["1", "complete", "100.0"],
-        ["2", "pruned", "11.0"],
-    ]
+    monkeypatch.setattr(tune, "start", start)
+    with Search(tmp_path, settings) as search:
+        for _ in range(2):
+            trial = search.study.ask(search.space)
+            for step in (64, 128, 192):
+                trial.report(100.0, step)
+            search.study.tell(trial, 100.0)
+        search.run(3, workers=1)
+    assert process.signals == [signal.SIGINT]
+    assert search.study.trials[-1].intermediate_values == {64: 10, 128: (10 + 12) / 2}
+    last = read(tmp_path / "trials.csv")[-1]
+    assert (last["state"], last["value"], last["step"]) == ("pruned", "11.0", "128")
+    for number in (0, 1):  # told, not run: they would be begun again
+        (tmp_path / "trials.csv").write_text(
+            (tmp_path / "trials.csv").read_text().replace(f"{number},complete", f"{number},fail")
+        )
+    with Search(tmp_path, settings) as search:
+        pruned = search.study.trials[-1]
+    assert (pruned.state.name, pruned.intermediate_values) == ("PRUNED", {128: 11})
 
 
 @pytest.mark.parametrize(
     ("space", "message"),
     [
-        ({"learning_rat": {"type": "float", "low": 0, "high": 1}}, "unknown field 'learning_rat'"),
-        (
-            {"backbone.history.depth": {"type": "int", "low": 0, "high": 1}},
-            "unknown field 'backbone.history.depth'",
-        ),
-        ({"seed": {"type": "int", "low": 0, "high": 1}}, "unknown field 'seed'"),
+        ({"learning_rat": SPACE["learning_rate"]}, "unknown field 'learning_rat'"),
+        ({"backbone.history.depth": SPACE["epochs"]}, "unknown field 'backbone.history.depth'"),
+        ({"seed": SPACE["epochs"]}, "unknown field 'seed'"),
         ({"epochs": {"type": "int", "low": 0, "high": 3}}, "epochs must be at least 1, not 0"),
-        ({"epochs": {"type": "float", "low": 1, "high": 3.5}}, "field 'epochs' is 1.0"),
-        ({"epochs": {"type": "int", "low": 3, "high": 1}}, "low must be below high, not 3 and 1"),
-        ({"gamma": {"type": "float", "low": 0, "high": 1, "log": True}}, "low must be above 0"),
+        ({"epochs": {"type": "int", "low": 1.5, "high": 3}}, "field 'epochs' is 1.5"),
+        ({"epochs": {"type": "float", "low": 1, "high": 3.5}}, "field 'epochs' is 3.5"),
+        ({"epochs": {"type": "int", "low": 3, "high": 1}}, "`low <= high` must hold"),
+        ({"gamma": {"type": "float", "low": 0, "high": 1, "log": True}}, "`low > 0` must hold"),
         ({"gamma": {"type": "categorical", "choices": []}}, "is not a search space"),
-        ({"gamma": {"type": "uniform", "low": 0}}, "is not a search space"),
+        ({"gamma": {"type": "uniform", "low": 0}}, "gamma is none of categorical, float, int"),
         ({"gamma": [1, 2]}, "is not a search space"),
+        ([], "is not a search space"),
         ({}, "names no field"),
     ],
 )
@@ -171,38 +229,27 @@ def test_bad_spaces_are_refused_before_anything_runs(space, message, files, caps
     assert not (files / "out").exists()
 
 
-def test_values_that_do_not_go_together_fail_the_trial_only(tmp_path):
+def test_seeds_that_cannot_be_are_refused_before_anything_runs(files, capsys):
+    with pytest.raises(SystemExit):
+        main([*words(files, 1), "--seeds", "0", "-1"])
+    assert "seed must be at least 0, not -1" in capsys.readouterr().err
+    assert not (files / "out").exists()
+
+
+def test_values_that_do_not_go_together_fail_the_trial_only(tmp_path, naps):
     recipe = get_recipe("ppo/cartpole/enhanced-tit")
-    (tmp_path / "space.json").write_text(
-        json.dumps({"backbone.history.num_heads": {"type": "categorical", "choices": [1, 3]}})
-    )
-    space = load_space(tmp_path / "space.json", recipe)
-    search = Search(tmp_path / "out", Settings(recipe, space))
-    search.study.enqueue_trial({"backbone.history.num_heads": 3})  # does not divide the width
-    assert search.run(1, workers=1) == [0]
-    assert "width 32" in (tmp_path / "out/trial-0/error.log").read_text()
-
-
-def ask(search):
-    """Draws a trial with all its values."""
-    trial = search.study.ask()
-    for field, values in search.settings.space.items():
-        values.suggest(trial, field)
-    return trial
-
-
-class FailingWorker:
-    """A worker's process that fails at once."""
-
-    returncode = 2
-
-    def poll(self):
-        return self.returncode
+    space = {"backbone.history.num_heads": {"type": "categorical", "choices": [3]}}
+    with Search(tmp_path, Settings(recipe, space)) as search:  # 3 does not divide the width
+        assert search.run(1, workers=1) == [0]
+    assert "width 32" in (tmp_path / "trial-0/error.log").read_text()
+    with Search(tmp_path, Settings(recipe, space)) as search:
+        assert [trial.state.name for trial in search.study.trials] == ["FAIL"]
 
 
 def test_a_run_that_a_killed_search_left_at_work_is_waited_for(tmp_path, monkeypatch):
-    search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
-    recipe = search.recipe(0, ask(search).params)
+    with Search(tmp_path, SETTINGS) as search:
+        recipe = search.recipe(0, search.study.ask(search.space).params)
+        search._write_trials()  # and killed
     events = []
 
     def sleep(_):
@@ -212,200 +259,84 @@ def test_a_run_that_a_killed_search_left_at_work_is_waited_for(tmp_path, monkeyp
 
     def start(job):
         events.append(f"start {job.folder.parent.name}")
-        return FailingWorker()
+        return Process(2)
 
-    monkeypatch.setattr("recipes.sweeps.tune.start", start)
+    monkeypatch.setattr(tune, "start", start)
     with Run.create(tmp_path / "trial-0" / "seed-0", recipe) as left:
         monkeypatch.setattr(time, "sleep", sleep)
-        assert search.run(1, workers=1) == [0]
+        with Search(tmp_path, SETTINGS) as search:
+            assert search.run(1, workers=1) == [0]
     assert events == ["wait"] * 3 + ["start trial-0", "wait"]
 
 
-def test_no_more_trials_than_workers_go_on(tmp_path, monkeypatch):
-    search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
-    for _ in range(3):  # at work when the search was killed
-        search.study.ask()
+def test_no_more_trials_than_workers_go_on(tmp_path, naps, monkeypatch):
     begun = []
-
-    def start(job):
-        begun.append(job.folder.parent.name)
-        return FailingWorker()
-
-    monkeypatch.setattr("recipes.sweeps.tune.start", start)
-    monkeypatch.setattr(time, "sleep", lambda _: None)
-    assert search.run(2, workers=1) == [0, 1]
-    assert begun == ["trial-0", "trial-1"]
-
-
-def test_without_a_progress_view(tmp_path, monkeypatch):
-    """TQDM_DISABLE=1 switches it off."""
-    (tmp_path / "space.json").write_text(json.dumps({"epochs": SPACE["epochs"]}))
-    space = load_space(tmp_path / "space.json", RECIPE)
-    naps = iter(range(20))  # a search without an end runs out of them
-    monkeypatch.setattr("recipes.sweeps.tune.tqdm", partial(tqdm, disable=True))
-    monkeypatch.setattr("recipes.sweeps.tune.start", lambda job: FailingWorker())
-    monkeypatch.setattr(time, "sleep", lambda _: next(naps))
-    assert Search(tmp_path / "out", Settings(RECIPE, space)).run(2, workers=1) == [0, 1]
-
-
-@pytest.mark.parametrize("line", ['{"op_code": 99, "worker_id": "w"}', "{}", "[]", "trial 7"])
-def test_a_journal_that_optuna_did_not_write_is_named(tmp_path, line):
-    settings = Settings(RECIPE, load_space(None, RECIPE))
-    Search(tmp_path, settings)
-    with (tmp_path / "study.log").open("a") as file:
-        file.write(f"{line}\n")
-    before = (tmp_path / "study.log").read_bytes()
-    with pytest.raises(ValueError, match=r"study\.log is not an intact journal") as error:
-        Search(tmp_path, settings)
-    assert "\n" not in str(error.value)
-    assert (tmp_path / "study.log").read_bytes() == before
-
-
-def search_with_a_trial(folder):
-    """A search that has told Optuna of one trial."""
-    (folder / "space.json").write_text(json.dumps(SPACE))
-    settings = Settings(RECIPE, load_space(folder / "space.json", RECIPE))
-    search = Search(folder / "out", settings)
-    search.study.tell(ask(search), 7.5)
-    return settings, folder / "out" / "study.log"
+    with Search(tmp_path, SETTINGS) as search:
+        for _ in range(3):  # at work when the search was killed
+            search.study.ask(search.space)
+        search._write_trials()
+    monkeypatch.setattr(tune, "start", lambda job: begun.append(job.folder.name) or Process(2))
+    with Search(tmp_path, SETTINGS) as search:
+        assert search.run(2, workers=1) == [0, 1]
+    assert len(begun) == 2
 
 
 @pytest.mark.parametrize(
-    ("field", "value", "message"),
+    ("change", "message"),
     [
-        ("learning_rate", 1e9, "trial 0 has learning_rate 1000000000.0, not in the search space"),
-        ("learning_rate", math.nan, "learning_rate nan, not in the search space"),
-        ("learning_rate", "fast", "learning_rate 'fast', not in the search space"),
-        ("backbone.history.hidden_dim", 9, "IndexError: .* out of range"),
-        ("values", [math.nan], "trial 0 has the return nan, not a finite number"),
-        ("values", ["high"], "trial 0 has the return 'high', not a finite number"),
-        ("directions", [1], "its study does not maximize one value"),
-        ("study_name", "other", "it holds the study 'other', not 'ppo/cartpole/mine'"),
+        ({"learning_rate": "1e9"}, r"isn't contained in the distribution FloatDistribution"),
+        ({"learning_rate": "nan"}, r"`nan` is invalid value"),
+        ({"learning_rate": "fast"}, r"could not convert string to float: 'fast'"),
+        ({"backbone.history.activation": "sin"}, r"KeyError: 'sin'"),
+        ({"value": "nan"}, "trial 0 has the return nan, not a finite number"),
+        ({"value": "high"}, "could not convert string to float: 'high'"),
+        ({"state": "done"}, "KeyError: 'DONE'"),
+        ({"trial": "7"}, "trial 0 is missing"),
+        ({"step": None}, "KeyError: 'step'"),
     ],
 )
-def test_a_journal_that_the_search_did_not_write_is_refused(tmp_path, field, value, message):
-    settings, journal = search_with_a_trial(tmp_path)
-    lines = [json.loads(line) for line in journal.read_text().splitlines()]
-    for line in lines:
-        if line.get("param_name") == field:
-            line["param_value_internal"] = value
-        elif field in line:
-            line[field] = value
-    journal.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
-    with pytest.raises(ValueError, match=rf"out/study\.log is not .*{message}") as error:
-        Search(tmp_path / "out", settings)
+def test_trials_that_the_search_did_not_write_are_refused(searched, change, message):
+    folder, _ = searched
+    path = folder / "trials.csv"
+    rows = [row | change for row in read(path)]
+    names = [name for name in rows[0] if rows[0][name] is not None]
+    with path.open("w") as file:
+        writer = csv.DictWriter(file, names, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(rows)
+    with pytest.raises(ValueError, match=rf"trials\.csv is not an intact .*{message}") as error:
+        Search(folder, SETTINGS).__enter__()
     assert "\n" not in str(error.value)
+    path.write_bytes(b"trial,\xff\0\n")
+    with pytest.raises(ValueError, match=r"trials\.csv is not an intact"):
+        Search(folder, SETTINGS).__enter__()
 
 
-@pytest.mark.parametrize("cut", [1, 40, -1])
-def test_a_half_written_last_line_of_the_journal_is_removed(tmp_path, cut):
-    settings, journal = search_with_a_trial(tmp_path)
-    content = journal.read_bytes()
-    last = content.splitlines(keepends=True)[-1]
-    journal.write_bytes(content.removesuffix(last) + last[:cut])
-    with pytest.warns(UserWarning, match=r"removed the last line of .*study\.log"):
-        search = Search(tmp_path / "out", settings)
-    (trial,) = search.study.trials
-    assert trial.state == optuna.trial.TrialState.RUNNING  # its end was not recorded
-    search.study.tell(0, 7.5)
-    assert Search(tmp_path / "out", settings).study.best_value == 7.5
-
-
-def test_a_lock_that_a_killed_search_left_behind_is_removed(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    settings = Settings(RECIPE, load_space(None, RECIPE))
-    Search(Path("out"), settings)
-    Path("out/study.log.lock").symlink_to("out/study.log")  # relative: it leads nowhere
-    search = Search(Path("out"), settings)
-    search.study.ask()
-    assert not Path("out/study.log.lock").is_symlink()
-
-
-def test_a_resumed_search_draws_other_values(tmp_path):
-    settings, _ = search_with_a_trial(tmp_path)
-    search = Search(tmp_path / "out", settings)
-    assert ask(search).params != search.study.trials[0].params
-
-
-class DoneWorker:
-    """A worker's process that has completed its run."""
-
-    returncode = 0
-
-    def poll(self):
-        return 0
-
-
-def complete(job, mean=None):
-    """Completes a run; its return is its learning rate."""
-    run = Run.create(job.folder, job.recipe)
-    mean = job.recipe.learning_rate if mean is None else mean
-    numbers = {"episodes": 1, "seed": 0, "returns": [mean], "mean": mean, "std": 0.0}
-    run.save_evaluation({"env": job.recipe.env, "steps": job.recipe.final_step, **numbers})
-    run.curve.touch()
-    return DoneWorker()
-
-
-def test_a_trial_is_not_credited_with_the_run_of_another(tmp_path, monkeypatch):
-    monkeypatch.setattr("recipes.sweeps.tune.start", complete)
-    monkeypatch.setattr(time, "sleep", lambda _: None)
-    settings = Settings(RECIPE, load_space(None, RECIPE))
-    search = Search(tmp_path, settings)
-    search.run(2, workers=1)
-    best = (tmp_path / "best.json").read_text()
-    assert json.loads(best)["learning_rate"] == search.study.best_value
-    files = [tmp_path / f"trial-{number}.json" for number in (0, 1)]
-    texts = [file.read_text() for file in files]
-    for file, text in zip(files, reversed(texts), strict=True):
-        file.write_text(text)
-    Search(tmp_path, settings).best()
-    assert (tmp_path / "best.json").read_text() == best
-
-    (tmp_path / "trial-0").rename(tmp_path / "other")
-    (tmp_path / "trial-1").rename(tmp_path / "trial-0")
-    (tmp_path / "other").rename(tmp_path / "trial-1")
-    with pytest.raises(ValueError, match=r"trial-0/seed-0 holds a run with other settings"):
-        Search(tmp_path, settings)
-    (tmp_path / "study.log").unlink()
-    search = Search(tmp_path, settings)
+def test_a_trial_is_not_credited_with_the_run_of_another(searched):
+    folder, _ = searched
+    for old, new in (("trial-0", "other"), ("trial-1", "trial-0"), ("other", "trial-1")):
+        (folder / old).rename(folder / new)
     with pytest.raises(ValueError, match=r"trial-0/seed-0 holds a run of .* with other settings"):
-        search.run(2, workers=1)
-    assert search.best() is None
-
-
-def test_a_search_without_its_settings_is_refused(tmp_path):
-    settings = Settings(RECIPE, load_space(None, RECIPE))
-    Search(tmp_path, settings)
-    (tmp_path / "settings.json").unlink()
+        Search(folder, SETTINGS).__enter__()
+    (folder / "settings.json").unlink()
     with pytest.raises(ValueError, match=r"settings\.json is missing"):
-        Search(tmp_path, settings)
+        Search(folder, SETTINGS).__enter__()
 
 
 @pytest.mark.parametrize("mean", [math.nan, 1e300, "high"])
-def test_an_evaluation_that_cannot_be_read_fails_the_trial(mean, tmp_path, monkeypatch):
-    naps = iter(range(20))  # a trial that is started again and again runs out of them
-    monkeypatch.setattr("recipes.sweeps.tune.start", partial(complete, mean=mean))
-    monkeypatch.setattr(time, "sleep", lambda _: next(naps))
-    search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
-    assert search.run(1, workers=1) == [0]
+def test_an_evaluation_that_cannot_be_read_fails_the_trial(mean, tmp_path, naps, monkeypatch):
+    monkeypatch.setattr(tune, "start", partial(complete, mean=mean))
+    with Search(tmp_path, SETTINGS) as search:
+        assert search.run(1, workers=1) == [0]
     assert "seed-0 is not complete" in (tmp_path / "trial-0" / "error.log").read_text()
 
 
 def test_one_process_at_a_time(tmp_path):
-    search = Search(tmp_path, Settings(RECIPE, load_space(None, RECIPE)))
-    with (
-        filelock.FileLock(tmp_path / ".lock"),
-        pytest.raises(RuntimeError, match="is in use by another process"),
-    ):
-        search.run(1, workers=1)
-    assert not search.study.trials
-
-
-def test_seeds_that_cannot_be_are_refused_before_anything_runs(files, capsys):
-    with pytest.raises(SystemExit):
-        main([*words(files, 1), "--seeds", "0", "-1"])
-    assert "seed must be at least 0, not -1" in capsys.readouterr().err
-    assert not (files / "out").exists()
+    other = Search(tmp_path, SETTINGS)
+    with Search(tmp_path, SETTINGS), pytest.raises(RuntimeError, match="in use by another process"):
+        other.__enter__()
+    with other:
+        pass
 
 
 @pytest.mark.parametrize(
@@ -414,11 +345,28 @@ def test_seeds_that_cannot_be_are_refused_before_anything_runs(files, capsys):
 )
 def test_every_default_space_fits_its_recipes(name):
     recipe = get_recipe(name)
-    space = load_space(None, recipe)
-    values = {field: values.examples()[-1] for field, values in space.items()}
+    ranges = load_space(None, recipe).items()
+    values = {field: x["choices"][-1] if "choices" in x else x["high"] for field, x in ranges}
     assert with_values(recipe, values, Path("here")) != recipe
 
 
 def test_other_algorithms_need_a_space():
     with pytest.raises(ValueError, match="there is no default search space for the algorithm dt"):
         load_space(None, get_recipe("dt/hopper-medium-v2/dt"))
+
+
+@pytest.mark.parametrize("value", [lambda rate: 100 * rate, lambda rate: 1.0])
+def test_the_field_that_decides_is_the_most_important(value):
+    study = optuna.create_study(direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(30):
+        trial = study.ask()
+        rate = trial.suggest_float("learning_rate", 0, 1)
+        trial.suggest_int("epochs", 1, 9)
+        study.tell(trial, value(rate))
+    shares = importances(study)
+    if value(0) == value(1):
+        assert shares == {}, "equal values say nothing"
+        return
+    assert list(shares) == ["learning_rate", "epochs"]
+    assert shares["learning_rate"] > 0.6
+    assert sum(shares.values()) == pytest.approx(1)
