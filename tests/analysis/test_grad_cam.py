@@ -18,7 +18,7 @@ from tests.analysis.policies import (
     make_policy,
 )
 from tests.numerics import assert_near
-from torchrl_tit.analysis import grad_cam, map_attention, measure_flows
+from torchrl_tit.analysis import count_flows, grad_cam, map_attention
 from torchrl_tit.analysis.layers import image_layers
 from torchrl_tit.analysis.targets import find_network, run_policy
 from torchrl_tit.frames.inner import InnerTransformer
@@ -148,7 +148,7 @@ def test_normalised_frames() -> None:
     assert_near(grad_cam(policy, states)["observation"], maps)
     shares = map_attention(network, states["history"])["observation"]
     assert shares.shape == maps.shape
-    assert measure_flows(network).spatial == 6
+    assert count_flows(network).spatial == 6
 
 
 @pytest.mark.parametrize(

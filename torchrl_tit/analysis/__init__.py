@@ -11,17 +11,14 @@ from torchrl_tit.analysis.attention import (
     outer_attention,
     roll_out,
 )
-from torchrl_tit.analysis.counted_flows import Flows, count_flows
-from torchrl_tit.analysis.flow_table import flow_table
+from torchrl_tit.analysis.flows import Flows, count_flows, flow_table
 from torchrl_tit.analysis.grad_cam import grad_cam
 from torchrl_tit.analysis.integrated_gradients import integrated_gradients
 from torchrl_tit.analysis.map_measures import find_objects, map_change, share_on_objects
-from torchrl_tit.analysis.measured_flows import MeasuredFlows, measure_flows
 from torchrl_tit.analysis.targets import Target
 
 __all__ = [
     "Flows",
-    "MeasuredFlows",
     "Target",
     "count_flows",
     "find_objects",
@@ -31,7 +28,6 @@ __all__ = [
     "integrated_gradients",
     "map_attention",
     "map_change",
-    "measure_flows",
     "outer_attention",
     "roll_out",
     "share_on_objects",
