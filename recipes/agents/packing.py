@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import fields, replace
+from importlib import resources
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 
 from torchrl_tit.agents import AgentError
 from torchrl_tit.agents.folder import CARD, EVALUATION, RECIPE, VERSIONS, WEIGHTS
+from torchrl_tit.agents.hub import import_hub
 
 from ..dataset_recipe import DatasetRecipe
 from ..recipe import Recipe
@@ -21,7 +23,6 @@ from ..recipe_json import recipe_to_json
 from ..run import Run
 from ..runner import load_trained
 from .building import evaluation_of, read_json
-from .card import Facts, make_card
 
 
 def pack(
@@ -65,10 +66,18 @@ def pack(
     recipe = without_places(run.recipe)
     if isinstance(recipe, DatasetRecipe):
         evaluation["dataset"] = recipe.dataset
-    parameters = sum(weight.numel() for weight in networks.parameters())
-    facts = Facts(name, source or name, license, recipe, steps, evaluation, versions, parameters)
+    metadata = _metadata(name, license, recipe, evaluation)
+    card = _card(
+        recipe,
+        evaluation,
+        name=name,
+        source=source or name,
+        steps=steps,
+        versions=versions,
+        parameters=sum(weight.numel() for weight in networks.parameters()),
+    )
     files = {
-        CARD: make_card(facts).encode(),
+        CARD: f"---\n{metadata}\n---\n\n{card}".encode(),
         RECIPE: recipe_to_json(recipe).encode(),
         WEIGHTS: save(_weights(networks)),
         EVALUATION: _json(evaluation),
@@ -115,3 +124,49 @@ def _check_words(what: str, value: str) -> None:
 
 def _json(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=2) + "\n").encode()
+
+
+def _card(recipe: Recipe, evaluation: Mapping[str, Any], **facts: Any) -> str:
+    """Writes the card of an agent in Markdown."""
+    settings = [f"`{setting}`" for setting in [*recipe.env_settings, *recipe.wrappers]]
+    hidden = " without velocities" if getattr(recipe, "hide_velocities", False) else ""
+    target = ""
+    if "target_return" in evaluation:
+        target = f" The policy was told to aim for a return of {evaluation['target_return']:g}."
+    versions = "\n".join(f"| {name} | {version} |" for name, version in facts["versions"].items())
+    template = resources.files(__package__).joinpath("card.md").read_text(encoding="utf-8")
+    return template.format(
+        **{**facts, "versions": versions},
+        recipe=recipe,
+        evaluation=evaluation,
+        task=f"`{recipe.env}`{hidden}" + (f" with {', '.join(settings)}" if settings else ""),
+        unit="gradient steps" if recipe.offline else "environment steps",
+        data=f", on the data set `{evaluation['dataset']}`" if "dataset" in evaluation else "",
+        recipe_name=f"`{recipe.name}`, " if recipe.name else "",
+        last=evaluation["seed"] + evaluation["episodes"] - 1,
+        target=target,
+    )
+
+
+def _metadata(name: str, license: str | None, recipe: Recipe, evaluation: Mapping[str, Any]) -> str:
+    """The metadata in YAML, written by the Hub's own library."""
+    hub = import_hub()
+    task = "reinforcement-learning"
+    result = hub.EvalResult(
+        task_type=task,
+        task_name=task,
+        dataset_type=recipe.env,
+        dataset_name=recipe.env,
+        metric_type="mean_reward",
+        metric_name="mean_reward",
+        metric_value=f"{evaluation['mean']:.2f} +/- {evaluation['std']:.2f}",
+    )
+    data = hub.ModelCardData(
+        library_name="torchrl-tit",
+        license=license,
+        pipeline_tag=task,
+        tags=[task, "deep-reinforcement-learning", "torchrl", recipe.env, recipe.algorithm],
+        model_name=name,
+        eval_results=[result],
+    )
+    return str(data.to_yaml()).strip()

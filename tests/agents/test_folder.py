@@ -47,7 +47,7 @@ def with_manifest(agent, **changes):
 def test_round_trip(agent, tmp_path):
     assert {path.name for path in agent.iterdir()} == {*CONTENTS, MANIFEST}
     files = read_agent(agent)
-    assert (files.folder, files.steps, files.card) == (agent, 7, "# Ä\n")
+    assert (files.folder, files.steps) == (agent, 7)
     assert (files.evaluation, files.versions) == (EVALUATION, {"torch": 1})
     assert files.recipe == FILES["recipe.json"]
     assert files.weights.keys() == {"weight"}
@@ -74,7 +74,7 @@ def test_a_file_that_was_changed(agent, name):
 def test_a_file_that_was_cut_or_grew(agent):
     for content in (b"", FILES[WEIGHTS] + b" "):
         (agent / WEIGHTS).write_bytes(content)
-        with pytest.raises(AgentError, match=f"{len(content)} bytes instead of"):
+        with pytest.raises(AgentError, match=r"safetensors was changed .*wrong checksum"):
             read_agent(agent)
 
 
@@ -83,12 +83,12 @@ def test_a_file_that_was_cut_or_grew(agent):
     [
         ({"format": "other"}, "does not say that it is a torchrl-tit agent"),
         ({"version": 2}, "it has version 2, and this torchrl-tit reads 1"),
-        ({"files": {}}, "agent.json does not list README.md with its 'bytes' and 'sha256'"),
-        ({"files": []}, "agent.json does not list README.md"),
-        ({"files": dict.fromkeys(CONTENTS, "x")}, "agent.json does not list README.md"),
-        ({"steps": "many"}, "agent.json has no 'steps' that is a whole number"),
-        ({"steps": float("inf")}, "agent.json has no 'steps' that is a whole number"),
-        ({"steps": -1}, "agent.json has no 'steps' that is a whole number"),
+        ({"files": {}}, "agent.json does not list README.md"),
+        ({"files": []}, r"agent.json is not an agent's: Expected `object`.* at `\$.files`"),
+        ({"files": dict.fromkeys(CONTENTS, "x")}, "agent.json is not an agent's: Expected `object`"),
+        ({"steps": "many"}, r"agent.json is not an agent's: Expected `int`.* at `\$.steps`"),
+        ({"steps": float("inf")}, "agent.json is not an agent's: Expected `int`"),
+        ({"steps": -1}, "agent.json is not an agent's: Expected `int` >= 0"),
     ],
 )
 def test_manifests_of_others(agent, changes, reason):
@@ -102,14 +102,13 @@ def test_manifests_of_others(agent, changes, reason):
     [
         (WEIGHTS, pickle.dumps(print), "model.safetensors is not a file of safetensors"),
         ("evaluation.json", b"[]", "evaluation.json is not a JSON object"),
-        ("evaluation.json", b'{"env": "CartPole-v1"}', "has no 'episodes' that is a whole number"),
-        ("evaluation.json", evaluation(seed=-1), "has no 'seed' that is a whole number from 0"),
-        ("evaluation.json", evaluation(mean=float("nan")), "has no 'mean' that is a number"),
-        ("evaluation.json", evaluation(std=10**400), "has no 'std' that is a number"),
-        ("evaluation.json", evaluation(returns=["9"]), "has no 'returns' that is a list of numb"),
+        ("evaluation.json", b'{"env": "CartPole-v1"}', "missing required field `episodes`"),
+        ("evaluation.json", evaluation(seed=-1), r"Expected `int` >= 0 - at `\$.seed`"),
+        ("evaluation.json", evaluation(mean=float("nan")), r"Expected `float`.*at `\$.mean`"),
+        ("evaluation.json", evaluation(std=10**400), r"out of range - at `\$.std`"),
+        ("evaluation.json", evaluation(returns=["9"]), r"got `str` - at `\$.returns\[0\]`"),
         ("evaluation.json", evaluation(returns=[]), "does not have a return for each of its 'epi"),
         ("versions.json", b"[" * 10_000, "versions.json is not valid JSON"),
-        (CARD, b"\xff", "README.md is not text in UTF-8"),
     ],
 )
 def test_files_of_another_kind(tmp_path, name, content, reason):

@@ -10,7 +10,7 @@ from huggingface_hub import ModelCard
 
 from torchrl_tit import agents
 from torchrl_tit.agents import agent_names, load_agent
-from torchrl_tit.agents.folder import CONTENTS, MANIFEST, read_agent
+from torchrl_tit.agents.folder import CARD, CONTENTS, MANIFEST, read_agent
 
 FOLDER = Path(agents.__file__).parent
 NAMES = agent_names()
@@ -29,7 +29,7 @@ def test_they_are_small_and_complete():
 @pytest.mark.parametrize("name", NAMES)
 def test_their_cards_say_what_was_evaluated(name):
     files = read_agent(FOLDER / name)
-    card: Any = ModelCard(files.card)
+    card: Any = ModelCard((FOLDER / name / CARD).read_text(encoding="utf-8"))
     evaluation = files.evaluation
     assert len(evaluation["returns"]) == evaluation["episodes"]
     returns = torch.tensor(evaluation["returns"], dtype=torch.float64)

@@ -5,7 +5,6 @@ the disk, or in a repository of the Hugging Face Hub. Reading one executes nothi
 """
 
 from torchrl_tit.agents.folder import AgentError
-from torchrl_tit.agents.loading import agent_names, load_agent
-from torchrl_tit.agents.trained_agent import TrainedAgent
+from torchrl_tit.agents.loading import TrainedAgent, agent_names, load_agent
 
 __all__ = ["AgentError", "TrainedAgent", "agent_names", "load_agent"]

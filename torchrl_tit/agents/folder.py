@@ -17,13 +17,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, pstdev
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
+from msgspec import UNSET, Meta, UnsetType
 from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
@@ -40,24 +42,6 @@ MANIFEST = "agent.json"
 CONTENTS = (CARD, RECIPE, WEIGHTS, EVALUATION, VERSIONS)
 """The files that the manifest lists."""
 
-_EVALUATION: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "env": ("a text", lambda x: isinstance(x, str)),
-    "episodes": ("a whole number from 1", lambda x: _is_whole(x) and x >= 1),
-    "seed": ("a whole number from 0 to 2147483648", lambda x: _is_whole(x) and x <= 2**31),
-    "returns": ("a list of numbers", lambda x: isinstance(x, list) and all(map(is_number, x))),
-    "mean": ("a number", lambda x: is_number(x)),
-    "std": ("a number from 0", lambda x: is_number(x) and x >= 0),
-    "steps": ("a whole number from 0", lambda x: _is_whole(x) and x <= MOST_STEPS),
-}
-"""The entries that others rely on, and their checks."""
-_OF_SCORES: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    "score": (
-        "'best' and 'last', numbers",
-        lambda x: isinstance(x, dict) and all(is_number(x.get(name)) for name in ("best", "last")),
-    ),
-    "score_std": _EVALUATION["std"],
-}
-"""Entries that only some evaluations have."""
 MOST_STEPS = 2**53
 """Larger whole numbers are not those of any run, and floats do not hold them exactly."""
 _LARGEST = 3.4e38  # of float32, the dtype of rewards
@@ -68,6 +52,38 @@ _MOST_BYTES = {WEIGHTS: 2**32}
 _MOST_BYTES_OF_TEXT = 2**24
 _FORMAT = "torchrl-tit agent"
 _VERSION = 1
+
+_Number = Annotated[float, Meta(ge=-_LARGEST, le=_LARGEST)]
+_Spread = Annotated[float, Meta(ge=0, le=_LARGEST)]
+_Steps = Annotated[int, Meta(ge=0, le=MOST_STEPS)]
+
+
+class _Score(msgspec.Struct):
+    best: _Number
+    last: _Number
+
+
+class _Evaluation(msgspec.Struct):
+    """The entries of an evaluation that others rely on."""
+
+    env: str
+    episodes: Annotated[int, Meta(ge=1)]
+    seed: Annotated[int, Meta(ge=0, le=2**31)]
+    returns: list[_Number]
+    mean: _Number
+    std: _Spread
+    steps: _Steps
+    score: _Score | UnsetType = UNSET
+    score_std: _Spread | UnsetType = UNSET
+
+
+class _Listed(msgspec.Struct):
+    sha256: str
+
+
+class _Manifest(msgspec.Struct):
+    steps: _Steps
+    files: dict[str, _Listed]
 
 
 class AgentError(ValueError):
@@ -95,7 +111,6 @@ class AgentFiles:
 
     folder: Path
     steps: int
-    card: str
     recipe: bytes
     weights: dict[str, Tensor]
     evaluation: dict[str, Any]
@@ -135,14 +150,10 @@ def write_agent(folder: str | os.PathLike[str], contents: Mapping[str, bytes], s
         6
     """
     listed = {
-        name: {
-            "bytes": len(contents[name]),
-            "sha256": hashlib.sha256(contents[name]).hexdigest(),
-        }
-        for name in CONTENTS
+        name: {"bytes": len(contents[name]), "sha256": _sha256(contents[name])} for name in CONTENTS
     }
     manifest = {"format": _FORMAT, "version": _VERSION, "steps": steps, "files": listed}
-    manifest["sha256"] = _sha256_of_manifest(manifest)
+    manifest["sha256"] = _sha256(json.dumps(manifest).encode())
     with whole_or_not_at_all(folder) as hidden:
         hidden.mkdir()
         for name in CONTENTS:
@@ -168,13 +179,15 @@ def read_agent(folder: str | os.PathLike[str]) -> AgentFiles:
     folder = Path(folder)
     try:
         manifest = _read_manifest(folder)
-        contents = {name: _read(folder, name, manifest["files"][name]) for name in CONTENTS}
+        contents = {name: _read(folder, name) for name in CONTENTS}
+        for name, listed in manifest.files.items():
+            if name in contents and _sha256(contents[name]) != listed.sha256:
+                raise ValueError(f"{name} was changed after it was written (wrong checksum)")
         evaluation = _parse(contents[EVALUATION], EVALUATION)
         check_evaluation(evaluation)
         return AgentFiles(
             folder,
-            manifest["steps"],
-            _text(contents[CARD], CARD),
+            manifest.steps,
             contents[RECIPE],
             _tensors(contents[WEIGHTS]),
             evaluation,
@@ -197,14 +210,12 @@ def check_evaluation(evaluation: Mapping[str, Any]) -> None:
         >>> check_evaluation({"env": "CartPole-v1", "returns": "many", **numbers})
         Traceback (most recent call last):
         ...
-        ValueError: evaluation.json has no 'returns' that is a list of numbers
+        ValueError: evaluation.json is not that of a run: Expected `array`, got `str` - at ...
     """
-    for name, (expected, is_right) in _EVALUATION.items():
-        if not is_right(evaluation.get(name)):
-            raise ValueError(f"{EVALUATION} has no {name!r} that is {expected}")
-    for name, (expected, is_right) in _OF_SCORES.items():
-        if name in evaluation and not is_right(evaluation[name]):
-            raise ValueError(f"{EVALUATION} has a {name!r} that is not {expected}")
+    try:
+        msgspec.convert(evaluation, _Evaluation)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{EVALUATION} is not that of a run: {error}") from error
     returns = evaluation["returns"]
     if len(returns) != evaluation["episodes"]:
         raise ValueError(f"{EVALUATION} does not have a return for each of its 'episodes'")
@@ -227,8 +238,7 @@ def read_evaluation(folder: str | os.PathLike[str]) -> dict[str, Any] | None:
         >>> read_evaluation("nowhere") is None
         True
     """
-    path = Path(folder, EVALUATION)
-    with suppress(FileNotFoundError), path.open("rb") as file:
+    with suppress(FileNotFoundError), Path(folder, EVALUATION).open("rb") as file:
         return parse_evaluation(file.read(_MOST_BYTES_OF_TEXT + 1), folder)  # one more is refused
     return None
 
@@ -254,44 +264,40 @@ def parse_evaluation(content: bytes, folder: str | os.PathLike[str]) -> dict[str
         ) from error
 
 
-def _read_manifest(folder: Path) -> dict[str, Any]:
+def _read_manifest(folder: Path) -> _Manifest:
     if not is_agent(folder):
         raise ValueError(f"there is no {MANIFEST}")
-    _check_size(MANIFEST, folder.joinpath(MANIFEST).stat().st_size)
-    manifest = _parse(folder.joinpath(MANIFEST).read_bytes(), MANIFEST)
-    if manifest.get("format") != _FORMAT:
+    fields = _parse(_read(folder, MANIFEST), MANIFEST)
+    if fields.get("format") != _FORMAT:
         raise ValueError(f"{MANIFEST} does not say that it is a {_FORMAT}")
-    if manifest.get("version") != _VERSION:
+    if fields.get("version") != _VERSION:
         raise ValueError(
-            f"it has version {manifest.get('version')!r}, and this torchrl-tit reads {_VERSION}"
+            f"it has version {fields.get('version')!r}, and this torchrl-tit reads {_VERSION}"
         )
-    if manifest.pop("sha256", None) != _sha256_of_manifest(manifest):
+    if fields.pop("sha256", None) != _sha256(json.dumps(fields).encode()):
         raise ValueError(f"{MANIFEST} was changed after it was written (wrong checksum)")
-    if not _is_whole(manifest.get("steps")):
-        raise ValueError(f"{MANIFEST} has no 'steps' that is a whole number from 0")
-    files = manifest.get("files")
-    for name in CONTENTS:
-        listed = files.get(name) if isinstance(files, dict) else None
-        if not isinstance(listed, dict) or not {"bytes", "sha256"} <= set(listed):
-            raise ValueError(f"{MANIFEST} does not list {name} with its 'bytes' and 'sha256'")
+    try:
+        manifest = msgspec.convert(fields, _Manifest)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"{MANIFEST} is not an agent's: {error}") from error
+    if missing := [name for name in CONTENTS if name not in manifest.files]:
+        raise ValueError(f"{MANIFEST} does not list {missing[0]}")
     return manifest
 
 
-def _read(folder: Path, name: str, listed: dict[str, Any]) -> bytes:
+def _read(folder: Path, name: str) -> bytes:
     """Reads a file once, so that the bytes that are used are those that were checked."""
     path = folder / name
     if not path.is_file():
         raise ValueError(f"{name} is missing")
-    if path.stat().st_size != listed["bytes"]:
-        raise ValueError(
-            f"{name} was changed after it was written ({path.stat().st_size} bytes instead of "
-            f"{listed['bytes']})"
-        )
     _check_size(name, path.stat().st_size)
-    content = path.read_bytes()
-    if hashlib.sha256(content).hexdigest() != listed["sha256"]:
-        raise ValueError(f"{name} was changed after it was written (wrong checksum)")
-    return content
+    return path.read_bytes()
+
+
+def _check_size(name: str, size: int) -> None:
+    most = _MOST_BYTES.get(name, _MOST_BYTES_OF_TEXT)
+    if size > most:
+        raise ValueError(f"{name} has {size} bytes, more than the {most} that an agent's may have")
 
 
 def _tensors(content: bytes) -> dict[str, Tensor]:
@@ -311,23 +317,6 @@ def _parse(content: bytes, name: str) -> dict[str, Any]:
     return parsed
 
 
-def _text(content: bytes, name: str) -> str:
-    try:
-        return content.decode()
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{name} is not text in UTF-8 ({error})") from error
-
-
-def _check_size(name: str, size: int) -> None:
-    most = _MOST_BYTES.get(name, _MOST_BYTES_OF_TEXT)
-    if size > most:
-        raise ValueError(f"{name} has {size} bytes, more than the {most} that an agent's may have")
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-
-
 def is_number(value: Any) -> bool:
     """Whether a value is a finite number of float32's range, which JSON does not ensure.
 
@@ -338,5 +327,5 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST
 
 
-def _sha256_of_manifest(manifest: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(manifest).encode()).hexdigest()
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

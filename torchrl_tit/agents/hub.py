@@ -109,23 +109,18 @@ def import_hub() -> ModuleType:
 @contextmanager
 def _in_one_line(hub: ModuleType, repository: str, revision: str = "") -> Iterator[None]:
     """Turns errors of the Hub into messages of one line."""
-    errors = hub.errors
+    errors, name = hub.errors, f"{PREFIX}{repository}"
+    known = {
+        errors.RevisionNotFoundError: f"{name} has no revision {revision!r}",
+        errors.RepositoryNotFoundError: f"there is no repository {repository!r} on the Hugging "
+        "Face Hub, or you may not see it: check the name, or log in with `hf auth login`",
+        errors.LocalEntryNotFoundError: f"{name} is not on this machine yet, and the Hugging Face "
+        "Hub cannot be reached: check the connection",
+    }
     try:
         yield
-    except errors.RevisionNotFoundError as error:
-        raise AgentError(f"{PREFIX}{repository} has no revision {revision!r}") from error
-    except errors.RepositoryNotFoundError as error:
-        raise AgentError(
-            f"there is no repository {repository!r} on the Hugging Face Hub, or you may not see "
-            "it: check the name, or log in with `hf auth login`"
-        ) from error
-    except errors.LocalEntryNotFoundError as error:
-        raise AgentError(
-            f"{PREFIX}{repository} is not on this machine yet, and the Hugging Face Hub cannot be "
-            "reached: check the connection"
-        ) from error
     except Exception as error:  # also the HTTP client's errors, which differ between versions
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise AgentError(
-            f"the request to the Hugging Face Hub for {PREFIX}{repository} failed: {reason}"
-        ) from error
+        unknown = f"the request to the Hugging Face Hub for {name} failed: {reason}"
+        messages = (text for kind, text in known.items() if isinstance(error, kind))
+        raise AgentError(next(messages, unknown)) from error

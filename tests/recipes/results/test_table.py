@@ -225,17 +225,17 @@ def test_fewer_episodes_are_named(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"mean": float("nan")}, "no 'mean' that is a number"),
+        ({"mean": float("nan")}, "at `$.mean`"),
         ({"mean": 26.0}, "the 'mean' 26.0, but that of its 'returns' is 25.0"),
-        ({"std": -1.0}, "no 'std' that is a number from 0"),
+        ({"std": -1.0}, "Expected `float` >= 0.0 - at `$.std`"),
         ({"std": 1.0}, "the 'std' 1.0, but that of its 'returns' is 5.0"),
-        ({"returns": [1e300] * 100}, "no 'returns' that is a list of numbers"),
+        ({"returns": [1e300] * 100}, "at `$.returns[0]`"),
         ({"returns": [25.0]}, "not have a return for each of its 'episodes'"),
-        ({"steps": -5}, "no 'steps' that is a whole number"),
-        ({"steps": 10**400}, "no 'steps' that is a whole number"),
-        ({"episodes": "100\x1b[2J"}, "no 'episodes' that is a whole number"),
-        ({"score": {"best": float("inf"), "last": 0.0}}, "a 'score' that is not 'best' and 'last'"),
-        ({"score_std": -1.0}, "a 'score_std' that is not a number from 0"),
+        ({"steps": -5}, "Expected `int` >= 0 - at `$.steps`"),
+        ({"steps": 10**400}, "at `$.steps`"),
+        ({"episodes": "100\x1b[2J"}, "Expected `int`, got `str` - at `$.episodes`"),
+        ({"score": {"best": float("inf"), "last": 0.0}}, "at `$.score.best`"),
+        ({"score_std": -1.0}, "Expected `float` >= 0.0 - at `$.score_std`"),
     ],
 )
 def test_wrong_evaluations_are_no_results(tmp_path, capsys, changes, reason):
