@@ -42,7 +42,7 @@ def export(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     from torchrl_tit import load_agent  # not at the top: help needs no PyTorch
     from torchrl_tit.export import export_policy
-    from torchrl_tit.export.policy import find_format
+    from torchrl_tit.export.formats import find_format
 
     find_format(options.out, options.format).check_installed()  # before an agent is loaded
     agent = load_agent(options.agent)

@@ -12,8 +12,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_tit.envs import make_env, observation_specs
 from torchrl_tit.export.comparison import COPIES
-from torchrl_tit.export.policy import make_program
-from torchrl_tit.export.program import Program, read_parts
+from torchrl_tit.export.parts import read_parts
+from torchrl_tit.export.program import Program, make_program
 from torchrl_tit.modules import Backbone, history_keys, make_actor, make_value
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings import FrameSettings, HistorySettings, Linear, Outer

@@ -12,8 +12,7 @@ from tests.numerics import assert_near
 from tests.recipes.ppo import tasks
 from torchrl_tit.envs import make_env
 from torchrl_tit.export.comparison import COPIES, NotTheSameError, compare
-from torchrl_tit.export.observed import Entry
-from torchrl_tit.export.program import read_parts
+from torchrl_tit.export.parts import Entry, read_parts
 from torchrl_tit.modules import Backbone, make_actor
 from torchrl_tit.networks import MLP
 from torchrl_tit.settings import (

@@ -23,8 +23,9 @@ from tests.recipes.decision_transformer.sequence_runs import SMALL, make_dt, mak
 from tests.recipes.offline.offline_runs import BC, IQL, TD3BC, make
 from torchrl_tit.agents import load_agent
 from torchrl_tit.export.comparison import COPIES, compare
-from torchrl_tit.export.policy import export_policy, make_program
-from torchrl_tit.export.program import read_parts
+from torchrl_tit.export.parts import read_parts
+from torchrl_tit.export.policy import export_policy
+from torchrl_tit.export.program import make_program
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.settings.networks import decision_transformer
 

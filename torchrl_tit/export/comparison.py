@@ -9,10 +9,9 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, set_interaction_type
 from tensordict.nn.probabilistic import InteractionType
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, RenameTransform, TransformedEnv
 
 from torchrl_tit.export.formats import Run
-from torchrl_tit.export.observed import Untouched
 from torchrl_tit.export.program import NOISE, Program, Step
 
 TOLERANCE = 1e-5
@@ -109,7 +108,8 @@ def _keep_untouched(program: Program, env: EnvBase) -> list[NestedKey]:
         if len(seen.layers):
             keys[index] = f"untouched_{index}"
             assert isinstance(env, TransformedEnv)
-            env.insert_transform(seen.place, Untouched([seen.key], [keys[index]]))
+            copied = RenameTransform([seen.key], [keys[index]], create_copy=True)
+            env.insert_transform(seen.place, copied)
     return keys
 
 
@@ -132,10 +132,7 @@ def _distance(mine: Tensor, other: Tensor) -> float:
         return float("inf")
     if not mine.is_floating_point():
         return 0.0 if torch.equal(mine, other) else float("inf")
-    both = (mine == other) | (mine.isnan() & other.isnan())  # -inf of options that do not exist
-    apart = (mine - other).abs().masked_fill(both, 0.0)
-    if apart.isnan().any():
-        return float("inf")
-    finite = other.abs().masked_fill(~other.isfinite(), 0.0)
-    scale = max(1.0, finite.max().item()) if finite.numel() else 1.0
-    return apart.max().item() / scale if apart.numel() else 0.0
+    same = (mine == other) | (mine.isnan() & other.isnan())  # -inf of options that do not exist
+    apart = (mine - other).abs().masked_fill(same, 0).nan_to_num(nan=float("inf"))
+    scale = other.abs().masked_fill(~other.isfinite(), 0).max().clamp(min=1)
+    return (apart.max() / scale).item()

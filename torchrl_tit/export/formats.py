@@ -8,11 +8,11 @@ import json
 import logging
 import re
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -29,114 +29,113 @@ Run = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
 """Maps inputs by name to outputs by name."""
 
 
-class Format(ABC):
+@dataclass(frozen=True)
+class Format:
     """A file format."""
 
-    suffix: ClassVar[str]
-
-    @abstractmethod
-    def write(
-        self, program: torch.export.ExportedProgram, facts: Mapping[str, Any], path: Path
-    ) -> None:
-        """Writes a program to a file.
-
-        Args:
-            program: the program.
-            facts: metadata of the policy; "inputs" and "outputs" list its tensors in order.
-            path: the file.
-
-        Raises:
-            ValueError: if the format cannot express it, or a package is missing.
-        """
-
-    @abstractmethod
-    def read(self, path: Path) -> Run:
-        """Reads a file; returns the function from inputs to outputs by name."""
+    suffix: str
+    write: Callable[[torch.export.ExportedProgram, Mapping[str, Any], Path], None]
+    """Writes a program and the facts about its policy, whose "inputs" and "outputs" list its
+    tensors in order; raises ValueError if the format cannot express it."""
+    read: Callable[[Path], Run]
+    """Reads a file as a function from inputs to outputs by name."""
+    packages: tuple[str, ...] = ()
+    """Packages that it needs."""
 
     def check_installed(self) -> None:
         """Raises ValueError if a required package is missing."""
-        return
-
-
-class PT2(Format):
-    """PyTorch's own format, which `torch.export.load` reads, for any device and AOTInductor."""
-
-    suffix = ".pt2"
-
-    def write(
-        self, program: torch.export.ExportedProgram, facts: Mapping[str, Any], path: Path
-    ) -> None:
-        """See :meth:`Format.write`."""
-        with path.open("wb") as file:
-            torch.export.save(program, file, extra_files={FACTS: json.dumps(facts)})
-
-    def read(self, path: Path) -> Run:
-        """See :meth:`Format.read`."""
-        with path.open("rb") as file:
-            module = torch.export.load(file).module()
-        return lambda inputs: module(**inputs)
-
-
-class ONNX(Format):
-    """ONNX, written by PyTorch's exporter for exported programs; any ONNX runtime reads it."""
-
-    suffix = ".onnx"
-
-    def check_installed(self) -> None:
-        """See :meth:`Format.check_installed`."""
-        packages = ("onnx", "onnxscript", "onnxruntime")
-        missing = [name for name in packages if importlib.util.find_spec(name) is None]
+        missing = [name for name in self.packages if importlib.util.find_spec(name) is None]
         if missing:
             raise ValueError(
                 f"ONNX needs {', '.join(missing)}: {install('onnx')}, or export to .pt2"
             )
 
-    def write(
-        self, program: torch.export.ExportedProgram, facts: Mapping[str, Any], path: Path
-    ) -> None:
-        """See :meth:`Format.write`."""
-        try:
-            with _quiet():
-                converted = torch.onnx.export(
-                    program,
-                    input_names=list(facts["inputs"]),
-                    output_names=list(facts["outputs"]),
-                    verbose=False,
-                )
-        except Exception as error:  # the exporter's own errors, which have no public base
-            raise ValueError(f"{_missing_operator(error)}: export to .pt2 instead") from error
-        assert converted is not None
-        _require_one_batch_size(converted.model.graph)
-        converted.model.metadata_props[METADATA] = json.dumps(facts)
-        converted.save(path, external_data=False)
 
-    def read(self, path: Path) -> Run:
-        """See :meth:`Format.read`."""
-        import onnxruntime
+def _write_pt2(program: torch.export.ExportedProgram, facts: Mapping[str, Any], path: Path) -> None:
+    with path.open("wb") as file:
+        torch.export.save(program, file, extra_files={FACTS: json.dumps(facts)})
 
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = torch.get_num_threads()
-        try:
-            session = onnxruntime.InferenceSession(
-                path.read_bytes(), options, providers=["CPUExecutionProvider"]
+
+def _read_pt2(path: Path) -> Run:
+    with path.open("rb") as file:
+        module = torch.export.load(file).module()
+    return lambda inputs: module(**inputs)
+
+
+def _write_onnx(
+    program: torch.export.ExportedProgram, facts: Mapping[str, Any], path: Path
+) -> None:
+    try:
+        with _quiet():
+            converted = torch.onnx.export(
+                program,
+                input_names=list(facts["inputs"]),
+                output_names=list(facts["outputs"]),
+                verbose=False,
             )
-        except Exception as error:  # its errors have no public base
-            raise ValueError(
-                f"ONNX Runtime cannot run this policy ({_first_line(error)}): export to .pt2 "
-                "instead"
-            ) from error
-        names = [output.name for output in session.get_outputs()]
-
-        def run(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            arrays = session.run(names, {name: x.numpy() for name, x in inputs.items()})
-            return {
-                name: torch.from_numpy(array) for name, array in zip(names, arrays, strict=True)
-            }
-
-        return run
+    except Exception as error:  # the exporter's own errors, which have no public base
+        raise ValueError(f"{_missing_operator(error)}: export to .pt2 instead") from error
+    assert converted is not None
+    _require_one_batch_size(converted.model.graph)
+    converted.model.metadata_props[METADATA] = json.dumps(facts)
+    converted.save(path, external_data=False)
 
 
-FORMATS: dict[str, Format] = {"pt2": PT2(), "onnx": ONNX()}
+def _read_onnx(path: Path) -> Run:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    try:
+        session = onnxruntime.InferenceSession(
+            path.read_bytes(), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:  # its errors have no public base
+        raise ValueError(
+            f"ONNX Runtime cannot run this policy ({_first_line(error)}): export to .pt2 instead"
+        ) from error
+    names = [output.name for output in session.get_outputs()]
+
+    def run(inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        arrays = session.run(names, {name: x.numpy() for name, x in inputs.items()})
+        return dict(zip(names, map(torch.from_numpy, arrays), strict=True))
+
+    return run
+
+
+FORMATS = {
+    "pt2": Format(".pt2", _write_pt2, _read_pt2),
+    "onnx": Format(".onnx", _write_onnx, _read_onnx, ("onnx", "onnxscript", "onnxruntime")),
+}
+"""PyTorch's own format, which `torch.export.load` reads, for any device and AOTInductor; and ONNX,
+written by PyTorch's exporter for exported programs, which any ONNX runtime reads."""
+
+
+def find_format(path: Path, format: str | None = None) -> Format:
+    """Returns the format of a file.
+
+    Args:
+        path: the file.
+        format: its name; by default, it follows from the file's suffix.
+
+    Raises:
+        ValueError: if it is unknown.
+
+    Example:
+        >>> find_format(Path("agent.onnx")).suffix
+        '.onnx'
+    """
+    name = path.suffix.removeprefix(".") if format is None else format
+    if name not in FORMATS:
+        known = ", ".join(FORMATS)
+        raise ValueError(
+            f"unknown format {name!r}: choose one of {known}"
+            if format is not None
+            else f"the name {path.name!r} tells no format: end it with "
+            f"{' or '.join(known.suffix for known in FORMATS.values())}, or choose one with "
+            "--format"
+        )
+    return FORMATS[name]
 
 
 def trace(program: Program) -> torch.export.ExportedProgram:
@@ -184,16 +183,13 @@ class _Named(nn.Module):
 def _quiet() -> Iterator[None]:
     """Hides the exporters' own messages."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "torch.export", "onnxscript")]
-    levels = [logger.level for logger in loggers]
-    try:
+    with ExitStack() as stack:
         for logger in loggers:
+            stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.ERROR)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+        stack.enter_context(warnings.catch_warnings())
+        warnings.simplefilter("ignore")
+        yield
 
 
 def _require_one_batch_size(graph: Any) -> None:

@@ -13,17 +13,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TargetReturn
 
 from torchrl_tit.export.comparison import COPIES, compare
-from torchrl_tit.export.formats import FORMATS, Format, trace
-from torchrl_tit.export.observed import Entry, transforms_of
-from torchrl_tit.export.program import (
-    Parts,
-    Program,
-    RecurrentSteps,
-    TokenSteps,
-    Windows,
-    read_parts,
-)
-from torchrl_tit.export.sequences import SequenceSteps, SequenceWindows
+from torchrl_tit.export.formats import find_format, trace
+from torchrl_tit.export.parts import Entry, read_parts, transforms_of
+from torchrl_tit.export.program import Program, make_program
 from torchrl_tit.files import whole_or_not_at_all
 
 VERSION = 1
@@ -112,7 +104,7 @@ def export_policy(
             program = make_program(parts, step_by_step=step_by_step, sample=sample)
             # A copy, because tracing modifies the weights of some layers, such as nn.LSTM.
             exported = trace(copy.deepcopy(program))
-            said = {**describe(program, env), **(facts or {})}
+            said = {**_describe(program, env), **(facts or {})}
             kind.write(exported, said, hidden)
             with torch.random.fork_rng(devices=[]):  # seeding an environment seeds PyTorch
                 difference = compare(kind.read(hidden), program, policy, env)
@@ -121,65 +113,7 @@ def export_policy(
     return {**said, "difference": difference}
 
 
-def find_format(path: Path, format: str | None = None) -> Format:
-    """Returns the format of a file.
-
-    Args:
-        path: the file.
-        format: its name; by default, it follows from the file's suffix.
-
-    Raises:
-        ValueError: if it is unknown.
-
-    Example:
-        >>> find_format(Path("agent.onnx")).suffix
-        '.onnx'
-    """
-    name = path.suffix.removeprefix(".") if format is None else format
-    if name not in FORMATS:
-        known = ", ".join(FORMATS)
-        raise ValueError(
-            f"unknown format {name!r}: choose one of {known}"
-            if format is not None
-            else f"the name {path.name!r} tells no format: end it with "
-            f"{' or '.join(known.suffix for known in FORMATS.values())}, or choose one with "
-            "--format"
-        )
-    return FORMATS[name]
-
-
-def make_program(parts: Parts, *, step_by_step: bool = False, sample: bool = False) -> Program:
-    """Turns a policy into a function of plain tensors.
-
-    Args:
-        parts: the policy.
-        step_by_step: whether each frame is encoded only once.
-        sample: whether actions are sampled.
-
-    Raises:
-        ValueError: if its history encoder has unknown inputs, or there is nothing to sample.
-    """
-    trunk = parts.trunk
-    program: Program
-    if trunk.history_encoder.context:
-        if parts.sequence is None or len(parts.observed) != 1:
-            raise ValueError(
-                f"{type(trunk.history_encoder).__name__} reads "
-                f"{', '.join(trunk.history_encoder.context)} beside observations, which only a "
-                "Decision Transformer on a SequenceHistory can be exported with"
-            )
-        kind = SequenceSteps if step_by_step else SequenceWindows
-        program = kind(parts, sample=sample)
-    elif trunk.carries_state:
-        program = RecurrentSteps(parts, sample=sample)
-    elif step_by_step and trunk.num_frames > 1:
-        program = TokenSteps(parts, sample=sample)
-    else:
-        program = Windows(parts, sample=sample)
-    return program.complete().eval()
-
-
-def describe(program: Program, env: EnvBase) -> dict[str, Any]:
+def _describe(program: Program, env: EnvBase) -> dict[str, Any]:
     """Describes a program's inputs and outputs in a form suitable for JSON."""
     examples = program.examples(1)
     with torch.no_grad():

@@ -7,18 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
 
-from torchrl_tit.export.head import Head, split_policy
-from torchrl_tit.export.observed import Entry, Observed, identifiers, trace, transforms_of
-from torchrl_tit.export.task_action import TaskAction
+from torchrl_tit.export.parts import Entry, Parts
 from torchrl_tit.histories.encoder import RecurrentEncoder
-from torchrl_tit.modules.backbone import Backbone, trunks_of
-from torchrl_tit.networks import HistoryNetwork
-from torchrl_tit.transforms import SequenceHistory
 from torchrl_tit.windows import Padding
 
 FIRST = "is_init"
@@ -27,91 +21,35 @@ NOISE = "noise"
 """Name of the input from which actions are sampled."""
 
 
-@dataclass(frozen=True)
-class Parts:
-    """The parts of a policy, and its inputs in an environment."""
-
-    backbone: Backbone
-    trunk: HistoryNetwork
-    """The network of the action; a separate network of the value is left out."""
-    features_key: NestedKey
-    head: Head
-    observed: Sequence[Observed]
-    """The observations, in the order of the network."""
-    further: Mapping[str, NestedKey]
-    """Keys of the head's other inputs from the environment, such as masks, by name of the input."""
-    entries: Mapping[str, Entry]
-    """Shapes and dtypes of these."""
-    to_task: nn.Module
-    """Converts actions to those of the task."""
-    action: Entry
-    """An action of the policy."""
-    sequence: SequenceHistory | None
-    """The transform that writes the windows of a Decision Transformer."""
-
-    @property
-    def names(self) -> list[str]:
-        """Suffixes of argument names for the observations: "" for a single one, or "_NAME"."""
-        if len(self.observed) == 1:
-            return [""]
-        return [f"_{name}" for name in identifiers([seen.name for seen in self.observed])]
-
-
-def read_parts(policy: nn.Module, env: EnvBase) -> Parts:
-    """Splits a policy into its parts.
+def make_program(parts: Parts, *, step_by_step: bool = False, sample: bool = False) -> Program:
+    """Turns a policy into a function of plain tensors.
 
     Args:
-        policy: a backbone around a network of this library, and the modules after it.
-        env: the environment in which it acts.
+        parts: the policy.
+        step_by_step: whether each frame is encoded only once.
+        sample: whether actions are sampled.
 
     Raises:
-        ValueError: if it is not such a policy, or has unknown inputs.
+        ValueError: if its history encoder has unknown inputs, or there is nothing to sample.
     """
-    backbone, modules = split_policy(policy)
-    trunks = list(trunks_of(backbone.module).values())
-    if not trunks:
-        raise ValueError(
-            f"the backbone is around a {type(backbone.module).__name__}; only one around a "
-            "HistoryNetwork or TwoTrunks can be exported"
-        )
-    head = Head(modules)
-    known = zip(backbone.features_keys, trunks, strict=True)
-    read = [(key, trunk) for key, trunk in known if unravel_key(key) in head.reads]
-    if len(read) != 1:
-        raise ValueError(
-            f"the action depends on {len(read)} of the features {backbone.features_keys}; expected "
-            "that it depends on one"
-        )
-    ((features_key, trunk),) = read
-    names = list(trunk.observations)
-    histories = backbone.history_keys[: len(names)]
-    observed = [trace(env, key, name) for key, name in zip(histories, names, strict=True)]
-    windows = {unravel_key(key) for key in backbone.history_keys}
-    further = sorted(
-        (key for key in head.reads - windows - {unravel_key(features_key)}), key=_last_name
-    )
-    for key in further:
-        if key not in env.observation_spec.keys(True, True):
-            raise ValueError(f"the policy reads {key!r}, which the environment does not write")
-    keys = dict(zip(identifiers([_last_name(key) for key in further]), further, strict=True))
-    specs = {name: env.observation_spec[key] for name, key in keys.items()}
-    writer = getattr(env.base_env, "action_writer", None)
-    action = env.action_spec_unbatched
-    sequences = [t for t in transforms_of(env) if isinstance(t, SequenceHistory)]
-    return Parts(
-        backbone=backbone,
-        trunk=trunk,
-        features_key=features_key,
-        head=head,
-        observed=observed,
-        further=keys,
-        entries={
-            name: Entry(tuple(spec.shape[env.ndim :]), spec.dtype) for name, spec in specs.items()
-        },
-        to_task=nn.Identity() if writer is None else TaskAction(writer),
-        action=Entry(tuple(action.shape), action.dtype),
-        sequence=sequences[0] if sequences else None,
-    )
+    trunk = parts.trunk
+    program: Program
+    if trunk.history_encoder.context:
+        if parts.sequence is None or len(parts.observed) != 1:
+            raise ValueError(
+                f"{type(trunk.history_encoder).__name__} reads "
+                f"{', '.join(trunk.history_encoder.context)} beside observations, which only a "
+                "Decision Transformer on a SequenceHistory can be exported with"
+            )
+        kind = SequenceSteps if step_by_step else SequenceWindows
+        program = kind(parts, sample=sample)
+    elif trunk.carries_state:
+        program = RecurrentSteps(parts, sample=sample)
+    elif step_by_step and trunk.num_frames > 1:
+        program = TokenSteps(parts, sample=sample)
+    else:
+        program = Windows(parts, sample=sample)
+    return program.complete().eval()
 
 
 @dataclass(frozen=True)
@@ -177,16 +115,16 @@ class Program(nn.Module, ABC):
         """Returns the state to carry on, once the action is known; by default the same."""
         return carried
 
-    def windows(self, inputs: Mapping[str, Tensor]) -> dict[NestedKey, Tensor]:
-        """Returns the entries of the windows that the head reads, by key; by default none."""
-        return {}
-
     def forward(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Maps inputs to outputs, [N, ...] each."""
         parts = self.parts
         features, carried = self.read(inputs)
         further = {key: inputs[name] for name, key in parts.further.items()}
-        entries = {parts.features_key: features, **self.windows(inputs), **further}
+        entries = {parts.features_key: features, **further}
+        if (
+            self.trunk.history_encoder.context
+        ):  # the head of a Decision Transformer checks their kind
+            entries[unravel_key(parts.backbone.history_keys[1])] = inputs["actions"]
         action, parameters = self.head(entries, inputs.get(NOISE))
         carried = self.act(carried, action)
         following = {f"next_{name}": carried[name] for name in self.state}
@@ -196,8 +134,10 @@ class Program(nn.Module, ABC):
         """Adds the inputs that all programs share; returns itself."""
         self.inputs |= self.parts.entries
         if self.noise is not None:
-            # A mask of zeros would allow no action; noise has the shape of the parameters.
-            self.inputs[NOISE] = Entry(tuple(self._parameter().shape[1:]), torch.float32)
+            with torch.no_grad():
+                outputs = self(self.examples(1))
+            parameter = outputs["logits" if "logits" in outputs else "loc"]
+            self.inputs[NOISE] = Entry(tuple(parameter.shape[1:]), torch.float32)
         return self
 
     def examples(self, size: int) -> dict[str, Tensor]:
@@ -205,11 +145,6 @@ class Program(nn.Module, ABC):
         zeros = {name: entry.zeros(size) for name, entry in self.inputs.items()}
         masks = {name: torch.ones_like(zeros[name]) for name in self.parts.further}
         return {**zeros, **masks}
-
-    @torch.no_grad()
-    def _parameter(self) -> Tensor:
-        outputs = self(self.examples(1))
-        return outputs["logits" if "logits" in outputs else "loc"]
 
 
 class Windows(Program):
@@ -227,7 +162,7 @@ class Windows(Program):
         num_frames = parts.trunk.num_frames
         self.stacks = num_frames > 1
         noun, leading = ("history", (num_frames,)) if self.stacks else ("observation", ())
-        self.names = [noun + name for name in parts.names]
+        self.names = [noun + seen.suffix for seen in parts.observed]
         for name, seen in zip(self.names, parts.observed, strict=True):
             self.inputs[name] = Entry((*leading, *seen.entry.shape), seen.entry.dtype)
 
@@ -259,7 +194,7 @@ class Steps(Program):
 
     def __init__(self, parts: Parts, *, sample: bool = False) -> None:
         super().__init__(parts, sample=sample)
-        self.names = [f"observation{name}" for name in parts.names]
+        self.names = [f"observation{seen.suffix}" for seen in parts.observed]
         for name, seen in zip(self.names, parts.observed, strict=True):
             self.inputs[name] = seen.entry
         self.inputs[FIRST] = Entry((), torch.bool)
@@ -354,6 +289,129 @@ class RecurrentSteps(Steps):
         return self.trunk.head(outputs), state
 
 
+class SequenceWindows(Program):
+    """Reads the last K observations, actions, returns to go and time steps.
+
+        observation [N, K, *obs], actions [N, K, *action], return_to_go [N, K, 1],
+        timestep int64 [N, K], mask bool [N, K]  ->  action
+
+    Returns are unscaled, and steps before an episode are masked. As in
+    :class:`~torchrl_tit.transforms.SequenceHistory`, the last action is not read.
+
+    Args:
+        parts: the policy.
+        sample: whether actions are sampled.
+    """
+
+    def __init__(self, parts: Parts, *, sample: bool = False) -> None:
+        super().__init__(parts, sample=sample)
+        assert parts.sequence is not None
+        (seen,), steps = parts.observed, parts.sequence.num_frames
+        self.num_frames = steps
+        self.return_scale = parts.sequence.return_scale
+        self.inputs |= {
+            "observation": Entry((steps, *seen.entry.shape), seen.entry.dtype),
+            "actions": Entry((steps, *parts.action.shape), parts.action.dtype),
+            "return_to_go": Entry((steps, 1), torch.float32),
+            "timestep": Entry((steps,), torch.int64),
+            "mask": Entry((steps,), torch.bool),
+        }
+
+    def read(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """See :meth:`Program.read`; no state is carried on."""
+        (prepare,) = self.preparations
+        features = self.trunk(
+            prepare(inputs["observation"]),
+            inputs["actions"],
+            inputs["return_to_go"] / self.return_scale,
+            inputs["timestep"],
+            inputs["mask"],
+        )
+        return features, {}
+
+    def feed(self, episode: Sequence[Step]) -> dict[str, Tensor]:
+        """See :meth:`Program.feed`."""
+        size = len(episode[-1].observations[0])
+        *before, last = (step.tensordict["action"] for step in episode)
+        times = [torch.full((size,), time) for time in range(len(episode))]
+        to_go = [step.tensordict["target_return"] for step in episode]
+        entries = {
+            "observation": [step.observations[0] for step in episode],
+            "actions": [*before, torch.zeros_like(last)],
+            "return_to_go": to_go,
+            "timestep": times,
+            "mask": [torch.ones_like(time, dtype=torch.bool) for time in times],
+        }
+        return {name: stack(x, self.num_frames, "constant") for name, x in entries.items()}
+
+
+class SequenceSteps(TokenSteps):
+    """Carries the tokens of the last K - 1 frames, their actions and returns, and the time.
+
+        observation [N, *obs], is_init [N], reward [N], target_return [N], state  ->  action, next_
+
+    The return to go is the target, read at the episode's first step, minus the rewards since then.
+
+    Args:
+        parts: the policy.
+        sample: whether actions are sampled.
+    """
+
+    def __init__(self, parts: Parts, *, sample: bool = False) -> None:
+        super().__init__(parts, sample=sample)
+        assert parts.sequence is not None
+        steps = parts.sequence.num_frames
+        self.num_frames = steps
+        self.return_scale = parts.sequence.return_scale
+        scalar = Entry((), torch.float32)
+        self.inputs |= {"reward": scalar, "target_return": scalar}
+        tokens = self.inputs["tokens"]
+        self.carry(
+            {
+                "tokens": Entry((steps - 1, *tokens.shape[1:]), tokens.dtype),
+                "actions": Entry((steps - 1, *parts.action.shape), parts.action.dtype),
+                "returns": Entry((steps - 1, 1), torch.float32),
+                "return_to_go": scalar,
+                "time": Entry((), torch.int64),
+            }
+        )
+
+    def read(self, inputs: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """See :meth:`Program.read`."""
+        first, steps = inputs[FIRST], self.num_frames
+        tokens = self.window(inputs)  # [N, K, L, D]
+        time = torch.where(first, 0, inputs["time"] + 1)
+        to_go = inputs["return_to_go"] - inputs["reward"]
+        to_go = torch.where(first, inputs["target_return"], to_go)
+        returns = torch.cat([inputs["returns"], to_go.reshape(-1, 1, 1)], dim=1)
+        actions = inputs["actions"]
+        actions = torch.cat([actions, torch.zeros_like(actions[:, :1])], dim=1)
+        back = torch.arange(1 - steps, 1, device=time.device)
+        timestep = time.unsqueeze(1) + back  # negative before the episode
+        features = self.trunk.encode_history(
+            tokens, actions, returns / self.return_scale, timestep.clamp(min=0), timestep >= 0
+        )
+        carried = {
+            "tokens": tokens[:, 1:],
+            "actions": actions[:, 1:],
+            "returns": returns[:, 1:],
+            "return_to_go": to_go,
+            "time": time,
+        }
+        return features, carried
+
+    def act(self, carried: dict[str, Tensor], action: Tensor) -> dict[str, Tensor]:
+        """Adds the action to the actions that are carried on."""
+        actions = torch.cat([carried["actions"][:, :-1], action.unsqueeze(1)], dim=1)
+        return {**carried, "actions": actions}
+
+    def feed(self, episode: Sequence[Step]) -> dict[str, Tensor]:
+        """See :meth:`Program.feed`."""
+        step = episode[-1]
+        target = episode[0].tensordict["target_return"].squeeze(-1)
+        return {**super().feed(episode), "reward": step.reward, "target_return": target}
+
+
 def stack(frames: Sequence[Tensor], num_frames: int, padding: Padding | None) -> Tensor:
     """Stacks the last K of an episode's frames, [N, ...] each -> [N, K, ...].
 
@@ -369,7 +427,3 @@ def stack(frames: Sequence[Tensor], num_frames: int, padding: Padding | None) ->
     last = list(frames[-num_frames:])
     first = last[0] if padding == "same" else torch.zeros_like(last[0])
     return torch.stack([first] * (num_frames - len(last)) + last, dim=1)
-
-
-def _last_name(key: NestedKey) -> str:
-    return key if isinstance(key, str) else key[-1]
