@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchrl_tit.interop.weights import count_layers, load_renamed, size_of, strip_prefix
+from torchrl_tit.interop.weights import Renaming, count_layers, size_of
 from torchrl_tit.modules import DTHead
 from torchrl_tit.networks import DTTIT, DecisionTransformer, HistoryNetwork
 
@@ -86,36 +86,41 @@ _INNER = [
 ]
 # Weights that the authors' network does not use: untrained predictions of states and returns, token
 # and position embeddings of GPT-2, and causal masks.
-_UNUSED = re.compile(
-    r"predict_(state|return)\..*|transformer\.w[tp]e\..*|.*\.attn\.(masked_)?bias|.*mask.*"
-)
+_UNUSED = re.compile(r"predict_(state|return)\..*|transformer\.w[tp]e\..*|.*\.attn\.bias")
 _CONV1D = re.compile(r".*\.(c_attn|c_proj|c_fc)\.weight")
 # Names of activations in GPT-2 configurations that differ from ours.
 _ACTIVATIONS = {"gelu_new": "gelu_tanh", "gelu_pytorch_tanh": "gelu_tanh", "swish": "silu"}
 
 
-def dt_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
-    """Builds Decision Transformer; see :func:`~torchrl_tit.interop.from_official`."""
+def build_dt(
+    config: Mapping[str, Any], params: Mapping[str, Tensor]
+) -> tuple[nn.Module, Mapping[str, Tensor], Renaming]:
+    """Builds Decision Transformer; returns it with its parameters and how they are called here."""
     params = _prepare(params)
     size = config.get("state_dim", size_of(params, "embed_state.weight", axis=1))
-    return _build(DecisionTransformer, config, params, size, {}, _LINEAR)
+    return _build(DecisionTransformer, config, params, size), params, [*_RENAMING, *_LINEAR]
 
 
-def dt_tit_from_official(config: Mapping[str, Any], params: Mapping[str, Tensor]) -> nn.Module:
-    """Builds DT_TIT; see :func:`~torchrl_tit.interop.from_official`."""
+def build_dt_tit(
+    config: Mapping[str, Any], params: Mapping[str, Tensor]
+) -> tuple[nn.Module, Mapping[str, Tensor], Renaming]:
+    """Builds DT_TIT; see :func:`build_dt`."""
     params = _prepare(params)
     width = size_of(params, "obs_patch_embed.weight")
     patch_size = size_of(params, "obs_patch_embed.weight", axis=-1)
-    hyperparameters = {
-        "patch_size": patch_size,
-        "num_blocks_inner": count_layers(params, r"inner_blocks\.(\d+)\..*"),
-        "num_heads_inner": config.get("num_heads_inner", 1),
-        "ffn_expansion_inner": size_of(params, "inner_blocks.0.ffn.0.weight") // width,
-        "activation_inner": _activation(config.get("activation_inner", "relu")),
-        "position_encoding": "obs_patch_pos_encoding" in params,
-    }
-    size = config.get("state_dim", patch_size)
-    return _build(DTTIT, config, params, size, hyperparameters, _INNER)
+    network = _build(
+        DTTIT,
+        config,
+        params,
+        config.get("state_dim", patch_size),
+        patch_size=patch_size,
+        num_blocks_inner=count_layers(params, r"inner_blocks\.(\d+)\..*"),
+        num_heads_inner=config.get("num_heads_inner", 1),
+        ffn_expansion_inner=size_of(params, "inner_blocks.0.ffn.0.weight") // width,
+        activation_inner=_activation(config.get("activation_inner", "relu")),
+        position_encoding="obs_patch_pos_encoding" in params,
+    )
+    return network, params, [*_RENAMING, *_INNER]
 
 
 def _build(
@@ -123,8 +128,7 @@ def _build(
     config: Mapping[str, Any],
     params: Mapping[str, Tensor],
     state_dim: int,
-    hyperparameters: Mapping[str, Any],
-    renaming: list[tuple[str, str]],
+    **hyperparameters: Any,
 ) -> ActionPredictor:
     embed_dim = config.get("embed_dim", size_of(params, "embed_ln.weight"))
     max_ep_len = config.get("max_ep_len", size_of(params, "embed_timestep.weight"))
@@ -141,14 +145,11 @@ def _build(
         max_ep_len=max_ep_len,
         **hyperparameters,
     )
-    predictor = ActionPredictor(network, DTHead(embed_dim, action_dim))
-    load_renamed(predictor, params, [*_RENAMING, *renaming])
-    return predictor
+    return ActionPredictor(network, DTHead(embed_dim, action_dim))
 
 
 def _prepare(params: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Drops prefix and unused parameters, and transposes GPT-2's weights [in, out]."""
-    params = strip_prefix(params, "embed_ln.weight")
+    """Drops unused parameters, and transposes GPT-2's weights [in, out]."""
     used = {name: value for name, value in params.items() if not _UNUSED.fullmatch(name)}
     prepared = {n: value.T if _CONV1D.fullmatch(n) else value for n, value in used.items()}
     missing = [
