@@ -1,7 +1,14 @@
 """TorchRL transforms: the last K observations, and observations with hidden entries."""
 
 from torchrl_tit.transforms.hide_velocities import VELOCITIES, HideEntries, HideVelocities
-from torchrl_tit.transforms.history import History
+from torchrl_tit.transforms.history import History, frames_before
 from torchrl_tit.transforms.sequence_history import SequenceHistory
 
-__all__ = ["VELOCITIES", "HideEntries", "HideVelocities", "History", "SequenceHistory"]
+__all__ = [
+    "VELOCITIES",
+    "HideEntries",
+    "HideVelocities",
+    "History",
+    "SequenceHistory",
+    "frames_before",
+]

@@ -8,7 +8,7 @@ from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.utils import expand_right
 from torch import Tensor
 from torchrl.data import Composite, SliceSampler, TensorSpec
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import CatFrames, Compose, ExcludeTransform, Transform
 
 from torchrl_tit.transforms.stored_histories import find_histories
@@ -149,6 +149,21 @@ class History(CatFrames):
         buffer.copy_(history)
         return history
 
+    def frames_before(self) -> dict[NestedKey, Tensor]:
+        """Returns the frames that precede the newest one of the environment it belongs to.
+
+        So a batch of consecutive steps needs no histories: read them before the first step.
+
+        Returns:
+            Copies of the K - 1 frames before the newest, oldest first, [..., K - 1, *obs], under
+            the key of the observation; empty if K = 1.
+        """
+        frames = self.N - 1
+        if not frames:
+            return {}
+        buffers = {key: getattr(self, _buffer_name(key)) for key in self.in_keys}
+        return {key: x.narrow(self.dim, 0, frames).clone() for key, x in buffers.items()}
+
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
@@ -280,6 +295,32 @@ class History(CatFrames):
                 f"One observation {key!r} has the shape {list(shape)}, so observation_ndim "
                 f"must be {len(shape)}, not {self._observation_ndim}"
             )
+
+
+def frames_before(env: EnvBase) -> dict[NestedKey, Tensor]:
+    """Returns the frames that precede the newest one of an environment, from each `History` in it.
+
+    Args:
+        env: an environment with transforms.
+
+    Returns:
+        See :meth:`History.frames_before`.
+
+    Example:
+        >>> from torchrl.envs import GymEnv
+        >>> env = TransformedEnv(GymEnv("CartPole-v1"), History(num_frames=4))
+        >>> first = env.reset()["history"]
+        >>> torch.equal(frames_before(env)["observation"], first[:-1])
+        True
+    """
+    frames: dict[NestedKey, Tensor] = {}
+    while isinstance(env, TransformedEnv):
+        transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
+        for transform in transforms:
+            if isinstance(transform, History):
+                frames |= transform.frames_before()
+        env = env.base_env
+    return frames
 
 
 def _buffer_name(key: NestedKey) -> str:
