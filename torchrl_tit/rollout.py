@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from torchrl_tit.modules import ActingCollector
 from torchrl_tit.modules.frame_tables import table_of_first
+from torchrl_tit.transforms import frames_before
 from torchrl_tit.windows import Padding, Windows, find_windows
 
 
@@ -26,17 +27,13 @@ class FrameCollector(ActingCollector):
 
     def rollout(self) -> TensorDictBase:
         """Collects a batch, [envs, time]."""
-        history = self._carrier["history"]
-        histories: dict[NestedKey, Tensor] = (
-            {"before": history}
-            if isinstance(history, Tensor)
-            else {("before", name): leaf for name, leaf in history.items()}
-        )
-        older = {key: leaf[:, :-1].flatten(1) for key, leaf in histories.items()}  # [envs, entries]
+        older = {
+            ("before", *key[1:]) if isinstance(key, tuple) else "before": frames.flatten(1)
+            for key, frames in frames_before(self.env).items()
+        }
         batch = super().rollout()
         for key, entries in older.items():
-            if entries.shape[1]:
-                batch[key] = _in_pieces(entries, batch.shape[1])
+            batch[key] = _in_pieces(entries, batch.shape[1])
         return batch
 
 
