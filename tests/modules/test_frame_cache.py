@@ -244,9 +244,9 @@ def test_only_one_batch_is_kept_and_it_goes_at_the_end():
         for n in (7, 3):
             features(backbone, torch.randn(n, 4, *shape))
         kept = cache_of(backbone)
-        words, tokens = kept.words.entries, kept.tokens.entries
+        kept_frames, tokens = kept.frames.entries, kept.tokens.entries
         assert tokens.shape == (3, 3, 2, 16)
-        assert words.untyped_storage().nbytes() == 2 * (3 * 3 * 3 * 8)  # with room for as many
+        assert kept_frames.untyped_storage().nbytes() == 2 * (3 * 3 * 3 * 8)  # with room for as many
         assert tokens.untyped_storage().nbytes() == 2 * (3 * 3 * 2 * 16 * 8)
     assert backbone._acting is None
 

@@ -14,7 +14,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, Transform
 
 from torchrl_tit.histories.encoder import RecurrentEncoder
-from torchrl_tit.modules.acting_network import ActingNetwork
+from torchrl_tit.modules.frame_cache import ActingNetwork
 from torchrl_tit.modules.sequences import SequenceKeys, default_observation_keys
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import HistoryNetwork, TwoTrunks

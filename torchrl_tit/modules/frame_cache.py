@@ -5,27 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import forward_ad
-from torch.nn.modules.batchnorm import _BatchNorm
-from torch.nn.modules.dropout import _DropoutNd
 
-from torchrl_tit.modules.same_bytes import all_same, as_words, same_frames
-from torchrl_tit.modules.sliding_window import SlidingWindow
+from torchrl_tit.modules.torch_internals import Weights, is_recorded, mode_dependent
+from torchrl_tit.networks import HistoryNetwork
 
 Encode = Callable[[Tensor], Tensor]
-
-
-@dataclass
-class _Kept:
-    """The last K - 1 frames and their tokens, and the conditions under which they can be reused."""
-
-    conditions: tuple[object, ...]
-    weights: list[Tensor]  # kept alive, because the conditions hold their ids
-    words: SlidingWindow  # bytes of the frames, int [N, K - 1, words]
-    tokens: SlidingWindow  # float [N, K - 1, *token_shape]
 
 
 class FrameCache:
@@ -34,12 +22,11 @@ class FrameCache:
     A frame's tokens depend on that frame alone. While acting, each step's window is the previous
     step's window, moved by one frame, so K - 1 of its frames have already been encoded.
 
-    Any windows are allowed. Tokens are reused only if the frame has the same bytes as the one they
-    were computed from, in the same row of the batch, one place later in the window. All other
-    frames are encoded; a frame that occurs several times is encoded once. So the first window of an
-    episode, padded with copies of one observation or with zeros, costs one or two frames. The
-    output is that of the encoder, up to rounding: the last bits may differ between a frame encoded
-    alone and in a batch.
+    Any windows are allowed. Tokens are reused only if the frame equals the one they were computed
+    from, in the same row of the batch, one place later in the window. All other frames are encoded;
+    a frame that occurs several times is encoded once. So the first window of an episode, padded
+    with copies of one observation or with zeros, costs one or two frames. The output is that of the
+    encoder, up to rounding: the last bits may differ between a frame encoded alone and in a batch.
 
     Tokens are kept while each parameter and buffer of the encoder is the same tensor of the same
     version, PyTorch's count of writes. So a loaded state dict, ``to_module``, ``copy_`` and most
@@ -47,7 +34,7 @@ class FrameCache:
     leave no trace, and modules that replace others are not looked for: call :meth:`clear`
     afterwards, or the previous frames keep the tokens of the old weights.
 
-    Nothing is kept or reused while gradients are enabled, dropout or batch normalisation is active
+    Nothing is kept or reused while gradients are enabled, dropout or batch normalization is active
     in the encoder, ``to_module`` has put tensors in the place of parameters, under ``vmap`` and the
     other transforms of ``torch.func``, or while ``torch.compile``, ``torch.export`` or a CUDA graph
     is recording.
@@ -78,18 +65,8 @@ class FrameCache:
         """Maps observations to tokens."""
         self._observation_ndim = observation_ndim
         self._encode_newest = encoder if encode_newest is None else encode_newest
-        modules = list(encoder.modules())
-        # All modules that behave differently in training mode.
-        self._mode_dependent = [
-            module
-            for module in modules
-            if isinstance(module, _BatchNorm) or (isinstance(module, _DropoutNd) and module.p > 0)
-        ]
-        # Looked up at every step, for which named_parameters() takes too long.
-        self._weights = [
-            x for module in modules for x in (module._parameters, module._buffers) if x
-        ]
-        self._number_of_weights = len(self._present_weights())
+        self._mode_dependent = mode_dependent(encoder)
+        self._weights = Weights(encoder)
         self._kept: _Kept | None = None
 
     def clear(self) -> None:
@@ -105,48 +82,37 @@ class FrameCache:
         Returns:
             float [..., K, *token_shape].
         """
-        if self._must_bypass(window):
+        conditions = self._conditions(window)
+        if conditions is None:
             return self.encoder(window)
-        weights = self._present_weights()
-        versions = _versions(weights)
-        if len(weights) != self._number_of_weights or versions is None:
-            return self.encoder(window)  # a later change of the weights would leave no trace
-        device = window.device.type
-        conditions = (
-            *map(id, weights),
-            *versions,
-            window.shape,
-            window.dtype,
-            window.device,
-            # Tokens computed in another mode are not interchangeable.
-            torch.is_inference_mode_enabled(),
-            torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device),
-        )
         kept = self._kept if self._kept and self._kept.conditions == conditions else None
         leading = window.shape[: window.ndim - self._observation_ndim - 1]
         frames = window.reshape(math.prod(leading), *window.shape[len(leading) :])  # [N, K, *obs]
-        words = as_words(frames.flatten(2))  # [N, K, words]
+        flat = _as_words(frames.flatten(2))  # [N, K, entries]
         newest = self._encode_newest(frames[:, -1]).unsqueeze(1)  # [N, 1, *token_shape]
-        if kept and all_same(words[:, :-1], kept.words.entries):
+        if kept and torch.equal(flat[:, :-1], kept.frames.entries):
             tokens = torch.cat([kept.tokens.entries, newest], dim=1)
-            kept.words.append(words[:, -1])
+            kept.frames.append(flat[:, -1])
             kept.tokens.append(newest[:, 0])
         else:
-            tokens = torch.cat([self._encode_older(frames, words, newest, kept), newest], dim=1)
+            tokens = torch.cat([self._encode_older(frames, flat, newest, kept), newest], dim=1)
             self._kept = _Kept(
-                conditions, weights, SlidingWindow(words[:, 1:]), SlidingWindow(tokens[:, 1:])
+                conditions,
+                self._weights.present(),
+                SlidingWindow(flat[:, 1:]),
+                SlidingWindow(tokens[:, 1:]),
             )
         return tokens.reshape(*leading, *tokens.shape[1:])
 
     def _encode_older(
-        self, frames: Tensor, words: Tensor, newest: Tensor, kept: _Kept | None
+        self, frames: Tensor, flat: Tensor, newest: Tensor, kept: _Kept | None
     ) -> Tensor:
         """Tokens of all frames but the newest, [N, K - 1, *token_shape]; some are known."""
-        older = words[:, :-1]
-        unknown = ~same_frames(older, words[:, -1:])
+        older = flat[:, :-1]
+        unknown = (older != flat[:, -1:]).any(-1)
         tokens = newest.repeat(1, older.shape[1], *[1] * (newest.ndim - 2))
         if kept is not None:
-            known = same_frames(older, kept.words.entries)
+            known = (older == kept.frames.entries).all(-1)
             tokens[known] = kept.tokens.entries[known]
             unknown &= ~known
         if unknown.any():
@@ -155,28 +121,132 @@ class FrameCache:
             tokens[unknown] = self.encoder(distinct)[index]
         return tokens
 
-    def _present_weights(self) -> list[Tensor]:
-        """The parameters and buffers of the encoder, without those that to_module has replaced."""
-        return [x for tensors in self._weights for x in tensors.values() if x is not None]
+    def _conditions(self, window: Tensor) -> tuple[object, ...] | None:
+        """What must be the same for tokens to be reused; None if they cannot be.
 
-    def _must_bypass(self, window: Tensor) -> bool:
-        """Whether reused tokens would lack gradients or randomness, or cannot be compared."""
-        return (
+        Reused tokens lack gradients and the randomness of dropout.
+        """
+        if (
             torch.is_grad_enabled()
             or any(module.training for module in self._mode_dependent)
-            or torch.compiler.is_compiling()
-            or torch.jit.is_tracing()
-            or type(window) is not Tensor  # a fake tensor, during tracing
-            or window.is_meta
-            or forward_ad._current_level >= 0
-            or torch._C._functorch.peek_interpreter_stack() is not None  # vmap, jvp, ...
-            or (window.is_cuda and torch.cuda.is_current_stream_capturing())
+            or is_recorded(window)
+            or (weights := self._weights.state()) is None
+        ):
+            return None
+        device = window.device.type
+        return (
+            weights,
+            window.shape,
+            window.dtype,
+            window.device,
+            # Tokens computed in another mode are not interchangeable.
+            torch.is_inference_mode_enabled(),
+            torch.is_autocast_enabled(device) and torch.get_autocast_dtype(device),
         )
 
 
-def _versions(tensors: list[Tensor]) -> list[int] | None:
-    """How often each tensor has been written, as PyTorch counts for autograd."""
-    try:
-        return [tensor._version for tensor in tensors]
-    except RuntimeError:  # not counted, for tensors of inference mode
-        return None
+class ActingNetwork:
+    """Maps histories to features, and keeps the tokens of the frames for the next call.
+
+    Args:
+        network: the network (see :class:`FrameCache` for weights that change).
+
+    Example:
+        >>> from torchrl_tit import EnhancedTIT
+        >>> network = EnhancedTIT((4,), num_frames=8)
+        >>> acting, frames = ActingNetwork(network), torch.randn(16, 9, 4)
+        >>> with torch.no_grad():
+        ...     first = acting(frames[:, :8])  # encodes 8 frames of each of 16 environments
+        ...     second = acting(frames[:, 1:])  # encodes 1 frame of each
+        >>> torch.allclose(second, network(frames[:, 1:]), atol=1e-4)
+        True
+    """
+
+    def __init__(self, network: HistoryNetwork) -> None:
+        self.network = network
+        self._encode_history = network.encode_history
+        self._encode_newest: list[Encode] = list(network.frames)
+        self.clear()
+
+    def compile(self, **options: Any) -> None:
+        """Compiles the encoding of the newest frames, and everything after the frame encoders.
+
+        Between the two, plain Python decides which tokens can be reused.
+
+        Args:
+            **options: passed to ``torch.compile``.
+        """
+        self._encode_history = torch.compile(self.network.encode_history, **options)
+        self._encode_newest = [torch.compile(frame, **options) for frame in self.network.frames]
+        self.clear()
+
+    def __call__(self, *inputs: Tensor) -> Tensor:
+        """Maps histories to features; see :meth:`HistoryNetwork.forward`."""
+        caches = self._caches
+        histories, context = inputs[: len(caches)], inputs[len(caches) :]
+        self.network.check(*histories)
+        tokens = [cache(history) for cache, history in zip(caches, histories, strict=True)]
+        return self._encode_history(self.network.join_tokens(tokens), *context)
+
+    def clear(self) -> None:
+        """Discards the tokens, so that the next histories are encoded like the first ones.
+
+        Can be called from another thread: tokens that a running call still computes are not kept.
+        """
+        self._caches = [
+            FrameCache(encoder, len(encoder.observation_shape), encode_newest)
+            for encoder, encode_newest in zip(self.network.frames, self._encode_newest, strict=True)
+        ]
+
+
+class SlidingWindow:
+    """The last M entries of a sequence: appending one drops the oldest.
+
+    Args:
+        entries: the first M entries, [N, M, ...], which are copied.
+
+    Example:
+        >>> window = SlidingWindow(torch.tensor([[1, 2, 3]]))
+        >>> window.append(torch.tensor([4]))
+        >>> window.entries
+        tensor([[2, 3, 4]])
+    """
+
+    def __init__(self, entries: Tensor) -> None:
+        self._count = entries.shape[1]
+        # Room for 2 M entries, so that they move to the front only when the end is reached.
+        self._room = entries.new_empty(len(entries), 2 * self._count, *entries.shape[2:])
+        self._room[:, : self._count] = entries
+        self._start = 0
+
+    @property
+    def entries(self) -> Tensor:
+        """The entries, [N, M, ...], as a view."""
+        return self._room[:, self._start : self._start + self._count]
+
+    def append(self, entry: Tensor) -> None:
+        """Appends an entry [N, ...] and drops the oldest."""
+        if self._start == self._count:
+            self._room[:, : self._count] = self.entries
+            self._start = 0
+        self._room[:, self._start + self._count] = entry
+        self._start += 1
+
+
+@dataclass
+class _Kept:
+    """The last K - 1 frames and their tokens, and the conditions under which they can be reused."""
+
+    conditions: tuple[object, ...]
+    weights: list[Tensor]  # kept alive, because the conditions hold their ids
+    frames: SlidingWindow  # [N, K - 1, entries]
+    tokens: SlidingWindow  # float [N, K - 1, *token_shape]
+
+
+def _as_words(frames: Tensor) -> Tensor:
+    """Views frames [N, K, entries] as int64 if they fit: images compare five times faster."""
+    frames = frames.detach().contiguous()
+    size = frames.element_size()
+    if frames.shape[-1] * size % 8 or frames.storage_offset() * size % 8:
+        return frames
+    return frames.view(torch.int64)
