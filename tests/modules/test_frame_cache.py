@@ -246,7 +246,9 @@ def test_only_one_batch_is_kept_and_it_goes_at_the_end():
         kept = cache_of(backbone)
         kept_frames, tokens = kept.frames.entries, kept.tokens.entries
         assert tokens.shape == (3, 3, 2, 16)
-        assert kept_frames.untyped_storage().nbytes() == 2 * (3 * 3 * 3 * 8)  # with room for as many
+        assert kept_frames.untyped_storage().nbytes() == 2 * (
+            3 * 3 * 3 * 8
+        )  # with room for as many
         assert tokens.untyped_storage().nbytes() == 2 * (3 * 3 * 2 * 16 * 8)
     assert backbone._acting is None
 

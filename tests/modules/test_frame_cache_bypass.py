@@ -180,7 +180,7 @@ def test_export_holds_the_whole_network(strict):
             self.backbone = backbone
 
         def forward(self, history):
-            return self.backbone._call_module([history])
+            return self.backbone(history)
 
     with backbone.acting():
         history = act(backbone, torch.randn(5, 8, *shape))
@@ -220,9 +220,7 @@ def test_traced_by_jit_and_shaped_without_values():
     network.requires_grad_(False)
     with backbone.acting():
         history = act(backbone, torch.randn(5, 8, *shape))
-        traced = torch.jit.trace(
-            lambda history: backbone._call_module([history]), (history,), check_trace=False
-        )
+        traced = torch.jit.trace(lambda history: backbone(history), (history,), check_trace=False)
         other = torch.randn(5, 4, *shape)
         assert_near(traced(other), network(other))
         network.to("meta")

@@ -1,8 +1,7 @@
 """TensorDictModules: backbones around networks, and heads on their features."""
 
-from torchrl_tit.modules.acting import acting, while_acting
-from torchrl_tit.modules.acting_collector import ActingCollector
-from torchrl_tit.modules.backbone import Backbone
+from torchrl_tit.modules.acting import ActingCollector, acting, while_acting
+from torchrl_tit.modules.backbone import Backbone, history_keys
 from torchrl_tit.modules.decision_transformer import (
     DTHead,
     make_dt_actor,
@@ -10,10 +9,8 @@ from torchrl_tit.modules.decision_transformer import (
     make_dt_predictor,
 )
 from torchrl_tit.modules.frame_cache import FrameCache
-from torchrl_tit.modules.heads import make_actor, make_value
+from torchrl_tit.modules.heads import make_actor, make_squashed_actor, make_value
 from torchrl_tit.modules.many_actions import ManyActions
-from torchrl_tit.modules.observation_keys import history_keys
-from torchrl_tit.modules.squashed_actor import make_squashed_actor
 
 __all__ = [
     "ActingCollector",

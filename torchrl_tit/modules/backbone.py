@@ -1,8 +1,21 @@
-"""The backbone: a network of this library as a TensorDictModule."""
+"""The backbone: a network of this library as a TensorDictModule.
+
+Which call encodes what::
+
+    backbone(td)                     as TorchRL calls it: one of the next two, by its recurrent mode
+      encode_steps(td)               steps [*B]: the K frames of each history; with a recurrent
+                                     network, the newest frame and the state
+        within acting()              ... the newest frame only: the tokens of the others are kept
+                                     (frame_cache.py)
+      encode_sequences(td)           sequences [*B, T]: each frame once; makes a table of their
+                                     frames (sequences.py, frame_tables.py), and calls
+        encode_windows(frames, windows)    each frame of a table once; also for batches that are
+                                           tables already, as those of recipes and replay buffers
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
@@ -10,7 +23,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key_list
 from tensordict.nn import dispatch, skip_existing
 from torch import Tensor, nn
-from torchrl.data import Unbounded
+from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, Transform
 
 from torchrl_tit.histories.encoder import RecurrentEncoder
@@ -178,13 +191,81 @@ class Backbone(TensorModule):
             return tensordict
         # A recurrent network reads sequences itself.
         if not self.is_recurrent and self.sequence_keys.in_sequence(tensordict):
-            keys, written = self._read_sequences(tensordict)
+            written = self.encode_sequences(tensordict)
         else:
-            self._check_entries(tensordict)
-            keys = self.out_keys_source
-            outputs = self._call_module([tensordict.get(key) for key in self._step_keys])
-            written = [outputs] if isinstance(outputs, Tensor) else list(outputs)
-        return self._write_to_tensordict(tensordict, written, tensordict_out, keys)
+            written = self.encode_steps(tensordict)
+        return self._write_to_tensordict(
+            tensordict, list(written.values()), tensordict_out, list(written)
+        )
+
+    def encode_steps(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Encodes single steps; within :meth:`acting`, only their newest frames.
+
+        Args:
+            tensordict: [*B], with the histories, and with its state if the network is recurrent
+                (which within TorchRL's recurrent mode takes [*B, T], as an `LSTMModule` does).
+
+        Returns:
+            The features, and the next state, by key.
+
+        Raises:
+            KeyError: if an entry is missing.
+        """
+        self._check_entries(tensordict)
+        tensors = [tensordict.get(key) for key in self._step_keys]
+        with self.computing(tensors[0].device):
+            outputs = self._encode(tensors)
+        return dict(zip(self.out_keys_source, self._in_full(outputs), strict=True))
+
+    def encode_sequences(self, tensordict: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Encodes sequences of consecutive steps, each frame once; not for recurrent networks.
+
+        Args:
+            tensordict: [*B, T], see the class's docstring.
+
+        Returns:
+            The features by key, and "features_valid" if there are no histories.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if the steps are not consecutive, or an entry does not fit the network.
+        """
+        trunks = list(trunks_of(self.module).values())
+        table, context = self.sequence_keys.lay_out(tensordict, trunks)
+        outputs = self.encode_windows(table.frames, table.windows, *context)
+        shape = self.sequence_keys.shape_of(tensordict)
+        written: dict[NestedKey, Tensor] = {
+            key: output.reshape(*shape, *output.shape[2:])
+            for key, output in zip(self.features_keys, outputs, strict=True)
+        }
+        if table.valid is not None:
+            written["features_valid"] = table.valid.reshape(*shape, 1)
+        return written
+
+    def encode_windows(
+        self, frames: Sequence[Tensor], windows: Windows, *context: Tensor
+    ) -> tuple[Tensor, ...]:
+        """Maps windows on a table of frames to features, encoding each frame once.
+
+        Args:
+            frames: the table of each observation, [R, *observation_shape].
+            windows: the rows of each window, [..., K].
+            *context: further inputs of the history encoder, [..., K, *entry] each.
+
+        Returns:
+            One tensor for each of ``features_keys``, float [..., F], or [..., K, F] if
+            ``every_frame``.
+        """
+        trunks = trunks_of(self.module).values()
+        with self.computing(windows.rows.device):
+            if trunks:
+                outputs: Any = [
+                    trunk.encode_windows(frames, windows, *context, every_frame=self.every_frame)
+                    for trunk in trunks
+                ]
+            else:
+                outputs = self.module(*(windows.gather(table) for table in frames), *context)
+        return self._in_full(outputs)
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -338,56 +419,10 @@ class Backbone(TensorModule):
         # A compiled network clears its cache when it enters `acting`.
         return self._compiled or list(map(ActingNetwork, trunks_of(self.module).values()))
 
-    def encode_windows(
-        self, frames: Sequence[Tensor], windows: Windows, *context: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Maps windows on a table of frames to features, encoding each frame once.
-
-        Args:
-            frames: the table of each observation, [R, *observation_shape].
-            windows: the rows of each window, [..., K].
-            *context: further inputs of the history encoder, [..., K, *entry] each.
-
-        Returns:
-            One tensor for each of ``features_keys``, float [..., F], or [..., K, F] if
-            ``every_frame``.
-        """
-        trunks = trunks_of(self.module).values()
-        with self.computing(windows.rows.device):
-            if trunks:
-                outputs = [
-                    trunk.encode_windows(frames, windows, *context, every_frame=self.every_frame)
-                    for trunk in trunks
-                ]
-            else:
-                result = self.module(*(windows.gather(table) for table in frames), *context)
-                outputs = [result] if isinstance(result, Tensor) else list(result)
-        # Heads and losses need full precision.
-        return tuple(x.float() if self.autocast is not None else x for x in outputs)
-
-    def _read_sequences(self, tensordict: TensorDictBase) -> tuple[list[NestedKey], list[Tensor]]:
-        """Returns the keys and the values of what it writes into sequences."""
-        trunks = list(trunks_of(self.module).values())
-        table, context = self.sequence_keys.lay_out(tensordict, trunks)
-        outputs = self.encode_windows(table.frames, table.windows, *context)
-        shape = self.sequence_keys.shape_of(tensordict)
-        keys = list(self.features_keys)
-        values = [output.reshape(*shape, *output.shape[2:]) for output in outputs]
-        if table.valid is not None:
-            keys.append("features_valid")
-            values.append(table.valid.reshape(*shape, 1))
-        return keys, values
-
-    def _call_module(self, tensors: Sequence[Tensor], **kwargs: Any) -> Any:
-        """Calls the network on single steps; overrides TensorDictModule's method."""
-        if self.autocast is None:
-            return self._encode(tensors)
-        with self.computing(tensors[0].device):
-            outputs = self._encode(tensors)
-        # Heads and losses need full precision.
-        if isinstance(outputs, Tensor):
-            return outputs.float()
-        return tuple(output.float() for output in outputs)
+    def _in_full(self, outputs: Tensor | Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """Returns the outputs in the full precision that heads and losses need."""
+        outputs = (outputs,) if isinstance(outputs, Tensor) else tuple(outputs)
+        return outputs if self.autocast is None else tuple(x.float() for x in outputs)
 
     def _encode(self, tensors: Sequence[Tensor]) -> Any:
         if self.every_frame:
@@ -457,6 +492,26 @@ def trunks_of(network: nn.Module) -> dict[str, HistoryNetwork]:
     if isinstance(network, TwoTrunks):
         return {"policy_": network.policy, "value_": network.value}
     return {"": network} if isinstance(network, HistoryNetwork) else {}
+
+
+def history_keys(observation: object) -> list[NestedKey]:
+    """Names the histories of a task's observations: the ``in_keys`` of a backbone.
+
+    Args:
+        observation: the argument that builds a network: the shape or spec of the only observation,
+            or those of several by name (a mapping or a ``Composite``), as
+            :func:`~torchrl_tit.envs.observation_specs` returns them.
+
+    Returns:
+        ``"history"`` for the only observation, or ``("history", NAME)`` for each.
+
+    Example:
+        >>> history_keys((4,)), history_keys({"image": (3, 84, 84), "state": (4,)})
+        (['history'], [('history', 'image'), ('history', 'state')])
+    """
+    if isinstance(observation, Mapping | Composite):
+        return [("history", name) for name in observation.keys()]  # noqa: SIM118
+    return ["history"]
 
 
 def _sequence_keys(

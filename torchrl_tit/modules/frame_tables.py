@@ -67,18 +67,13 @@ def table_of_first(
         is_init: bool [N, T], where an episode begins.
         padding: what precedes its first observation.
     """
-    (count, steps), num_frames = is_init.shape, first[0].shape[1]
+    num_frames = first[0].shape[1]
     frames = [
-        torch.cat([history, observation[:, 1:]], dim=1).flatten(0, 1)
+        torch.cat([history[:, :-1], observation], dim=1)
         for history, observation in zip(first, observations, strict=True)
     ]
     start = _last_start(_after_first(is_init, False))
-    oldest = torch.where(start == 0, 0, start + num_frames - 1)
-    newest = torch.arange(steps, device=start.device) + num_frames - 1
-    span = steps + num_frames - 1
-    offset = _offsets(count, span, start)
-    windows = find_windows(offset + newest, offset + oldest, num_frames, padding)
-    return FrameTable(frames, windows._replace(span=span))
+    return FrameTable(*_cut(frames, start, num_frames, padding))
 
 
 def table_without_histories(
@@ -99,14 +94,30 @@ def table_without_histories(
         num_frames: number K of frames in a window.
         padding: what precedes a sequence's first observation.
     """
-    count, steps = is_init.shape
     start = _last_start(starts)
-    newest = torch.arange(steps, device=start.device)
-    valid = (newest - start >= num_frames - 1) | is_init.gather(1, start)
-    offset = _offsets(count, steps, start)
-    windows = find_windows(offset + newest, offset + start, num_frames, padding)
-    frames = [x.flatten(0, 1) for x in observations]
-    return FrameTable(frames, windows._replace(span=steps), valid)
+    steps = torch.arange(starts.shape[1], device=starts.device)
+    valid = (steps - start >= num_frames - 1) | is_init.gather(1, start)
+    return FrameTable(*_cut(observations, start, num_frames, padding), valid)
+
+
+def _cut(
+    frames: Sequence[Tensor], start: Tensor, num_frames: int, padding: Padding
+) -> tuple[list[Tensor], Windows]:
+    """Cuts the windows of sequences, whose frames may begin before their first step.
+
+    Args:
+        frames: [N, S + T, *observation_shape] each, of which S precede the first step.
+        start: step at which the episode of each step begins, int64 [N, T]; 0 also stands for the
+            first of the S frames.
+        num_frames: number K of frames in a window.
+        padding: what precedes an episode's first observation.
+    """
+    (count, steps), span = start.shape, frames[0].shape[1]
+    newest = torch.arange(span - steps, span, device=start.device)
+    oldest = torch.where(start == 0, 0, start + span - steps)
+    offset = torch.arange(count, device=start.device).unsqueeze(-1) * span
+    windows = find_windows(offset + newest, offset + oldest, num_frames, padding)
+    return [table.flatten(0, 1) for table in frames], windows._replace(span=span)
 
 
 def find_starts(is_init: Tensor, ends: Sequence[Tensor]) -> Tensor:
@@ -136,8 +147,3 @@ def _last_start(starts: Tensor) -> Tensor:
     """The step of the last start at or before each step, or 0; bool [N, T] -> int64 [N, T]."""
     steps = torch.arange(starts.shape[1], device=starts.device)
     return torch.where(starts, steps, 0).cummax(dim=1).values
-
-
-def _offsets(count: int, length: int, like: Tensor) -> Tensor:
-    """The row at which the frames of each of N sequences begin, int64 [N, 1]."""
-    return (torch.arange(count, device=like.device) * length).unsqueeze(-1)

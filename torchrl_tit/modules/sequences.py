@@ -19,6 +19,7 @@ from torchrl_tit.modules.frame_tables import (
     table_of_stored,
     table_without_histories,
 )
+from torchrl_tit.modules.torch_internals import is_transformed
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.windows import Padding
 
@@ -140,7 +141,7 @@ class SequenceKeys:
 
 def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -> None:
     """Raises ValueError if steps [N, T] do not follow one another, as shuffled ones do not."""
-    if torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None:
+    if is_transformed():
         return
     now, after = observation[:, 1:], following[:, :-1]
     differs = ((now != after) & (after == after)).flatten(2).any(-1)  # NaN differs from itself

@@ -2,10 +2,10 @@
 
 :class:`~torchrl_tit.modules.FrameCache` decides with Python whether kept tokens can be used, and
 checks of values end in Python errors. Neither is possible while PyTorch records or transforms the
-computation, and a public ``torch.func.is_transforming()`` would make :func:`is_transformed`
-unnecessary. Modules have no public list of their weights that is cheap enough to read at each step
-(``module.parameters()`` takes 0.16 ms for a small encoder, 6% of a step of 8 CartPoles), and tensors
-no public count of writes; ``_version`` is what autograd's own error messages name.
+computation; a public ``torch.func.is_transforming()`` would make :func:`is_transformed`
+unnecessary. No public list of a module's weights is cheap enough to be read at each step
+(``module.parameters()`` takes 0.16 ms for a small encoder, 6% of a step of 8 CartPoles), and no
+public count tells how often a tensor was written.
 """
 
 from __future__ import annotations
@@ -29,9 +29,7 @@ def is_transformed() -> bool:
         >>> _ = torch.vmap(lambda x: print(is_transformed()) or x)(torch.zeros(2))
         True
     """
-    return (
-        torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None
-    )
+    return torch.compiler.is_compiling() or torch._C._functorch.peek_interpreter_stack() is not None
 
 
 def is_recorded(tensor: Tensor) -> bool:
