@@ -1,5 +1,7 @@
 """Returns of a policy over whole episodes, as measured in the paper."""
 
+from __future__ import annotations
+
 import random
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

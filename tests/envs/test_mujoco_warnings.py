@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from torchrl_tit.envs import make_env, mujoco_warnings
+from torchrl_tit.envs import gymnasium_tasks, make_env
 
 MESSAGE = "MuJoCo: Nan, Inf or huge value in CTRL"  # at every step with such an action
 
@@ -24,7 +24,7 @@ def handler() -> Iterator[Callable[[Callable[[str], None] | None], None]]:
 def test_each_warning_is_shown_once(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(mujoco_warnings, "_shown", set())
+    monkeypatch.setattr(gymnasium_tasks, "_shown", set())
     monkeypatch.chdir(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # what the handler raised would end the process

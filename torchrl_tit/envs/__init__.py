@@ -1,8 +1,10 @@
 """Gymnasium tasks, Atari games and any TorchRL environment, with the same keys and spec kinds."""
 
-from torchrl_tit.envs.atari import AtariEnv
-from torchrl_tit.envs.atari_games import AtariGames
+from __future__ import annotations
+
+from torchrl_tit.envs.atari import AtariEnv, AtariGames
 from torchrl_tit.envs.factory import (
+    TransformedVectorEnv,
     is_atari,
     make_env,
     make_games,
@@ -11,7 +13,6 @@ from torchrl_tit.envs.factory import (
 from torchrl_tit.envs.gymnasium_tasks import VectorizationMode
 from torchrl_tit.envs.spaces import ImageLayout, observation_keys, observation_specs
 from torchrl_tit.envs.torchrl_tasks import TorchRLTask
-from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
 
 __all__ = [

@@ -1,5 +1,7 @@
 """Which actions a Gymnasium task allows."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

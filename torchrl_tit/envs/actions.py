@@ -1,5 +1,7 @@
 """Converts Gymnasium's action spaces to TorchRL's specs, and actions to those of the tasks."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

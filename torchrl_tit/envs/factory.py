@@ -1,23 +1,23 @@
 """Tasks by name, with histories of their observations."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
 import torch
-from tensordict import NestedKey
-from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
+from tensordict import NestedKey, TensorDictBase
+from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
-from torchrl_tit.envs.atari import AtariEnv
-from torchrl_tit.envs.atari_games import FRAME_SKIP, MAX_NUM_FRAMES, AtariGames
+from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.envs.atari import FRAME_SKIP, MAX_NUM_FRAMES, AtariEnv, AtariGames
 from torchrl_tit.envs.gymnasium_tasks import VectorizationMode, make_gymnasium_tasks
-from torchrl_tit.envs.names import find_task, task_spec, unknown
+from torchrl_tit.envs.names import find_task, load_wrappers, task_spec, unknown
 from torchrl_tit.envs.spaces import ImageLayout
 from torchrl_tit.envs.spaces import observation_keys as keys_of
 from torchrl_tit.envs.torchrl_tasks import make_torchrl_tasks
-from torchrl_tit.envs.transformed import TransformedVectorEnv
 from torchrl_tit.envs.vector import GymVectorEnv
-from torchrl_tit.envs.wrappers import load_wrappers
 from torchrl_tit.extras import install
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Copies, Seed
@@ -168,6 +168,74 @@ def make_env(
     for history in _histories(env, num_frames, padding):
         env.append_transform(history)
     return env
+
+
+class TransformedVectorEnv(TransformedEnv):
+    """TorchRL's `TransformedEnv`, whose taken steps can lack entries that only the policy reads.
+
+    Args:
+        base_env: the environment.
+        transform: as in `TransformedEnv`.
+        transient_keys: entries that only the policy reads, such as histories. They are removed from
+            a step after it is taken, at its root and under "next". The tensordict to act on next
+            has them, so a collector works as usual but does not store them.
+        **settings: as in `TransformedEnv`.
+
+    Example:
+        >>> from torchrl_tit.envs import make_env
+        >>> env = make_env("CartPole-v1", num_envs=8, num_frames=4, keep_histories=False)
+        >>> step, following = env.step_and_maybe_reset(env.rand_action(env.reset()))
+        >>> "history" in step, "history" in following
+        (False, True)
+    """
+
+    def __init__(
+        self,
+        base_env: EnvBase,
+        transform: Transform | None = None,
+        *,
+        transient_keys: Sequence[NestedKey] = (),
+        **settings: Any,
+    ) -> None:
+        super().__init__(base_env, transform, **settings)
+        self.transient_keys = tuple(transient_keys)
+        """Entries that are removed from a step after it is taken."""
+
+    def step_and_maybe_reset(
+        self, tensordict: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase]:
+        """Steps all environments and resets those whose episode ended.
+
+        Args:
+            tensordict: [N], with the action.
+
+        Returns:
+            The tensordict with its "next", both without ``transient_keys``, and the one to act on
+            next.
+        """
+        taken, following = super().step_and_maybe_reset(tensordict)
+        for key in self.transient_keys:
+            for part in (taken, taken.get("next")):
+                if part.get(key, None) is not None:
+                    part.del_(key)
+        return taken, following
+
+    def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        """Draws an action; an allowed one, if the tensordict has an "action_mask".
+
+        TorchRL's `ActionMask` could do this, but keeps the mask in the spec.
+
+        Args:
+            tensordict: the environment's output, [N].
+
+        Returns:
+            The tensordict with the action.
+        """
+        if tensordict is None or tensordict.get(MASK, None) is None:
+            return super().rand_action(tensordict)
+        spec = self.action_spec.clone()
+        spec.update_mask(tensordict[MASK])
+        return tensordict.set(self.action_key, spec.rand())
 
 
 def _histories(env: EnvBase, num_frames: int, padding: Padding) -> list[History]:

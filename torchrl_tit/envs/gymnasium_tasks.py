@@ -1,5 +1,8 @@
 """Copies of a Gymnasium task in a vector environment, in this process or in one process each."""
 
+from __future__ import annotations
+
+import logging
 import os
 import signal
 import sys
@@ -11,12 +14,12 @@ from typing import Any, Literal
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
-from torchrl_tit.envs.mujoco_warnings import show_mujoco_warnings_once
-from torchrl_tit.envs.names import task_spec
-from torchrl_tit.envs.wrappers import Wrap
+from torchrl_tit.envs.names import Wrap, task_spec
 from torchrl_tit.settings.plugins import load_plugins
 
 VectorizationMode = Literal["sync", "async"]
+
+_shown: set[str] = set()  # MuJoCo's warnings
 
 _HAS_SCREEN = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")) or (
     sys.platform != "linux"
@@ -105,3 +108,29 @@ def _make(name: str, wraps: Sequence[Wrap], uses_mujoco: bool, **kwargs: Any) ->
     for wrap in wraps:
         env = wrap(env)
     return env
+
+
+def show_mujoco_warnings_once() -> None:
+    """Logs each of MuJoCo's warnings once per process, with the logger ``torchrl_tit.mujoco``.
+
+    By default MuJoCo prints a warning every time (for example, for each environment with an
+    outdated model) and appends it to MUJOCO_LOG.TXT in the working directory, so both grow in a
+    long run. A handler that the user has set is kept.
+
+    Example:
+        >>> import mujoco
+        >>> show_mujoco_warnings_once()
+        >>> mujoco.get_mju_user_warning() is not None
+        True
+    """
+    import mujoco  # here, since most tasks do not need it
+
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(_show)
+
+
+def _show(text: str) -> None:
+    # Not warnings.warn: if warnings are errors, an exception in this callback ends the process.
+    if text not in _shown:
+        _shown.add(text)
+        logging.getLogger("torchrl_tit.mujoco").warning("MuJoCo: %s", text)

@@ -1,5 +1,7 @@
 """Converts Gymnasium's observation spaces and values to TorchRL's specs."""
 
+from __future__ import annotations
+
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

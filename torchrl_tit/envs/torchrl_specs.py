@@ -1,5 +1,7 @@
 """Converts specs and values of any TorchRL environment to those of our environments."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import Any
 

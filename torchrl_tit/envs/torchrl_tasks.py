@@ -1,5 +1,7 @@
 """Copies of any TorchRL environment, with the keys and spec kinds of our environments."""
 
+from __future__ import annotations
+
 import inspect
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -13,8 +15,8 @@ from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, StepCounter, 
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.envs.names import load_wrappers
 from torchrl_tit.envs.torchrl_specs import TensorReader, action_spec
-from torchrl_tit.envs.wrappers import load_wrappers
 
 
 class TorchRLTask(EnvBase):

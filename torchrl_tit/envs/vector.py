@@ -1,5 +1,7 @@
 """A Gymnasium vector environment as a TorchRL environment with little overhead per step."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,5 +1,7 @@
 """TensorDictModules: backbones around networks, and heads on their features."""
 
+from __future__ import annotations
+
 from torchrl_tit.modules.acting import ActingCollector, acting, while_acting
 from torchrl_tit.modules.backbone import Backbone, history_keys
 from torchrl_tit.modules.decision_transformer import (

@@ -211,8 +211,7 @@ class Backbone(TensorModule):
         Raises:
             KeyError: if an entry is missing.
         """
-        self._check_entries(tensordict)
-        tensors = [tensordict.get(key) for key in self._step_keys]
+        tensors = [self._entry(tensordict, key) for key in self._step_keys]
         with self.computing(tensors[0].device):
             outputs = self._encode(tensors)
         return dict(zip(self.out_keys_source, self._in_full(outputs), strict=True))
@@ -462,19 +461,21 @@ class Backbone(TensorModule):
         }
         return (*(features for features, _ in outputs), *(after[key] for key in self.state_shapes))
 
-    def _check_entries(self, tensordict: TensorDictBase) -> None:
-        for key in self._step_keys:
-            if tensordict.get(key, None) is None:
-                hint = (
-                    "add torchrl_tit.History to the environment (SequenceHistory for Decision "
-                    "Transformer), or name the key in in_keys"
-                )
-                if key not in self.history_keys:
-                    hint = "add backbone.make_transforms() to the environment, which supplies it"
-                raise KeyError(
-                    f"there is no {'history' if key in self.history_keys else 'entry'} under "
-                    f"{key!r}, only {sorted(map(str, tensordict.keys(True)))}: {hint}"
-                )
+    def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        """Gets an entry; raises KeyError if it is missing."""
+        if (entry := tensordict.get(key, None)) is not None:
+            return entry
+        kind, hint = "entry", "add backbone.make_transforms() to the environment, which supplies it"
+        if key in self.history_keys:
+            kind = "history"
+            hint = (
+                "add torchrl_tit.History to the environment (SequenceHistory for Decision "
+                "Transformer), or name the key in in_keys"
+            )
+        raise KeyError(
+            f"there is no {kind} under {key!r}, only {sorted(map(str, tensordict.keys(True)))}: "
+            f"{hint}"
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         # Compiled code cannot be copied, and nothing would clear a copy's cache.

@@ -411,7 +411,9 @@ def weights_dtype(network: nn.Module) -> torch.dtype:
     with plain tensors (target weights, a stack of critics).
     """
     names = ("weight", "weight_ih_l0")  # the second is an LSTM's, which may be the only layer
-    weights = (getattr(module, name, None) for module in network.modules() for name in names)
+    # Asked at every step: in the head, a few layers, a weight is found several times faster.
+    parts = (getattr(network, "head", network), network)
+    weights = (getattr(x, name, None) for name in names for part in parts for x in part.modules())
     return next(weight.dtype for weight in weights if isinstance(weight, Tensor))
 
 

@@ -1,5 +1,7 @@
 """Tasks that require memory, registered with Gymnasium, and a wrapper for MiniGrid's tasks."""
 
+from __future__ import annotations
+
 import gymnasium
 
 from torchrl_tit.tasks.first_actions import FirstActions

@@ -1,5 +1,7 @@
 """Partially observable variants of tasks, without velocities."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 from tensordict import NestedKey, TensorDictBase
