@@ -59,7 +59,7 @@ def test_every_field_is_that_of_the_file(
 def test_samples_are_rows_of_the_file(tmp_path: Path, rolled: Transitions) -> None:
     storage = HistoryStorage(read_hdf5(write(tmp_path / "a.hdf5", rolled)))
 
-    sample = storage[:]
+    sample = storage.get(slice(None))
 
     pairs = {
         "observations": sample["observation"],

@@ -46,7 +46,7 @@ def test_windows_are_those_of_catframes(num_frames: int, padding: Any) -> None:
     assert stream["next", "terminated"].any()
     assert stream["next", "truncated"].any()
 
-    sample = HistoryStorage(store(stream), num_frames, padding=padding, unfinished="keep")[:]
+    sample = HistoryStorage(store(stream), num_frames, padding=padding, unfinished="keep").get(slice(None))
 
     assert sample.batch_size == (150,)
     for key in sample.exclude("episode").keys(True, True):
@@ -60,7 +60,7 @@ def test_windows_of_images_are_those_of_catframes(padding: Any) -> None:
     )
     stream = env.rollout(100, break_when_any_done=False)
 
-    sample = HistoryStorage(store(stream), 4, padding=padding, unfinished="keep")[:]
+    sample = HistoryStorage(store(stream), 4, padding=padding, unfinished="keep").get(slice(None))
 
     assert sample["history"].dtype == torch.uint8
     for key in ("history", ("next", "history"), "observation", ("next", "observation")):
@@ -71,7 +71,7 @@ def test_settings_of_d3rlpy_1(arrays: Transitions) -> None:
     arrays["terminals"][arrays["timeouts"].argmax()] = True  # both at once count as terminal
     episodes = episodes_from_arrays(**arrays)
 
-    sample = HistoryStorage(episodes, 3, time_limits="drop", terminal_observations="zero")[:]
+    sample = HistoryStorage(episodes, 3, time_limits="drop", terminal_observations="zero").get(slice(None))
 
     drawn = ~arrays["timeouts"] | arrays["terminals"]
     terminals = arrays["terminals"][drawn]
@@ -84,14 +84,14 @@ def test_settings_of_d3rlpy_1(arrays: Transitions) -> None:
     torch.testing.assert_close(sample["next", "history"][:, :-1], sample["history"][:, 1:])
     # The data themselves have not changed.
     torch.testing.assert_close(
-        HistoryStorage(episodes)[:]["next", "observation"].numpy(), arrays["next_observations"]
+        HistoryStorage(episodes).get(slice(None))["next", "observation"].numpy(), arrays["next_observations"]
     )
 
 
 @pytest.mark.parametrize("num_frames", [1, 3])
 def test_indices_of_every_kind(rolled: Transitions, num_frames: int) -> None:
     storage = HistoryStorage(episodes_from_arrays(**rolled), num_frames)
-    everything = storage[:]
+    everything = storage.get(slice(None))
     grid = torch.tensor([[0, 5, 2], [7, -1, 40]])
 
     assert (storage[grid] == everything[grid]).all()
@@ -101,7 +101,7 @@ def test_indices_of_every_kind(rolled: Transitions, num_frames: int) -> None:
     assert (storage[10:20:3] == everything[10:20:3]).all()
     assert storage[:0].batch_size == (0,)
     for wrong in (len(storage), -len(storage) - 1):
-        with pytest.raises(IndexError, match="items"):
+        with pytest.raises(IndexError, match="out of bounds"):
             storage[wrong]
 
 
@@ -121,7 +121,7 @@ def test_discrete_actions_are_indices(dtype: type) -> None:
     ends = np.arange(4) == 3
     actions: NDArray = np.array([3, 1, 0, 2]).astype(dtype)
     episodes = episodes_from_arrays(np.zeros((4, 2)), actions, np.ones(4), ends)
-    action = HistoryStorage(episodes)[:]["action"]
+    action = HistoryStorage(episodes).get(slice(None))["action"]
     assert action.dtype == torch.int64
     assert action.tolist() == [3, 1, 0, 2]
 
@@ -176,10 +176,10 @@ def test_the_buffer_cannot_be_written(rolled: Transitions) -> None:
     ("settings", "message"),
     [
         ({"num_frames": 0}, "num_frames must be at least 1"),
-        ({"padding": "zeros"}, "padding must be one of"),
-        ({"time_limits": "lose"}, "time_limits must be one of 'keep', 'drop', not 'lose'"),
-        ({"terminal_observations": "drop"}, "terminal_observations must be one of 'keep', 'zero'"),
-        ({"unfinished": True}, "unfinished must be one of"),
+        ({"padding": "zeros"}, "field 'padding' is 'zeros', not one of"),
+        ({"time_limits": "lose"}, "'time_limits' is 'lose', not one of"),
+        ({"terminal_observations": "drop"}, "'terminal_observations' is 'drop', not one of"),
+        ({"unfinished": True}, "unfinished"),
     ],
 )
 def test_wrong_settings(rolled: Transitions, settings: dict[str, Any], message: str) -> None:
@@ -201,7 +201,7 @@ def test_windows_gathered_on_a_gpu(rolled: Transitions) -> None:
     there = HistoryStorage(episodes.to("cuda"), 4, terminal_observations="zero")
     buffer = make_replay_buffer(there, 16)
 
-    assert (there[:].cpu() == here[:]).all()
+    assert (there.get(slice(None)).cpu() == here.get(slice(None))).all()
     state = buffer.state_dict()
     sample = buffer.sample()
     buffer.load_state_dict(state)

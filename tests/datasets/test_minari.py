@@ -60,8 +60,8 @@ def test_every_field_is_that_of_minari(rolled: Transitions) -> None:
 
     episodes = load_episodes("walk/random-v0", task="Hopper-v5")
 
-    sample = HistoryStorage(episodes)[:]
-    expected = HistoryStorage(episodes_from_arrays(**rolled))[:]
+    sample = HistoryStorage(episodes).get(slice(None))
+    expected = HistoryStorage(episodes_from_arrays(**rolled)).get(slice(None))
     assert (sample == expected).all()
     assert (episodes.rows == episodes_from_arrays(**rolled).rows).all()
     assert episodes.lengths.tolist() == [stop - start for start, stop in spans(rolled)]
@@ -169,10 +169,10 @@ def test_an_episode_without_a_flag_is_unfinished(rolled: Transitions) -> None:
     episodes = load_episodes("walk/random-v0")
 
     assert episodes.finished.tolist() == [i != 1 for i in range(len(spans(rolled)))]
-    everything = HistoryStorage(episodes_from_arrays(**rolled))[:]
+    everything = HistoryStorage(episodes_from_arrays(**rolled)).get(slice(None))
     drawn = torch.ones(len(everything), dtype=torch.bool)
     drawn[start:stop] = False
-    assert (HistoryStorage(episodes)[:] == everything[drawn]).all()
+    assert (HistoryStorage(episodes).get(slice(None)) == everything[drawn]).all()
     assert len(HistoryStorage(episodes, unfinished="keep")) == len(everything)
     with pytest.raises(ValueError, match="episode 1 is neither terminated nor truncated"):
         write_hdf5(episodes, "never-written.hdf5")

@@ -35,5 +35,5 @@ def test_joined_episodes_are_both(arrays: Transitions) -> None:
     joined = join_episodes([some, rest])
     expected = select_episodes(episodes, torch.tensor([1, 4, 0]))
     assert (joined.rows == expected.rows).all()
-    items = [HistoryStorage(data, 3)[:] for data in (joined, expected)]
+    items = [HistoryStorage(data, 3).get(slice(None)) for data in (joined, expected)]
     assert (items[0] == items[1]).all()

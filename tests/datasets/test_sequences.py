@@ -45,7 +45,7 @@ def test_every_item(arrays: Transitions, num_frames: int, with_next: bool) -> No
         del arrays["next_observations"]
     storage = SequenceStorage(episodes_from_arrays(**arrays), num_frames, return_scale=10.0)
 
-    items = storage[:]
+    items = storage.get(slice(None))
 
     index = 0
     for start, stop in spans(arrays):

@@ -62,7 +62,7 @@ def test_without_next_observations_those_of_time_limits_are_never_drawn(
     following = arrays.pop("next_observations")
 
     episodes = episodes_from_arrays(**arrays)
-    sample = HistoryStorage(episodes)[:]
+    sample = HistoryStorage(episodes).get(slice(None))
 
     drawn = ~arrays["timeouts"] | arrays["terminals"]
     expected = np.where(arrays["terminals"][:, None], 0, following)[drawn]
@@ -92,7 +92,7 @@ def test_images_and_discrete_actions_stay_integers() -> None:
 
     sample = HistoryStorage(
         episodes_from_arrays(frames, np.arange(6, dtype=np.int32), np.ones(6, int), ends), 2
-    )[:]
+    ).get(slice(None))
 
     assert sample["history"].dtype == torch.uint8
     assert sample["history"].shape == (6, 2, 8, 8)

@@ -183,7 +183,7 @@ def test_sac_stores_the_steps_of_all_environments_in_order(cluster: str, tmp_pat
         last, first = batch["next", "observation"][:, -1], following["observation"][:, 0]
         torch.testing.assert_close(last, first, rtol=0, atol=0)
     collected = torch.cat([batch["observation"] for batch in batches], 1)
-    stored = algorithm.buffer[:]["observation"]
+    stored = algorithm.buffer.storage.get(slice(None))["observation"].transpose(0, 1)
     torch.testing.assert_close(stored, collected, rtol=0, atol=0)
 
 

@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache, partial
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import LazyTensorStorage
 
-from torchrl_tit.datasets.end_frames import EndFrames
-from torchrl_tit.datasets.gathering import Entries, GatheringStorage, take
-from torchrl_tit.datasets.histories import check_windows, episode_entries, frame_entries
+from torchrl_tit.datasets.storages import (
+    Entries,
+    StateCheckpointer,
+    expand_right,
+    frame_entries,
+    is_peek,
+    nest,
+    take,
+)
 from torchrl_tit.settings.arguments import checked_arguments
-from torchrl_tit.settings.numbers import Batch
+from torchrl_tit.settings.numbers import Batch, Frames
 from torchrl_tit.windows import Padding, Windows, find_windows
 
-_HERE = ("observation", "action", "action_mask", "is_init")
-_NEXT = ("observation", "reward", "terminated", "truncated", "done", "action_mask")
-_OPTIONAL = ("action_mask", "is_init", "truncated")
+_STORED = [
+    "observation",
+    "action",
+    *(("next", name) for name in ("observation", "reward", "terminated", "done")),
+]
+_OPTIONAL = ["action_mask", "is_init", ("next", "truncated"), ("next", "action_mask")]
 
 
-class OnlineHistoryStorage(GatheringStorage):
+class OnlineHistoryStorage(LazyTensorStorage):
     """The newest collected steps, as items with histories like those of :class:`HistoryStorage`.
 
     When it is full, each new step replaces the oldest one. Each observation is stored once. It also
@@ -31,6 +39,10 @@ class OnlineHistoryStorage(GatheringStorage):
     oldest step. So every item can be drawn, and its histories equal those of
     :class:`~torchrl_tit.transforms.History` in the environment, even if their first steps were
     overwritten. Actions, action masks, rewards and flags are stored unchanged.
+
+    TorchRL keeps the steps without their frames, as in any `LazyTensorStorage`. ``storage[:]`` and
+    ``storage[i, j]``, with which slice samplers look for episodes, read that table;
+    ``storage.get(...)`` also gathers observations and histories, with any index.
 
     As in TorchRL's storages, a collector's batches [envs, T] need ``ndim=2``. Pass them to
     ``extend`` as they are; items are numbered by time and environment. An episode ends where a step
@@ -49,7 +61,6 @@ class OnlineHistoryStorage(GatheringStorage):
         device: Device on which the steps are stored.
 
     Raises:
-        TypeError: If ``num_frames`` is not an integer.
         ValueError: If a number is less than 1, the padding is unknown, or ``ndim`` is not 1 or 2.
 
     Example:
@@ -62,32 +73,35 @@ class OnlineHistoryStorage(GatheringStorage):
         torch.Size([32, 8, 4])
     """
 
+    _default_checkpointer = StateCheckpointer
+    supports_conditional_update = False
+
     @checked_arguments
     def __init__(
         self,
         max_size: Batch,
-        num_frames: int = 1,
+        num_frames: Frames = 1,
         *,
         ndim: int = 1,
         padding: Padding = "same",
         is_init: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
-        check_windows(num_frames, padding)
         if ndim not in (1, 2):
             raise ValueError(f"ndim must be 1 (steps) or 2 (environments, steps), not {ndim}")
         super().__init__(max_size, device=device, ndim=ndim)
         self.max_size: int
         self._num_frames = num_frames
-        self._padding: Padding = padding if num_frames > 1 else "same"
+        self._padding: Padding = padding
         self._is_init = is_init
         self._envs = 1
         self._count = 0  # steps per environment so far; a step's time is counted from 0
+        self._start = torch.zeros(0)  # the time at which each environment's newest episode began
         # In these tables, the rows of one time are adjacent, one per environment.
-        self._steps = TensorDict()  # action and outcome at the newest times
-        self._frames = TensorDict()  # at the same times, K - 1 older ones and the next one
-        self._starts = torch.empty(0)  # per step: the time at which its episode begins
-        self._ends = torch.empty(0)  # per step: the number of its end frame, or -1
+        self._items = torch.empty(0)  # int64 [times, envs] or [times]: the row of each step
+        self._steps: Entries = {}  # those written so far, as TorchRL stores them
+        self._frames = TensorDict()  # at the newest times, K - 1 older ones and the next one
+        self._ends = torch.zeros(0)  # per step: the number of its end frame, or -1
         self._end_frames = EndFrames(TensorDict(batch_size=[1]))
 
     @property
@@ -104,6 +118,57 @@ class OnlineHistoryStorage(GatheringStorage):
     def num_end_frames(self) -> int:
         """Number of frames that are stored because an episode ended."""
         return self._end_frames.stop - self._end_frames.first
+
+    @property
+    def oldest(self) -> int:
+        """Index of the oldest step, in the first dimension."""
+        return self._count % self._num_times if self._count > self._num_times else 0
+
+    @property
+    def _num_times(self) -> int:
+        """Maximum number of steps per environment."""
+        return self.max_size // self._envs
+
+    def __getitem__(self, index: Any) -> TensorDictBase:
+        """Gives items; for ``[:]`` and tuples, the table of steps, without their frames."""
+        return super().get(index) if is_peek(index) else self.get(index)
+
+    def get(self, index: Any) -> TensorDict:
+        """Gathers items with their observations and histories.
+
+        Args:
+            index: An index of a tensor of the storage's shape.
+
+        Returns:
+            The items, with the shape of the selection.
+
+        Raises:
+            IndexError: If there is no such item, or none yet.
+        """
+        if not self._count:
+            raise IndexError("there are no items yet: extend the buffer first")
+        item = self._items[: min(self._count, self._num_times)][index]
+        entries: Entries = {key: take(table, item) for key, table in self._steps.items()}
+        episode, newest = entries["episode"], self._count - 1
+        start, env = episode // self._envs, episode % self._envs
+        time = newest - (newest - item // self._envs) % self._num_times
+        windows = find_windows(time, start, self._num_frames, self._padding)
+        windows = Windows(self._frame_row(windows.rows, env.unsqueeze(-1)), windows.missing)
+        here, after = self._frame_row(time, env), self._frame_row(time + 1, env)
+        end = take(self._ends, item)
+        for key, frames in self._frames.items(True, True):
+            _, *leaf = (key,) if isinstance(key, str) else key
+            following, last = take(frames, after), self._end_frames.table[key]
+            following = torch.where(
+                expand_right(end < 0, following),
+                following,
+                take(last, end.clamp(min=0) % len(last)),
+            )
+            history = windows.gather(frames)
+            entries |= frame_entries(tuple(leaf), take(frames, here), history, following, item.ndim)
+        if self._is_init:
+            entries["next", "is_init"] = entries["is_init"].clone()
+        return nest(entries, item.shape)
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         """Writes steps after the newest ones.
@@ -130,10 +195,11 @@ class OnlineHistoryStorage(GatheringStorage):
                 f"A storage of ndim={self.ndim} takes steps {names}, but these are "
                 f"{list(data.shape)} as stored; choose the ndim of the collector's batches."
             )
-        steps = _select(data).to(self.device)
+        steps = data.select(*_STORED).update(data.select(*_OPTIONAL, strict=False))
+        steps = steps.to(self.device)
         steps = steps if self.ndim == 2 else steps.unsqueeze(-1)  # [T, envs]
         if not self.initialized:
-            self._make_room(steps.select("observation")[0], _fields_of(steps)[0])
+            self._make_room(steps.select("observation")[0])
         if steps.shape[1] != self._envs:
             raise ValueError(
                 f"These are steps of {steps.shape[1]} environments, but {self._envs} were stored."
@@ -147,99 +213,83 @@ class OnlineHistoryStorage(GatheringStorage):
             )
         for part in steps.split(self._num_times):
             self._append(part)
-        self._finish()
 
-    def _append(self, data: TensorDictBase) -> None:
+    def _append(self, steps: TensorDictBase) -> None:
         """Writes steps [T, envs], at most as many as the storage holds."""
-        begin, count, envs = self._count, len(data), self._envs
-        frames, following = (group.select("observation") for group in (data, data["next"]))
-        done = _flag(data, "done")
-        goes_on = torch.zeros(count, envs, dtype=torch.bool, device=self.device)
+        begin, count = self._count, len(steps)
+        frames, following = (group.select("observation") for group in (steps, steps["next"]))
+        done = steps["next", "done"].reshape(steps.shape)
+        goes_on = torch.zeros_like(done)  # whether a step continues the episode of the one before
         goes_on[1:] = ~done[:-1] & _equal(following[:-1], frames[1:])
-        last = self._rows(begin - 1, begin)  # the newest steps so far
         if begin:
-            newest = self._frames[self._frame_rows(begin, begin + 1)]
-            same = (self._ends[last] < 0) & ~_flag(self._steps[last], "done")
-            goes_on[0] = same & _equal(newest, frames[0])
-        if (is_init := data.get("is_init", None)) is not None:
-            goes_on &= ~is_init.reshape(count, envs)
+            last, newest = self._newest()
+            goes_on[0] = (self._ends[last] < 0) & _equal(newest, frames[0])
+        if "is_init" in steps.keys():  # noqa: SIM118 (a tensordict)
+            goes_on &= ~steps["is_init"].reshape(steps.shape)
         if begin:  # only the new steps show whether these ended an episode
-            ended = ~goes_on[0] & (self._ends[last] < 0)
-            self._ends[last[ended]] = self._push(newest[ended])
-        starts = torch.arange(begin, begin + count, device=self.device).unsqueeze(-1)
-        starts = torch.where(goes_on, -1, starts)
-        if begin:
-            starts[0] = starts[0].maximum(self._starts[last])
+            self._end(last, newest, ~goes_on[0])
+        time = torch.arange(begin, begin + count, device=self.device).unsqueeze(-1)
+        starts = torch.where(goes_on, -1, time)
+        starts[0] = torch.where(goes_on[0], self._start, starts[0])
+        starts = starts.cummax(0).values
         ends = torch.full_like(starts, -1)
         ended = torch.cat([~goes_on[1:], done[-1:]])
         rows = self._rows(begin, begin + count)
-        self._end_frames.drop(int((self._ends[rows] >= 0).sum()))  # of the overwritten steps
-        ends[ended] = self._push(following[ended])
-        self._starts[rows] = starts.cummax(0).values.flatten()
+        # The table of ends still has those of the steps that are overwritten.
+        self._end_frames.drop(int((self._ends[rows] >= 0).sum()))
+        ends[ended] = self._end_frames.push(following[ended]).to(self.device)
         self._ends[rows] = ends.flatten()
-        self._steps[rows] = _fields_of(data).flatten()
         self._frames[self._frame_rows(begin, begin + count + 1)] = torch.cat(
             [frames, following[-1:]]
         ).flatten()
-        self._count += count
+        self._write(begin, steps.exclude("observation", "is_init", ("next", "observation")), starts)
+
+    def _write(self, begin: int, steps: TensorDictBase, starts: Tensor) -> None:
+        """Writes steps [T, envs] without frames into TorchRL's table, and where episodes began."""
+        stop = begin + len(steps)
+        time = torch.arange(begin, stop, device=self.device).unsqueeze(-1).expand_as(starts)
+        steps["episode"] = starts * self._envs + torch.arange(self._envs, device=self.device)
+        if self._is_init:
+            steps["is_init"] = (time == starts).unsqueeze(-1)
+        super().set(
+            torch.arange(begin, stop) % self._num_times,
+            steps if self.ndim == 2 else steps.squeeze(-1),
+        )
+        self._count, self._start = stop, starts[-1]
+        table = super().get(slice(None)).flatten(0, self.ndim - 1)  # views
+        self._steps = dict(table.items(True, True))
+
+    def _newest(self) -> tuple[Tensor, TensorDict]:
+        """The rows of the newest steps, int64 [envs], and the frames after them."""
+        count = self._count
+        return self._rows(count - 1, count), self._frames[self._frame_rows(count, count + 1)]
+
+    def _end(self, steps: Tensor, frames: TensorDictBase, ended: Tensor) -> None:
+        """Notes that steps, int64 [envs], ended their episodes, unless that is known; bool [envs].
+
+        Args:
+            steps: The rows of the steps.
+            frames: What followed them, [envs].
+            ended: Whether they ended an episode.
+        """
+        ended = ended & (self._ends[steps] < 0)
+        self._ends[steps[ended]] = self._end_frames.push(frames[ended]).to(self.device)
 
     def end_episodes(self) -> None:
         """Ends the episodes of the newest steps: what is written next belongs to others.
 
         Steps that are not done keep their next observations, from which values are bootstrapped.
         """
-        if not self._count:
-            return
-        last = self._rows(self._count - 1, self._count)
-        going = self._ends[last] < 0
-        newest = self._frames[self._frame_rows(self._count, self._count + 1)]
-        self._ends[last[going]] = self._push(newest[going])
+        if self._count:
+            last, newest = self._newest()
+            self._end(last, newest, torch.ones_like(last, dtype=torch.bool))
 
-    def _push(self, frames: TensorDictBase) -> Tensor:
-        return self._end_frames.push(frames).to(self.device)
-
-    def _entries(self, items: Tensor) -> Entries:
-        env = items % self._envs
-        newest = self._count - 1
-        time = newest - (newest - items // self._envs) % self._num_times
-        start = take(self._starts, items)
-        end = cache(partial(take, self._ends, items))
-        first_of_episode = (time == start) if self._is_init else None
-        entries = episode_entries(start * self._envs + env, first_of_episode)
-
-        @cache
-        def windows() -> Windows:
-            found = find_windows(time, start, self._num_frames, self._padding)
-            return Windows(self._row(found.rows, env.unsqueeze(-1)), found.missing)
-
-        def following(table: Tensor, last: Tensor) -> Tensor:
-            frames = take(table, self._row(time + 1, env))
-            here = (end() < 0).view(*items.shape, *[1] * (frames.ndim - items.ndim))
-            return torch.where(here, frames, take(last, end().clamp(min=0) % len(last)))
-
-        def history(table: Tensor) -> Tensor:
-            return windows().gather(table)
-
-        for key, table in self._frames.items(True, True):
-            _, *leaf = (key,) if isinstance(key, str) else key
-            last = self._end_frames.table[key]
-            entries |= frame_entries(
-                tuple(leaf),
-                partial(_take_later, table, lambda: self._row(time, env)),
-                partial(history, table),
-                partial(following, table, last),
-                items.ndim,
-            )
-        for key, table in self._steps.items(True, True):
-            entries[key] = partial(take, table, items)
-        return entries
-
-    def _row(self, time: Tensor, env: Tensor) -> Tensor:
+    def _frame_row(self, time: Tensor, env: Tensor) -> Tensor:
         """Rows of frames, by time and environment; int64 [...]."""
         return time % (self._num_times + self._num_frames) * self._envs + env
 
     def _rows(self, begin: int, stop: int) -> Tensor:
-        """Rows of the steps of some times, int64 [(stop - begin) * envs]."""
+        """Rows of the steps of some times in the table of ends; int64 [(stop - begin) * envs]."""
         return self._of_all_envs(torch.arange(begin, stop) % self._num_times)
 
     def _frame_rows(self, begin: int, stop: int) -> Tensor:
@@ -249,11 +299,6 @@ class OnlineHistoryStorage(GatheringStorage):
     def _of_all_envs(self, times: Tensor) -> Tensor:
         rows = times.unsqueeze(-1) * self._envs + torch.arange(self._envs)
         return rows.flatten().to(self.device)
-
-    @property
-    def _num_times(self) -> int:
-        """Maximum number of steps per environment."""
-        return self.max_size // self._envs
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the steps, each frame once."""
@@ -284,14 +329,15 @@ class OnlineHistoryStorage(GatheringStorage):
         first_end = max(0, begin - 1, stop - self._num_times)
         ends = self._ends[self._rows(first_end, stop)]
         first = int(torch.where(ends < 0, self._end_frames.stop, ends).min())
+        steps = super().get(torch.arange(begin, stop) % self._num_times).flatten()
         return {
             "begin": begin,
             "stop": stop,
             "max_size": self.max_size,
             "num_frames": self._num_frames,
             "num_envs": self._envs,
-            "steps": self._steps[self._rows(begin, stop)].to_dict(),
-            "starts": self._starts[self._rows(begin, stop)],
+            "steps": steps.exclude("episode", "is_init").to_dict(),
+            "starts": steps["episode"] // self._envs,
             "first_frame": first_frame,
             "frames": self._frames[self._frame_rows(first_frame, stop + 1)].to_dict(),
             "ends": ends,
@@ -310,11 +356,12 @@ class OnlineHistoryStorage(GatheringStorage):
         begin, stop, envs = (int(part[name]) for name in ("begin", "stop", "num_envs"))
         frames, steps = _table(part["frames"], self.device), _table(part["steps"], self.device)
         if not self.initialized:
-            self._make_room(frames[:envs], steps[:envs])
+            self._make_room(frames[:envs])
         self._check_part(part)
-        self._steps[self._rows(begin, stop)] = steps
-        self._starts[self._rows(begin, stop)] = part["starts"].to(self.device)
         self._frames[self._frame_rows(int(part["first_frame"]), stop + 1)] = frames
+        self._write(
+            begin, steps.reshape(-1, envs), part["starts"].to(self.device).reshape(-1, envs)
+        )
         ends = part["ends"].to(self.device)
         self._ends[self._rows(stop - len(ends) // envs, stop)] = ends
         kept, first = self._ends[self._ends >= 0], int(part["first_end_frame"])
@@ -322,8 +369,6 @@ class OnlineHistoryStorage(GatheringStorage):
         self._end_frames.stop = max(self._end_frames.stop, self._end_frames.first)
         end_frames = _table(part["end_frames"], self.device)
         self._end_frames.write(end_frames, first + torch.arange(len(end_frames)))
-        self._count = stop
-        self._finish()
 
     def _check_part(self, part: dict[str, Any]) -> None:
         mine = {"max_size": self.max_size, "num_frames": self._num_frames, "num_envs": self._envs}
@@ -341,73 +386,84 @@ class OnlineHistoryStorage(GatheringStorage):
             )
 
     def _empty(self) -> None:
+        super()._empty()
         self._count = 0
         self._ends.fill_(-1)
         self._end_frames.first = self._end_frames.stop = 0
-        self._len = 0
-        self._bump_mutation_revision()
 
-    def _make_room(self, frames: TensorDictBase, steps: TensorDictBase) -> None:
-        """Allocates the memory, which the system provides as it is written.
+    def _make_room(self, frames: TensorDictBase) -> None:
+        """Allocates the memory of frames, which the system provides as it is written.
 
         Args:
             frames: The frames of all environments at one time, [envs].
-            steps: The other entries, [envs].
         """
         self._envs = len(frames)
-        num_times = -(-self.max_size // self._envs)
-        self.max_size = num_times * self._envs
-
-        def room(like: TensorDictBase, times: int) -> TensorDict:
-            count = times * self._envs
-            tables = {
-                key: value.new_empty(count, *value.shape[1:])
-                for key, value in like.items(True, True)
-            }
-            return TensorDict(tables, [count], device=self.device)
-
-        self._steps, self._frames = (
-            room(steps, num_times),
-            room(frames, num_times + self._num_frames),
+        self.max_size = -(-self.max_size // self._envs) * self._envs
+        count = self.max_size + self._num_frames * self._envs
+        self._frames = frames.apply(
+            lambda x: x.new_empty(count, *x.shape[1:]), batch_size=[count], device=self.device
         )
+        self._start = torch.zeros(self._envs, dtype=torch.int64, device=self.device)
+        items = torch.arange(self.max_size, device=self.device)
+        self._items = items if self.ndim == 1 else items.view(-1, self._envs)
+        self._ends = torch.full_like(items, -1)
         self._end_frames = EndFrames(frames.to(self.device))
-        self._starts, self._ends = (
-            torch.full((self.max_size,), -1, device=self.device) for _ in range(2)
-        )
-        self._total_shape_value = torch.Size([num_times, self._envs][: self.ndim])
-        self.initialized = True
-
-    def _finish(self) -> None:
-        """Tells TorchRL the number of steps and the position of the newest."""
-        self._len = min(self._count, self._num_times) * self._envs
-        self._set_last_cursor((self._count - 1) % self._num_times)
-        self._bump_mutation_revision()
 
 
-def _select(steps: TensorDictBase) -> TensorDictBase:
-    """Selects the entries to store, and "is_init"."""
-    groups = ((steps, (), _HERE), (steps["next"], ("next",), _NEXT))
-    for group, prefix, names in groups:
-        for name in names:
-            if name not in group.keys() and name not in _OPTIONAL:  # noqa: SIM118 (a tensordict)
-                raise KeyError(
-                    f"Steps need {(*prefix, name)}, but have only {sorted(group.keys())}."
-                )
-    here = steps.select(*_HERE, strict=False)
-    return here.set("next", steps["next"].select(*_NEXT, strict=False))
+class EndFrames:
+    """A queue of frames, numbered from 0, in a table that grows when it is full.
 
+    Args:
+        like: Frames [N] that give the shapes and dtypes.
 
-def _fields_of(steps: TensorDictBase) -> TensorDictBase:
-    return steps.exclude("observation", "is_init", ("next", "observation"))
+    Example:
+        >>> frames = EndFrames(TensorDict({"observation": torch.zeros(1, 2)}, [1]))
+        >>> frames.push(TensorDict({"observation": torch.arange(4.0).view(2, 2)}, [2]))
+        tensor([0, 1])
+        >>> frames.drop(1)
+        >>> frames.read(1)["observation"]
+        tensor([[2., 3.]])
+    """
 
+    def __init__(self, like: TensorDictBase) -> None:
+        self.table = like[:1].clone()
+        """Frame number n is in row n modulo the length."""
+        self.first = 0
+        """Number of the oldest frame."""
+        self.stop = 0
+        """Number of the newest frame, plus one."""
 
-def _take_later(table: Tensor, rows: Callable[[], Tensor]) -> Tensor:
-    return take(table, rows())
+    def push(self, frames: TensorDictBase) -> Tensor:
+        """Adds frames [N]; returns their numbers, int64 [N]."""
+        numbers = torch.arange(self.stop, self.stop + len(frames))
+        self.write(frames, numbers)
+        return numbers
 
+    def write(self, frames: TensorDictBase, numbers: Tensor) -> None:
+        """Writes the newest frames [N], with consecutive numbers."""
+        if not len(numbers):
+            return
+        stop = int(numbers[-1]) + 1
+        if stop - self.first > len(self.table):
+            kept = torch.arange(self.first, self.stop)
+            table, self.table = self.table, self._room(2 * (stop - self.first))
+            self._write(table[kept % len(table)], kept)
+        self._write(frames, numbers)
+        self.stop = max(self.stop, stop)
 
-def _flag(steps: TensorDictBase, name: str) -> Tensor:
-    """A flag of the steps, [..., 1] -> bool [...]."""
-    return steps["next", name].reshape(steps.shape)
+    def drop(self, count: int) -> None:
+        """Forgets the oldest frames."""
+        self.first += count
+
+    def read(self, first: int) -> TensorDict:
+        """Copies the frames from number ``first`` on."""
+        return self.table[torch.arange(first, self.stop) % len(self.table)]
+
+    def _write(self, frames: TensorDictBase, numbers: Tensor) -> None:
+        self.table[numbers % len(self.table)] = frames
+
+    def _room(self, count: int) -> TensorDict:
+        return self.table[:1].expand(count).clone()
 
 
 def _equal(left: TensorDictBase, right: TensorDictBase) -> Tensor:

@@ -101,7 +101,7 @@ def test_actions_are_those_of_the_agent_at_its_mark(cartpole: Path) -> None:
         policy = make_algorithm(CARTPOLE_RECIPE).policy
         policy.load_state_dict(weights)
         episodes = load_episodes(cartpole / f"{kind}.hdf5")
-        steps = HistoryStorage(episodes, num_frames=2)[:]
+        steps = HistoryStorage(episodes, num_frames=2).get(slice(None))
         with torch.no_grad():
             logits = policy(TensorDict({"history": steps["history"]}, len(steps)))["logits"]
         assert torch.equal(logits.argmax(-1), steps["action"])

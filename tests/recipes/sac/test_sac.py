@@ -106,7 +106,7 @@ def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
         algorithm.prepare(60, run.folder)
         algorithm.buffer_state.load_state_dict(state)
         algorithm.close()
-    stored = algorithm.buffer[:][0]
+    stored = algorithm.buffer.storage.get(slice(None))[:, 0]
     assert len(stored) == 60
     assert stored["observation"].isfinite().all()
     # The transitions of one environment, in order.
