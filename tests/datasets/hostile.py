@@ -154,10 +154,6 @@ def _long_episode(file: h5py.File, folder: Path) -> None:
     file["episode_1"].attrs["total_steps"] = 10**12
 
 
-def _huge_number(file: h5py.File, folder: Path) -> None:
-    file["episode_1"].attrs["total_steps"] = 1e30
-
-
 def _many_texts(file: h5py.File, folder: Path) -> None:
     file["episode_1"].attrs["names"] = ["walk"] * 1000
 
@@ -202,7 +198,7 @@ def _one_text_for_all(folder: Path) -> Path:
 def _nested(metadata: dict[str, Any]) -> dict[str, Any]:
     depth = 100_000  # Python 3.13 still reads a thousand
     deep = '{"type": "Tuple", "subspaces": [' * depth + "]}" * depth
-    return metadata | {"action_space": deep}
+    return metadata | {"observation_space": deep}
 
 
 HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
@@ -227,10 +223,6 @@ HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "1e9 episodes": (
         lambda f: _minari(f, lambda m: m | {"total_episodes": 10**9}),
         "claim 1000000000 episodes, but there are 2",
-    ),
-    "a space of 1e10 entries": (
-        lambda f: _minari(f, _endless_space),
-        "a space of 10000000000 entries lists bounds of fewer",
     ),
     "spaces in spaces": (lambda f: _minari(f, _nested), "is not a whole Minari data set"),
     "metadata of a list": (lambda f: _minari(f, lambda m: [m]), "Expected `object`, got `array`"),
@@ -264,17 +256,15 @@ HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
         ),
         "episode 1: field 'rewards': has the dtype float128",
     ),
-    "many texts in an attribute": (
-        lambda f: _minari(f, change=_many_texts),
-        "'episode_1': the attribute 'names' is neither text nor a few numbers",
-    ),
-    "one text for a thousand": (_one_text_for_all, "'infos/texts': has .* bytes of data in its"),
-    "groups in groups": (lambda f: _minari(f, change=_deep_groups), "more than 1000 fields and gr"),
-    "groups in two places": (
-        lambda f: _minari(f, change=_doubling_groups),
-        "'infos/b': is a group that is also in another place",
-    ),
-    "1e12 steps": (lambda f: _minari(f, change=_long_episode), "declares .* bytes of data, but"),
-    "1e30 steps": (lambda f: _minari(f, change=_huge_number), "its episodes cannot be listed"),
 }
 """Each with a part of the message that refuses it."""
+
+HARMLESS: dict[str, Callable[[Path], Path]] = {
+    "a space of 1e10 entries": lambda f: _minari(f, _endless_space),
+    "many texts in an attribute": lambda f: _minari(f, change=_many_texts),
+    "one text for a thousand": _one_text_for_all,
+    "groups in groups": lambda f: _minari(f, change=_deep_groups),
+    "groups in two places": lambda f: _minari(f, change=_doubling_groups),
+    "1e12 steps": lambda f: _minari(f, change=_long_episode),
+}
+"""What is not read of a data set cannot fill the memory."""

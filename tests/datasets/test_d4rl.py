@@ -17,7 +17,7 @@ from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from tests.datasets.rollouts import Transitions, write
 from torchrl_tit.datasets import DatasetError, download_d4rl, load_episodes
-from torchrl_tit.datasets.d4rl import address
+from torchrl_tit.datasets.sources import address
 
 NAME = "hopper-medium-replay-v0"
 

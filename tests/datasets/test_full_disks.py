@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_tit.datasets import TransitionParts, episodes_from_arrays, write_hdf5, write_minari
-from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
+from torchrl_tit.datasets.episodes import memory_mapped_rows
 
 NOISE = np.random.default_rng(0).normal(size=(1, 4000, 8)).astype(np.float32)
 ENDS = np.arange(4000)[None] % 100 == 99

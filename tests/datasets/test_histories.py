@@ -46,7 +46,9 @@ def test_windows_are_those_of_catframes(num_frames: int, padding: Any) -> None:
     assert stream["next", "terminated"].any()
     assert stream["next", "truncated"].any()
 
-    sample = HistoryStorage(store(stream), num_frames, padding=padding, unfinished="keep").get(slice(None))
+    sample = HistoryStorage(store(stream), num_frames, padding=padding, unfinished="keep").get(
+        slice(None)
+    )
 
     assert sample.batch_size == (150,)
     for key in sample.exclude("episode").keys(True, True):
@@ -71,7 +73,9 @@ def test_settings_of_d3rlpy_1(arrays: Transitions) -> None:
     arrays["terminals"][arrays["timeouts"].argmax()] = True  # both at once count as terminal
     episodes = episodes_from_arrays(**arrays)
 
-    sample = HistoryStorage(episodes, 3, time_limits="drop", terminal_observations="zero").get(slice(None))
+    sample = HistoryStorage(episodes, 3, time_limits="drop", terminal_observations="zero").get(
+        slice(None)
+    )
 
     drawn = ~arrays["timeouts"] | arrays["terminals"]
     terminals = arrays["terminals"][drawn]
@@ -84,7 +88,8 @@ def test_settings_of_d3rlpy_1(arrays: Transitions) -> None:
     torch.testing.assert_close(sample["next", "history"][:, :-1], sample["history"][:, 1:])
     # The data themselves have not changed.
     torch.testing.assert_close(
-        HistoryStorage(episodes).get(slice(None))["next", "observation"].numpy(), arrays["next_observations"]
+        HistoryStorage(episodes).get(slice(None))["next", "observation"].numpy(),
+        arrays["next_observations"],
     )
 
 

@@ -16,7 +16,7 @@ from torchrl_tit.datasets import (
     load_episodes,
     make_replay_buffer,
 )
-from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
+from torchrl_tit.datasets.episodes import memory_mapped_rows
 
 ROWS, WIDTH = 200_000, 100  # 80 MB of observations, and as much of the next ones
 

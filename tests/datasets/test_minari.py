@@ -1,8 +1,8 @@
 """Minari data sets, read and written."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import h5py
@@ -10,9 +10,8 @@ import minari
 import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, Dict
+from gymnasium.spaces import Box, Dict, Discrete
 from minari.data_collector import EpisodeBuffer
-from numpy.typing import NDArray
 
 from tests.datasets.rollouts import Transitions, spans, write
 from torchrl_tit.datasets import (
@@ -26,65 +25,71 @@ from torchrl_tit.datasets import (
     write_minari,
 )
 
+NAME = "walk/random-v0"
+
 
 @pytest.fixture(autouse=True)
-def _minaris_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Minari's folder of the data set's files."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return tmp_path / "minari" / NAME / "data"
 
 
-def make_with_minari(arrays: Transitions, name: str = "walk/random-v0") -> minari.MinariDataset:
+def make(episode: dict[str, Any] | list[dict[str, Any]], name: str = NAME, **settings: Any) -> Any:
     """A data set that Minari itself writes."""
-    buffers = []
+    episodes = episode if isinstance(episode, list) else [episode]
+    buffers = [EpisodeBuffer(**each) for each in episodes]
+    settings = {"author": {"Ann"}, "author_email": {"a@b.c"}, "code_permalink": "x", **settings}
+    settings = {"algorithm_name": "none", "description": "none", **settings}
+    return minari.create_dataset_from_buffers(name, buffers, **settings)
+
+
+def make_walk(arrays: Transitions, name: str = NAME) -> Any:
+    episodes = []
     for start, stop in spans(arrays):
-        observations = [*arrays["observations"][start:stop], arrays["next_observations"][stop - 1]]
-        buffers.append(
-            EpisodeBuffer(
-                observations=observations,
-                actions=list(arrays["actions"][start:stop]),
-                rewards=list(arrays["rewards"][start:stop]),
-                terminations=list(arrays["terminals"][start:stop]),
-                truncations=list(arrays["timeouts"][start:stop]),
-            )
-        )
-    with pytest.warns(UserWarning, match="`author` is set to None"):
-        return minari.create_dataset_from_buffers(
-            name,
-            buffers,
-            env="Hopper-v5",
-            observation_space=Box(-np.inf, np.inf, (11,), np.float32),
-        )
+        names = {"actions": "actions", "rewards": "rewards"}
+        names |= {"terminations": "terminals", "truncations": "timeouts"}
+        steps = {theirs: list(arrays[ours][start:stop]) for theirs, ours in names.items()}
+        last = arrays["next_observations"][stop - 1]
+        episodes.append({"observations": [*arrays["observations"][start:stop], last], **steps})
+    return make(
+        episodes, name, env="Hopper-v5", observation_space=Box(-np.inf, np.inf, (11,), np.float32)
+    )
 
 
-def test_every_field_is_that_of_minari(rolled: Transitions) -> None:
-    make_with_minari(rolled)
-
-    episodes = load_episodes("walk/random-v0", task="Hopper-v5")
-
-    sample = HistoryStorage(episodes).get(slice(None))
-    expected = HistoryStorage(episodes_from_arrays(**rolled)).get(slice(None))
-    assert (sample == expected).all()
-    assert (episodes.rows == episodes_from_arrays(**rolled).rows).all()
-    assert episodes.lengths.tolist() == [stop - start for start, stop in spans(rolled)]
+def test_every_field_is_that_of_minari(rolled: Transitions, folder: Path) -> None:
+    make_walk(rolled)
+    expected = episodes_from_arrays(**rolled)
+    for source in (NAME, folder, folder.parent):
+        episodes = load_episodes(source, task="Hopper-v5")
+        assert (episodes.rows == expected.rows).all()
+        assert episodes.lengths.tolist() == [stop - start for start, stop in spans(rolled)]
+        assert episodes.final_known.all()
 
 
-def test_a_folder_is_read_too(rolled: Transitions, tmp_path: Path) -> None:
-    make_with_minari(rolled)
-    expected = load_episodes("walk/random-v0").rows
-    folder = tmp_path / "minari" / "walk" / "random-v0"
-    for path in (folder, folder / "data"):
-        assert (load_episodes(path).rows == expected).all()
+def test_a_missing_set_is_downloaded(rolled: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(name: str) -> None:
+        raise RuntimeError(f"no network for {name}")
+
+    monkeypatch.setattr(minari, "download_dataset", fail)
+    message = f"There is no Minari data set '{NAME}' .* cannot be downloaded: no network for {NAME}"
+    with pytest.raises(FileNotFoundError, match=message):
+        load_episodes(NAME)
+    monkeypatch.setattr(minari, "download_dataset", lambda name: make_walk(rolled, name))
+    episodes = load_episodes(NAME)
+    assert episodes.num_transitions == len(rolled["rewards"])
+    assert episodes.source == NAME
 
 
 def test_minari_reads_what_was_written(rolled: Transitions) -> None:
-    write_minari(episodes_from_arrays(**rolled), "walk/random-v1", "Hopper-v5")
+    write_minari(episodes_from_arrays(**rolled), NAME, "Hopper-v5")
 
-    dataset = minari.load_dataset("walk/random-v1")
+    dataset = minari.load_dataset(NAME)
 
     assert dataset.total_episodes == len(spans(rolled))
     assert dataset.total_steps == len(rolled["rewards"])
     assert dataset.env_spec.id == "Hopper-v5"
     assert dataset.action_space == gymnasium.make("Hopper-v5").action_space
-    assert list(minari.list_local_datasets()) == ["walk/random-v1"]
     for (start, stop), episode in zip(spans(rolled), dataset, strict=True):
         fields = {
             "actions": episode.actions,
@@ -114,16 +119,16 @@ def test_hdf5_to_minari_and_back_is_lossless(rolled: Transitions, tmp_path: Path
 
 
 def test_metadata_survive(tmp_path: Path) -> None:
-    episode = EpisodeBuffer(
-        seed=3,
-        options={"low": 1},
-        observations=np.zeros((2, 11)),
-        actions=np.zeros((1, 3), np.float32),
-        rewards=[0.0],
-        terminations=[True],
-        truncations=[False],
-        infos={"x": np.zeros(2)},
-    )
+    episode = {
+        "seed": 3,
+        "options": {"low": 1},
+        "observations": np.zeros((2, 11)),
+        "actions": np.zeros((1, 3), np.float32),
+        "rewards": [0.0],
+        "terminations": [True],
+        "truncations": [False],
+        "infos": {"x": np.zeros(2)},
+    }
     told = {
         "algorithm_name": "SAC",
         "author": {"Ann", "Bob"},
@@ -131,8 +136,8 @@ def test_metadata_survive(tmp_path: Path) -> None:
         "code_permalink": "https://example.org/code",
         "description": "hops",
     }
-    env = gymnasium.make("Hopper-v5", terminate_when_unhealthy=False).spec
-    minari.create_dataset_from_buffers("hop/sac-v0", [episode], env=env, **told)
+    spec = gymnasium.make("Hopper-v5", terminate_when_unhealthy=False).spec
+    make(episode, "hop/sac-v0", env=spec, **told)
 
     episodes = load_episodes("hop/sac-v0", dtype=None)
     write_hdf5(episodes, tmp_path / "a.hdf5")
@@ -144,126 +149,165 @@ def test_metadata_survive(tmp_path: Path) -> None:
     assert again.env_spec.id == "Hopper-v5"
     assert again.action_space == Box(-1, 1, (3,), np.float32)
     attributes = load_episodes("hop/sac-v1").attributes
-    assert attributes == episodes.attributes == load_episodes(tmp_path / "a.hdf5").attributes
-    assert attributes["env_id"] == "Hopper-v5"
+    assert attributes == load_episodes(tmp_path / "a.hdf5").attributes
+    assert attributes == {
+        "algorithm": "SAC",
+        "author": ["Ann", "Bob"],
+        "author_email": ["ann@example.org"],
+        "code_permalink": "https://example.org/code",
+        "description": "hops",
+        "env_id": "Hopper-v5",
+    }
 
 
-def test_images_and_discrete_actions_survive(tmp_path: Path) -> None:
-    frames = np.random.default_rng(0).integers(0, 256, (6, 16, 16, 3), dtype=np.uint8)
-    ends = np.array([False, False, True] * 2)
-    episodes = episodes_from_arrays(frames, np.arange(6), np.ones(6), ends)
+@pytest.mark.parametrize("jpeg", [True, False])
+@pytest.mark.parametrize("shape", [(40, 48, 3), (40, 48)])
+def test_images_and_discrete_actions(shape: tuple[int, ...], jpeg: bool, tmp_path: Path) -> None:
+    """Images as Minari stores and decodes them; what we write is lossless."""
+    frames = np.random.default_rng(0).integers(0, 256, (3, 4, *shape), dtype=np.uint8)
+    steps = {"actions": [0, 2, 1], "rewards": [0.0, 0.0, 1.0]}
+    steps |= {"terminations": [False, False, True], "truncations": [False] * 3}
+    dataset = make(
+        [{"observations": images, **steps} for images in frames],
+        observation_space=Box(0, 255, shape, np.uint8),
+        action_space=Discrete(3),
+        jpeg_encoding=jpeg,
+    )
 
-    write_minari(episodes, tmp_path / "images-v0")
+    episodes = load_episodes(NAME)
+    write_minari(episodes, tmp_path / "again-v0")
 
-    assert (load_episodes(tmp_path / "images-v0").rows == episodes.rows).all()
+    expected = np.concatenate([episode.observations for episode in dataset])
+    np.testing.assert_array_equal(episodes.rows["observation"].numpy(), expected)
+    assert (expected == frames.reshape(12, *shape)).all() != jpeg
+    assert episodes.rows["action"].tolist() == [0, 2, 1, 0] * 3
+    assert (load_episodes(tmp_path / "again-v0").rows == episodes.rows).all()
 
 
-def test_an_episode_without_a_flag_is_unfinished(rolled: Transitions) -> None:
-    arrays = {name: array.copy() for name, array in rolled.items()}
+@pytest.mark.parametrize("damage", [lambda x: x[:20], lambda x: x * 0, "size"])
+def test_images_that_cannot_be_decoded(damage: Any, folder: Path) -> None:
+    steps = {"actions": [0], "rewards": [0.0], "terminations": [True], "truncations": [False]}
+    spaces = {"observation_space": Box(0, 255, (40, 48), np.uint8), "action_space": Discrete(2)}
+    make({"observations": np.zeros((2, 40, 48), np.uint8), **steps}, **spaces)
+    path = folder / "metadata.json"
+    if damage == "size":
+        path.write_text(path.read_text().replace("[40, 48]", "[50, 48]"))
+    else:
+        with h5py.File(folder / "main_data.hdf5", "a") as file:
+            images = file["episode_0/observations"][:]
+            del file["episode_0/observations"]
+            file["episode_0/observations"] = np.stack([damage(image) for image in images])
+    with pytest.raises(DatasetError, match="'observations', row 0: rows from here on cannot be"):
+        load_episodes(NAME)
+
+
+def test_states_that_are_one_number_become_columns() -> None:
+    steps = {"actions": [0, 1], "rewards": [0.0, 1.0]}
+    steps |= {"terminations": [False, True], "truncations": [False, False]}
+    spaces = {"observation_space": Discrete(9), "action_space": Discrete(2)}
+    make({"observations": np.array([5, 3, 8]), **steps}, **spaces)
+    assert load_episodes(NAME).rows["observation"].tolist() == [[5], [3], [8]]
+
+
+def test_an_episode_without_a_flag_is_unfinished(rolled: Transitions, folder: Path) -> None:
     start, stop = spans(rolled)[1]
-    dataset = make_with_minari(arrays)
-    with h5py.File(dataset.storage.data_path / "main_data.hdf5", "a") as file:
+    make_walk(rolled)
+    with h5py.File(folder / "main_data.hdf5", "a") as file:
         for name in ("terminations", "truncations"):
             file["episode_1"][name][-1] = False
 
-    episodes = load_episodes("walk/random-v0")
+    episodes = load_episodes(NAME)
 
     assert episodes.finished.tolist() == [i != 1 for i in range(len(spans(rolled)))]
     everything = HistoryStorage(episodes_from_arrays(**rolled)).get(slice(None))
     drawn = torch.ones(len(everything), dtype=torch.bool)
     drawn[start:stop] = False
-    assert (HistoryStorage(episodes).get(slice(None)) == everything[drawn]).all()
+    found = HistoryStorage(episodes).get(slice(None)).exclude("episode")
+    assert (found == everything[drawn].exclude("episode")).all()
     assert len(HistoryStorage(episodes, unfinished="keep")) == len(everything)
     with pytest.raises(ValueError, match="episode 1 is neither terminated nor truncated"):
         write_hdf5(episodes, "never-written.hdf5")
 
 
-@pytest.mark.parametrize(
-    ("field", "row", "value", "message"),
-    [
-        ("rewards", 2, np.nan, "episode 1: field 'rewards', row 2: is nan"),
-        ("observations", 3, np.inf, "episode 1: field 'observations', row 3: is inf"),
-        ("actions", 1, -2.0, "episode 1: field 'actions', row 1: is -2.0, but the task's"),
-        ("terminations", 0, True, "episode 1: field 'terminations', row 0: ends the episode, but"),
-        ("rewards", slice(1), None, "episode 1: field 'rewards': has the shape"),
-        ("actions", None, None, "episode 1: cannot be read"),
-    ],
-)
-def test_errors_name_episode_field_and_row(
-    rolled: Transitions, field: str, row: int | slice | None, value: float | None, message: str
-) -> None:
-    dataset = make_with_minari(rolled)
-    with h5py.File(dataset.storage.data_path / "main_data.hdf5", "a") as file:
-        if row is None:
-            del file["episode_1"][field]
-        elif isinstance(row, slice):
-            file["episode_1"][field].resize(1, axis=0)
-        else:
-            file["episode_1"][field][row] = value
-    with pytest.raises(DatasetError, match=f"^walk/random-v0: {message}"):
-        load_episodes("walk/random-v0", task="Hopper-v5")
+def _set(field: str, row: int, value: float) -> Callable[[h5py.Group], None]:
+    return lambda episode: episode[field].__setitem__(row, value)
 
 
-def test_damaged_sets(rolled: Transitions, tmp_path: Path) -> None:
-    data = Path(make_with_minari(rolled).storage.data_path)
-    with pytest.raises(DatasetError, match="field 'env_id': is Hopper-v5, but the task is Walker2"):
-        load_episodes("walk/random-v0", task="Walker2d-v5")
-    walker = task_spaces("Walker2d-v5")._replace(name="a walker")
-    with pytest.raises(DatasetError, match="episode 0: field 'observations': one row has the sh"):
-        load_episodes("walk/random-v0", task=walker)
-    main = (data / "main_data.hdf5").read_bytes()
-    (data / "main_data.hdf5").write_bytes(main[:-1000])
-    with pytest.raises(DatasetError, match=r"main_data\.hdf5: is not a whole HDF5 file"):
-        load_episodes("walk/random-v0")
-    (data / "metadata.json").write_text("{")
-    with pytest.raises(DatasetError, match="is not a whole Minari data set"):
-        load_episodes("walk/random-v0")
+def _retype(field: str, add: float, dtype: type) -> Callable[[h5py.Group], None]:
+    def change(episode: h5py.Group) -> None:
+        values = (episode[field][:].astype(np.float64) + add).astype(dtype)
+        del episode[field]
+        episode[field] = values
+
+    return change
 
 
 @pytest.mark.parametrize(
-    ("field", "values", "message"),
+    ("change", "message"),
     [
+        (_set("rewards", 2, np.nan), "field 'rewards', row {2}: is nan"),
+        (_set("observations", 3, np.inf), "field '(next_)?observations', row {[23]}: is inf"),
+        (_set("actions", 1, -2.0), "field 'actions', row {1}: is -2.0, but the task's"),
+        (_set("terminations", 0, True), "field 'terminals', row {0}: ends the episode, but"),
         (
-            "actions",
-            lambda x: x.astype(int),
-            "episode 1: field 'actions': has the dtype float32",
+            _retype("rewards", 1e300, np.float64),
+            "episode 1: field 'rewards': has the dtype float64",
         ),
-        ("rewards", lambda x: x + 1e300, "episode 0: field 'rewards', row 0: is 1e.300, but all"),
+        (_retype("actions", 0, int), "episode 1: field 'actions': has the dtype int64 and rows"),
+        (lambda e: e["rewards"].resize(1, axis=0), "episode 1: field 'observations': has .* rows"),
+        (lambda e: e.pop("actions"), "episode 1: field 'actions': is not an array"),
+        (lambda e: e.file.pop(e.name), "field 'episode_1': is missing"),
     ],
 )
-def test_numbers_that_would_be_changed(
-    rolled: Transitions, field: str, values: Callable[[NDArray], NDArray], message: str
+def test_errors_name_the_place(
+    rolled: Transitions, folder: Path, change: Callable[[h5py.Group], None], message: str
 ) -> None:
-    dataset = make_with_minari(rolled)
-    with h5py.File(dataset.storage.data_path / "main_data.hdf5", "a") as file:
-        array = file["episode_0"][field][:].astype(np.float64)
-        del file["episode_0"][field]
-        file["episode_0"][field] = values(array)
-    with pytest.raises(DatasetError, match=message):
-        load_episodes("walk/random-v0")
+    """Rows are counted over all episodes."""
+    make_walk(rolled)
+    with h5py.File(folder / "main_data.hdf5", "a") as file:
+        file["more"] = 0  # so that there are as many entries as episodes
+        change(file["episode_1"])
+    start = spans(rolled)[1][0]
+    for step in range(4):
+        message = message.replace(f"{{{step}}}", str(start + step))
+    message = message.replace("{[23]}", f"({start + 2}|{start + 3})")
+    with pytest.raises(DatasetError, match=f"^{NAME}: {message}"):
+        load_episodes(NAME, task="Hopper-v5")
+
+
+def test_damaged_sets(rolled: Transitions, folder: Path) -> None:
+    make_walk(rolled)
+    with pytest.raises(DatasetError, match="field 'env_id': is Hopper-v5, but the task is Walker2"):
+        load_episodes(NAME, task="Walker2d-v5")
+    walker = task_spaces("Walker2d-v5")._replace(name="a walker")
+    with pytest.raises(DatasetError, match="field 'observations': one row has the shape"):
+        load_episodes(NAME, task=walker)
+    main, metadata = folder / "main_data.hdf5", folder / "metadata.json"
+    text = metadata.read_text()
+    metadata.write_text(text.replace('"data_format": "hdf5"', '"data_format": "arrow"'))
+    with pytest.raises(DatasetError, match="is in the format 'arrow', but must be in HDF5"):
+        load_episodes(NAME)
+    metadata.write_text(text)
+    main.write_bytes(main.read_bytes()[:-1000])
+    with pytest.raises(DatasetError, match=r"main_data\.hdf5: is not a whole HDF5 file"):
+        load_episodes(NAME)
+    metadata.write_text("{")
+    with pytest.raises(DatasetError, match="is not a whole Minari data set"):
+        load_episodes(NAME)
 
 
 def test_observations_of_several_arrays_are_refused() -> None:
-    space = Dict(a=Box(-1, 1, (2,)))
-    episode = EpisodeBuffer(
-        observations={"a": np.zeros((2, 2))},
-        actions=np.zeros((1, 1)),
-        rewards=[0.0],
-        terminations=[True],
-        truncations=[False],
-    )
-    with pytest.warns(UserWarning, match="`author` is set to None"):
-        minari.create_dataset_from_buffers(
-            "many-v0",
-            [episode],
-            observation_space=space,
-            action_space=Box(-1, 1, (1,)),
-        )
+    steps = {"actions": np.zeros((1, 1)), "rewards": [0.0]}
+    steps |= {"terminations": [True], "truncations": [False]}
+    spaces = {"observation_space": Dict(a=Box(-1, 1, (2,))), "action_space": Box(-1, 1, (1,))}
+    make({"observations": {"a": np.zeros((2, 2))}, **steps}, **spaces)
     with pytest.raises(DatasetError, match="its observations are a Dict space"):
-        load_episodes("many-v0")
+        load_episodes(NAME)
 
 
-def test_targets_that_cannot_be_written(rolled: Transitions, tmp_path: Path) -> None:
+def test_targets_that_cannot_be_written(
+    rolled: Transitions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     episodes = episodes_from_arrays(**rolled)
     write_minari(episodes, tmp_path / "a-v0")
     with pytest.raises(FileExistsError, match="exists already"):
@@ -272,36 +316,4 @@ def test_targets_that_cannot_be_written(rolled: Transitions, tmp_path: Path) -> 
         write_minari(episodes, tmp_path / "unnumbered")
     with pytest.raises(ValueError, match="'Hoper-v5' cannot be made"):
         write_minari(episodes, tmp_path / "b-v0", "Hoper-v5")
-    assert [path.name for path in tmp_path.iterdir() if path.name != "minari"] == ["a-v0"]
-
-
-def test_a_failed_write_leaves_nothing(
-    rolled: Transitions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*args: object, **kwargs: object) -> None:
-        raise OSError("no space left")
-
-    monkeypatch.setattr("h5py.Group.create_dataset", fail)
-    with pytest.raises(OSError, match="no space left"):
-        write_minari(episodes_from_arrays(**rolled), tmp_path / "sets" / "a-v0")
-    assert list((tmp_path / "sets").iterdir()) == []
-
-
-def test_a_set_that_cannot_be_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(name: str) -> None:
-        raise RuntimeError(f"no network for {name}")
-
-    monkeypatch.setattr(minari, "download_dataset", fail)
-    message = "'mujoco/hopper/medium-v0' .* cannot be downloaded: no network for mujoco/hopper"
-    with pytest.raises(FileNotFoundError, match=message):
-        load_episodes("mujoco/hopper/medium-v0")
-
-
-def test_a_missing_set_is_downloaded(rolled: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    def download(name: str) -> None:
-        make_with_minari(rolled, name)
-
-    monkeypatch.setattr(minari, "download_dataset", download)
-    episodes = load_episodes("mujoco/walk/random-v0")
-    assert episodes.num_transitions == len(rolled["rewards"])
-    assert re.fullmatch("mujoco/walk/random-v0", episodes.source)
+    assert [path.name for path in tmp_path.iterdir()] == ["a-v0"]

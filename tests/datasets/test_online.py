@@ -146,7 +146,10 @@ def test_one_observation_and_single_steps() -> None:
         buffer.extend(given[:3])
         for step in given[3:]:
             buffer.add(step)
-        assert buffer.storage.get(slice(None))["is_init"].flatten().nonzero().flatten().tolist() == starts
+        assert (
+            buffer.storage.get(slice(None))["is_init"].flatten().nonzero().flatten().tolist()
+            == starts
+        )
         assert buffer.storage.num_end_frames == len(starts) - 1
         assert buffer.storage.get(slice(None))["action"].tolist() == list(range(6))
 

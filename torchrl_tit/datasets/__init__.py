@@ -1,11 +1,9 @@
 """Data sets for offline RL: from D4RL, Minari, HDF5 files and arrays to TorchRL replay buffers."""
 
-from torchrl_tit.datasets.d4rl import download_d4rl
-from torchrl_tit.datasets.episodes import Episodes
-from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.checks import DatasetError, TaskSpaces, task_spaces
+from torchrl_tit.datasets.episodes import Episodes, join_episodes, select_episodes
 from torchrl_tit.datasets.hdf5 import read_hdf5, write_hdf5
-from torchrl_tit.datasets.minari import read_minari
-from torchrl_tit.datasets.minari_writer import write_minari
+from torchrl_tit.datasets.minari import read_minari, write_minari
 from torchrl_tit.datasets.online import OnlineHistoryStorage
 from torchrl_tit.datasets.replay_buffer import ConsecutiveSampler, make_replay_buffer, make_sampler
 from torchrl_tit.datasets.scores import (
@@ -14,10 +12,8 @@ from torchrl_tit.datasets.scores import (
     normalized_score,
     normalized_spread,
 )
-from torchrl_tit.datasets.selection import join_episodes, select_episodes
-from torchrl_tit.datasets.sources import load_episodes
+from torchrl_tit.datasets.sources import download_d4rl, load_episodes
 from torchrl_tit.datasets.storages import EpisodeStorage, HistoryStorage, SequenceStorage
-from torchrl_tit.datasets.tasks import TaskSpaces, task_spaces
 from torchrl_tit.datasets.transition_parts import TransitionParts
 from torchrl_tit.datasets.transitions import episodes_from_arrays
 

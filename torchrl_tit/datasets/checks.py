@@ -1,22 +1,152 @@
-"""Checks of values before training."""
+"""What data must satisfy before training: finite values, the shapes and bounds of their task."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import gymnasium
 import numpy as np
 import torch
 from gymnasium import Space
+from gymnasium.envs.registration import parse_env_id
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.envs import is_atari, make_games
+from torchrl_tit.envs.gymnasium_tasks import make_unchecked
+from torchrl_tit.settings.arguments import checked_arguments
 
-FLAGS = ("terminals", "timeouts", "terminations", "truncations")  # D4RL's names and Minari's
-
-_LARGEST = np.iinfo(np.int64).max
+FLAGS = ("terminals", "timeouts")
 
 # Actions of a squashed policy reach the bounds, and rounding moves some slightly beyond them.
 _ACTION_TOLERANCE = 1e-5
+
+
+class DatasetError(ValueError):
+    """A data set is damaged, incomplete, or of another task; the message names file, field and row.
+
+    Args:
+        source: The file, or another description of the source.
+        problem: What is wrong, what was expected and what to do.
+        field: Name of the field, if the problem is in one.
+        row: Index of the row, if the problem is in one.
+
+    Example:
+        >>> print(DatasetError("a.hdf5", "is nan, but must be finite.", "rewards", 3))
+        a.hdf5: field 'rewards', row 3: is nan, but must be finite.
+    """
+
+    def __init__(
+        self, source: str, problem: str, field: str | None = None, row: int | None = None
+    ) -> None:
+        place = "" if field is None else f" field {field!r}"
+        place += "" if row is None else f"{',' if place else ''} row {row}"
+        super().__init__(f"{source}:{place}{':' if place else ''} {problem}")
+
+
+class TaskSpaces(NamedTuple):
+    """The spaces of a task.
+
+    Attributes:
+        observation: Gymnasium's space of one observation.
+        action: Gymnasium's space of one action.
+        name: The task's name, for error messages.
+    """
+
+    observation: Space
+    action: Space
+    name: str = "the task"
+
+
+@checked_arguments
+def task_spaces(env_name: str) -> TaskSpaces:
+    """Returns the spaces of a Gymnasium task.
+
+    Args:
+        env_name: A name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
+            "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one grey
+            image of 84 x 84.
+
+    Returns:
+        Its spaces.
+
+    Raises:
+        ValueError: If the task cannot be made.
+
+    Example:
+        >>> task_spaces("Pendulum-v1").action.shape
+        (1,)
+    """
+    if is_atari(env_name):
+        games = make_games(env_name)
+        games.close()
+        return TaskSpaces(games.single_observation_space, games.single_action_space, env_name)
+    try:
+        env = make_unchecked(env_name)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ValueError(f"Task {env_name!r} cannot be made: {error}") from error
+    try:
+        return TaskSpaces(env.observation_space, env.action_space, env_name)
+    finally:
+        env.close()
+
+
+def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
+    """Checks that the data set's recorded task is the requested one.
+
+    Tasks with spaces of the same shapes, such as HalfCheetah and Walker2d, cannot be told apart
+    otherwise.
+
+    Args:
+        source: Where the data came from, for error messages.
+        recorded: The recorded name of the task; anything but a string if there is none.
+        task: The requested task. The versions may differ. If its name does not have Gymnasium's
+            form, nothing is checked.
+
+    Raises:
+        DatasetError: If it is another task.
+
+    Example:
+        >>> check_task_name("a.hdf5", "Pendulum-v0", task_spaces("Pendulum-v1"))
+        >>> check_task_name("a.hdf5", "CartPole-v1", task_spaces("Pendulum-v1"))
+        Traceback (most recent call last):
+        ...
+        torchrl_tit.datasets.checks.DatasetError: a.hdf5: field 'env_id': is CartPole-v1, but t...
+    """
+    if not isinstance(recorded, str):
+        return
+    try:
+        (space, name, _), (task_space, task_name, _) = map(parse_env_id, (recorded, task.name))
+    except gymnasium.error.Error:
+        return
+    if space == task_space and name.lower() != task_name.lower():
+        raise DatasetError(
+            source, f"is {recorded}, but the task is {task.name}: use other data.", "env_id"
+        )
+
+
+def check_shape(
+    source: str, field: str, shape: tuple[int, ...], space: Space, task: TaskSpaces
+) -> None:
+    """Checks that one row of observations or actions has the shape of the task's space.
+
+    Raises:
+        DatasetError: If the shape differs.
+
+    Example:
+        >>> task = task_spaces("Pendulum-v1")
+        >>> check_shape("a.hdf5", "actions", (1,), task.action, task)
+    """
+    expected = space.shape or ()
+    # A scalar may be stored as a column.
+    if shape != expected and not (expected == () and shape == (1,)):
+        raise DatasetError(
+            source,
+            f"one row has the shape {list(shape)}, but in {task.name} it is {list(expected)}; "
+            f"the data set is of another task.",
+            field,
+        )
 
 
 def check_finite(
@@ -42,24 +172,22 @@ def check_finite(
         >>> check_finite("a.hdf5", "rewards", np.array([0.0, np.nan]), first_row=100)
         Traceback (most recent call last):
         ...
-        torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'rewards', row 101: is nan, but...
+        torchrl_tit.datasets.checks.DatasetError: a.hdf5: field 'rewards', row 101: is nan, but...
     """
+    kind, largest = str(kept_as).removeprefix("torch."), np.iinfo(np.int64).max
     if np.issubdtype(values.dtype, np.floating):
         wrong = ~plain_tensor(values).to(kept_as).isfinite().numpy()
-    elif values.dtype.itemsize == 8 and values.dtype.kind == "u" and kept_as == torch.int64:
-        wrong = values > _LARGEST
+    elif values.dtype == np.uint64:
+        wrong = values > largest
     else:
         return
     if wrong.any():
-        row = int(wrong.reshape(len(values), -1).any(1).argmax())
-        value = values[row][wrong[row]].flat[0] if values.ndim > 1 else values[row]
-        kind = str(kept_as).removeprefix("torch.")
-        problem = f"at most {_LARGEST}, the largest {kind}"
+        row, value = _first(wrong, values)
+        allowed = f"at most {largest}, the largest {kind}"
         if np.issubdtype(values.dtype, np.floating):
-            problem = f"finite as {kind}" if np.isfinite(value) else "finite"
-        raise DatasetError(
-            source, f"is {value}, but all values must be {problem}.", field, first_row + row
-        )
+            allowed = f"finite as {kind}" if np.isfinite(value) else "finite"
+        problem = f"is {value}, but all values must be {allowed}."
+        raise DatasetError(source, problem, field, first_row + row)
 
 
 def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0) -> None:
@@ -78,7 +206,7 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
         >>> check_actions("a.hdf5", np.array([[1.5]]), Box(-1.0, 1.0, (1,)))
         Traceback (most recent call last):
         ...
-        torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'actions', row 0: is 1.5, but...
+        torchrl_tit.datasets.checks.DatasetError: a.hdf5: field 'actions', row 0: is 1.5, but...
     """
     if isinstance(space, Box):
         low, high, tolerance = space.low, space.high, _ACTION_TOLERANCE
@@ -89,15 +217,15 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
         return
     wrong = (values < low - tolerance) | (values > high + tolerance)
     if wrong.any():
-        row = int(wrong.reshape(len(values), -1).any(1).argmax())
-        entries = np.broadcast_arrays(values[row], low, high)
-        value, lowest, highest = (x[np.asarray(wrong[row])].flat[0] for x in entries)
-        raise DatasetError(
-            source,
-            f"is {value}, but the task's actions range from {lowest} to {highest} here.",
-            "actions",
-            first_row + row,
-        )
+        row, value, lowest, highest = _first(wrong, *np.broadcast_arrays(values, low, high))
+        problem = f"is {value}, but the task's actions range from {lowest} to {highest} here."
+        raise DatasetError(source, problem, "actions", first_row + row)
+
+
+def _first(wrong: NDArray, *arrays: NDArray) -> tuple:
+    """The row of the first wrong entry, and what each array holds there."""
+    place = tuple(np.argwhere(wrong)[0])
+    return (int(place[0]), *(array[place] for array in arrays))
 
 
 def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | None) -> torch.dtype:
@@ -138,13 +266,7 @@ def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | N
 
 
 def plain_tensor(values: NDArray) -> Tensor:
-    """Converts an array of any layout into a tensor.
-
-    Args:
-        values: The array, in any byte order and memory layout.
-
-    Returns:
-        A tensor of the same shape, dtype and values.
+    """Converts an array, in any byte order and memory layout, into a tensor.
 
     Example:
         >>> plain_tensor(np.array([1.0, 2.0], dtype=">f8"))

@@ -1,17 +1,21 @@
-"""Episodes, stored one after the other, each with its final observation."""
+"""Episodes, stored one after the other, each with its final observation, possibly on disk."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from torchrl_tit.datasets.errors import DatasetError
+from torchrl_tit.datasets.checks import DatasetError
 
 CHUNK_BYTES = 4 * 2**20  # bytes read, checked and converted at a time
 
@@ -136,6 +140,81 @@ class Episodes:
             yield observations[start : start + size][chosen[start : start + size]]
 
 
+def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
+    """Copies some of the episodes.
+
+    Args:
+        episodes: The data.
+        index: Indices of the episodes, in the order of the result; int64 [M].
+
+    Returns:
+        The selected episodes.
+
+    Raises:
+        ValueError: If there is no such episode.
+
+    Example:
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> states, ends = torch.arange(5.0).view(5, 1), [False, True, False, False, True]
+        >>> episodes = episodes_from_arrays(states, states, torch.ones(5), ends)
+        >>> select_episodes(episodes, torch.tensor([1])).rows["observation"].flatten()
+        tensor([2., 3., 4., 0.])
+    """
+    index = torch.as_tensor(index)
+    count = len(episodes.lengths)
+    if index.is_floating_point() or ((index < 0) | (index >= count)).any():
+        raise ValueError(f"index must be integers from 0 to {count - 1}, not {index.tolist()}")
+    lengths = episodes.lengths[index] + 1  # including the final observation
+    shifts = episodes.first_rows[index] - (lengths.cumsum(0) - lengths)
+    steps = torch.arange(int(lengths.sum()), device=lengths.device)
+    rows = steps + shifts.repeat_interleave(lengths)
+    return replace(
+        episodes,
+        rows=episodes.rows[rows],
+        lengths=episodes.lengths[index],
+        final_known=episodes.final_known[index],
+    )
+
+
+def join_episodes(parts: Sequence[Episodes]) -> Episodes:
+    """Concatenates data sets.
+
+    Args:
+        parts: Data sets with the same fields, at least one; the result has the source and the
+            attributes of the first.
+
+    Returns:
+        The episodes of all of them.
+
+    Raises:
+        ValueError: If there are none, or the shapes or dtypes of their fields differ.
+
+    Example:
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> states, ends = torch.zeros(3, 1), [False, False, True]
+        >>> episodes = episodes_from_arrays(states, states, torch.ones(3), ends)
+        >>> join_episodes([episodes, episodes]).lengths
+        tensor([3, 3])
+    """
+    if not parts:
+        raise ValueError("there are no data sets to join")
+    for part in parts:
+        for name, first in parts[0].rows.items():
+            other = part.rows[name]
+            if (other.shape[1:], other.dtype) != (first.shape[1:], first.dtype):
+                raise ValueError(
+                    f"{part.source}: field {name!r} has the shape {list(other.shape[1:])} and "
+                    f"{other.dtype}, but in {parts[0].source} {list(first.shape[1:])} and "
+                    f"{first.dtype}: data sets of one task and dtype can be joined"
+                )
+    return replace(
+        parts[0],
+        rows=torch.cat([part.rows for part in parts]),
+        lengths=torch.cat([part.lengths for part in parts]),
+        final_known=torch.cat([part.final_known for part in parts]),
+    )
+
+
 def check_final_observations(episodes: Episodes) -> None:
     """Checks that the episodes can be written with their final observations.
 
@@ -152,7 +231,7 @@ def check_final_observations(episodes: Episodes) -> None:
         >>> check_final_observations(episodes)
         Traceback (most recent call last):
         ...
-        torchrl_tit.datasets.errors.DatasetError: the data: episode 0 was truncated and its...
+        torchrl_tit.datasets.checks.DatasetError: the data: episode 0 was truncated and its...
     """
     unknown = ~episodes.final_known & ~episodes.terminated
     if unknown.any():
@@ -174,3 +253,59 @@ def rows_per_chunk(bytes_per_row: int) -> int:
         4096
     """
     return max(1, CHUNK_BYTES // max(1, bytes_per_row))
+
+
+def memory_mapped_rows(
+    num_rows: int,
+    fields: Mapping[str, tuple[tuple[int, ...], torch.dtype]],
+    directory: str | os.PathLike[str] | None = None,
+) -> TensorDict:
+    """Creates rows of zeros in memory-mapped files.
+
+    The files are unlinked once they are mapped (where the system allows that), so nothing remains
+    of them when the tensors are freed or the program ends in any way.
+
+    Args:
+        num_rows: Number R of rows.
+        fields: The shape of one row of each field, and its dtype.
+        directory: Folder for the files; by default the system's folder for temporary files, which
+            may be small.
+
+    Returns:
+        Tensors [R, *shape] by name.
+
+    Raises:
+        OSError: If the disk is full, or the folder cannot be written.
+
+    Example:
+        >>> memory_mapped_rows(5, {"reward": ((1,), torch.float32)})["reward"].shape
+        torch.Size([5, 1])
+    """
+    size = num_rows * sum(prod(shape) * dtype.itemsize for shape, dtype in fields.values())
+    try:
+        with tempfile.TemporaryDirectory(
+            prefix="torchrl-tit-", dir=directory, ignore_cleanup_errors=True
+        ) as folder:
+            tensors = {
+                name: _map(Path(folder, name), (num_rows, *shape), dtype)
+                for name, (shape, dtype) in fields.items()
+            }
+    except OSError as error:
+        raise OSError(
+            f"{num_rows} rows of {size} bytes in all cannot be written into "
+            f"{directory or tempfile.gettempdir()} ({error.strerror or error}): choose a folder "
+            "with room for them as directory"
+        ) from error
+    return TensorDict(tensors, [num_rows])
+
+
+def _map(file: Path, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    size = prod(shape)
+    if hasattr(os, "posix_fallocate"):
+        # Allocated now, because a disk that fills up later would kill the program without an error.
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT)
+        try:
+            os.posix_fallocate(descriptor, 0, max(1, size * dtype.itemsize))
+        finally:
+            os.close(descriptor)
+    return torch.from_file(str(file), shared=True, size=size, dtype=dtype).view(shape)

@@ -3,40 +3,37 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations, rows_per_chunk
-from torchrl_tit.datasets.full_disks import new_hdf5
-from torchrl_tit.datasets.optional import h5py
-from torchrl_tit.datasets.stored import (
+from torchrl_tit.datasets.hdf5_files import (
     array_names,
     attribute_fits,
-    check_stored,
     damage_named,
     find,
+    h5py,
+    new_hdf5,
     open_hdf5,
 )
-from torchrl_tit.datasets.transition_reader import FIELDS
-from torchrl_tit.datasets.transitions import episodes_from_transitions
+from torchrl_tit.datasets.transitions import FIELDS, episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
+
+_LIKE_TASK = ("observations", "actions", "next_observations")  # others are one number a row
 
 
 def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     """Reads a file with one row per transition, in chunks; it may be larger than memory.
 
     Only values stored in the file itself are read, and no more than it can hold: see
-    :func:`~torchrl_tit.datasets.stored.check_stored`.
+    :func:`~torchrl_tit.datasets.hdf5_files.find`.
 
     Args:
         path: The file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
             "terminals" [N], and optionally "timeouts" [N] and "next_observations" [N, *obs].
-            Hard and soft links to other places in the file are followed. Other fields, and
-            attributes that are neither text nor a few numbers, are not read.
+            Other fields, and attributes that are neither text nor a few numbers, are not read.
         **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
             which describes how missing fields are replaced.
 
@@ -66,10 +63,12 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     source = str(path)
     with open_hdf5(path) as file:
         with damage_named(source, "cannot be read"):
-            fields, attributes = _datasets(source, file), _attributes(file)
+            # The arrays of the layout, and the names of others, which are not opened.
+            fields: dict[str, Any] = dict.fromkeys(set(array_names(file)) - set(FIELDS))
+            attributes = _attributes(file)
         for name in FIELDS:
-            if fields.get(name) is not None:
-                check_stored(source, name, fields[name])
+            if isinstance(field := find(source, file, name), h5py.Dataset):
+                fields[name] = field
         return episodes_from_transitions(fields, source=source, attributes=attributes, **settings)
 
 
@@ -106,38 +105,20 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
         )
     check_final_observations(episodes)
     steps = episodes.step_rows
-    fields = {
-        "observations": (episodes.rows["observation"], steps),
-        "actions": (episodes.rows["action"], steps),
-        "rewards": (episodes.rows["reward"].squeeze(-1), steps),
-        "terminals": (episodes.rows["terminated"].squeeze(-1), steps),
-        "timeouts": (episodes.rows["truncated"].squeeze(-1), steps),
-        "next_observations": (episodes.rows["observation"], steps + 1),
-    }
+    kept = zip(FIELDS, ("observation", "action", "reward", "terminated", "truncated"), strict=False)
+    fields = {name: (episodes.rows[field], steps) for name, field in kept}
+    fields["next_observations"] = (episodes.rows["observation"], steps + 1)
     with whole_or_not_at_all(path) as hidden, new_hdf5(hidden, path) as (file, check):
         file.attrs.update(episodes.attributes)
         for name, (values, rows) in fields.items():
-            _write(file, name, values, rows, check)
-
-
-def _write(
-    file: h5py.File, name: str, values: Tensor, rows: Tensor, check: Callable[[], None]
-) -> None:
-    """Writes some rows of a field, in chunks."""
-    array = values.numpy()
-    shape = (len(rows), *array.shape[1:])
-    dataset = file.create_dataset(name, shape, array.dtype, chunks=True, compression="gzip")
-    size = rows_per_chunk(array[0].nbytes)
-    for start in range(0, len(rows), size):
-        dataset[start : start + size] = array[rows[start : start + size].numpy()]
-        check()
-
-
-def _datasets(source: str, file: h5py.File) -> dict[str, h5py.Dataset | None]:
-    """The arrays of the layout by their names, and the names of others, which are not opened."""
-    others = dict.fromkeys(set(array_names(file)) - set(FIELDS))
-    named = {name: find(source, file, name) for name in FIELDS}
-    return others | {name: array for name, array in named.items() if array is not None}
+            array = values.numpy()
+            array = array if name in _LIKE_TASK else array.squeeze(-1)
+            shape = (len(rows), *array.shape[1:])
+            dataset = file.create_dataset(name, shape, array.dtype, chunks=True, compression="gzip")
+            size = rows_per_chunk(array[0].nbytes)
+            for start in range(0, len(rows), size):
+                dataset[start : start + size] = array[rows[start : start + size].numpy()]
+                check()
 
 
 def _attributes(file: h5py.File) -> dict[str, Any]:

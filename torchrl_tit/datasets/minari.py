@@ -1,80 +1,106 @@
-"""Reads Minari data sets."""
+"""Minari data sets.
+
+Files of others are not handed to Minari, which makes the environment that they name, running any
+function, and reads whole episodes into memory. They are HDF5 files with a group for each episode,
+and are read like those of D4RL.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import os
-from itertools import pairwise
-from math import prod
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import gymnasium
+import msgspec
 import numpy as np
 import torch
+from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
-from tensordict import TensorDict
 
-from torchrl_tit.datasets.checks import (
-    FLAGS,
-    check_actions,
-    check_finite,
-    kept_dtype,
-    plain_tensor,
+from torchrl_tit.datasets.checks import DatasetError, task_spaces
+from torchrl_tit.datasets.episodes import Episodes, check_final_observations
+from torchrl_tit.datasets.hdf5_files import (
+    JoinedField,
+    check_size,
+    find,
+    h5py,
+    new_hdf5,
+    open_hdf5,
 )
-from torchrl_tit.datasets.episodes import Episodes
-from torchrl_tit.datasets.errors import DatasetError
-from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
-from torchrl_tit.datasets.minari_folder import check_folder, check_rows, episodes_checked
-from torchrl_tit.datasets.optional import minari
-from torchrl_tit.datasets.tasks import TaskSpaces, check_shape, check_task_name
+from torchrl_tit.datasets.transitions import episodes_from_transitions
+from torchrl_tit.envs import is_atari
+from torchrl_tit.extras import Missing
+from torchrl_tit.files import whole_or_not_at_all
 
-# What Minari raises if a data set is damaged or cannot be downloaded.
-_FAILURES = (
-    AssertionError,
-    AttributeError,
-    ImportError,
-    IndexError,
-    KeyError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-)
-ATTRIBUTES = "attributes"  # this library's entry in Minari's metadata
+try:
+    import minari
+except ModuleNotFoundError:
+    minari = Missing("minari")
+
+# Minari's name of each of D4RL's fields, and of our rows.
+_NAMES = {
+    "observations": ("observations", "observation"),
+    "actions": ("actions", "action"),
+    "rewards": ("rewards", "reward"),
+    "terminals": ("terminations", "terminated"),
+    "timeouts": ("truncations", "truncated"),
+}
 # Minari's own metadata fields, by the names of our attributes.
-METADATA_FIELDS = {
+_METADATA_FIELDS = {
     "algorithm": "algorithm_name",
     "description": "description",
     "author": "author",
     "author_email": "author_email",
     "code_permalink": "code_permalink",
 }
-
-# Minari's name of each field, and the number of rows of an episode beyond its steps.
-FIELDS = {
-    "observation": ("observations", 1),
-    "action": ("actions", 0),
-    "reward": ("rewards", 0),
-    "terminated": ("terminations", 0),
-    "truncated": ("truncations", 0),
-}
+_Count = Annotated[int, msgspec.Meta(ge=0)]
 
 
-def read_minari(
-    name: str | os.PathLike[str],
-    *,
-    task: TaskSpaces | None = None,
-    dtype: torch.dtype | None = torch.float32,
-    directory: str | os.PathLike[str] | None = None,
-) -> Episodes:
-    """Reads a Minari data set, one episode at a time; it may be larger than memory.
+class _Metadata(msgspec.Struct):
+    """The fields of metadata.json that are read; there may be others."""
+
+    total_episodes: _Count
+    observation_space: str
+    data_format: str = "hdf5"
+    env_spec: str | None = None
+    jpeg_encoding: bool = True
+    algorithm_name: str | None = None
+    description: str | None = None
+    code_permalink: str | None = None
+    author: list[str] | str | None = None
+    author_email: list[str] | str | None = None
+    attributes: dict[str, str | int | float | bool | list[Any] | None] = {}
+
+
+class _Space(msgspec.Struct):
+    """A space as Minari writes it."""
+
+    type: str
+    shape: list[_Count] = []
+
+
+class _EnvSpec(msgspec.Struct):
+    """A task as Gymnasium writes it."""
+
+    id: str
+    kwargs: dict[str, Any] | None = None
+    additional_wrappers: list[Any] | None = None
+
+
+def read_minari(name: str | os.PathLike[str], **settings: Any) -> Episodes:
+    """Reads a Minari data set in HDF5, in chunks; it may be larger than memory.
 
     Args:
         name: A folder with a data set, or a data set's name such as "mujoco/hopper/medium-v0",
             which Minari downloads if it is not in Minari's own folder yet.
-        task: The task whose shapes and action bounds the data must have; not checked if None.
-        dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
-        directory: Folder for the memory-mapped rows; see
-            :func:`~torchrl_tit.datasets.memory_mapping.memory_mapped_rows`.
+        **settings: ``task``, ``dtype`` and ``directory`` as for
+            :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
 
     Returns:
         The episodes. An episode whose last step has no flag is unfinished. The attributes contain
@@ -84,7 +110,8 @@ def read_minari(
         FileNotFoundError: If Minari has no such data set, or cannot download it.
         DatasetError: If it is damaged, declares more than its files can hold, takes data from other
             files or is of another task; or if a field is missing, has the wrong length, shape or
-            dtype, or contains NaN, infinity, or actions out of bounds.
+            dtype, or contains NaN, infinity, or actions out of bounds. Rows are counted over all
+            episodes.
 
     Example:
         >>> import tempfile
@@ -96,42 +123,60 @@ def read_minari(
         >>> read_minari(folder).lengths
         tensor([2, 2])
     """
-    source = str(name)
-    folder = _folder(name)
-    dataset = _open(source, folder)
-    attributes = _attributes(dataset)
-    if task is not None:
-        check_task_name(source, attributes.get("env_id"), task)
-    lengths, left_out = _lengths(dataset, source)
-    spec = dataset.env_spec
-    if spec is not None and (spec.kwargs or spec.additional_wrappers):
-        left_out.add("env_spec")  # except for the name
-    bounds = [0, *(lengths + 1).cumsum(0).tolist()]
-    rows = TensorDict({}, [0])
-    places = episodes_checked(source, folder, len(lengths))
-    for number, (place, (start, stop)) in enumerate(zip(places, pairwise(bounds), strict=True)):
-        episode = _episode(dataset, number, place)
-        left_out |= {"infos"} if episode.infos else set()
-        fields = _checked(place, episode, stop - start - 1, task)
-        kept = {
-            field: (array.shape[1:], kept_dtype(place, FIELDS[field][0], array.dtype, dtype))
-            for field, array in fields.items()
-        }
-        if number == 0:
-            check_rows(source, folder, bounds[-1], _row_bytes(kept))
-            rows = memory_mapped_rows(bounds[-1], kept, directory)
-        for field, array in fields.items():
-            target = rows[field][start : start + len(array)]
-            _check_alike(place, FIELDS[field][0], array, target)
-            target[:] = plain_tensor(array)
-    return Episodes(
-        rows=rows,
-        lengths=lengths,
-        final_known=torch.ones(len(lengths), dtype=torch.bool),
-        source=source,
-        attributes=attributes,
-        left_out=tuple(sorted(left_out)),
-    )
+    source, folder = str(name), _folder(name)
+    path = folder / "metadata.json"
+    try:
+        metadata = msgspec.convert(json.loads(path.read_bytes()), _Metadata)
+        space = msgspec.convert(json.loads(metadata.observation_space), _Space)
+        task = metadata.env_spec and msgspec.convert(json.loads(metadata.env_spec), _EnvSpec)
+    except (OSError, RecursionError, ValueError) as error:
+        raise DatasetError(
+            source, f"is not a whole Minari data set ({error}): see {path}."
+        ) from error
+    if space.type not in ("Box", "Discrete"):
+        problem = f"its observations are a {space.type} space, but must be one array."
+        raise DatasetError(source, problem)
+    if metadata.data_format != "hdf5":
+        raise DatasetError(
+            source, f"is in the format {metadata.data_format!r}, but must be in HDF5."
+        )
+    known = {ours: getattr(metadata, theirs) for ours, theirs in _METADATA_FIELDS.items()}
+    attributes: dict[str, Any] = {
+        name: sorted(value) if isinstance(value, list) else value
+        for name, value in known.items()
+        if value is not None
+    }
+    left_out = set()
+    if task:
+        attributes["env_id"] = task.id
+        if task.kwargs or task.additional_wrappers:
+            left_out.add("env_spec")  # except for the name
+    with open_hdf5(folder / "main_data.hdf5") as file:
+        if metadata.total_episodes > len(file):
+            raise DatasetError(
+                source,
+                f"its metadata claim {metadata.total_episodes} episodes, but there are "
+                f"{len(file)}: see {path}.",
+            )
+        if metadata.total_episodes == 0:
+            raise DatasetError(source, "has no episodes.")
+        groups = [_group(source, file, number) for number in range(metadata.total_episodes)]
+        encoded = metadata.jpeg_encoding and len(space.shape) in (2, 3)
+        fields, lengths = _joined(source, groups, tuple(space.shape) if encoded else None)
+        for group in groups:
+            left_out |= {"infos"} & set(group)
+            left_out |= {"seed", "options"} & {key.split("/")[0] for key in group.attrs}
+        declared = sum(
+            field.dtype.itemsize * int(np.prod(field.shape)) for field in fields.values()
+        )
+        check_size(source, declared, file.id.get_filesize())
+        return episodes_from_transitions(
+            {**fields, **dict.fromkeys(left_out)},
+            source=source,
+            attributes={**attributes, **metadata.attributes},
+            lengths=lengths,
+            **settings,
+        )
 
 
 def is_minari_name(name: str) -> bool:
@@ -153,7 +198,7 @@ def is_minari_name(name: str) -> bool:
 
 def _folder(name: str | os.PathLike[str]) -> Path:
     """The folder of a data set's files, which are downloaded if necessary."""
-    folder = Path(name).absolute()  # Minari cannot handle relative paths
+    folder = Path(name).absolute()
     if folder.is_dir():
         return folder / "data" if (folder / "data").is_dir() else folder
     data = minari.storage.datasets_root_dir.get_dataset_path(str(name)) / "data"
@@ -168,92 +213,207 @@ def _folder(name: str | os.PathLike[str]) -> Path:
     return data
 
 
-def _open(source: str, folder: Path) -> minari.MinariDataset:
-    check_folder(source, folder)
-    try:
-        return minari.MinariDataset(folder)
-    except _FAILURES as error:
-        raise DatasetError(
-            source, f"is not a whole Minari data set ({error}): see {folder}."
-        ) from error
+def _group(source: str, file: h5py.File, number: int) -> h5py.Group:
+    """The group of an episode."""
+    group = find(source, file, f"episode_{number}")
+    if not isinstance(group, h5py.Group):
+        raise DatasetError(source, "is missing.", f"episode_{number}")
+    return group
 
 
-def _attributes(dataset: minari.MinariDataset) -> dict[str, Any]:
-    """The metadata of the data set, as strings, numbers and lists of them."""
-    metadata = dataset.storage.metadata
-    known = {name: metadata[place] for name, place in METADATA_FIELDS.items() if place in metadata}
-    known = {name: sorted(v) if isinstance(v, set) else v for name, v in known.items()}
-    if dataset.env_spec is not None:
-        known["env_id"] = dataset.env_spec.id
-    return {**known, **metadata.get(ATTRIBUTES, {})}
+def _joined(
+    source: str, groups: list[h5py.Group], image: tuple[int, ...] | None
+) -> tuple[dict[str, JoinedField], NDArray]:
+    """The fields of all episodes in the layout of D4RL, and the length of each episode.
+
+    Args:
+        source: The data set, for error messages.
+        groups: The group of each episode.
+        image: Shape of an observation that may be stored as a JPEG image; None otherwise.
+    """
+    pieces: dict[str, list] = {name: [] for name in (*_NAMES, "next_observations")}
+    rows: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
+    for number, group in enumerate(groups):
+        place = f"{source}: episode {number}"
+        found = {name: find(place, group, theirs) for name, (theirs, _) in _NAMES.items()}
+        for name, field in found.items():
+            if not isinstance(field, h5py.Dataset) or not field.shape:
+                raise DatasetError(place, "is not an array with one row per step.", _NAMES[name][0])
+            steps = len(found["rewards"])
+            more = name == "observations"  # the final one
+            if len(field) != steps + more or steps == 0:
+                problem = f"has {len(field)} rows, but needs {steps + more}, and one step at least."
+                raise DatasetError(place, problem, _NAMES[name][0])
+            if more and image is not None and field.ndim <= 2:
+                row, dtype, read = image, np.dtype(np.uint8), partial(_images, field, image)
+            else:  # a single number becomes a column
+                row, dtype = field.shape[1:] or ((1,) if more else ()), field.dtype
+                read = partial(_rows, field)
+            expected = rows.setdefault(name, (row, dtype))
+            if (row, dtype) != expected:
+                problem = (
+                    f"has the dtype {dtype} and rows of the shape {list(row)}, but in "
+                    f"episode 0 {expected[1]} and {list(expected[0])}."
+                )
+                raise DatasetError(place, problem, _NAMES[name][0])
+            pieces[name].append((steps, read))
+            if more:
+                pieces["next_observations"].append((steps, partial(_later, read)))
+    rows["next_observations"] = rows["observations"]
+    fields = {name: JoinedField(parts, *rows[name]) for name, parts in pieces.items()}
+    return fields, np.array([steps for steps, _ in pieces["rewards"]])
 
 
-def _lengths(dataset: minari.MinariDataset, source: str) -> tuple[torch.Tensor, set[str]]:
-    """The length of each episode, and the names of episode metadata that are not read."""
-    noted: set[str] = set()
-    steps = []
-    try:
-        for episode in dataset.storage.get_episode_metadata(dataset.episode_indices):
-            steps.append(int(episode["total_steps"]))
-            noted |= {name for name in ("seed", "options") if episode.get(name) is not None}
-        lengths = torch.tensor(steps)  # raises if a number is too large
-    except _FAILURES as error:
-        raise DatasetError(source, f"its episodes cannot be listed ({error}).") from error
-    if not len(lengths):
-        raise DatasetError(source, "has no episodes.")
-    if lengths.min() < 1:
-        raise DatasetError(source, f"episode {int(lengths.argmin())} has no steps.")
-    return lengths, noted
+def _rows(field: h5py.Dataset, start: int, stop: int) -> NDArray:
+    return field[start:stop]
 
 
-def _row_bytes(fields: dict[str, tuple[tuple[int, ...], torch.dtype]]) -> int:
-    """Bytes of one row of all fields."""
-    return sum(prod(shape) * dtype.itemsize for shape, dtype in fields.values())
+def _later(read: Any, start: int, stop: int) -> NDArray:
+    return read(start + 1, stop + 1)
 
 
-def _episode(dataset: minari.MinariDataset, number: int, place: str) -> minari.EpisodeData:
-    try:
-        return dataset[number]
-    except _FAILURES as error:
-        raise DatasetError(place, f"cannot be read ({error}).") from error
+def _images(field: h5py.Dataset, shape: tuple[int, ...], start: int, stop: int) -> NDArray:
+    """Decodes JPEG images, each of which is a row of bytes."""
+    from PIL import Image  # which Minari installs
+
+    images = np.empty((stop - start, *shape), np.uint8)
+    for row in range(start, stop):
+        try:
+            image = Image.open(io.BytesIO(bytes(field[row])))
+        except Image.DecompressionBombError as error:
+            raise ValueError(str(error)) from error
+        if image.size[::-1] != shape[:2]:
+            raise ValueError(f"an image is of {image.size[::-1]}, but the space of {shape}")
+        images[row - start] = image
+    return images
 
 
-def _checked(
-    place: str, episode: minari.EpisodeData, length: int, task: TaskSpaces | None
-) -> dict[str, NDArray]:
-    """Checks the fields of an episode, and returns them under the names of our rows."""
-    fields = {}
-    for field, (name, more) in FIELDS.items():
-        array = np.asarray(getattr(episode, name))
-        if array.shape[:1] != (length + more,):
-            raise DatasetError(
-                place, f"has the shape {list(array.shape)}, but needs {length + more} rows.", name
-            )
-        # A field of scalars becomes a column, except for actions, which are then discrete.
-        fields[field] = array[:, None] if array.ndim == 1 and field != "action" else array
-    if task is not None:
-        actions = fields["action"]
-        if task.action.shape == () and actions.shape[1:] == (1,):
-            fields["action"] = actions[:, 0]  # discrete, stored as a column
-        check_shape(place, "observations", fields["observation"].shape[1:], task.observation, task)
-        check_shape(place, "actions", fields["action"].shape[1:], task.action, task)
-        check_actions(place, fields["action"], task.action)
-    inside = ((fields["terminated"] != 0) | (fields["truncated"] != 0))[:-1].any(1)
-    if inside.any():
-        raise DatasetError(
-            place,
-            "ends the episode, but more steps follow.",
-            "terminations",
-            int(inside.argmax()),
+def write_minari(
+    episodes: Episodes, name: str | os.PathLike[str], env_name: str | None = None
+) -> None:
+    """Writes episodes as a Minari data set, one at a time.
+
+    Fields keep their dtypes. Minari writes its metadata; this function writes the episodes, in
+    Minari's layout, because it survives a full disk. The attributes "algorithm", "description",
+    "author", "author_email" and "code_permalink" also go into Minari's own metadata.
+
+    Args:
+        episodes: The data.
+        name: The folder to create, an absolute path or one that begins with a dot, whose last part
+            ends in a version such as "-v0"; or the name of a data set in Minari's own folder.
+        env_name: The Gymnasium task of the data, from which Minari can recreate the environment.
+            For Atari games it only determines the action space, because the environment that Minari
+            recreates has different images from :func:`~torchrl_tit.envs.make_env`.
+
+    Raises:
+        FileExistsError: If the data set exists already.
+        ValueError: If Minari does not accept the name, or Gymnasium does not know the task.
+        DatasetError: If the final observation of a truncated episode is unknown.
+        OSError: If it cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> folder = Path(tempfile.mkdtemp()) / "walk-v0"
+        >>> episodes = episodes_from_arrays(np.ones((2, 2)), np.ones((2, 1)), np.ones(2), [0, 1])
+        >>> write_minari(episodes, folder)
+        >>> minari.MinariDataset(folder / "data")[0].observations.shape
+        (3, 2)
+    """
+    check_final_observations(episodes)
+    folder, dataset_id = _target(name)
+    action = episodes.rows["action"]
+    if env_name is not None:
+        action_space = task_spaces(env_name).action
+    else:
+        action_space = Discrete(int(action.max()) + 1) if action.ndim == 1 else _box(action)
+    remade = env_name is not None and not is_atari(env_name)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with whole_or_not_at_all(folder) as hidden, _errors_named(folder):
+        hidden.mkdir()
+        storage = minari.dataset.minari_storage.MinariStorage.new(
+            hidden / "data",
+            observation_space=_box(episodes.rows["observation"]),
+            action_space=action_space,
+            env_spec=gymnasium.spec(env_name) if remade else None,
+            jpeg_encoding=False,  # images are stored losslessly
         )
-    return fields
+        with new_hdf5(hidden / "data" / "main_data.hdf5", folder) as (file, check):
+            for number, steps in enumerate(_steps(episodes)):
+                group = file.create_group(f"episode_{number}")
+                group.attrs.update({"id": number, "total_steps": len(steps["rewards"])})
+                for field, values in steps.items():
+                    shape = (None, *values.shape[1:])  # resizable, like Minari's own
+                    group.create_dataset(field, data=values, chunks=True, maxshape=shape)
+                check()
+        storage.update_metadata(
+            {
+                "dataset_id": dataset_id,
+                "minari_version": minari.__version__,
+                "total_episodes": len(episodes.lengths),
+                "total_steps": episodes.num_transitions,
+                "dataset_size": storage.get_size(),
+                "attributes": dict(episodes.attributes),
+                **_listed(episodes),
+            }
+        )
 
 
-def _check_alike(place: str, name: str, array: NDArray, target: torch.Tensor) -> None:
-    """Checks that a field has the shape and dtype that it has in the first episode."""
-    if array.shape != tuple(target.shape):
-        problem = f"one row has the shape {list(array.shape[1:])}, not {list(target.shape[1:])}."
-        raise DatasetError(place, problem, name)
-    if array.dtype.kind == "f" and not target.is_floating_point() and name not in FLAGS:
-        raise DatasetError(place, f"has the dtype {array.dtype}, but integers in episode 0.", name)
-    check_finite(place, name, array, kept_as=target.dtype)
+def _target(name: str | os.PathLike[str]) -> tuple[Path, str]:
+    """Returns the folder to write to, and the data set's name."""
+    path = Path(name)
+    if path.is_absolute() or str(name).startswith("."):
+        folder, dataset_id = path.absolute(), path.name  # Minari cannot handle relative paths
+    else:
+        folder = minari.storage.datasets_root_dir.get_dataset_path(str(name))
+        dataset_id = str(name)
+    if not is_minari_name(dataset_id):
+        raise ValueError(
+            f"{dataset_id!r} is not a valid name of a Minari data set: it must end in a version, "
+            f"as 'medium-v0' does."
+        )
+    return folder, dataset_id
+
+
+@contextlib.contextmanager
+def _errors_named(path: Path) -> Iterator[None]:
+    """Adds the name of the folder being written to errors that lack it."""
+    try:
+        yield
+    except OSError as error:
+        if str(path) in str(error):
+            raise
+        raise OSError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _listed(episodes: Episodes) -> dict[str, Any]:
+    """The attributes that have a field in Minari's metadata: texts, and sets of people."""
+    listed: dict[str, Any] = {}
+    for ours, theirs in _METADATA_FIELDS.items():
+        value = episodes.attributes.get(ours)
+        people = ours.startswith("author")
+        if isinstance(value, str):
+            listed[theirs] = {value} if people else value
+        elif isinstance(value, list) and people:
+            listed[theirs] = set(value)
+    return listed
+
+
+def _box(values: torch.Tensor) -> Box:
+    """A space of arrays whose bounds are unknown."""
+    array = values[:1].numpy()
+    floating = np.issubdtype(array.dtype, np.floating)
+    low = -np.inf if floating else np.iinfo(array.dtype).min
+    high = np.inf if floating else np.iinfo(array.dtype).max
+    return Box(low, high, array.shape[1:], array.dtype.type)
+
+
+def _steps(episodes: Episodes) -> Iterator[dict[str, NDArray]]:
+    """The fields of each episode by Minari's names."""
+    for first, last in zip(episodes.first_rows.tolist(), episodes.last_rows.tolist(), strict=True):
+        steps = {}
+        for name, (theirs, ours) in _NAMES.items():
+            stop = last + 2 if name == "observations" else last + 1
+            values = episodes.rows[ours][first:stop].numpy()
+            steps[theirs] = values if name in ("observations", "actions") else values.squeeze(-1)
+        yield steps

@@ -14,8 +14,8 @@ from torch import Tensor
 from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 
+from torchrl_tit.datasets.checks import DatasetError
 from torchrl_tit.datasets.episodes import Episodes
-from torchrl_tit.datasets.errors import DatasetError
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Frames, Positive, Real
 from torchrl_tit.windows import Padding, find_windows

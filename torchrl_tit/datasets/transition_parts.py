@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_tit.datasets.checks import DatasetError
 from torchrl_tit.datasets.episodes import Episodes
-from torchrl_tit.datasets.errors import DatasetError
-from torchrl_tit.datasets.full_disks import new_hdf5
-from torchrl_tit.datasets.joined_field import JoinedField
-from torchrl_tit.datasets.optional import h5py
-from torchrl_tit.datasets.stored import check_group, damage_named, open_hdf5
-from torchrl_tit.datasets.transition_reader import FIELDS
-from torchrl_tit.datasets.transitions import episodes_from_transitions
+from torchrl_tit.datasets.hdf5_files import JoinedField, find, h5py, new_hdf5, open_hdf5
+from torchrl_tit.datasets.transitions import FIELDS, episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
 
 
@@ -80,21 +77,6 @@ class TransitionParts:
                 file.create_dataset(name, data=array, chunks=True, compression="lzf")
                 check()
 
-    def read(self, number: int) -> dict[str, NDArray]:
-        """Reads a part.
-
-        Args:
-            number: Its number.
-
-        Returns:
-            The fields as they were written.
-
-        Raises:
-            DatasetError: If it is damaged.
-        """
-        with self._open(number) as file, damage_named(str(self._path(number)), "cannot be read"):
-            return {name: file[name][:] for name in FIELDS}
-
     def drop_after(self, number: int) -> None:
         """Removes the parts after a number, and unfinished files of killed processes.
 
@@ -116,11 +98,7 @@ class TransitionParts:
         Returns:
             The number of transitions.
         """
-        total = 0
-        for number in self.numbers(last):
-            with self._open(number) as file:
-                total += file["rewards"].size
-        return total
+        return sum(int(np.prod(self._shapes(number)["rewards"])) for number in self.numbers(last))
 
     def episodes(self, last: int | None = None, **settings: Any) -> Episodes:
         """Joins the parts, one stream after the other, without reading them all at once.
@@ -141,46 +119,58 @@ class TransitionParts:
         numbers = self.numbers(last)
         if not numbers:
             raise DatasetError(str(self.folder), "contains no transitions.")
-        fields: dict[str, Any] = {name: self._joined(numbers, name) for name in FIELDS}
-        streams = self._shape(numbers[0], "rewards")[0]
-        ends = fields["terminals"][:].reshape(streams, -1)
-        timeouts = fields["timeouts"][:].reshape(streams, -1)
+        shapes = [self._shapes(number) for number in numbers]
+        first = shapes[0]
+        for number, shape in zip(numbers, shapes, strict=True):
+            for name in FIELDS:
+                if (shape[name][0], *shape[name][2:]) != (first[name][0], *first[name][2:]):
+                    raise DatasetError(
+                        str(self._path(number)),
+                        f"has the shape {list(shape[name])}, which does not fit that in "
+                        f"{self._path(numbers[0]).name}, {list(first[name])}.",
+                        name,
+                    )
+        streams = first["rewards"][0]
+        steps = [shape["rewards"][1] for shape in shapes]
+        fields: dict[str, Any] = {}
+        with self._open(numbers[0]) as file:
+            for name in FIELDS:
+                pieces = [
+                    (count, partial(self._read, number, name, stream))
+                    for stream in range(streams)
+                    for number, count in zip(numbers, steps, strict=True)
+                ]
+                fields[name] = JoinedField(pieces, first[name][2:], file[name].dtype)
+        ends, timeouts = (
+            fields[name][:].reshape(streams, -1) for name in ("terminals", "timeouts")
+        )
         timeouts[:, -1] |= ~ends[:, -1]
         fields["timeouts"] = timeouts.reshape(-1)
         return episodes_from_transitions(
             fields, source=str(self.folder), gaps="cut", **{"dtype": None, **settings}
         )
 
-    def _joined(self, numbers: list[int], name: str) -> JoinedField:
-        """All rows of a field, stream after stream; [S * T, ...]."""
-        first = self._shape(numbers[0], name)
-
-        def check(number: int, shape: tuple[int, ...]) -> None:
-            if (shape[0], *shape[2:]) != (first[0], *first[2:]):
-                raise DatasetError(
-                    str(self._path(number)),
-                    f"has the shape {list(shape)}, which does not fit that in "
-                    f"{self._path(numbers[0]).name}, {list(first)}.",
-                    name,
-                )
-
-        return JoinedField(name, numbers, self._open, check)
-
-    def _shape(self, number: int, name: str) -> tuple[int, ...]:
-        """Shape of a field of a part: streams, steps, and the shape of a row."""
+    def _read(self, number: int, name: str, stream: int, start: int, stop: int) -> NDArray:
+        """Reads some steps of a stream."""
         with self._open(number) as file:
-            return file[name].shape
+            return file[name][stream, start:stop]
+
+    def _shapes(self, number: int) -> dict[str, tuple[int, ...]]:
+        """The shape of each field of a part, [S, T, ...]."""
+        with self._open(number) as file:
+            shapes = {name: getattr(file.get(name), "shape", ()) for name in FIELDS}
+        for name, shape in shapes.items():
+            if len(shape) < 2 or shape[:2] != shapes["observations"][:2]:
+                problem = f"has the shape {list(shape)}, which must begin as all others do."
+                raise DatasetError(str(self._path(number)), problem, name)
+        return shapes
 
     def _open(self, number: int) -> h5py.File:
         path = self._path(number)
         file = open_hdf5(path)
         if number not in self._checked:
-            check_group(str(path), file)
             for name in FIELDS:
-                shape = getattr(file.get(name), "shape", ())
-                if len(shape) < 2 or shape[:2] != file["observations"].shape[:2]:
-                    problem = f"has the shape {list(shape)}, which must begin as all others do."
-                    raise DatasetError(str(path), problem, name)
+                find(str(path), file, name)
             self._checked.add(number)
         return file
 

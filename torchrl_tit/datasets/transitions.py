@@ -1,9 +1,10 @@
-"""Builds episodes from arrays of transitions, the layout of D4RL."""
+"""Builds episodes from transitions in the layout of D4RL."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -12,15 +13,26 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from torchrl_tit.datasets.episodes import Episodes
-from torchrl_tit.datasets.errors import DatasetError
-from torchrl_tit.datasets.memory_mapping import memory_mapped_rows
-from torchrl_tit.datasets.tasks import TaskSpaces, check_task_name
-from torchrl_tit.datasets.transition_reader import FIELDS, TransitionReader
+from torchrl_tit.datasets.checks import (
+    FLAGS,
+    DatasetError,
+    TaskSpaces,
+    check_actions,
+    check_finite,
+    check_shape,
+    check_task_name,
+    kept_dtype,
+    plain_tensor,
+)
+from torchrl_tit.datasets.episodes import Episodes, memory_mapped_rows, rows_per_chunk
+from torchrl_tit.datasets.hdf5_files import damage_named
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.numbers import Steps
 
 Gaps = Literal["error", "cut"]
+FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
+_REQUIRED = FIELDS[:4]
+_NUMBERS = (*FLAGS, "rewards")  # fields with one number a row
 
 
 def episodes_from_arrays(
@@ -57,19 +69,14 @@ def episodes_from_arrays(
         tensor([3, 3])
     """
     given = (observations, actions, rewards, terminals, timeouts, next_observations)
-    fields = {
-        name: _as_array(name, array)
-        for name, array in zip(FIELDS, given, strict=True)
-        if array is not None
-    }
+    fields = {}
+    for name, array in zip(FIELDS, given, strict=True):
+        if array is not None:
+            try:
+                fields[name] = np.asarray(array)
+            except ValueError as error:  # rows of several lengths
+                raise DatasetError("the data", f"is not one array ({error}).", name) from error
     return episodes_from_transitions(fields, **settings)
-
-
-def _as_array(name: str, array: ArrayLike) -> NDArray:
-    try:
-        return np.asarray(array)
-    except ValueError as error:  # rows of several lengths
-        raise DatasetError("the data", f"is not one array ({error}).", name) from error
 
 
 @checked_arguments
@@ -83,6 +90,7 @@ def episodes_from_transitions(
     dtype: torch.dtype | None = torch.float32,
     directory: str | os.PathLike[str] | None = None,
     attributes: Mapping[str, Any] | None = None,
+    lengths: NDArray | None = None,
 ) -> Episodes:
     """Builds episodes from transitions in D4RL's layout, read in chunks.
 
@@ -102,9 +110,11 @@ def episodes_from_transitions(
             an episode: ``"error"`` raises, ``"cut"`` truncates the episode there.
         dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
         directory: Folder for the memory-mapped rows; see
-            :func:`~torchrl_tit.datasets.memory_mapping.memory_mapped_rows`.
+            :func:`~torchrl_tit.datasets.episodes.memory_mapped_rows`.
         attributes: Metadata of the source. If they contain "env_id", the name of the task, it must
             be that of ``task``, except for the version.
+        lengths: Number of steps of each episode, if the source says so; int64 [E]. Episodes then
+            end there only, also without a flag.
 
     Returns:
         The episodes. The last one may be unfinished.
@@ -121,36 +131,48 @@ def episodes_from_transitions(
         >>> episodes_from_transitions(fields, source="a.hdf5")
         Traceback (most recent call last):
         ...
-        torchrl_tit.datasets.errors.DatasetError: a.hdf5: field 'actions': is missing; there...
+        torchrl_tit.datasets.checks.DatasetError: a.hdf5: field 'actions': is missing; there...
     """
     if not isinstance(task, TaskSpaces | None):
         raise ValueError(f"task must be what task_spaces returns, not {task!r}")
     if task is not None:
         check_task_name(source, (attributes or {}).get("env_id"), task)
-    reader = TransitionReader(fields, source, task, dtype)
+    reader = _Reader(fields, source, task, dtype)
     terminated = reader.flags("terminals")
-    truncated, ends = _ends(reader, terminated, max_episode_steps, gaps)
-    last_steps = np.flatnonzero(ends)
-    if last_steps.size == 0:
-        hint = "" if "timeouts" in fields else "; give max_episode_steps if there is a time limit"
-        raise DatasetError(source, f"no episode ends in its {reader.num_rows} rows{hint}.")
-    if last_steps[-1] != reader.num_rows - 1:
-        last_steps = np.append(last_steps, reader.num_rows - 1)
+    if lengths is None:
+        truncated = _truncations(reader, terminated, max_episode_steps, gaps)
+        ends = terminated | truncated
+        if not ends.any():
+            hint = "; give max_episode_steps if there is a time limit"
+            hint = "" if "timeouts" in fields else hint
+            raise DatasetError(source, f"no episode ends in its {reader.num_rows} rows{hint}.")
+        ends[-1] = True
+    else:
+        truncated = reader.flags("timeouts")
+        ends = np.zeros_like(terminated)
+        ends[lengths.cumsum() - 1] = True
+        if (inside := (terminated | truncated) & ~ends).any():
+            problem = "ends the episode, but more steps follow."
+            raise DatasetError(source, problem, "terminals", int(inside.argmax()))
 
+    last_steps = np.flatnonzero(ends)
     rows = memory_mapped_rows(reader.num_rows + len(last_steps), reader.row_fields(), directory)
     # The final observation of an episode is an additional row, so all later rows move by one.
     row_of = np.arange(reader.num_rows)
     row_of[1:] += ends[:-1].cumsum()
-    for name in ("observations", "actions", "rewards"):
+    row_of = torch.from_numpy(row_of)
+    for name, kept in {
+        "observations": "observation",
+        "actions": "action",
+        "rewards": "reward",
+    }.items():
         for start, values in reader.chunks(name):
-            target = torch.from_numpy(row_of[start : start + len(values)])
-            rows[_ROW_NAMES[name]][target] = values
-    flags = {"terminated": terminated, "truncated": truncated}
-    for name, flag in flags.items():
-        rows[name][torch.from_numpy(row_of)] = torch.from_numpy(flag).unsqueeze(-1)
+            rows[kept][row_of[start : start + len(values)]] = values
+    for name, flag in {"terminated": terminated, "truncated": truncated}.items():
+        rows[name][row_of] = torch.from_numpy(flag).unsqueeze(-1)
     has_next = "next_observations" in fields
     if has_next:
-        _place_next_observations(reader, rows["observation"], row_of, ends)
+        _place_next_observations(reader, rows["observation"], row_of, torch.from_numpy(ends))
     return Episodes(
         rows=rows,
         lengths=torch.from_numpy(np.diff(last_steps, prepend=-1)),
@@ -161,27 +183,135 @@ def episodes_from_transitions(
     )
 
 
-_ROW_NAMES = {"observations": "observation", "actions": "action", "rewards": "reward"}
+class _Reader:
+    """The fields of one source; names, lengths and shapes are checked on construction."""
+
+    def __init__(
+        self,
+        fields: Mapping[str, Any],
+        source: str,
+        task: TaskSpaces | None,
+        dtype: torch.dtype | None,
+    ) -> None:
+        self.fields, self.source, self.task = fields, source, task
+        for name in _REQUIRED:
+            if name not in fields:
+                found = ", ".join(sorted(map(str, fields))) or "nothing"
+                raise DatasetError(source, f"is missing; there is {found}.", name)
+        given = [name for name in FIELDS if name in fields]
+        self.shapes = {name: self._shape(name) for name in given}
+        self.num_rows = len(fields["observations"])
+        self.dtypes = {
+            name: kept_dtype(source, name, np.dtype(fields[name].dtype), dtype) for name in given
+        }
+        for name in given:
+            self._check_shape(name)
+        self.dtypes["next_observations"] = self.dtypes["observations"]
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """Shape of one row."""
+        shape = getattr(self.fields[name], "shape", None)
+        if not shape:
+            raise DatasetError(self.source, "is not an array with one row per transition.", name)
+        row = tuple(shape[1:])
+        # Discrete actions may be stored as a column, as rewards and flags.
+        discrete = self.task is not None and self.task.action.shape == ()
+        is_number = name in _NUMBERS or (name == "actions" and discrete)
+        return () if row == (1,) and is_number else row
+
+    def _check_shape(self, name: str) -> None:
+        """Raises DatasetError if a field has the wrong number of rows, or rows of a wrong shape."""
+        length, shape, observation = (
+            len(self.fields[name]),
+            self.shapes[name],
+            self.shapes["observations"],
+        )
+        problem = None
+        if self.num_rows == 0:
+            problem = "has no rows."
+        elif length != self.num_rows:
+            problem = f"has {length} rows, but 'observations' has {self.num_rows}."
+        elif name in _NUMBERS and shape != ():
+            problem = f"one row has the shape {list(shape)}, but must be a number."
+        elif name == "observations" and shape == ():
+            problem = "one row is one number; give it [N, 1]."
+        elif name == "next_observations" and shape != observation:
+            problem = (
+                f"one row has the shape {list(shape)}, but one of 'observations' has "
+                f"{list(observation)}."
+            )
+        if problem:
+            raise DatasetError(self.source, problem, name)
+        if self.task is not None and name in ("observations", "actions"):
+            space = self.task.observation if name == "observations" else self.task.action
+            check_shape(self.source, name, shape, space, self.task)
+
+    def row_fields(self) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+        """Shapes and dtypes of the rows of the episodes."""
+        return {
+            "observation": (self.shapes["observations"], self.dtypes["observations"]),
+            "action": (self.shapes["actions"], self.dtypes["actions"]),
+            "reward": ((1,), self.dtypes["rewards"]),
+            "terminated": ((1,), torch.bool),
+            "truncated": ((1,), torch.bool),
+        }
+
+    def flags(self, name: str) -> NDArray:
+        """All values of a field of flags; bool [N]."""
+        flags = np.empty(self.num_rows, dtype=bool)
+        for part in self._parts(name):
+            values = self._slice(name, part).reshape(-1)
+            wrong = (values != 0) & (values != 1)
+            if wrong.any():
+                row = int(wrong.argmax())
+                problem = f"is {values[row]}, but must be 0 or 1."
+                raise DatasetError(self.source, problem, name, part.start + row)
+            flags[part] = values
+        return flags
+
+    def chunks(self, name: str) -> Iterator[tuple[int, Tensor]]:
+        """The chunks of a field, each with the index of its first row."""
+        for part in self._parts(name):
+            yield part.start, self.read(name, part.start, part.stop)
+
+    def read(self, name: str, start: int, stop: int) -> Tensor:
+        """Reads, checks and converts some rows; [n, *row]."""
+        values = self._slice(name, slice(start, stop))
+        check_finite(self.source, name, values, start, self.dtypes[name])
+        shape = (1,) if name == "rewards" else self.shapes[name]
+        values = values.reshape(len(values), *shape)
+        if name == "actions" and self.task is not None:
+            check_actions(self.source, values, self.task.action, start)
+        return plain_tensor(values).to(self.dtypes[name])
+
+    def _parts(self, name: str) -> Iterator[slice]:
+        """The rows of a field in pieces of bounded size."""
+        size = rows_per_chunk(self.fields[name].dtype.itemsize * math.prod(self.shapes[name]))
+        for start in range(0, self.num_rows, size):
+            yield slice(start, min(start + size, self.num_rows))
+
+    def _slice(self, name: str, rows: slice) -> NDArray:
+        with damage_named(self.source, "rows from here on cannot be read", name, rows.start):
+            return np.asarray(self.fields[name][rows])
 
 
-def _ends(
-    reader: TransitionReader, terminated: NDArray, max_episode_steps: int | None, gaps: Gaps
-) -> tuple[NDArray, NDArray]:
-    """Where episodes were truncated, and where they end; bool [N] each."""
+def _truncations(
+    reader: _Reader, terminated: NDArray, max_episode_steps: int | None, gaps: Gaps
+) -> NDArray:
+    """Where episodes were truncated; bool [N]."""
     marked = "timeouts" in reader.fields
     truncated = reader.flags("timeouts") if marked else np.zeros_like(terminated)
     if "next_observations" in reader.fields and (gaps == "cut" or not marked):
         truncated |= _gaps(reader) & ~terminated
-    ends = terminated | truncated
     if max_episode_steps is not None and not marked:
-        bounds = [-1, *np.flatnonzero(ends), len(ends) - 1]
-        for before, last in pairwise(bounds):
+        ends = np.flatnonzero(terminated | truncated)
+        for before, last in pairwise([-1, *ends, reader.num_rows - 1]):
             truncated[before + max_episode_steps : last + 1 : max_episode_steps] = True
         truncated &= ~terminated
-    return truncated, terminated | truncated
+    return truncated
 
 
-def _gaps(reader: TransitionReader) -> NDArray:
+def _gaps(reader: _Reader) -> NDArray:
     """Where the next observation is not the observation of the next row; bool [N]."""
     gaps = np.zeros(reader.num_rows, dtype=bool)
     for start, following in reader.chunks("next_observations"):
@@ -193,15 +323,12 @@ def _gaps(reader: TransitionReader) -> NDArray:
 
 
 def _place_next_observations(
-    reader: TransitionReader, observations: Tensor, row_of: NDArray, ends: NDArray
+    reader: _Reader, observations: Tensor, row_of: Tensor, ends: Tensor
 ) -> None:
-    """Writes the final observations, and checks the others; row_of int64 [N]."""
+    """Writes the final observations, and checks the others; row_of int64 [N], ends bool [N]."""
     for start, following in reader.chunks("next_observations"):
         part = slice(start, start + len(following))
-        target = torch.from_numpy(row_of[part] + 1)
-        # At the end of an episode, and after the very last row, there is nothing to compare with.
-        is_final = torch.from_numpy(ends[part].copy())
-        is_final[reader.num_rows - 1 - start :] = True
+        target, is_final = row_of[part] + 1, ends[part]
         observations[target[is_final]] = following[is_final]
         differs = (observations[target] != following).flatten(1).any(1)
         if differs.any():
