@@ -232,7 +232,7 @@ def test_minari_holds_the_same(cartpole: Path, pendulum: Path) -> None:
 
 def test_images_are_stored_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Instead of a whole game, which takes half a minute.
-    monkeypatch.setattr("recipes.collect.agent.evaluate", lambda *_, **__: torch.zeros(1))
+    monkeypatch.setattr("recipes.collect.agents.evaluate", lambda *_, **__: torch.zeros(1))
     recipe = PPO(
         env="ALE/Pong-v5",
         backbone=nature_cnn(num_frames=4, features_dim=8),

@@ -10,9 +10,8 @@ from gymnasium.spaces import Box, Discrete, MultiDiscrete, Space
 
 from recipes.cli import main
 from recipes.collect import Collection
-from recipes.collect.agent_in_training import AgentInTraining
+from recipes.collect.agents import AgentInTraining, find_agent
 from recipes.collect.collect import collect
-from recipes.collect.find_agent import find_agent
 from recipes.recipe_json import recipe_to_json
 from recipes.sac import SAC
 from tests.recipes.collect.collected import (
@@ -147,7 +146,7 @@ def test_a_recipe_is_trained_no_longer_than_it_says(tmp_path: Path) -> None:
             replace(settings, total_steps=total_steps), tmp_path, task_spaces("CartPole-v1").action
         )
         assert isinstance(agent, AgentInTraining)
-        assert agent.final_step == final_step
+        assert agent.last_step == final_step
         assert agent.recipe == replace(CARTPOLE_RECIPE, total_steps=1000, checkpoint_interval=768)
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from recipes import runner
-from recipes.collect import Collection, agent_in_training, set_maker
-from recipes.collect.agent_in_training import AgentInTraining
+from recipes.collect import Collection, agents
+from recipes.collect import collect as collecting
+from recipes.collect.agents import AgentInTraining
 from recipes.collect.collect import collect
 from recipes.collect.settings import KINDS
 from tests.recipes.collect.collected import (
@@ -35,12 +36,12 @@ def test_a_killed_collection_is_completed(
 ) -> None:
     """Killed at many places, one after the other; another algorithm's is below."""
     write, train, save = (
-        (agent_in_training.TransitionParts, "write"),
+        (agents.TransitionParts, "write"),
         (AgentInTraining, "updated"),
         (runner, "_save"),
     )
-    keep_agent = (agent_in_training, "save_checkpoint")
-    write_hdf5, write_minari = (set_maker, "write_hdf5"), (set_maker, "write_minari")
+    keep_agent = (agents, "save_checkpoint")
+    write_hdf5, write_minari = (collecting, "write_hdf5"), (collecting, "write_minari")
     # The place, and how often it is reached before the process is killed there.
     places: list[tuple[tuple[Any, str], int]] = [
         (write, 1),
@@ -100,10 +101,10 @@ def test_what_is_finished_is_not_repeated(
         raise AssertionError("this is finished")
 
     before = {path: path.stat().st_mtime_ns for path in cartpole.rglob("*.hdf5")}
-    monkeypatch.setattr(agent_in_training, "train", refuse)
-    monkeypatch.setattr(set_maker, "play_episodes", refuse)
-    monkeypatch.setattr(set_maker, "write_hdf5", refuse)
-    monkeypatch.setattr(set_maker, "write_minari", refuse)
+    monkeypatch.setattr(agents, "train", refuse)
+    monkeypatch.setattr(collecting, "play_episodes", refuse)
+    monkeypatch.setattr(collecting, "write_hdf5", refuse)
+    monkeypatch.setattr(collecting, "write_minari", refuse)
     lines = collect(cartpole_settings, cartpole, "the command")
     assert [line.split(":")[0] for line in lines] == list(KINDS)
     assert {path: path.stat().st_mtime_ns for path in cartpole.rglob("*.hdf5")} == before
