@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
+from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -251,10 +254,11 @@ class OnlineHistoryStorage(LazyTensorStorage):
         steps["episode"] = starts * self._envs + torch.arange(self._envs, device=self.device)
         if self._is_init:
             steps["is_init"] = (time == starts).unsqueeze(-1)
-        super().set(
-            torch.arange(begin, stop) % self._num_times,
-            steps if self.ndim == 2 else steps.squeeze(-1),
-        )
+        with _without_notice():
+            super().set(
+                torch.arange(begin, stop) % self._num_times,
+                steps if self.ndim == 2 else steps.squeeze(-1),
+            )
         self._count, self._start = stop, starts[-1]
         table = super().get(slice(None)).flatten(0, self.ndim - 1)  # views
         self._steps = dict(table.items(True, True))
@@ -464,6 +468,18 @@ class EndFrames:
 
     def _room(self, count: int) -> TensorDict:
         return self.table[:1].expand(count).clone()
+
+
+@contextlib.contextmanager
+def _without_notice() -> Iterator[None]:
+    """Keeps TorchRL from printing that it made a table, in the output of commands."""
+    logger = logging.getLogger("torchrl")
+    level = logger.level
+    logger.setLevel(max(level, logging.WARNING))
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
 
 
 def _equal(left: TensorDictBase, right: TensorDictBase) -> Tensor:
