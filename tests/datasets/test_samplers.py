@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import (
     LazyTensorStorage,
-    PrioritizedSampler,
     RandomSampler,
     ReplayBuffer,
     SamplerWithoutReplacement,
@@ -25,16 +24,14 @@ from torchrl.data import (
 from torchrl.envs import RenameTransform
 from torchrl.modules import set_recurrent_mode
 
-from tests.datasets import segment_trees
 from tests.datasets.rollouts import Transitions
-from tests.datasets.several import newest, play_several
+from tests.datasets.several import play_several
 from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.datasets import (
     ConsecutiveSampler,
     Episodes,
     HistoryStorage,
     OnlineHistoryStorage,
-    SequenceStorage,
     episodes_from_arrays,
 )
 from torchrl_tit.windows import Windows
@@ -78,7 +75,6 @@ def make(request: pytest.FixtureRequest, episodes: Episodes) -> Make:
 SAMPLERS: dict[str, Callable[[], Any]] = {
     "random": RandomSampler,
     "without replacement": SamplerWithoutReplacement,
-    "prioritized": lambda: PrioritizedSampler(1000, alpha=0.7, beta=0.5),
     "consecutive": lambda: ConsecutiveSampler(4),
     "slices": lambda: SliceSampler(slice_len=2),
     "cached slices": lambda: SliceSampler(num_slices=12, cache_values=True),
@@ -90,8 +86,7 @@ SAMPLERS: dict[str, Callable[[], Any]] = {
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
-def test_samplers(make: Make, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    segment_trees.provide(monkeypatch)
+def test_samplers(make: Make, name: str) -> None:
     for kind in (ReplayBuffer, TensorDictReplayBuffer):
         buffer = make(kind, sampler=SAMPLERS[name](), prefetch=2)
         seen = []
@@ -108,14 +103,6 @@ def test_samplers(make: Make, name: str, monkeypatch: pytest.MonkeyPatch) -> Non
         width = seen[0].shape[-1] if buffer.storage.ndim > 1 else 1
         drawn = torch.cat([x.reshape(-1, width) for x in seen])
         assert (drawn.amax(0) >= torch.tensor(buffer.storage.shape) * 3 // 4 - 1).all()
-        if name == "prioritized":
-            every = torch.ones(buffer.storage.shape).nonzero()
-            buffer.update_priority(every.squeeze(-1), torch.full((len(every),), 1e-9))
-            buffer.update_priority(drawn[:1].squeeze(-1), torch.ones(1))
-            buffer._prefetch_queue.clear()
-            index = buffer.sample(24, return_info=True)[1]["index"]
-            index = torch.stack(index, -1) if isinstance(index, tuple) else index.unsqueeze(-1)
-            assert (index == drawn[0]).all(-1).float().mean() > 0.9
 
 
 def check_slices(batch: TensorDictBase, marked: bool) -> None:
@@ -169,7 +156,6 @@ INDICES: list[Any] = [
     "list mask",
     "full mask",
     "short mask",
-    "long mask",
     (slice(None), 1),
     (torch.tensor([4, 2]), torch.tensor([-1, 0])),
     (torch.tensor([4, 2]),),
@@ -197,7 +183,6 @@ def test_indices_are_those_of_torchrls_storages(make: Make, index: Any) -> None:
             "list mask": mask.tolist(),
             "full mask": torch.rand(storage.shape) < 0.3,
             "short mask": mask[:-1],
-            "long mask": torch.cat([mask, mask]),
         }[index]
     expected = None
     with contextlib.suppress(IndexError):
@@ -245,11 +230,6 @@ def test_transforms_and_their_batches(make: Make) -> None:
     assert torch.equal(batch["twice"], 2 * batch["next", "reward"])
 
 
-def test_sequences_need_no_collate_fn(episodes: Episodes) -> None:
-    batch = ReplayBuffer(storage=SequenceStorage(episodes, 5), batch_size=6).sample()
-    assert batch["observation"].shape == (6, 5, 11)
-
-
 def drawn(sampler: ConsecutiveSampler, storage: Any) -> Tensor:
     index, _ = sampler.sample(storage, 40_000)
     flat = index[0] * storage.shape[1] + index[1] if isinstance(index, tuple) else index
@@ -291,13 +271,3 @@ def test_slices_that_cannot_be_drawn(make: Make) -> None:
         ConsecutiveSampler(1000).sample(storage, 2000)
     with pytest.raises(ValueError, match="There are 0 consecutive steps"):
         ConsecutiveSampler(2).sample(OnlineHistoryStorage(10, ndim=2), 4)
-
-
-def test_a_mask_of_what_a_ring_holds() -> None:
-    storage = on_ring(3)().storage
-    expected = newest(play_several(3, 60, 3, "same"), 60, 120)
-    mask = expected["next", "done"].squeeze(-1)
-    chosen = storage[mask]
-    assert chosen["next", "done"].all()
-    assert torch.equal(chosen["history", "cell"], expected["history", "cell"][mask])
-    assert isinstance(chosen, TensorDict)
