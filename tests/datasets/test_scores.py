@@ -11,10 +11,7 @@ from torchrl_tit.datasets import has_reference, normalized_score, normalized_spr
     ("name", "random", "expert"),
     [
         ("halfcheetah-medium-replay-v0", -280.178953, 12135.0),
-        ("HalfCheetah-v5", -280.178953, 12135.0),
-        ("hopper-medium-v2", -20.272305, 3234.3),
         ("mujoco/hopper/medium-v0", -20.272305, 3234.3),
-        ("walker2d-medium-v0", 1.629008, 4592.3),
         ("Walker2d-v5", 1.629008, 4592.3),
     ],
 )
