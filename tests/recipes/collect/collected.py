@@ -73,10 +73,6 @@ def attributes(path: Path) -> dict[str, Any]:
     return dict(load_episodes(path, dtype=None).attributes)
 
 
-def sets(folder: Path) -> dict[str, dict[str, NDArray]]:
-    return {kind: read(folder / f"{kind}.hdf5") for kind in KINDS}
-
-
 def assert_same(left: Path, right: Path) -> None:
     for kind in KINDS:
         for name, array in read(left / f"{kind}.hdf5").items():

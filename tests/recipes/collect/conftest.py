@@ -8,12 +8,7 @@ import pytest
 from recipes.collect import Collection
 from recipes.collect.collect import collect
 from recipes.recipe_json import recipe_to_json
-from tests.recipes.collect.collected import (
-    CARTPOLE,
-    CARTPOLE_RECIPE,
-    PENDULUM,
-    PENDULUM_RECIPE,
-)
+from tests.recipes.collect.collected import CARTPOLE, CARTPOLE_RECIPE, PENDULUM, PENDULUM_RECIPE
 
 
 @pytest.fixture(scope="session")
@@ -30,17 +25,19 @@ def pendulum_settings(tmp_path_factory: pytest.TempPathFactory) -> Collection:
     return replace(PENDULUM, agent=str(path))
 
 
+def _collect(settings: Collection, factory: pytest.TempPathFactory) -> Path:
+    folder = factory.mktemp("collected") / "sets"
+    collect(settings, folder, "the command")
+    return folder
+
+
 @pytest.fixture(scope="session")
 def cartpole(cartpole_settings: Collection, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All sets of a discrete task, collected once."""
-    folder = tmp_path_factory.mktemp("collected") / "cartpole"
-    collect(cartpole_settings, folder, "the command")
-    return folder
+    """All sets of a discrete task."""
+    return _collect(cartpole_settings, tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
 def pendulum(pendulum_settings: Collection, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All sets of a continuous task, collected once."""
-    folder = tmp_path_factory.mktemp("collected") / "pendulum"
-    collect(pendulum_settings, folder, "the command")
-    return folder
+    """All sets of a continuous task."""
+    return _collect(pendulum_settings, tmp_path_factory)

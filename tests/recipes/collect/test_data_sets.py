@@ -26,12 +26,12 @@ from recipes.run import Run
 from recipes.runner import train
 from tests.recipes.collect.collected import (
     CARTPOLE_RECIPE,
+    FIELDS,
     PENDULUM,
     PENDULUM_RECIPE,
     attributes,
     check_episodes,
     read,
-    sets,
 )
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buffer
@@ -39,7 +39,7 @@ from torchrl_tit.settings.networks import mlp, nature_cnn
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_row_is_a_step_of_cartpole(cartpole: Path, kind: str) -> None:
+def test_every_row_is_a_step_of_the_task(cartpole: Path, pendulum: Path, kind: str) -> None:
     data = read(cartpole / f"{kind}.hdf5")
     env: Any = gymnasium.make("CartPole-v1").unwrapped
     env.reset(seed=0)
@@ -52,21 +52,12 @@ def test_every_row_is_a_step_of_cartpole(cartpole: Path, kind: str) -> None:
     fallen = (np.abs(x) > 2.4) | (np.abs(angle) > 12 * np.pi / 180)
     np.testing.assert_array_equal(data["terminals"], fallen)
     np.testing.assert_array_equal(data["rewards"], np.ones(len(x)))
-    assert {name: array.dtype.str for name, array in data.items()} == {
-        "observations": "<f4",
-        "actions": "<i8",
-        "rewards": "<f4",
-        "terminals": "|b1",
-        "timeouts": "|b1",
-        "next_observations": "<f4",
-    }
+    dtypes = [data[name].dtype.str for name in FIELDS]
+    assert dtypes == ["<f4", "<i8", "<f4", "|b1", "|b1", "<f4"]
     check_episodes(data)
 
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_row_is_a_step_of_pendulum(pendulum: Path, kind: str) -> None:
     data = read(pendulum / f"{kind}.hdf5")
-    env: Any = gymnasium.make("Pendulum-v1").unwrapped
+    env = gymnasium.make("Pendulum-v1").unwrapped
     env.reset(seed=0)
     for row in range(len(data["rewards"])):
         cosine, sine, speed = data["observations"][row].astype(np.float64)
@@ -74,39 +65,43 @@ def test_every_row_is_a_step_of_pendulum(pendulum: Path, kind: str) -> None:
         following, reward, *_ = env.step(data["actions"][row])
         np.testing.assert_allclose(following, data["next_observations"][row], atol=1e-4)
         np.testing.assert_allclose(reward, data["rewards"][row], atol=1e-3)
-    assert data["actions"].dtype == np.float32
-    assert data["actions"].shape == (len(data["rewards"]), 1)
+    assert (data["actions"].dtype, data["actions"].shape[1:]) == (np.float32, (1,))
     assert np.abs(data["actions"]).max() <= 2
     assert not data["terminals"].any()
     check_episodes(data)
 
 
 def test_rolled_out_sets_are_whole_episodes(cartpole: Path, pendulum: Path) -> None:
-    for kind, data in sets(cartpole).items():
+    for kind in KINDS:
+        data = read(cartpole / f"{kind}.hdf5")
         lengths = np.diff(np.flatnonzero(data["terminals"] | data["timeouts"]), prepend=-1)
         if kind != "mixed":
             assert lengths[:-1].sum() < 300 <= lengths.sum()
             # CartPole has a time limit of 500; the longest that was asked for is 300.
             assert (lengths[data["timeouts"][np.cumsum(lengths) - 1]] == 300).all()
-    for kind, data in sets(pendulum).items():
+        data = read(pendulum / f"{kind}.hdf5")
         if kind != "mixed":
             assert len(data["rewards"]) == 400  # two episodes
             assert np.flatnonzero(data["timeouts"]).tolist() == [199, 399]
 
 
-def test_actions_are_those_of_the_agent_at_its_mark(cartpole: Path) -> None:
-    for kind in ("medium", "expert"):
-        noted = attributes(cartpole / f"{kind}.hdf5")
-        _, weights = load_checkpoint(cartpole / "training" / "agents", noted["agent_steps"])
-        policy = make_algorithm(CARTPOLE_RECIPE).policy
-        policy.load_state_dict(weights)
-        episodes = load_episodes(cartpole / f"{kind}.hdf5")
-        steps = HistoryStorage(episodes, num_frames=2).get(slice(None))
-        with torch.no_grad():
-            logits = policy(TensorDict({"history": steps["history"]}, len(steps)))["logits"]
-        assert torch.equal(logits.argmax(-1), steps["action"])
-        assert noted[f"{kind}_return"] == (100 if kind == "medium" else 130)
-        assert noted["agent_return"] >= noted[f"{kind}_return"]
+def policy_of(folder: Path, kind: str, recipe: Any) -> Any:
+    """The agent that played a set."""
+    step = attributes(folder / f"{kind}.hdf5")["agent_steps"]
+    _, weights = load_checkpoint(folder / "training" / "agents", step)
+    policy = make_algorithm(recipe).policy
+    policy.load_state_dict(weights)
+    return policy
+
+
+@pytest.mark.parametrize("kind", ["medium", "expert"])
+def test_actions_are_those_of_the_agent_at_its_mark(cartpole: Path, kind: str) -> None:
+    policy = policy_of(cartpole, kind, CARTPOLE_RECIPE)
+    episodes = load_episodes(cartpole / f"{kind}.hdf5")
+    steps = HistoryStorage(episodes, num_frames=2).get(slice(None))
+    with torch.no_grad():
+        logits = policy(TensorDict({"history": steps["history"]}, len(steps)))["logits"]
+    assert torch.equal(logits.argmax(-1), steps["action"])
 
 
 def test_random_actions_are_uniform(cartpole: Path, pendulum: Path) -> None:
@@ -119,10 +114,7 @@ def test_random_actions_are_uniform(cartpole: Path, pendulum: Path) -> None:
 
 
 def test_sampled_actions_differ_from_the_most_likely(pendulum: Path) -> None:
-    noted = attributes(pendulum / "medium.hdf5")
-    _, weights = load_checkpoint(pendulum / "training" / "agents", noted["agent_steps"])
-    policy: Any = make_algorithm(PENDULUM_RECIPE).policy
-    policy.load_state_dict(weights)
+    policy = policy_of(pendulum, "medium", PENDULUM_RECIPE)
     data = read(pendulum / "medium.hdf5")
     histories = torch.from_numpy(data["observations"]).unsqueeze(1)
     td = TensorDict({"history": histories}, len(histories))
@@ -183,51 +175,40 @@ def test_the_mark_is_the_first_evaluation_that_reaches_it(cartpole: Path) -> Non
         first = next(score for score in scores if score["mean"] >= mark)
         noted = attributes(cartpole / f"{kind}.hdf5")
         assert [noted["agent_steps"], noted["agent_return"]] == [first["step"], first["mean"]]
+        assert noted[f"{kind}_return"] == mark
     assert scores[-1]["mean"] >= 130  # where the training ended
 
 
-def test_provenance_is_in_both_formats(
-    cartpole: Path,
-    pendulum: Path,
-    cartpole_settings: Collection,
-    pendulum_settings: Collection,
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("task", ["cartpole", "pendulum"])
+def test_both_formats_hold_the_same_and_where_it_came_from(
+    task: str, kind: str, request: pytest.FixtureRequest
 ) -> None:
-    for folder, settings, algorithm in (
-        (cartpole, cartpole_settings, "PPO"),
-        (pendulum, pendulum_settings, "SAC"),
-    ):
-        for kind in KINDS:
-            noted = attributes(folder / f"{kind}.hdf5")
-            assert noted == attributes(folder / f"{kind}-v0")
-            assert noted["env_id"] == settings.env
-            assert noted["kind"] == kind
-            assert noted["seed"] == 0
-            assert noted["command"] == "the command"
-            assert json.loads(noted["settings"])["total_steps"] == settings.total_steps
-            assert json.loads(noted["versions"])["torch"] == version("torch")
-            if kind == "random":
-                assert noted["algorithm"] == "uniform actions"
-                assert "agent_steps" not in noted
-                assert "recipe" not in noted
-            else:
-                assert noted["algorithm"] == algorithm
-                assert noted["agent"] == settings.agent
-            dataset = minari.MinariDataset(folder / f"{kind}-v0" / "data")
-            assert dataset.env_spec.id == settings.env
-            assert dataset.action_space == gymnasium.make(settings.env).action_space
-            assert dataset.storage.metadata["algorithm_name"] == noted["algorithm"]
-    assert json.loads(attributes(cartpole / "medium.hdf5")["recipe"])["learning_rate"] == 1e-3
-    assert json.loads(attributes(pendulum / "medium.hdf5")["recipe"])["updates_per_step"] == 0.2
-    # Without a mark, the end of the training.
-    assert attributes(pendulum / "expert.hdf5")["agent_steps"] == 400
-    assert "expert_return" not in attributes(pendulum / "expert.hdf5")
-
-
-def test_minari_holds_the_same(cartpole: Path, pendulum: Path) -> None:
-    for folder in (cartpole, pendulum):
-        for kind in KINDS:
-            rows = load_episodes(folder / f"{kind}.hdf5", dtype=None).rows
-            assert (load_episodes(folder / f"{kind}-v0", dtype=None).rows == rows).all()
+    folder: Path = request.getfixturevalue(task)
+    settings: Collection = request.getfixturevalue(f"{task}_settings")
+    data, again = (load_episodes(folder / f"{kind}{x}", dtype=None) for x in (".hdf5", "-v0"))
+    assert (again.rows == data.rows).all()
+    noted = data.attributes
+    assert noted == again.attributes
+    kept = {"env_id": settings.env, "kind": kind, "seed": 0, "command": "the command"}
+    algorithm = {"cartpole": "PPO", "pendulum": "SAC"}[task]
+    if kind == "random":
+        kept["algorithm"] = "uniform actions"
+        assert {"agent_steps", "recipe"}.isdisjoint(noted)
+    else:
+        kept |= {"algorithm": algorithm, "agent": settings.agent}
+        recipe = CARTPOLE_RECIPE if task == "cartpole" else PENDULUM_RECIPE
+        assert json.loads(noted["recipe"])["total_steps"] == recipe.total_steps
+    assert noted.items() >= kept.items()
+    assert json.loads(noted["settings"])["total_steps"] == settings.total_steps
+    assert json.loads(noted["versions"])["torch"] == version("torch")
+    if (task, kind) == ("pendulum", "expert"):  # without a mark, the end of the training
+        assert noted["agent_steps"] == 400
+        assert "expert_return" not in noted
+    dataset = minari.MinariDataset(folder / f"{kind}-v0" / "data")
+    assert dataset.env_spec.id == settings.env
+    assert dataset.action_space == gymnasium.make(settings.env).action_space
+    assert dataset.storage.metadata["algorithm_name"] == noted["algorithm"]
 
 
 def test_images_are_stored_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -265,8 +246,6 @@ def test_images_are_stored_one_by_one(tmp_path: Path, monkeypatch: pytest.Monkey
         assert set(np.unique(data["actions"])) <= set(range(6))
         assert len(np.unique(data["observations"].reshape(count, -1), axis=0)) > count / 2
         check_episodes(data)
-        rows = load_episodes(tmp_path / "pong" / f"{kind}-v0", dtype=None).rows
-        assert (rows == load_episodes(tmp_path / "pong" / f"{kind}.hdf5", dtype=None).rows).all()
         dataset = minari.MinariDataset(tmp_path / "pong" / f"{kind}-v0" / "data")
         assert dataset.action_space.n == 6
     # Two games side by side, which checkpoints do not interrupt.

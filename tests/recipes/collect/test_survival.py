@@ -16,12 +16,7 @@ from recipes.collect import collect as collecting
 from recipes.collect.agents import AgentInTraining
 from recipes.collect.collect import collect
 from recipes.collect.settings import KINDS
-from tests.recipes.collect.collected import (
-    assert_same,
-    attributes,
-    check_episodes,
-    read,
-)
+from tests.recipes.collect.collected import assert_same, attributes, check_episodes, read
 from tests.recipes.commands import Command
 from torchrl_tit.checkpoint import checkpoint_steps
 
@@ -35,30 +30,14 @@ def test_a_killed_collection_is_completed(
     cartpole: Path, cartpole_settings: Collection, tmp_path: Path, monkeypatch: Any
 ) -> None:
     """Killed at many places, one after the other; another algorithm's is below."""
-    write, train, save = (
-        (agents.TransitionParts, "write"),
-        (AgentInTraining, "updated"),
-        (runner, "_save"),
-    )
-    keep_agent = (agents, "save_checkpoint")
+    write, train = (agents.TransitionParts, "write"), (AgentInTraining, "updated")
+    save, keep_agent = (runner, "_save"), (agents, "save_checkpoint")
     write_hdf5, write_minari = (collecting, "write_hdf5"), (collecting, "write_minari")
     # The place, and how often it is reached before the process is killed there.
     places: list[tuple[tuple[Any, str], int]] = [
-        (write, 1),
-        (write_hdf5, 1),
-        (write_minari, 1),
-        (train, 2),
-        (keep_agent, 1),
-        (save, 1),
-        (write_hdf5, 1),
-        (write_minari, 1),
-        (write, 1),
-        (write_hdf5, 1),
-        (train, 1),
-        (save, 2),
-        (keep_agent, 1),
-        (write, 2),
-        (write_minari, 1),
+        *((write, 1), (write_hdf5, 1), (write_minari, 1), (train, 2), (keep_agent, 1), (save, 1)),
+        *((write_hdf5, 1), (write_minari, 1), (write, 1), (write_hdf5, 1), (train, 1), (save, 2)),
+        *((keep_agent, 1), (write, 2), (write_minari, 1)),
     ]
     folder, kills = tmp_path / "killed", 0
     for (owner, name), after in places:
