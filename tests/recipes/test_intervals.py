@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import random
 import shutil
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from recipes.dqn import DQN
 from recipes.metrics import read_metrics
 from recipes.ppo import PPO
 from recipes.recipe import Recipe
-from recipes.recipe_json import recipe_from_json, recipe_to_json
+from recipes.recipe_json import recipe_to_json
 from recipes.run import Run
 from recipes.runner import evaluate, train
 from recipes.sac import SAC
@@ -278,12 +277,3 @@ def test_the_command_line_names_it_in_one_line(
     errors = capsys.readouterr().err
     assert "is nan in CartPole-v1 after step 0; none was saved" in errors.splitlines()[-1]
     assert "Traceback" not in errors
-
-
-@pytest.mark.parametrize("field", PPO.removed)
-def test_a_field_that_was_removed_is_read_where_it_did_nothing(field) -> None:
-    fields = json.loads(recipe_to_json(PPO_RECIPE))
-    value = PPO.removed[field]
-    assert recipe_from_json(json.dumps({**fields, field: value}), "f") == PPO_RECIPE
-    with pytest.raises(ValueError, match=f"^f .*{field!r} no longer exists, and only {value}.*$"):
-        recipe_from_json(json.dumps({**fields, field: 0.5}), "f")
