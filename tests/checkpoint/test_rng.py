@@ -1,4 +1,5 @@
 import random
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,38 +14,31 @@ from torchrl_tit.checkpoint import (
 
 
 def draw() -> tuple[object, ...]:
-    return (
-        random.random(),
-        random.gauss(0, 1),
-        np.random.normal(),
-        np.random.rand(3).tolist(),
-        torch.randn(5).tolist(),
-        torch.randn(17).tolist(),
-    )
+    numbers = random.random(), random.gauss(0, 1), np.random.normal(), *np.random.rand(3)
+    return *numbers, *torch.randn(5).tolist(), *torch.randn(17).tolist()
 
 
-def test_generators_go_on_where_they_were(tmp_path) -> None:
-    random.seed(1)
-    np.random.seed(1)
-    torch.manual_seed(1)
-    draw()  # leaves halves of normal pairs behind
+def seed(number: int) -> None:
+    for set_seed in (random.seed, np.random.seed, torch.manual_seed):
+        set_seed(number)
+
+
+def draw_on_gpu() -> list[float]:
+    return torch.rand(3, device="cuda").tolist()
+
+
+GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+
+
+@pytest.mark.parametrize("numbers", [draw, pytest.param(draw_on_gpu, marks=GPU)])
+def test_generators_go_on_where_they_were(tmp_path, numbers: Callable[[], object]) -> None:
+    seed(1)
+    numbers()  # leaves halves of normal pairs behind
     save_checkpoint(tmp_path, 1, global_rng_state())
-    expected = draw()
-    random.seed(2)
-    np.random.seed(2)
-    torch.manual_seed(2)
-    _, state = load_checkpoint(tmp_path)
-    set_global_rng_state(state)
-    assert draw() == expected
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_gpu_generators(tmp_path) -> None:
-    torch.rand(3, device="cuda")
-    save_checkpoint(tmp_path, 1, global_rng_state())
-    expected = torch.rand(3, device="cuda")
+    expected = numbers()
+    seed(2)
     set_global_rng_state(load_checkpoint(tmp_path)[1])
-    assert torch.rand(3, device="cuda").equal(expected)
+    assert numbers() == expected
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without a GPU")

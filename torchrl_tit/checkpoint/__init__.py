@@ -5,9 +5,12 @@ encode, decode                      nested state as tensors and JSON
 global_rng_state, ...               the global random generators
 """
 
+from __future__ import annotations
+
 from torchrl_tit.checkpoint.codec import decode, encode
-from torchrl_tit.checkpoint.errors import CheckpointError, CheckpointNotFoundError
 from torchrl_tit.checkpoint.folder import (
+    CheckpointError,
+    CheckpointNotFoundError,
     checkpoint_steps,
     latest_step,
     load_checkpoint,

@@ -1,16 +1,20 @@
-"""A folder of numbered checkpoints, written atomically.
+"""A folder of numbered checkpoints, written atomically and checked when they are read.
 
-folder/
-000000018432/           one checkpoint, named after its step
-tensors.safetensors
-state.json            format, step, checksums, and the tree of codec.py
-000000020480/
-000000020480.new/       only for a moment, while a step is saved a second time
-.tmp-.../               being written or being removed; left behind by a killed process
+A checkpoint is a folder of two files::
+
+    folder/
+        000000018432/           one checkpoint, named after its step
+            tensors.safetensors
+            state.json          format, step, checksums, and the tree of codec.py
+        000000020480/
+        000000020480.new/       only for a moment, while a step is saved a second time
+        .tmp-.../               being written or being removed; left behind by a killed process
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import re
 import secrets
@@ -19,14 +23,36 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
 
-from torchrl_tit.checkpoint.codec import encode
-from torchrl_tit.checkpoint.contents import read_contents, write_contents
-from torchrl_tit.checkpoint.errors import CheckpointError, CheckpointNotFoundError
-from torchrl_tit.files import fsync_directory
+from torchrl_tit.checkpoint.codec import decode, encode
+from torchrl_tit.files import fsync_directory, fsync_file
 
 _NAME = re.compile(r"(\d{12,})(\.new)?")
 _TEMPORARY = ".tmp-"
+_TENSORS = "tensors.safetensors"
+_STATE = "state.json"
+_FORMAT = "torchrl-tit checkpoint"
+_VERSION = 1
+
+
+class CheckpointError(OSError):
+    """A checkpoint cannot be written or used; the message says why and what to do.
+
+    Example:
+        >>> issubclass(CheckpointError, OSError)
+        True
+    """
+
+
+class CheckpointNotFoundError(CheckpointError, FileNotFoundError):
+    """The requested checkpoint does not exist.
+
+    Example:
+        >>> issubclass(CheckpointNotFoundError, FileNotFoundError)
+        True
+    """
 
 
 def save_checkpoint(folder: str | os.PathLike[str], step: int, state: Any, keep: int = 3) -> Path:
@@ -124,7 +150,7 @@ def load_checkpoint(folder: str | os.PathLike[str], step: int | None = None) -> 
             f"there is no checkpoint of step {step} in {folder}, only of "
             f"{', '.join(map(str, sorted(paths)))}"
         )
-    return step, read_contents(paths[step], step)
+    return step, _read(paths[step], step)
 
 
 def checkpoint_steps(folder: str | os.PathLike[str]) -> list[int]:
@@ -198,7 +224,7 @@ def _add(folder: Path, step: int, tensors: dict[str, Any], tree: Any) -> Path:
     temporary = folder / f"{_TEMPORARY}{path.name}-{secrets.token_hex(4)}"
     temporary.mkdir()
     try:
-        write_contents(temporary, step, tensors, tree)
+        _write(temporary, step, tensors, tree)
         complete = path.with_name(f"{path.name}.new") if path.exists() else path
         os.rename(temporary, complete)
     except BaseException:  # Ctrl-C must leave nothing behind either
@@ -233,3 +259,89 @@ def _tidy(folder: Path) -> None:
             shutil.rmtree(path)
         elif (match := _NAME.fullmatch(path.name)) and match[2]:
             _promote(path)
+
+
+def _write(path: Path, step: int, tensors: dict[str, Tensor], tree: Any) -> None:
+    """Writes a checkpoint's files into an empty folder and flushes them to the disk."""
+    save_file(tensors, path / _TENSORS)
+    document = {
+        "format": _FORMAT,
+        "version": _VERSION,
+        "step": step,
+        "tensors": {
+            "bytes": (path / _TENSORS).stat().st_size,
+            "sha256": _sha256_of_file(path / _TENSORS),
+        },
+        "state": tree,
+    }
+    document["sha256"] = _sha256_of_document(document)
+    (path / _STATE).write_text(json.dumps(document, allow_nan=False), encoding="utf-8")
+    shutil.copymode(path / _STATE, path / _TENSORS)  # safetensors lets only the owner read
+    for name in (_TENSORS, _STATE):
+        fsync_file(path / name)
+    fsync_directory(path)
+
+
+def _read(path: Path, step: int) -> Any:
+    """Checks a checkpoint's files against their checksums and reads them."""
+    try:
+        _check_names(path)
+        document = _read_document(path / _STATE, step)
+        _check_tensors(path / _TENSORS, document["tensors"])
+        return decode(load_file(path / _TENSORS), document["state"])
+    # A tree from elsewhere can be wrong in many ways (a wrong hex number, a wrong shape, a list
+    # instead of an object), so any of these errors means that the checkpoint is unusable.
+    except (
+        *(ArithmeticError, AttributeError, LookupError, OSError, RuntimeError),
+        *(SafetensorError, TypeError, ValueError),
+    ) as error:
+        raise CheckpointError(
+            f"the checkpoint {path} cannot be used: {error}. "
+            "Delete that folder to fall back to the checkpoint before it"
+        ) from error
+
+
+def _check_names(path: Path) -> None:
+    names = {entry.name for entry in path.iterdir()}
+    for name in (_STATE, _TENSORS):
+        if name not in names:
+            raise ValueError(f"{name} is missing")
+        if (path / name).is_symlink() or not (path / name).is_file():
+            raise ValueError(f"{name} is not a plain file")
+    if foreign := sorted(names - {_STATE, _TENSORS}):
+        raise ValueError(f"it contains unknown files: {', '.join(foreign)}")
+
+
+def _read_document(file: Path, step: int) -> dict[str, Any]:
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{_STATE} is not valid JSON ({error})") from error
+    if not isinstance(document, dict) or document.get("format") != _FORMAT:
+        raise ValueError(f"{_STATE} does not say that it is a {_FORMAT}")
+    if document.get("version") != _VERSION:
+        raise ValueError(
+            f"it has version {document.get('version')!r}, and this program reads {_VERSION}"
+        )
+    if document.pop("sha256", None) != _sha256_of_document(document):
+        raise ValueError(f"{_STATE} was changed after it was written (wrong checksum)")
+    if document["step"] != step:
+        raise ValueError(f"it was saved at step {document['step']}, not at {step}")
+    return document
+
+
+def _check_tensors(file: Path, written: dict[str, Any]) -> None:
+    size = file.stat().st_size
+    if size != written["bytes"]:
+        raise ValueError(f"{_TENSORS} has {size} bytes, but {written['bytes']} were written")
+    if _sha256_of_file(file) != written["sha256"]:
+        raise ValueError(f"{_TENSORS} was changed after it was written (wrong checksum)")
+
+
+def _sha256_of_file(file: Path) -> str:
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _sha256_of_document(document: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(document).encode()).hexdigest()
