@@ -6,11 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from recipes import runner
 from recipes.free_memory import return_free_memory
-from recipes.ppo import PPO
-from recipes.run import Run
-from torchrl_tit.settings.networks import mlp
 
 BLOCK, COUNT = 100_000, 1_000  # bytes; smaller than what glibc takes from the system piece by piece
 
@@ -37,21 +33,3 @@ def test_memory_between_blocks_in_use_is_returned():
     returned = kept - own_memory()
     libc.free(last)
     assert returned > 0.8 * BLOCK * COUNT
-
-
-def test_checkpoints_return_it(tmp_path, monkeypatch):
-    calls: list[None] = []
-    monkeypatch.setattr(runner, "return_free_memory", lambda: calls.append(None))
-    recipe = PPO(
-        name="ppo/cartpole/mlp",
-        env="CartPole-v1",
-        backbone=mlp(),
-        total_steps=64,
-        steps_per_batch=32,
-        minibatch_size=32,
-        checkpoint_interval=32,
-        epochs=1,
-    )
-    with Run.create(tmp_path / "run", recipe) as run:
-        runner.train(recipe, run)
-    assert len(calls) == 2

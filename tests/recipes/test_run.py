@@ -1,7 +1,9 @@
-"""Run folders: made, continued, refused; and runs at the edges of what a recipe can say."""
+"""Run folders: made, continued, killed, damaged, used by two, and refused."""
+
+from __future__ import annotations
 
 import json
-import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,17 +15,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from recipes import run as run_module
 from recipes import runner
+from recipes.algorithm import make_algorithm
 from recipes.cli import main
-from recipes.metrics import Metrics, read_metrics
+from recipes.dataset_algorithm import is_remote
+from recipes.dataset_recipe import DatasetRecipe
+from recipes.metrics import read_metrics
 from recipes.ppo import PPO
-from recipes.recipe_json import settings_to_dict
+from recipes.recipe_json import recipe_to_json, settings_to_dict
+from recipes.registry import RECIPES
 from recipes.results.plot import plot_run
 from recipes.run import Run
 from tests.recipes.commands import Command
+from tests.recipes.dataset_runs import assert_same_run
 from tests.recipes.states import unchecked
 from tests.recipes.untrained import untrained
-from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
+from torchrl_tit.checkpoint import latest_step
 from torchrl_tit.settings.networks import enhanced_tit
 
 ROOT = Path(__file__).parents[2]
@@ -39,8 +47,7 @@ SMALL = PPO(
     checkpoint_interval=64,
     evaluation_episodes=2,
 )
-
-
+LONG = replace(SMALL, total_steps=64 * 400)
 BACKBONE = settings_to_dict(SMALL.backbone)
 
 
@@ -53,28 +60,6 @@ def trained(folder: Path, recipe: PPO = SMALL) -> Run:
     with Run.create(folder, recipe) as run:
         runner.train(recipe, run)
     return run
-
-
-def test_what_a_kill_leaves_before_the_recipe_is_no_run(tmp_path):
-    folder = tmp_path / "run"
-    folder.mkdir()
-    for name in ("versions.json", ".lock", ".recipe.json.0a1b2c3d.tmp"):
-        (folder / name).touch()
-    assert Run.create(folder, SMALL).recipe == Run.open(folder).recipe == SMALL
-
-
-def test_what_killed_writes_left_is_removed(tmp_path):
-    run = untrained(tmp_path / "run", SMALL)
-    for name in (".metrics.csv.0a1b2c3d.tmp", ".recipe.json.0a1b2c3d.tmp", ".mine.0a1b2c3d.tmp"):
-        (run.folder / name).touch()
-    with run:
-        hidden = {path.name for path in run.folder.iterdir() if path.name.startswith(".")}
-    assert hidden == {".lock", ".mine.0a1b2c3d.tmp"}
-
-
-def test_a_folder_may_be_named_by_text(tmp_path):
-    Run.create(str(tmp_path / "run"), SMALL)
-    assert Run.open(str(tmp_path / "run")).checkpoints == tmp_path / "run" / "checkpoints"
 
 
 def edit(path: Path, **fields: object) -> None:
@@ -98,13 +83,22 @@ def test_a_folder_that_a_killed_process_had_only_begun_becomes_a_run(tmp_path, m
         patch.setattr("recipes.run.write_text_atomic", killed)
         with pytest.raises(SystemExit):
             Run.create(tmp_path / "run", SMALL)
-    assert Run.create(tmp_path / "run", SMALL).recipe == SMALL
-    assert Run.open(tmp_path / "run").recipe == SMALL
+    (tmp_path / "run" / ".recipe.json.0a1b2c3d.tmp").touch()
+    assert Run.create(tmp_path / "run", SMALL).recipe == Run.open(tmp_path / "run").recipe == SMALL
+
+
+def test_what_killed_writes_left_is_removed(tmp_path):
+    run = untrained(tmp_path / "run", SMALL)
+    for name in (".metrics.csv.0a1b2c3d.tmp", ".recipe.json.0a1b2c3d.tmp", ".mine.0a1b2c3d.tmp"):
+        (run.folder / name).touch()
+    with run:
+        hidden = {path.name for path in run.folder.iterdir() if path.name.startswith(".")}
+    assert hidden == {".lock", ".mine.0a1b2c3d.tmp"}
 
 
 def test_only_a_new_or_empty_folder_becomes_a_run(tmp_path):
     (tmp_path / "empty").mkdir()
-    assert Run.create(tmp_path / "empty", SMALL).folder == tmp_path / "empty"
+    assert Run.create(str(tmp_path / "empty"), SMALL).folder == tmp_path / "empty"
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("years of work")
     (tmp_path / "file").write_text("a file")
@@ -128,29 +122,27 @@ def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch,
     assert folders == [name, f"{name}-2", f"{name}-3"]
 
 
-def test_is_complete_only_when_trained_evaluated_and_drawn(tmp_path):
+def test_a_run_is_complete_when_trained_evaluated_and_drawn(tmp_path):
     run = trained(tmp_path / "run")
+    assert Run.open(run.folder).recipe == SMALL
+    versions = json.loads((run.folder / "versions.json").read_text())
+    assert versions["torch"] == version("torch")
+    evaluation = runner.evaluate(run)
+    assert (evaluation["env"], evaluation["steps"], evaluation["episodes"]) == (
+        "CartPole-v1",
+        128,
+        2,
+    )
+    assert evaluation["mean"] == pytest.approx(sum(evaluation["returns"]) / 2)
     assert not run.is_complete()
-    evaluation = {
-        "env": "CartPole-v1",
-        "episodes": 1,
-        "seed": 1,
-        "returns": [9],
-        "mean": 9,
-        "std": 0,
-    }
-    run.save_evaluation(evaluation | {"steps": 64})  # of a checkpoint on the way
+    run.save_evaluation(evaluation)
+    assert not run.is_complete()
     plot_run(run)
-    assert not run.is_complete()
-    run.save_evaluation(evaluation | {"steps": 128})
+    assert run.curve.read_bytes().startswith(b"\x89PNG")
     assert run.is_complete()
-    (run.folder / "evaluation.json").write_text("{")
-    assert not run.is_complete()
-    (run.folder / "evaluation.json").write_text("[]")
-    assert not run.is_complete()
-    run.save_evaluation(evaluation | {"steps": 128})
-    (run.folder / "learning_curve.png").unlink()
-    assert not run.is_complete()
+    for text in ("{", "[]", json.dumps(evaluation | {"steps": 64})):  # of a checkpoint on the way
+        (run.folder / "evaluation.json").write_text(text)
+        assert not run.is_complete()
 
 
 def test_a_run_that_was_stopped_in_its_evaluation_is_evaluated_then(tmp_path, monkeypatch, capsys):
@@ -172,48 +164,6 @@ def test_a_run_that_was_stopped_in_its_evaluation_is_evaluated_then(tmp_path, mo
     assert (tmp_path / "run" / "learning_curve.png").is_file()
 
 
-def test_ctrl_c_saves_and_the_run_can_be_resumed(tmp_path, monkeypatch):
-    recipe = replace(SMALL, total_steps=256, checkpoint_interval=10**6)
-    log = Metrics.log
-
-    def ctrl_c(metrics, step, **values):
-        log(metrics, step, **values)
-        if step == 128:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    with Run.create(tmp_path / "run", recipe) as run:
-        with monkeypatch.context() as patch:
-            patch.setattr(Metrics, "log", ctrl_c)
-            with pytest.raises(KeyboardInterrupt):
-                runner.train(recipe, run)
-        assert checkpoint_steps(run.checkpoints) == [128]
-        runner.train(recipe, run)
-    assert checkpoint_steps(run.checkpoints) == [128, 256]
-
-
-def test_a_second_ctrl_c_stops_at_once(tmp_path, monkeypatch):
-    def twice(*_):
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr("recipes.ppo.PPOAlgorithm.advantages", twice)
-    with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
-        runner.train(SMALL, run)
-    assert checkpoint_steps(run.checkpoints) == []
-    assert read_metrics(run.folder / "metrics.csv") == []
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
-def test_an_error_that_ctrl_c_brings_about_is_a_stop(tmp_path, monkeypatch):
-    def compiler_stopped(*_):
-        os.kill(os.getpid(), signal.SIGINT)
-        raise RuntimeError("C++ compile error")
-
-    monkeypatch.setattr("recipes.ppo.PPOAlgorithm.advantages", compiler_stopped)
-    with Run.create(tmp_path / "run", SMALL) as run, pytest.raises(KeyboardInterrupt):
-        runner.train(SMALL, run)
-
-
 def test_version_changes(tmp_path):
     run = Run.create(tmp_path / "run", SMALL)
     assert run.version_changes() == []
@@ -230,17 +180,6 @@ def test_a_damaged_list_of_imports_does_not_hide_the_reason(tmp_path):
     (run.folder / "imports.json").write_text("[" * 100_000)
     with pytest.raises(ValueError, match="names 'evilmod:Mine-v0'"):
         Run.open(run.folder)
-
-
-def test_an_edited_recipe_takes_effect(tmp_path):
-    run = trained(tmp_path / "run")
-    edit(run.folder / "recipe.json", total_steps=192, learning_rate=0.01)
-    with Run.open(run.folder) as again:
-        runner.train(again.recipe, again)
-    rows = read_metrics(run.folder / "metrics.csv")
-    assert [row["learning_rate"] for row in rows] == [3e-4, 3e-4, 0.01]
-    _, state = load_checkpoint(run.checkpoints)
-    assert state["optimizer"]["param_groups"][0]["lr"] == 0.01
 
 
 @pytest.mark.parametrize(
@@ -265,28 +204,22 @@ def test_an_edited_recipe_that_no_longer_fits_changes_nothing(fields, tmp_path, 
     assert contents(run.folder) == before
 
 
-@pytest.mark.parametrize("text", [b"\xff\xfe{", b"[" * 100_000, b"{}", b"null"])
-def test_a_damaged_recipe_is_named(text, tmp_path, capsys):
-    run = trained(tmp_path / "run")
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        *((text, "") for text in (b"\xff\xfe{", b"[" * 100_000, b"{}", b"null")),
+        (b'{"algorithm": "ppo", "backbone": {"network": "enhanced-tit"}}', "an older version"),
+    ],
+)
+def test_a_damaged_or_older_recipe_is_named(text, reason, tmp_path, capsys):
+    run = untrained(tmp_path / "run", SMALL)
     (run.folder / "recipe.json").write_bytes(text)
     before = contents(run.folder)
     for words in (["train", "--resume"], ["evaluate"]):
-        assert "recipe.json cannot be read as a recipe" in fails(capsys, *words, run.folder)
-    assert contents(run.folder) == before
-
-
-def test_a_run_of_an_older_version_is_named(tmp_path, capsys):
-    run = trained(tmp_path / "run")
-    _, state = load_checkpoint(run.checkpoints)
-    state["agent"] = state.pop("networks")
-    run.save(192, state)
-    edit(run.folder / "recipe.json", total_steps=256)
-    for words in (["train", "--resume"], ["evaluate"]):
         line = fails(capsys, *words, run.folder)
-        assert "the checkpoint of step 192" in line
-        assert "is from an older version of torchrl-tit" in line
-    edit(run.folder / "recipe.json", backbone={"network": "enhanced-tit", "embed_dim": 8})
-    assert "'backbone.network' is from an older version" in fails(capsys, "evaluate", run.folder)
+        assert "recipe.json cannot be read as a recipe" in line
+        assert reason in line
+    assert contents(run.folder) == before
 
 
 def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(tmp_path):
@@ -294,7 +227,7 @@ def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(tmp_pa
     recipe = replace(SMALL, total_steps=192, steps_per_batch=96, checkpoint_interval=10**6)
     with run:
         runner.train(recipe, run)
-    assert run.load()[0] == 224  # type: ignore[index]
+    assert latest_step(run.checkpoints) == 224
 
 
 def test_no_episode_ends_at_all(tmp_path):
@@ -307,18 +240,24 @@ def test_no_episode_ends_at_all(tmp_path):
 
 
 def test_fewer_steps_than_a_batch_are_one_batch(tmp_path):
-    run = trained(tmp_path / "run", replace(SMALL, total_steps=1))
-    assert run.load()[0] == 64  # type: ignore[index]
+    assert latest_step(trained(tmp_path / "run", replace(SMALL, total_steps=1)).checkpoints) == 64
 
 
-@pytest.mark.parametrize("minibatch_size", [32, 64], ids=["in the update", "after it"])
-def test_weights_that_explode_are_never_saved(minibatch_size, tmp_path):
-    recipe = replace(SMALL, total_steps=192, minibatch_size=minibatch_size)
+@pytest.mark.parametrize(
+    ("poison", "message"),
+    [
+        ({"critic_coeff": float("inf")}, "loss_critic became inf"),
+        ({"learning_rate": 1e30}, "weights became (inf|nan)"),
+        ({"learning_rate": 1e30, "minibatch_size": 64}, "weights became (inf|nan)"),  # at the end
+    ],
+)
+def test_what_explodes_is_never_saved(poison, message, tmp_path):
+    recipe = replace(SMALL, total_steps=192)
     run = trained(tmp_path / "run", replace(recipe, total_steps=64))
-    message = r"weights became (inf|nan) in the update at step 128; the checkpoint of step 64 is"
-    with run, pytest.raises(FloatingPointError, match=message):
-        runner.train(unchecked(recipe, learning_rate=1e30), run)
-    assert run.load()[0] == 64  # type: ignore[index]
+    where = " in the update at step 128; the checkpoint of step 64 is good"
+    with run, pytest.raises(FloatingPointError, match=message + where):
+        runner.train(unchecked(recipe, **poison), run)
+    assert latest_step(run.checkpoints) == 64
     assert len(read_metrics(run.folder / "metrics.csv")) == 1
 
 
@@ -346,6 +285,89 @@ def test_a_disk_that_is_full_stops_the_process_with_one_line(tmp_path):
     assert contents(run.checkpoints) == before
 
 
+def test_ctrl_c_saves_and_says_how_to_go_on(tmp_path):
+    (tmp_path / "recipe.json").write_text(recipe_to_json(replace(LONG, checkpoint_interval=10**6)))
+    run = tmp_path / "run"
+    process = Command(["train", tmp_path / "recipe.json", "--out", run], tmp_path / "errors")
+    while len(read_metrics(run / "metrics.csv")) < 2:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    assert process.wait() == 130
+    assert f"train --resume {run}" in process.errors.read_text()
+    assert latest_step(run / "checkpoints") == read_metrics(run / "metrics.csv")[-1]["step"]
+    assert not (run / "evaluation.json").exists()
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_loses_nothing_that_was_saved(tmp_path):
+    """Nor does it depend on the moment of the kill, but for the steps since the checkpoint."""
+    (tmp_path / "recipe.json").write_text(recipe_to_json(replace(LONG, total_steps=64 * 14)))
+    killed = tmp_path / "killed"
+    process = Command(["train", tmp_path / "recipe.json", "--out", killed], tmp_path / "errors")
+    while process.poll() is None and (latest_step(killed / "checkpoints") or 0) < 4 * 64:
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    step = latest_step(killed / "checkpoints")
+    shutil.copytree(killed, tmp_path / "copy")
+    written = read_metrics(killed / "metrics.csv")
+    rows = [str(row) for row in written if row["step"] <= (step or 0)]
+    for folder in (killed, tmp_path / "copy"):
+        process = Command(["train", "--resume", folder], tmp_path / "errors")
+        assert process.wait() == 0, process.errors.read_text()
+        said = f"note: resuming at step {step} with new episodes: environments are not saved"
+        assert said in process.errors.read_text()
+        assert [*map(str, read_metrics(folder / "metrics.csv"))][: len(rows)] == rows
+    assert_same_run(Run.open(killed), Run.open(tmp_path / "copy"))
+
+
+def test_of_two_that_begin_at_once_one_gets_the_folder(tmp_path, monkeypatch):
+    """The second one finds no run yet, and the first one has begun to make it."""
+    folder, refused = tmp_path / "run", list[object]()
+    write = run_module.write_text_atomic
+
+    def begin_another(path, text):
+        if not refused:
+            with pytest.raises(RuntimeError, match="in use by another process") as error:
+                Run.create(folder, replace(SMALL, seed=1))
+            refused.append(error)
+        write(path, text)
+
+    monkeypatch.setattr(run_module, "write_text_atomic", begin_another)
+    Run.create(folder, SMALL)
+    assert refused
+    assert Run.open(folder).recipe == SMALL
+
+
+def test_the_second_looks_again_once_it_has_the_folder(tmp_path, monkeypatch):
+    folder, checks = tmp_path / "run", list[object]()
+    check = Run.check_new
+
+    def made_meanwhile(path):
+        check(path)
+        if not checks:  # after the first look, another process makes the run
+            checks.append(path)
+            Run.create(folder, replace(SMALL, seed=1))
+
+    monkeypatch.setattr(Run, "check_new", made_meanwhile)
+    with pytest.raises(FileExistsError, match="exists already"):
+        Run.create(folder, SMALL)
+    assert Run.open(folder).recipe.seed == 1
+
+
+def test_a_run_in_use_is_evaluated_into_another_file_only(tmp_path, capsys):
+    run = untrained(tmp_path / "run", SMALL)
+    record = runner.Record(SMALL, make_algorithm(SMALL)).state_dict()
+    run.save(64, {**run.load_trained()[1], "record": record})
+    with run:
+        assert "in use by another process" in fails(capsys, "evaluate", run.folder)
+        main(["evaluate", str(run.folder), "--out", str(tmp_path / "elsewhere.json")])
+    main(["evaluate", str(run.folder)])
+    text = (run.folder / "evaluation.json").read_text()
+    assert (tmp_path / "elsewhere.json").read_text() == text
+
+
 def test_a_run_of_any_algorithm_is_opened_by_a_script_of_its_own():
     script = (
         "from recipes.records import Records; from recipes.run import RecordedRun; "
@@ -355,3 +377,25 @@ def test_a_run_of_any_algorithm_is_opened_by_a_script_of_its_own():
         [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.stdout == "CartPole-v1\n", done.stderr
+
+
+@pytest.mark.slow
+def test_every_named_recipe_builds_its_agent():
+    built = set()
+    for name, recipe in RECIPES.items():
+        # Recipes of Atari games differ in the game alone (tests/recipes/ppo/test_atari.py); those
+        # without velocities are built in tests/recipes/ppo/test_no_velocity.py.
+        if recipe.env.startswith("ALE/") and "pong" not in name and "nature-cnn" not in name:
+            continue
+        if "-no-velocity/" in name:
+            continue
+        if isinstance(recipe, DatasetRecipe) and is_remote(recipe.dataset):  # not read here
+            alike = replace(recipe, name="", dataset="hopper-medium-v2")
+            if alike in built:
+                continue
+            built.add(alike)
+        if name.startswith("discrete-cql/"):  # on data that its user collects
+            with pytest.raises(FileNotFoundError, match=r"no data file data/.*create it first"):
+                make_algorithm(recipe).check()
+        else:
+            make_algorithm(recipe).check()

@@ -18,6 +18,7 @@ import pytest
 import torch
 from torch import nn
 
+from recipes import runner
 from recipes.algorithm import Algorithm, NotFiniteError, check_finite
 from recipes.callback import Callback
 from recipes.metrics import Metrics, read_metrics
@@ -96,6 +97,7 @@ class ToyAlgorithm(Algorithm[Toy]):
             if self.recipe.bad_value == "inf":  # found at once
                 check_finite(["weight"], torch.tensor([math.inf]))
             value = torch.tensor(float(self.recipe.bad_value))  # left to the loop
+        self.log.append(("weight", value.item()))
         return {"rare": math.nan, "weight": value}
 
     def state(self) -> dict[str, Any]:
@@ -125,6 +127,9 @@ def log():
     return ToyAlgorithm.log
 
 
+HOOKS = ("collected", "updated", "evaluated", "logged", "saving", "saved")
+
+
 def start(recipe: Toy, folder: Path, *callbacks: Callback) -> Run:
     run = Run(folder, recipe) if folder.exists() else Run.create(folder, recipe)
     with run:
@@ -136,19 +141,38 @@ def steps_of(run: Run) -> list[int]:
     return [int(row["step"]) for row in read_metrics(run.folder / "metrics.csv")]
 
 
-class Steps(Callback):
-    """Which steps it was shown; acts when it has seen some step's update."""
+class Hooks(Callback):
+    """Writes down which hook was called, with which step; acts when it has seen some update."""
 
-    def __init__(self, at: int = 0, act: Any = lambda: False) -> None:
-        self.at, self.act = at, act
-        self.seen: list[tuple[str, int]] = []
+    def __init__(self, at: int = 0, act: Any = lambda: False, name: str = "", calls: Any = None):
+        self.at, self.act, self.name = at, act, name
+        self.calls: list[Any] = [] if calls is None else calls
 
-    def collected(self, step: int, batch: Any) -> None:
-        self.seen.append(("collected", step))
+    def collected(self, step, batch):
+        self.calls.append((self.name, "collected", step))
 
-    def updated(self, step: int, policy: Any) -> bool:
-        self.seen.append(("updated", step))
+    def updated(self, step, policy):
+        self.calls.append((self.name, "updated", step))
         return step == self.at and bool(self.act())
+
+    def evaluated(self, step, outcomes):
+        self.calls.append((self.name, "evaluated", step, outcomes[0].returns))
+
+    def logged(self, step, row):
+        self.calls.append((self.name, "logged", step, row["step"]))
+
+    def saving(self, step):
+        self.calls.append((self.name, "saving", step))
+
+    def saved(self, step):
+        self.calls.append((self.name, "saved", step))
+
+
+def interrupt(times: int = 1, error: Exception | None = None) -> None:
+    for _ in range(times):
+        os.kill(os.getpid(), signal.SIGINT)
+    if error is not None:
+        raise error
 
 
 @pytest.mark.parametrize(
@@ -160,41 +184,31 @@ class Steps(Callback):
     ],
 )
 def test_rows_evaluations_and_checkpoints_come_at_their_steps(tmp_path, batch, rows, saved, log):
-    saves = []
-    save = Run.save
-
-    def record(run, step, state):
-        saves.append(step)
-        save(run, step, state)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Run, "save", record)
-        callback = Steps()
-        run = start(replace(SMALL, batch=batch), tmp_path / "run", callback)
+    hooks = Hooks()
+    run = start(replace(SMALL, batch=batch), tmp_path / "run", hooks)
     assert steps_of(run) == rows
-    assert saves == saved
-    ends = range(batch, 25, batch)
-    assert callback.seen == [(name, end) for end in ends for name in ("collected", "updated")]
-    played = [step for step in ends if step % 10 == 0]
-    assert [entry[1] for entry in log if entry[0] == "play"] == played
+    of = {name: [call[2] for call in hooks.calls if call[1] == name] for name in HOOKS}
+    ends = list(range(batch, 25, batch))
+    assert of["collected"] == of["updated"] == ends
+    assert of["logged"] == rows
+    assert of["saving"] == of["saved"] == saved
+    assert of["evaluated"] == [step for step in ends if step % 10 == 0]
+    assert [entry[1] for entry in log if entry[0] == "play"] == of["evaluated"]
     assert [entry[1] for entry in log if entry[0] == "update"] == [end - batch for end in ends]
     assert log[0] == ("prepare", 0, tmp_path / "run")
     assert log[-1] == ("close",)
 
 
-def test_rows_hold_means_and_episodes_since_the_last(tmp_path):
+def test_rows_hold_means_and_episodes_since_the_last(tmp_path, log):
     rows = read_metrics(start(SMALL, tmp_path / "run").folder / "metrics.csv")
-    assert list(rows[0]) == [
-        "step",
-        "time",
-        "steps_per_second",
-        "return_mean",
-        "episodes",
-        *ToyAlgorithm.columns,
-    ]
+    first = ["step", "time", "steps_per_second", "return_mean", "episodes"]
+    assert list(rows[0]) == [*first, *ToyAlgorithm.columns]
     # Batches 0 to 4 end with 0, 1, 2, 0, 1 episodes, which return 0; 0, 1; 0.
     assert (rows[0]["episodes"], rows[0]["return_mean"]) == (4, 0.25)
-    assert all(math.isnan(row["rare"]) for row in rows)
+    weights = [entry[1] for entry in log if entry[0] == "weight"]
+    for row, begin in zip(rows, (0, 5, 10, 15), strict=True):
+        assert row["weight"] == pytest.approx(sum(weights[begin : begin + 5]) / 5)
+    assert all(math.isnan(row["rare"]) for row in rows)  # an optional column
 
 
 @pytest.mark.parametrize("stop", [3, 7, 10, 20])
@@ -205,7 +219,7 @@ def test_a_run_that_was_interrupted_resumes_bit_for_bit(tmp_path, stop):
         start(
             SMALL,
             tmp_path / "run",
-            Steps(stop, lambda: os.kill(os.getpid(), signal.SIGINT)),
+            Hooks(stop, interrupt),
         )
     assert signal.getsignal(signal.SIGINT) is handler
     assert ToyAlgorithm.log[-1] == ("close",)
@@ -224,21 +238,6 @@ def test_a_run_that_was_interrupted_resumes_bit_for_bit(tmp_path, stop):
         for run in (resumed, whole)
     ]
     assert weights[0] == weights[1]
-
-
-def test_a_run_that_was_killed_resumes_from_its_newest_checkpoint(tmp_path):
-    """Rows that were written after it are written again, with the same numbers."""
-    recipe = replace(SMALL, batch=2)
-    whole = start(recipe, tmp_path / "whole")
-    shutil.copytree(tmp_path / "whole", tmp_path / "run")
-    *_, before, last = checkpoint_steps(whole.checkpoints)
-    assert (before, last) == (20, 24)
-    shutil.rmtree(tmp_path / "run" / "checkpoints" / f"{last:012d}")
-    torch.manual_seed(123)
-    run = start(recipe, tmp_path / "run")
-    assert load_checkpoint(run.checkpoints)[0] == 24
-    assert steps_of(run) == steps_of(whole)
-    assert_same(*(load_trained(r)[1].model.state_dict() for r in (run, whole)))
 
 
 def test_a_run_that_is_trained_is_not_trained_further(tmp_path):
@@ -285,33 +284,35 @@ def test_a_disk_that_is_full_at_any_write_loses_nothing(tmp_path, monkeypatch):
         shutil.rmtree(folder)
 
 
-def test_the_rows_of_a_checkpoint_are_on_the_disk_before_it_is(tmp_path, monkeypatch):
-    written: list[str] = []
-    sync, save = Metrics.sync, Run.save
+def test_rows_are_on_the_disk_before_a_checkpoint_and_memory_is_returned_after(
+    tmp_path, monkeypatch
+):
+    done: list[str] = []
 
-    def sync_rows(metrics):
-        sync(metrics)
-        written.append("rows")
+    def noted(owner: Any, name: str) -> None:
+        call = getattr(owner, name)
+        monkeypatch.setattr(owner, name, lambda *own: (done.append(name), call(*own)))
 
-    def save_state(*own):
-        written.append("checkpoint")
-        save(*own)
-
-    monkeypatch.setattr(Metrics, "sync", sync_rows)
-    monkeypatch.setattr(Run, "save", save_state)
+    for owner, name in ((Metrics, "sync"), (Run, "save"), (runner, "return_free_memory")):
+        noted(owner, name)
     start(replace(SMALL, total_steps=8), tmp_path / "run")
-    assert written == ["rows", "checkpoint"] * 2
+    assert done == ["sync", "save", "return_free_memory"] * 2
 
 
-def test_a_callback_that_ends_training_earlier_says_so_in_the_bar(tmp_path, capsys):
-    callback = Steps(7, lambda: True)
+@pytest.mark.parametrize("act", [lambda: interrupt(2), lambda: interrupt(1, RuntimeError("g++"))])
+def test_a_second_ctrl_c_or_an_error_that_it_brings_about_stops_at_once(tmp_path, act):
+    """A compiler that the batch runs is stopped by the same Ctrl-C."""
+    with pytest.raises(KeyboardInterrupt):
+        start(SMALL, tmp_path / "run", Hooks(6, act))
+    assert checkpoint_steps(tmp_path / "run" / "checkpoints") == [4]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_callback_ends_the_training_at_a_checkpoint_and_says_so_in_the_bar(tmp_path, capsys):
+    callback = Hooks(7, lambda: True)
     callback.last_step = 8
-    start(SMALL, tmp_path / "run", callback)
+    run = start(SMALL, tmp_path / "run", callback, Hooks())
     assert "/8 " in capsys.readouterr().err
-
-
-def test_a_callback_ends_the_training_at_a_checkpoint(tmp_path):
-    run = start(SMALL, tmp_path / "run", Steps(7, lambda: True), Steps())
     assert checkpoint_steps(run.checkpoints)[-1] == 7
     assert ToyAlgorithm.log[-1] == ("close",)
 
@@ -330,9 +331,7 @@ def test_a_finished_run_is_trained_further_as_if_it_had_been_that_long(tmp_path)
 
 
 @pytest.mark.parametrize("value", ["inf", "nan"])
-@pytest.mark.parametrize(
-    ("bad_step", "found", "saved"), [(1, 4, 0), (6, 8, 4), (9, 10, 8), (13, 15, 12), (23, 24, 20)]
-)
+@pytest.mark.parametrize(("bad_step", "found", "saved"), [(1, 4, 0), (9, 10, 8), (23, 24, 20)])
 def test_what_is_not_finite_is_neither_logged_nor_saved(tmp_path, value, bad_step, found, saved):
     """Found by the update itself, or by the loop before the next row and the next checkpoint."""
     recipe = replace(SMALL, bad_step=bad_step, bad_value=value)
@@ -347,44 +346,19 @@ def test_what_is_not_finite_is_neither_logged_nor_saved(tmp_path, value, bad_ste
     assert ToyAlgorithm.log[-1] == ("close",)
 
 
-class Hooks(Callback):
-    """Writes down which hook was called, with which step."""
-
-    def __init__(self, name, calls, checkpoints):
-        self.name, self.calls, self.checkpoints = name, calls, checkpoints
-
-    def collected(self, step, batch):
-        self.calls.append((self.name, "collected", step))
-
-    def updated(self, step, policy):
-        self.calls.append((self.name, "updated", step))
-
-    def evaluated(self, step, outcomes):
-        self.calls.append((self.name, "evaluated", step, outcomes[0].returns))
-
-    def logged(self, step, row):
-        self.calls.append((self.name, "logged", step, row["step"]))
-
-    def saving(self, step):
-        self.calls.append((self.name, "saving", step))
-
-    def saved(self, step):
-        self.calls.append((self.name, "saved", step, checkpoint_steps(self.checkpoints)[-1]))
-
-
 def test_hooks_are_called_in_their_order_and_from_the_checkpoint_on(tmp_path):
     calls: list[Any] = []
-    hooks = [Hooks(name, calls, tmp_path / "run" / "checkpoints") for name in "ab"]
+    hooks = [Hooks(name=name, calls=calls) for name in "ab"]
     recipe = replace(SMALL, total_steps=3, evaluation_interval=3)
     start(recipe, tmp_path / "run", *hooks)
     steps = [(hook, n) for n in (1, 2, 3) for hook in ("collected", "updated")]
-    end = [("evaluated", 3, [3, 4]), ("logged", 3, 3), ("saving", 3), ("saved", 3, 3)]
+    end = [("evaluated", 3, [3, 4]), ("logged", 3, 3), ("saving", 3), ("saved", 3)]
     assert calls == [(n, *call) for call in [*steps, *end] for n in "ab"]
     calls.clear()
     run = start(replace(recipe, total_steps=4), tmp_path / "run", *hooks)
     evaluate(run, callbacks=hooks[:1])
     four = [(n, *call) for call in [("collected", 4), ("updated", 4)] for n in "ab"]
-    saved = [(n, *call) for call in [("saving", 4), ("saved", 4, 4)] for n in "ab"]
+    saved = [(n, *call) for call in [("saving", 4), ("saved", 4)] for n in "ab"]
     assert calls == [*four, *saved, ("a", "evaluated", 4, [4, 5])]
 
 
@@ -412,6 +386,16 @@ def test_the_best_weights_play_new_episodes(tmp_path):
         chosen = replace(run.recipe, evaluation_seed=seed)
         assert evaluate(run, chosen, best=True)["seed"] == expected
     assert evaluate(run, replace(run.recipe, evaluation_seed=5), best=True)["seed"] == 5
+
+
+def test_evaluations_choose_the_best_weights_as_soon_as_there_are_any(tmp_path, monkeypatch):
+    """Until then, training episodes do, whose returns are not compared with evaluations."""
+    monkeypatch.setattr(ToyAlgorithm, "returns", lambda self, batch: torch.full((20,), 1000.0))
+    run = start(SMALL, tmp_path / "run", Hooks(7, lambda: True))
+    assert load_trained(run, best=True)[0] == 6
+    run = start(SMALL, tmp_path / "run")
+    best = load_checkpoint(run.checkpoints)[1]["best"]
+    assert (best["step"], best["return_mean"]) == (20, 20.5)
 
 
 def test_evaluations_of_other_weights_do_not_count(tmp_path):
