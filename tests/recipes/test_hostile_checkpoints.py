@@ -50,13 +50,10 @@ def run(trained, tmp_path) -> Run:
     return Run(tmp_path / "run", replace(RECIPE, total_steps=2 * STEPS))
 
 
-def weight(state: dict[str, Any]) -> tuple[dict[str, Any], str]:
-    return state["networks"], next(iter(state["networks"]))
-
-
 def change_weight(change: Callable[[torch.Tensor], Any]) -> Callable[[dict[str, Any]], None]:
     def edit(state: dict[str, Any]) -> None:
-        weights, name = weight(state)
+        weights = state["networks"]
+        name = next(iter(weights))
         weights[name] = change(weights[name])
 
     return edit
@@ -69,19 +66,13 @@ def change_moment(state: dict[str, Any]) -> None:
 
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "generators lost": (lambda s: s.pop("rng"), "rng"),
-    "generators of text": (lambda s: s.update(rng="torch"), "indices"),
     "weights of another dtype": (change_weight(lambda w: w.double()), "float64, not torch.float32"),
     "weights that are no numbers": (change_weight(lambda w: w * torch.nan), "not finite"),
-    "weights of text": (change_weight(lambda w: "weights"), ""),
     "moments of another dtype": (change_moment, "exp_avg of weight 0 is torch.float64"),
-    "no optimizer": (lambda s: s.update(optimizer=3), "int"),
     "negative count of updates": (lambda s: s["record"].update(count=-1), "count"),
     "sums of nothing": (lambda s: s["record"].update(sums=[1.0]), "1 sums of 0 updates"),
     "returns of text": (lambda s: s["record"].update(returns="none"), "array"),
-    "an evaluation of nothing": (
-        lambda s: s["record"].update(outcomes=[{"step": 1, "returns": []}]),
-        "length >= 1",
-    ),
+    "no returns": (lambda s: s["record"].update(outcomes=[{"step": 1, "returns": []}]), ">= 1"),
     "no best weights": (lambda s: s.update(best={}), "step"),
 }
 

@@ -53,7 +53,8 @@ def test_a_process_killed_while_it_opens_loses_no_row(tmp_path, monkeypatch):
     assert (tmp_path / "metrics.csv").read_bytes() == before
 
 
-def test_a_torn_last_row_is_no_row(tmp_path):
+def test_no_file_is_no_rows_and_a_torn_last_row_is_none(tmp_path):
+    assert read_metrics(tmp_path / "metrics.csv") == []
     write(tmp_path, [(64, 1.0, 2.0)])
     with (tmp_path / "metrics.csv").open("a") as file:
         file.write("128,17000")
@@ -62,22 +63,19 @@ def test_a_torn_last_row_is_no_row(tmp_path):
     assert [row["loss"] for row in read_metrics(tmp_path / "metrics.csv")] == [1.0, 5.0]
 
 
-@pytest.mark.parametrize("row", ["128,1.0", "128,1.0,high,3", "128,1.0,2,3,4,5"])
-def test_a_damaged_row_is_named(row, tmp_path):
+@pytest.mark.parametrize(
+    ("text", "after"),
+    [
+        *((f"{{}}{row}\n", "step 64") for row in ("128,1.0", "128,1.0,high,3", "128,1.0,2,3,4,5")),
+        *(("time,loss\n1,2\n", "its beginning"), ("step,loss\ninf,2\n", "its beginning")),
+        *((f"step,loss\n1,{'2' * 200_000}\n", "its beginning"), ("\xff", "its beginning")),
+    ],
+)
+def test_what_is_damaged_is_named(text, after, tmp_path):
     write(tmp_path, [(64, 1.0, 2.0)])
     path = tmp_path / "metrics.csv"
-    path.write_text(path.read_text() + row + "\n")
-    with pytest.raises(ValueError, match=r"metrics\.csv has a damaged row after step 64"):
-        read_metrics(path)
-
-
-@pytest.mark.parametrize(
-    "text", ["time,loss\n1,2\n", "step,loss\ninf,2\n", f"step,loss\n1,{'2' * 200_000}\n", "\xff"]
-)
-def test_a_file_that_is_no_metrics_is_named(text, tmp_path):
-    path = tmp_path / "metrics.csv"
-    path.write_text(text, encoding="latin-1")
-    with pytest.raises(ValueError, match=r"metrics\.csv has a damaged row after its beginning"):
+    path.write_text(text.format(path.read_text()), encoding="latin-1")
+    with pytest.raises(ValueError, match=rf"metrics\.csv has a damaged row after {after}"):
         read_metrics(path)
 
 
@@ -98,7 +96,3 @@ def test_metrics_of_another_run_are_refused_and_stay(tmp_path):
     with pytest.raises(ValueError, match=r"no column 'return'"):
         Metrics(tmp_path, ["loss", "return"], last_step=64)
     assert path.read_text() == "step,time,steps_per_second,loss\n64,1.0,9.0,2.0\n"
-
-
-def test_no_file_is_no_rows(tmp_path):
-    assert read_metrics(tmp_path / "metrics.csv") == []
