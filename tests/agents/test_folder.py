@@ -85,7 +85,10 @@ def test_a_file_that_was_cut_or_grew(agent):
         ({"version": 2}, "it has version 2, and this torchrl-tit reads 1"),
         ({"files": {}}, "agent.json does not list README.md"),
         ({"files": []}, r"agent.json is not an agent's: Expected `object`.* at `\$.files`"),
-        ({"files": dict.fromkeys(CONTENTS, "x")}, "agent.json is not an agent's: Expected `object`"),
+        (
+            {"files": dict.fromkeys(CONTENTS, "x")},
+            "agent.json is not an agent's: Expected `object`",
+        ),
         ({"steps": "many"}, r"agent.json is not an agent's: Expected `int`.* at `\$.steps`"),
         ({"steps": float("inf")}, "agent.json is not an agent's: Expected `int`"),
         ({"steps": -1}, "agent.json is not an agent's: Expected `int` >= 0"),
