@@ -13,7 +13,7 @@ from recipes.ppo import PPO
 from recipes.presets.ppo_memory import VIEW
 from recipes.registry import get_recipe
 from torchrl_tit.settings import GRU, Inner, Network, Outer
-from torchrl_tit.settings.histories import ChainedOuter, PairedOuter
+from torchrl_tit.settings.encoders import ChainedOuter, PairedOuter
 
 
 def _variant(recipe: str, name: str, network: dict[str, Any] | None = None, **fields: Any) -> PPO:

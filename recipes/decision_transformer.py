@@ -31,7 +31,6 @@ from torchrl_tit.histories.decision_transformer import DecisionTransformer
 from torchrl_tit.modules import DTHead, make_dt_actor, make_dt_predictor
 from torchrl_tit.networks import HistoryNetwork, build_network
 from torchrl_tit.objectives import MaskedDTLoss
-from torchrl_tit.settings.checks import check_at_most
 from torchrl_tit.settings.networks import decision_transformer
 from torchrl_tit.settings.numbers import (
     Batch,
@@ -99,8 +98,11 @@ class SequenceRecipe(DatasetRecipe):
                 f"backbone.history is {self.backbone.history.name}, but this recipe trains a "
                 "decision-transformer: choose another frame encoder, not another history encoder"
             )
-        if self.acting_num_frames is not None:
-            check_at_most(self, acting_num_frames=self.backbone.num_frames)
+        if (self.acting_num_frames or 0) > self.backbone.num_frames:
+            raise ValueError(
+                f"acting_num_frames must be at most {self.backbone.num_frames}, not "
+                f"{self.acting_num_frames}"
+            )
         if len(set(self.target_columns.values())) < len(self.target_returns):
             raise ValueError(
                 f"target_returns must differ within six digits, unlike {self.target_returns}"

@@ -34,7 +34,6 @@ from torchrl_tit.networks import build_network, masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings import CoBERL
-from torchrl_tit.settings.checks import check_at_least
 from torchrl_tit.settings.numbers import (
     Batch,
     Fraction,
@@ -171,8 +170,9 @@ class PPO(OnlineRecipe, algorithm="ppo"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # A single advantage has no standard deviation.
-        check_at_least(self, steps_per_batch=2, minibatch_size=2)
+        for field in ("steps_per_batch", "minibatch_size"):
+            if getattr(self, field) < 2:  # a single advantage has no standard deviation
+                raise ValueError(f"{field} must be at least 2, not {getattr(self, field)}")
         if self.contrastive_coeff and not isinstance(self.backbone.history, CoBERL):
             raise ValueError(
                 "contrastive_coeff is the weight of a loss that only coberl has: set it to 0 for "

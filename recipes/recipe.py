@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import importlib
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
-from torchrl_tit.settings import Network, PerKey
-from torchrl_tit.settings.fields import check_fields
+from torchrl_tit.settings import Network
+from torchrl_tit.settings.checks import check_fields
 from torchrl_tit.settings.literals import parse_assignments, parse_call
-from torchrl_tit.settings.names import Names
 from torchrl_tit.settings.numbers import Episodes, Seed, Steps, Threads
+from torchrl_tit.settings.parts import Names
 
 try:
     from tyro.conf import Suppress
@@ -182,7 +183,7 @@ def _check_all(settings: object) -> None:
     """Checks settings and nested settings, because a user's own part may not check its fields."""
     check_fields(settings)
     for value in vars(settings).values():
-        for part in value.values() if isinstance(value, PerKey) else [value]:
+        for part in value.values() if isinstance(value, Mapping) else [value]:
             if is_dataclass(part):
                 _check_all(part)
 

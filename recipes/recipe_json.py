@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from torchrl_tit.settings import FrameSettings, HistorySettings, Network, Part
-from torchrl_tit.settings.checks import nearest
-from torchrl_tit.settings.fields import checked, field_types
+from torchrl_tit.settings.checks import checked, field_types, nearest
 
 from .recipe import Recipe, get_recipe_class
 from .trust import check_names

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from torchrl_tit.settings.names import Names
+from torchrl_tit.settings.parts import Names
 
 from .presets.cql import CQL_RECIPES
 from .presets.decision_transformer import DT_RECIPES

@@ -20,9 +20,8 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any
 
-from torchrl_tit.settings.imports import allow, is_named
+from torchrl_tit.settings.imports import GROUP, allow, is_named, load_plugins
 from torchrl_tit.settings.literals import parse_call
-from torchrl_tit.settings.plugins import GROUP, load_plugins
 
 from .recipe import Recipe
 

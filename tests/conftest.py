@@ -22,8 +22,8 @@ import pytest
 from recipes.recipe import Recipe
 from recipes.registry import RECIPES
 from tests import processes
-from torchrl_tit.settings import FrameSettings, HistorySettings, plugins
-from torchrl_tit.settings.names import Names
+from torchrl_tit.settings import FrameSettings, HistorySettings, imports
+from torchrl_tit.settings.parts import Names
 
 # Small networks gain nothing from threads, and parallel test workers would fight over the cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -100,7 +100,7 @@ def own_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     """A current directory for modules of a user's own; what they register is forgotten again."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
-    monkeypatch.setattr(plugins, "_failures", None)
+    monkeypatch.setattr(imports, "_failures", None)
     tables: list[Names[Any]] = [FrameSettings.registered, HistorySettings.registered]
     tables += [Recipe.registered, RECIPES.names]
     before = [(dict(table), deepcopy(vars(table))) for table in tables]

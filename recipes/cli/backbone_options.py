@@ -16,10 +16,9 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from torchrl_tit.settings import NETWORKS, FrameSettings, HistorySettings, Part, PerKey
-from torchrl_tit.settings.checks import nearest
-from torchrl_tit.settings.fields import field_types
-from torchrl_tit.settings.plugins import load_plugins
+from torchrl_tit.settings import NETWORKS, FrameSettings, HistorySettings, Part
+from torchrl_tit.settings.checks import field_types, nearest
+from torchrl_tit.settings.imports import load_plugins
 
 from ..recipe import Recipe
 
@@ -85,7 +84,7 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
             key = option.removeprefix(_PER_KEY)
             old = frames.get(key, network.frame)
             frames[key] = _with_width_of(old, _replace_part(old, FrameSettings.get(name)))
-    network = _replace_unchecked(network, frames=PerKey(frames))
+    network = _replace_unchecked(network, frames=frames)
     return _replace_unchecked(recipe, backbone=network)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fnmatch import fnmatchcase
 
-from torchrl_tit.settings.plugins import load_plugins
+from torchrl_tit.settings.imports import load_plugins
 
 from ..recipe_json import recipe_to_json
 from ..registry import RECIPES, find_recipe

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 import tyro
 
 from torchrl_tit.settings import resolve
-from torchrl_tit.settings.fields import field_types
-from torchrl_tit.settings.plugins import load_plugins
+from torchrl_tit.settings.checks import field_types
+from torchrl_tit.settings.imports import load_plugins
 
 from ..recipe import Recipe
 from ..registry import find_recipe

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, get_args
 
 import tyro
 
-from torchrl_tit.settings.fields import check_fields
+from torchrl_tit.settings.checks import check_fields
 from torchrl_tit.settings.numbers import Batch, Copies, Episodes, Real, Seed, Steps, Threads
 
 Kind = Literal["random", "mixed", "medium", "expert"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchrl_tit.settings import Network
-from torchrl_tit.settings.frames import Activation
+from torchrl_tit.settings.encoders import Activation
 from torchrl_tit.settings.networks import enhanced_tit, mlp, nature_cnn
 
 from .ppo_atari import ATARI_RECIPES

@@ -17,7 +17,7 @@ from optuna.distributions import (
 
 from torchrl_tit.settings import Inner
 from torchrl_tit.settings.checks import nearest
-from torchrl_tit.settings.histories import OuterSettings
+from torchrl_tit.settings.encoders import OuterSettings
 
 from ..recipe import Recipe
 from ..recipe_json import recipe_from_json, recipe_to_json

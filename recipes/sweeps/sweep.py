@@ -16,8 +16,7 @@ from typing import Any, Protocol
 from tqdm import tqdm
 
 from torchrl_tit.settings.checks import nearest
-from torchrl_tit.settings.imports import import_options
-from torchrl_tit.settings.plugins import load_plugins
+from torchrl_tit.settings.imports import import_options, load_plugins
 
 from ..algorithm import make_algorithm
 from ..chosen_frames import with_chosen_frames

@@ -8,7 +8,7 @@ import pytest
 
 import recipes
 from torchrl_tit import frames, histories, settings
-from torchrl_tit.settings.plugins import GROUP
+from torchrl_tit.settings.imports import GROUP
 
 PAGE = (Path(__file__).parents[2] / "docs" / "api-stability.md").read_text()
 PACKAGES = re.findall(r"^- `([\w.]+)`$", PAGE, flags=re.MULTILINE)

@@ -8,7 +8,7 @@ from torchrl_tit import settings
 from torchrl_tit.frames import Observation
 from torchrl_tit.frames.linear import LinearFrameEncoder
 from torchrl_tit.layers.categories import CategoryIndex, CategoryPatchEmbedding
-from torchrl_tit.networks.frame_encoders import build_frame
+from torchrl_tit.networks.building import build_frame
 
 COUNTS = (4, 3, 5)
 OBSERVATION = Observation((3,), categories=COUNTS)

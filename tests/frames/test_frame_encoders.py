@@ -37,12 +37,6 @@ def test_convolutions_read_one_frame_at_a_time(kind: Any, shape: tuple[int, ...]
             torch.testing.assert_close(layers(image), tokens[b, k])
 
 
-def test_the_convolutions_are_those_of_their_name() -> None:
-    kinds = (settings.ResNetFrames(), settings.NatureCNNFrames())
-    torsos = [type(CNNFrameEncoder(kind, (36, 36)).torso).__name__ for kind in kinds]
-    assert torsos == ["ResNetTorso", "NatureCNNTorso"]
-
-
 def test_flat_frames_are_the_observations() -> None:
     encoder = Flat(settings.Flat(), (3, 4, 5))
     frames = torch.randint(0, 256, (2, 7, 3, 4, 5), dtype=torch.uint8)

@@ -88,7 +88,7 @@ def test_own_weights_tell_sizes_of_an_entry_apart() -> None:
         inner = settings.Inner(patch_weights=patch_weights).build((4,))  # type: ignore[arg-type]
         assert isinstance(inner, InnerTransformer)
         values = torch.tensor([[1.0], [2.0], [-1.0]]).expand(3, 4)
-        _, patches, _ = inner._tokens(values)
+        patches = inner.patch_embedding(values.unsqueeze(1))
         one, two, minus = inner.blocks[0].norm1(patches)  # type: ignore[operator]
         return ((one - two).norm() / (one - minus).norm()).item()
 

@@ -4,7 +4,7 @@ import pytest
 
 from torchrl_tit.frames import Observation
 from torchrl_tit.layers.patches import find_patch_size
-from torchrl_tit.networks.frame_encoders import build_frame
+from torchrl_tit.networks.building import build_frame
 from torchrl_tit.settings import Inner, StackedInner
 
 

@@ -12,7 +12,7 @@ from tests.numerics import assert_near
 from torchrl_tit import settings
 from torchrl_tit.histories import HistoryShape
 from torchrl_tit.histories.catformer import Catformer as CatformerEncoder
-from torchrl_tit.networks import Catformer
+from torchrl_tit.networks import Catformer, CoBERL, GTrXL
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -57,27 +57,7 @@ def test_steps_are_told_apart_and_maps_are_causal(num_blocks: int) -> None:
         assert torch.equal(weights, weights.tril())
 
 
-def test_attention_maps_of_the_network() -> None:
-    network = Catformer((20, 20), 3, **SMALL)
-    maps = network.attention_maps(torch.rand(2, 3, 20, 20))
-    assert maps.inner == []
-    assert [tuple(weights.shape) for weights in maps.outer] == [(2, 3, 3, 3)] * 2
-
-
-@pytest.mark.parametrize(
-    ("hyperparameters", "message"),
-    [
-        ({"num_heads": 4}, "width 255 cannot be split over 4 attention heads"),
-        ({"attention_expansion": 0}, "attention_expansion must be at least 1, not 0"),
-        ({"ffn_expansion": 0}, "ffn_expansion must be at least 1, not 0"),
-        ({"num_blocks": 0}, "num_blocks must be at least 1, not 0"),
-    ],
-)
-def test_wrong_settings(hyperparameters: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Catformer((84, 84), 4, **hyperparameters)
-
-
-def test_it_works_over_time() -> None:
-    with pytest.raises(ValueError, match="over time, but num_frames is 1: set it to 2 or more"):
-        Catformer((84, 84), 1)
+def test_transformers_over_time_read_several_frames() -> None:
+    for kind in (Catformer, CoBERL, GTrXL):
+        with pytest.raises(ValueError, match="over time, but num_frames is 1: set it to 2 or more"):
+            kind((84, 84), 1)

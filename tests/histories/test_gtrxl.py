@@ -34,24 +34,15 @@ def layer_norm(norm: nn.LayerNorm, x: Tensor) -> Tensor:
     )
 
 
-def gated(gate: GRUGate, x: Tensor, y: Tensor) -> Tensor:
-    """Section 3.2, "Gated-Recurrent-Unit-type gating"."""
-    w = dict(gate.named_parameters())
-    r = torch.sigmoid(y @ w["reset_y.weight"].T + x @ w["reset_x.weight"].T)
-    z = torch.sigmoid(y @ w["update_y.weight"].T + x @ w["update_x.weight"].T - w["bias"])
-    h = torch.tanh(y @ w["candidate_y.weight"].T + (r * x) @ w["candidate_x.weight"].T)
-    return (1 - z) * x + z * h
-
-
 def written_out_block(block: GatedTransformerBlock, x: Tensor) -> Tensor:
     """One history [K, D]: LayerNorm on the branch, attention or FFN, relu, gate."""
     attended = written_out(block.attention, layer_norm(block.norm1, x), causal=True)
-    x = gated(block.gate1, x, attended.clamp(min=0))
+    x = block.gate1(x, attended.clamp(min=0))
     first, _, second = block.ffn
     assert isinstance(first, nn.Linear)
     assert isinstance(second, nn.Linear)
     hidden = (layer_norm(block.norm2, x) @ first.weight.T + first.bias).clamp(min=0)
-    return gated(block.gate2, x, (hidden @ second.weight.T + second.bias).clamp(min=0))
+    return block.gate2(x, (hidden @ second.weight.T + second.bias).clamp(min=0))
 
 
 def test_it_is_the_equations_of_the_paper_with_their_gradients() -> None:
@@ -86,22 +77,15 @@ def test_attention_sees_the_past_and_tells_its_steps_apart() -> None:
     assert (encoder(past_swapped) - encoder(tokens)).abs().amax(-1).min() > 1e-4
 
 
-def test_gates_start_near_the_identity_and_survive_initialisation() -> None:
+def test_gates_start_near_the_identity_and_survive_initialization() -> None:
     tokens = torch.randn(2, FRAMES, 1, WIDTH)
     newest = tokens[:, -1, 0]
     distances = [(make(gate_bias=bias)(tokens) - newest).norm() for bias in (0, 2, 9)]
     assert distances[0] > 2 * distances[1] > 4 * distances[2]
     torch.testing.assert_close(make(gate_bias=9)(tokens), newest, rtol=0, atol=0.01)
     network = GTrXLSystem((20, 20), FRAMES, embed_dim=WIDTH, num_heads=2, features_dim=4)
-    for initialise in (init_orthogonal_, init_normal_):
-        initialise(network)
+    for initialize in (init_orthogonal_, init_normal_):
+        initialize(network)
         gates = [module for module in network.modules() if isinstance(module, GRUGate)]
         assert len(gates) == 4  # two a block
         assert all((gate.bias == 2).all() for gate in gates)
-
-
-def test_wrong_settings_say_what_to_do() -> None:
-    with pytest.raises(ValueError, match="width 8 cannot be split over 3 attention heads"):
-        settings.GTrXL(num_heads=3).build(HistoryShape(num_frames=4, num_tokens=1, width=8))
-    with pytest.raises(ValueError, match="gtrxl is a transformer over time, but num_frames is 1"):
-        GTrXLSystem((20, 20), 1)

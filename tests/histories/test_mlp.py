@@ -9,11 +9,9 @@ import torch
 from torch import nn
 
 from tests.numerics import assert_near
-from torchrl_tit.networks import D2RL, MLP, OFENet, TwoTrunks
+from torchrl_tit.networks import D2RL, MLP, OFENet
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
-
-EVERY = pytest.mark.parametrize("kind", [MLP, OFENet, D2RL])
 
 
 @pytest.mark.parametrize(("num_frames", "layers", "hidden"), [(1, 2, 64), (8, 2, 64), (3, 1, 7)])
@@ -30,26 +28,6 @@ def test_mlp_equals_layers_in_a_row(num_frames: int, layers: int, hidden: int) -
         assert latent.shape == (6, hidden) == (6, network.features_dim)
 
 
-@EVERY
-def test_trunks_share_nothing(kind: type[Any]) -> None:
-    network = kind((5,), 1)
-    assert isinstance(network, TwoTrunks)
-    policy, value = network(torch.randn(3, 1, 5))
-    assert policy.shape == value.shape == (3, network.features_dim)
-    policy.sum().backward()
-    assert all(p.grad is not None for p in network.policy.parameters())
-    assert all(p.grad is None for p in network.value.parameters())
-
-
-@EVERY
-def test_leading_dimensions_and_bytes(kind: type[Any]) -> None:
-    network = kind((5,), 1)
-    x = torch.randint(0, 256, (2, 3, 1, 5), dtype=torch.uint8)
-    for latent, expected in zip(network(x), network(x.reshape(6, 1, 5) / 255), strict=True):
-        assert_near(latent.reshape(6, -1), expected)
-    assert network(torch.randn(1, 5))[0].shape == (network.features_dim,)
-
-
 @pytest.mark.parametrize("kind", [OFENet, D2RL])
 def test_a_history_is_read_as_one_array(kind: type[Any]) -> None:
     network, flat = kind((5,), 4), kind((20,), 1)
@@ -58,15 +36,15 @@ def test_a_history_is_read_as_one_array(kind: type[Any]) -> None:
     torch.testing.assert_close(network(x), flat(x.flatten(1).unsqueeze(1)))
 
 
-@EVERY
-def test_wrong_settings_and_inputs(kind: type[Any]) -> None:
-    with pytest.raises(ValueError, match="hidden_dim must be at least 1, not 0"):
-        kind((5,), hidden_dim=0)
-    with pytest.raises(ValueError, match="num_layers must be at least 1, not 0"):
-        kind((5,), num_layers=0)
-    with pytest.raises(ValueError, match="field 'activation' is 'tan', not one of"):
-        kind((5,), activation="tan")
-    with pytest.raises(ValueError, match=r"\[\.\.\., 1, 5\]"):
-        kind((5,))(torch.randn(3, 5))
-    with pytest.raises(TypeError, match=r"torch.float32 does not fit"):
-        kind((5,))(torch.randn(3, 1, 5, dtype=torch.float32))
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"hidden_dim": 0}, "hidden_dim must be at least 1, not 0"),
+        ({"num_layers": 0}, "num_layers must be at least 1, not 0"),
+        ({"activation": "tan"}, "field 'activation' is 'tan', not one of"),
+    ],
+)
+@pytest.mark.parametrize("kind", [MLP, OFENet, D2RL])
+def test_wrong_settings(kind: type[Any], settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        kind((5,), **settings)

@@ -32,7 +32,7 @@ def test_a_chained_block_reads_its_token_and_the_block_before(share: bool) -> No
     x, outputs, maps = torch.zeros(5, FRAMES, WIDTH), [], []
     for index in range(3):
         block = chained.blocks[0 if share else index]
-        maps.append(block.attention_weights(x + tokens[:, :, index]))
+        maps.append(block.attention.weights(block.norm1(x + tokens[:, :, index])))
         x = block(x + tokens[:, :, index])
         outputs.append(x[:, -1])
     assert_near(chained(tokens), torch.cat(outputs, dim=-1))

@@ -101,32 +101,10 @@ def test_only_the_distance_counts(kind: TemporalPositions) -> None:
     assert (swapped - attention(x, "last")).abs().max() > 1e-3
 
 
-def test_relative_attention_starts_without_positions() -> None:
-    relative, none = SelfAttention(8, 2, causal=True, positions="relative", num_frames=4), None
-    none = SelfAttention(8, 2, causal=True)
-    weights = relative.state_dict()
-    assert not weights.pop("relative.bias").any()
-    none.load_state_dict(weights)
-    x = torch.randn(3, 4, 8)
-    assert_near([relative(x), relative(x, "last")], [none(x), none(x, "last")])
-
-
 @pytest.mark.parametrize("kind", ["none", "learned", "rotary"])
 def test_only_relative_positions_have_weights(kind: TemporalPositions) -> None:
     block = TransformerBlock(8, 2, causal=True, positions=kind, num_frames=4)
     assert list(block.state_dict()) == list(TransformerBlock(8, 2, causal=True).state_dict())
-
-
-@each_kind
-def test_bfloat16(kind: TemporalPositions) -> None:
-    attention, x = make(kind).float(), torch.randn(2, STEPS, WIDTH, dtype=torch.float32)
-    with torch.autocast("cpu", torch.bfloat16):
-        mixed = [attention(x), attention(x, "last")]
-    whole = attention.bfloat16()(x.bfloat16())
-    expected = attention.float()(x)
-    for actual, other in zip([*mixed, whole], [expected, expected[:, -1:], expected], strict=True):
-        assert actual.dtype == torch.bfloat16
-        torch.testing.assert_close(actual.float(), other, rtol=0, atol=2e-2)
 
 
 def test_wrong_settings_say_what_to_do() -> None:

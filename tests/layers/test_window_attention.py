@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from torchrl_tit.layers.attention import SelfAttention
-from torchrl_tit.layers.relative_attention import RelativeSelfAttention
+from torchrl_tit.layers.attention import RelativeSelfAttention, SelfAttention
 from torchrl_tit.layers.window_attention import attend_windows, worth_a_table
 from torchrl_tit.modules.frame_tables import find_starts, table_of_first, table_without_histories
 from torchrl_tit.networks import EnhancedTIT, build_network

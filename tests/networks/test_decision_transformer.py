@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call, stack_module_state
 
 from tests.networks.reference import randomize
 from torchrl_tit import settings
@@ -58,12 +55,6 @@ class Predictor(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         return self.head(self.network.every_frame(*inputs))
-
-
-@pytest.fixture(autouse=True)
-def _fresh_compiler() -> Iterator[None]:
-    yield
-    torch.compiler.reset()
 
 
 def make(case: str, seed: int = 0, **hyperparameters: Any) -> Predictor:
@@ -158,16 +149,6 @@ def test_only_the_newest_step_of_the_last_block_is_computed() -> None:
     assert computed == [14, 1, 14, 5]  # return, state and action of five steps, but for the last
 
 
-@every_case
-def test_leading_dimensions_are_free(case: str) -> None:
-    predictor, inputs = make(case), make_inputs(case, 2, 3)
-    mask = torch.ones(2, 3, 5)
-    expected = predictor(*(x.flatten(0, 1) for x in inputs), mask.flatten(0, 1))
-    torch.testing.assert_close(predictor(*inputs, mask).flatten(0, 1), expected)
-    alone = predictor(*(x[1, 2] for x in inputs), mask[1, 2])
-    torch.testing.assert_close(alone, expected[5])
-
-
 def test_several_tokens_of_a_state_are_joined() -> None:
     frame = settings.Inner(num_blocks=2, embed_dim=16)
     network = HistoryNetwork(
@@ -246,13 +227,6 @@ def test_gpt2_blocks_start_as_gpt2_and_the_rest_as_pytorch() -> None:
     assert bound / 2 < weight.abs().max() <= bound
 
 
-def test_dropout_only_while_training() -> None:
-    predictor, inputs = make("dt", dropout=0.5), make_inputs("dt", 2)
-    assert torch.equal(predictor(*inputs), predictor(*inputs))
-    predictor.train()
-    assert not torch.equal(predictor(*inputs), predictor(*inputs))
-
-
 def test_tokens_are_dropped_before_the_blocks() -> None:
     predictor, inputs = make("dt", dropout=0.5), make_inputs("dt", 2)
     predictor.encoder.blocks.eval()
@@ -279,53 +253,6 @@ def test_both_residuals_of_a_block_are_dropped(part: str) -> None:
     torch.testing.assert_close(update[~dropped], kept[~dropped] / 0.75, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("case", ["dt", "dt_tit on images"])
-def test_compile_in_one_graph_equals_eager(case: str) -> None:
-    """With dropout; tests/networks/test_pairs.py compiles it without."""
-    predictor, inputs = make(case).train(), make_inputs(case, 2)
-    mask = torch.tensor([[0, 0, 1, 1, 1], [1, 1, 1, 1, 1]])
-    compiled = torch.compile(predictor, fullgraph=True, backend="aot_eager")
-    results = []
-    for call in (predictor, compiled):
-        predictor.zero_grad()
-        torch.manual_seed(0)
-        actions = call(*inputs, mask)
-        actions.square().sum().backward()
-        results.append([actions, *(p.grad for p in predictor.parameters())])
-    torch.testing.assert_close(results[1], results[0])
-
-
-@every_case
-def test_vmap_over_stacked_parameters(case: str) -> None:
-    predictors = [make(case, seed) for seed in range(2)]
-    parameters, buffers = stack_module_state(list(predictors))
-    inputs = (*make_inputs(case, 2), torch.tensor([[0, 0, 1, 1, 1], [1, 1, 1, 1, 1]]))
-
-    def call(parameters: dict[str, Tensor], buffers: dict[str, Tensor]) -> Any:
-        return functional_call(predictors[0], (parameters, buffers), inputs)
-
-    actions = torch.vmap(call)(parameters, buffers)
-    torch.testing.assert_close(actions, torch.stack([one(*inputs) for one in predictors]))
-
-
-@pytest.mark.parametrize("case", ["dt", "dt_tit on images"])
-def test_export(case: str) -> None:
-    predictor, inputs = make(case), make_inputs(case, 2)
-    exported = torch.export.export(predictor, tuple(inputs)).module()
-    torch.testing.assert_close(exported(*inputs), predictor(*inputs))
-
-
-@every_case
-def test_copies_and_autocast(case: str) -> None:
-    predictor, inputs = make(case), make_inputs(case, 2)
-    expected = predictor(*inputs)
-    assert torch.equal(copy.deepcopy(predictor)(*inputs), expected)
-    floats = [x.float() if x.is_floating_point() else x for x in inputs]
-    with torch.autocast("cpu", torch.bfloat16):
-        actions = predictor.float()(*floats)
-    assert 1e-5 < (actions.double() - expected).norm() / expected.norm() < 0.05
-
-
 @pytest.mark.parametrize(
     ("hyperparameters", "message"),
     [
@@ -349,11 +276,6 @@ def test_wrong_settings(hyperparameters: dict[str, Any], message: str) -> None:
 def test_a_patch_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="patch_size must be at least 1, not 0"):
         DTTIT((11,), action_dim=3, patch_size=0)
-
-
-def test_an_unknown_action_space_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"unknown action_space 'box': choose one of \('continuo"):
-        DTHead(16, 3, "box")  # type: ignore[arg-type]
 
 
 def test_wrong_shapes_and_types_are_named() -> None:

@@ -1,10 +1,14 @@
-"""Every frame encoder with every history encoder: a pair works everywhere, or says why not."""
+"""Every frame encoder with every history encoder: a pair works everywhere, or says why not.
+
+Arrays and images with all pairs; categories, and several observations at once, with some.
+"""
 
 from __future__ import annotations
 
+import copy
 import io
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any
 
@@ -13,57 +17,60 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 from torch.func import functional_call, stack_module_state
+from torchrl.data import Bounded, MultiCategorical, Unbounded
 from torchrl.modules import set_recurrent_mode
 
+from tests.networks.reference import randomize
 from torchrl_tit import settings
-from torchrl_tit.histories import RecurrentEncoder
-from torchrl_tit.modules import Backbone
-from torchrl_tit.networks import HistoryNetwork, TwoTrunks, build_network, masked_predictions
+from torchrl_tit.frames import read_observations
+from torchrl_tit.modules import Backbone, history_keys
+from torchrl_tit.networks import (
+    EnhancedTIT,
+    HistoryNetwork,
+    TwoTrunks,
+    build_network,
+    masked_predictions,
+)
 from torchrl_tit.settings import FrameSettings, HistorySettings
+from torchrl_tit.windows import Padding, find_windows
 
 NUM_FRAMES, WIDTH, ACTIONS = 3, 8, 2
 
-SMALL_BLOCKS: dict[str, Any] = {"num_heads": 2, "ffn_expansion": 1}
+BLOCKS: dict[str, Any] = {"num_heads": 2, "ffn_expansion": 1}
 FRAMES: dict[str, FrameSettings] = {
     "flat": settings.Flat(),
     "linear": settings.Linear(embed_dim=WIDTH, bias=True, activation="tanh"),
-    "inner": settings.Inner(patch_size=4, embed_dim=WIDTH, **SMALL_BLOCKS),
+    "inner": settings.Inner(patch_size=4, embed_dim=WIDTH, **BLOCKS),
     "resnet": settings.ResNetFrames(embed_dim=WIDTH),
     "nature-cnn": settings.NatureCNNFrames(embed_dim=WIDTH),
 }
 HISTORIES: dict[str, HistorySettings] = {
     "outer": settings.Outer(ffn_expansion=1, temporal_positions="rotary"),
-    "paired-outer": settings.PairedOuter(**SMALL_BLOCKS, temporal_positions="learned"),
-    "chained-outer": settings.ChainedOuter(**SMALL_BLOCKS, temporal_positions="relative"),
-    "stacked-inner": settings.StackedInner(patch_size=4, embed_dim=WIDTH, **SMALL_BLOCKS),
+    "paired-outer": settings.PairedOuter(**BLOCKS, temporal_positions="learned"),
+    "chained-outer": settings.ChainedOuter(**BLOCKS, temporal_positions="relative"),
+    "stacked-inner": settings.StackedInner(patch_size=4, embed_dim=WIDTH, **BLOCKS),
     "stacked-cnn": settings.StackedCNN(),
     "mlp": settings.MLP(hidden_dim=WIDTH),
     "ofenet": settings.OFENet(hidden_dim=WIDTH),
     "d2rl": settings.D2RL(hidden_dim=WIDTH),
-    "catformer": settings.Catformer(**SMALL_BLOCKS),
-    "coberl": settings.CoBERL(**SMALL_BLOCKS, num_blocks=1, hidden_dim=WIDTH),
-    "gtrxl": settings.GTrXL(**SMALL_BLOCKS, num_blocks=1),
+    "catformer": settings.Catformer(**BLOCKS),
+    "coberl": settings.CoBERL(**BLOCKS, num_blocks=1, hidden_dim=WIDTH),
+    "gtrxl": settings.GTrXL(**BLOCKS, num_blocks=1),
     "lstm": settings.LSTM(hidden_dim=WIDTH),
     "gru": settings.GRU(hidden_dim=WIDTH),
     "decision-transformer": settings.DecisionTransformer(
         num_blocks=2, num_heads=2, ffn_dim=WIDTH, max_ep_len=10
     ),
 }
-Pair = tuple[str, str]
-READ_FRAMES = ("stacked-inner", "stacked-cnn")
-REFUSED: dict[Pair, str] = {
-    (frame, history): "stacks the frames themselves, not tokens: choose flat frames"
-    for frame in FRAMES
-    for history in READ_FRAMES
-    if frame != "flat"
-}
-PAIRS = [(f, h) for f in FRAMES for h in HISTORIES if (f, h) not in REFUSED]
-every_pair = pytest.mark.parametrize("pair", PAIRS, ids="+".join)
-# Tracing takes seconds, and the two encoders of a pair are traced apart: each history encoder
-# once, on several tokens where it reads tokens (on one in tests/modules/test_sequences.py), and
-# each frame encoder once.
-TRACED = [p for p in PAIRS if p[0] == ("flat" if p[1] in READ_FRAMES else "inner")]
-TRACED += [p for p in PAIRS if p[1] == "outer" and p[0] != "inner"]
+STACKED = ("stacked-inner", "stacked-cnn")
+REFUSED = [(f, h) for f in FRAMES for h in STACKED if f != "flat"]
+ROWS = MultiCategorical([4, 3, 5])
+BYTES = Bounded(0, 255, (3, 8, 8), dtype=torch.uint8)
+SEVERAL = {"image": BYTES, "arm/left": Unbounded(6, dtype=torch.float64), "row.of": ROWS}
+
+
+Pair = tuple[str, ...]
+"""A frame encoder and a history encoder; and, if they are no arrays and images, what they read."""
 
 
 def shape_of(pair: Pair) -> tuple[int, ...]:
@@ -72,40 +79,78 @@ def shape_of(pair: Pair) -> tuple[int, ...]:
     return (36, 36) if history == "stacked-cnn" or frame in ("resnet", "nature-cnn") else (6,)
 
 
-def build(pair: Pair, seed: int = 0, num_frames: int = NUM_FRAMES) -> HistoryNetwork:
-    frame, history = pair
+PAIRS: list[Pair] = [(f, h) for f in FRAMES for h in HISTORIES if (f, h) not in REFUSED]
+OF_KINDS: dict[Pair, Any] = {
+    ("flat", "mlp", "categories"): ROWS,
+    ("flat", "stacked-inner", "categories"): ROWS,
+    ("linear", "lstm", "categories"): ROWS,
+    ("inner", "paired-outer", "categories"): ROWS,
+    ("inner", "paired-outer", "several"): SEVERAL,
+    ("linear", "coberl", "several"): SEVERAL,
+    ("resnet", "mlp", "several"): SEVERAL,
+    ("flat", "d2rl", "several"): SEVERAL,
+}
+CASES: dict[Pair, Any] = {pair: shape_of(pair) for pair in PAIRS} | OF_KINDS
+every_case = pytest.mark.parametrize("case", CASES, ids="+".join)
+# Tracing takes seconds, and the two encoders of a pair are traced apart: each history encoder once
+# (on one token in tests/modules/test_sequences.py), and each frame encoder once.
+TRACED: list[Pair] = [("flat" if h in STACKED else "inner", h) for h in HISTORIES]
+TRACED += [(f, "outer") for f in FRAMES if f != "inner"]
+TRACED += [("inner", "paired-outer", "categories"), ("resnet", "mlp", "several")]
+traced_cases = pytest.mark.parametrize("case", TRACED, ids="+".join)
+
+
+def build(case: Pair, seed: int = 0, num_frames: int = NUM_FRAMES, **fields: Any) -> Any:
+    frame, history, *_ = case
     torch.manual_seed(seed)
-    return HistoryNetwork(
-        FRAMES[frame],
-        HISTORIES[history],
-        observation_shape=shape_of(pair),
-        num_frames=num_frames,
+    network = settings.Network(
+        frame=FRAMES[frame],
+        history=HISTORIES[history],
         head=settings.Head(features_dim=4),
-        action_dim=ACTIONS,
-    ).eval()
+        num_frames=num_frames,
+        **fields,
+    )
+    return build_network(network, CASES[case], action_dim=ACTIONS).eval()
 
 
 @cache
-def network_of(pair: Pair) -> HistoryNetwork:
+def network_of(case: Pair) -> HistoryNetwork:
     """A network in float64, which tests leave as it is."""
-    return build(pair).double()
+    return build(case).double()
 
 
-def inputs_of(pair: Pair, *leading: int) -> list[Tensor]:
-    """A history and what the history encoder reads beside, in float64."""
-    generator = torch.Generator().manual_seed(1)
+def frames_of(case: Pair, *leading: int, seed: int = 1) -> list[Tensor]:
+    """Observations of each kind, [*leading, *shape], as an environment writes them."""
+    generator = torch.Generator().manual_seed(seed)
 
-    def draw(*shape: int) -> Tensor:
-        return torch.randn(*leading, NUM_FRAMES, *shape, generator=generator, dtype=torch.float64)
+    def draw(shape: tuple[int, ...], high: int) -> Tensor:
+        return torch.randint(high, (*leading, *shape), generator=generator)
 
+    frames = []
+    for seen in read_observations(CASES[case]).values():
+        if seen.categories is not None:
+            frames.append(torch.cat([draw((1,), n) for n in seen.categories], -1))
+        elif seen.dtype == torch.uint8:
+            frames.append(draw(seen.shape, 256).byte())
+        else:
+            frames.append(torch.randn(*leading, *seen.shape, generator=generator).double())
+    return frames
+
+
+def context_of(case: Pair, *leading: int) -> list[Tensor]:
+    """What the history encoder reads beside tokens."""
+    drawn = torch.rand(*leading, NUM_FRAMES, ACTIONS + 1, dtype=torch.float64)
     context = {
-        "action": draw(ACTIONS),
-        "return_to_go": draw(1),
+        "action": drawn[..., 1:],
+        "return_to_go": drawn[..., :1],
         "timestep": torch.arange(NUM_FRAMES).expand(*leading, -1),
         "mask": torch.ones(*leading, NUM_FRAMES, dtype=torch.bool),
     }
-    history = draw(*shape_of(pair))
-    return [history, *(context[name] for name in network_of(pair).history_encoder.context)]
+    return [context[name] for name in network_of(case).history_encoder.context]
+
+
+def inputs_of(case: Pair, *leading: int) -> list[Tensor]:
+    return [*frames_of(case, *leading, NUM_FRAMES), *context_of(case, *leading)]
 
 
 @pytest.fixture
@@ -115,104 +160,166 @@ def _fresh_compiler() -> Iterator[None]:
     torch.compiler.reset()
 
 
-def own(registered: dict[str, type[Any]]) -> set[str]:
+def ours(registered: dict[str, type[Any]]) -> set[str]:
     """Names of the parts of this library: tests may have registered others."""
     return {name for name, part in registered.items() if part.__module__.startswith("torchrl_tit.")}
 
 
 def test_all_registered_parts_are_here() -> None:
-    assert set(FRAMES) == own(FrameSettings.registered)
-    assert set(HISTORIES) == own(HistorySettings.registered)
-    assert all(FRAMES[name].name == name for name in FRAMES)
-    assert all(HISTORIES[name].name == name for name in HISTORIES)
+    assert set(FRAMES) == ours(FrameSettings.registered)
+    assert set(HISTORIES) == ours(HistorySettings.registered)
+    assert all(parts[name].name == name for parts in (FRAMES, HISTORIES) for name in parts)
 
 
-@pytest.mark.parametrize("pair", REFUSED, ids="+".join)
-def test_a_pair_that_cannot_work_says_why(pair: Pair) -> None:
-    with pytest.raises(ValueError, match=REFUSED[pair]) as error:
-        build(pair)
-    assert "\n" not in str(error.value)
-
-
-@every_pair
-def test_values_and_gradients_are_finite(pair: Pair) -> None:
-    network = network_of(pair)
-    features = network(*inputs_of(pair, 4))
+@every_case
+def test_every_frame_matters_and_gradients_are_finite(case: Pair) -> None:
+    network, inputs = network_of(case), inputs_of(case, 4)
+    features = network(*inputs)
     assert features.shape == (4, network.features_dim) == (4, 4)
-    assert features.isfinite().all()
-    parameters = dict(network.named_parameters())
-    # Of CoBERL, the contrastive loss alone hides frames.
-    hidden = {name: parameters.pop(name) for name in list(parameters) if "mask_token" in name}
-    probe = torch.linspace(-1, 1, features.numel(), dtype=torch.float64).view_as(features)
-    gradients = torch.autograd.grad((features * probe).sum(), list(parameters.values()))
+    parameters, outputs = dict(network.named_parameters()), features
+    count = len(network.frames)
+    if "coberl" in case:  # its contrastive loss alone hides frames
+        mask = torch.tensor([[True, False, True]]).expand(4, -1)
+        _, predictions = masked_predictions(network, inputs[:count], mask)
+        outputs = torch.cat([features, predictions.flatten(1)], 1)
+    probe = torch.linspace(-1, 1, outputs.numel(), dtype=torch.float64).view_as(outputs)
+    gradients = torch.autograd.grad((outputs * probe).sum(), list(parameters.values()))
     for name, gradient in zip(parameters, gradients, strict=True):
         assert gradient.isfinite().all(), name
         assert gradient.any(), name
-    if hidden:
-        mask = torch.tensor([[True, False, True]]).expand(4, -1)
-        _, predictions = masked_predictions(network, inputs_of(pair, 4)[0], mask)
-        for gradient in torch.autograd.grad(predictions.square().sum(), list(hidden.values())):
-            assert gradient.any()
-
-
-@every_pair
-def test_a_frame_changes_its_own_tokens_and_the_features(pair: Pair) -> None:
-    network = network_of(pair)
-    history, *context = inputs_of(pair, 2)
-    with torch.no_grad():
-        tokens, features = network.encode_frames(history), network(history, *context)
+    tokens = network.encode_frames(*inputs[:count])
+    for number, other in enumerate(frames_of(case, 4, NUM_FRAMES, seed=2)):
         for step in range(NUM_FRAMES):
-            changed = history.clone()
-            changed[:, step] = torch.randn(2, *shape_of(pair))
-            same = network.encode_frames(changed) == tokens
-            others = [other for other in range(NUM_FRAMES) if other != step]
-            assert same[:, others].all()
-            assert not same[:, step].all()
-            assert not torch.equal(network(changed, *context), features)
+            changed = [x.clone() for x in inputs]
+            changed[number][:, step] = other[:, step]
+            assert not torch.equal(network(*changed), features), (number, step)
+            # A frame changes its own tokens only.
+            same = (network.encode_frames(*changed[:count]) == tokens).flatten(2).all(-1)
+            assert same.all(0).tolist() == [k != step for k in range(NUM_FRAMES)]
 
 
-@every_pair
-def test_acting_with_kept_frames_equals_the_full_pass(pair: Pair) -> None:
-    network = network_of(pair)
-    names = network.history_encoder.context
-    backbone = Backbone(network, ["history", *names], ["features"])
-    frames = torch.randn(2, 7, *shape_of(pair), dtype=torch.float64)
-    _, *context = inputs_of(pair, 2)
-    history = frames[:, :1].expand(-1, NUM_FRAMES, *shape_of(pair)).clone()
-    with torch.no_grad(), backbone.acting():
-        for step in range(1, 7):
-            history = torch.cat([history[:, 1:], frames[:, step : step + 1]], dim=1)
-            if step == 4:  # the first environment starts anew
-                history[0] = frames[0, step]
-            entries = {"history": history, **dict(zip(names, context, strict=True))}
-            features = backbone(TensorDict(entries, [2]))["features"]
-            torch.testing.assert_close(features, network(history, *context))
-    assert backbone.keeps_frames == (pair[0] != "flat")
+@every_case
+@torch.no_grad()
+def test_leading_dimensions_are_free(case: Pair) -> None:
+    network, inputs = network_of(case), inputs_of(case, 2, 3)
+    expected = network(*(x.flatten(0, 1) for x in inputs))
+    torch.testing.assert_close(network(*inputs).flatten(0, 1), expected)
+    torch.testing.assert_close(network(*(x[1, 2] for x in inputs)), expected[5])
+    assert network(*inputs_of(case, 0)).shape == (0, 4)
 
 
-@every_pair
-def test_state_dict_round_trip(pair: Pair) -> None:
-    network, fresh, inputs = network_of(pair), build(pair, seed=1).double(), inputs_of(pair, 2)
-    assert not torch.equal(fresh(*inputs), network(*inputs))
+@pytest.mark.parametrize("case", PAIRS, ids="+".join)
+@torch.no_grad()
+def test_bytes_are_divided_by_255(case: Pair) -> None:
+    network, (history, *context) = network_of(case), inputs_of(case, 2)
+    history = torch.randint(256, history.shape, dtype=torch.uint8)
+    expected = network(history.double() / 255, *context)
+    torch.testing.assert_close(network(history, *context), expected)
+
+
+def sequences(case: Pair, count: int, steps: int, padding: Padding) -> TensorDict:
+    """Observations and histories of steps, [count, steps]; one episode ends inside."""
+    is_init = torch.zeros(count, steps, 1, dtype=torch.bool)
+    is_init[:, 0] = is_init[-1, steps // 2] = True
+    sequence = TensorDict({"is_init": is_init}, [count, steps])
+    start = torch.where(is_init.squeeze(-1), torch.arange(steps), 0).cummax(1).values
+    for key, frames in zip(history_keys(CASES[case]), frames_of(case, count, steps), strict=True):
+        rows = find_windows(torch.arange(steps).expand(count, -1), start, NUM_FRAMES, padding)
+        windows = []
+        for number, table in enumerate(frames):
+            missing = None if rows.missing is None else rows.missing[number]
+            windows.append(type(rows)(rows.rows[number], missing).gather(table))
+        own = "observation" if key == "history" else ("observation", *key[1:])
+        sequence[own], sequence[key] = frames, torch.stack(windows)
+    for name, entry in zip(
+        network_of(case).history_encoder.context, context_of(case, count, steps), strict=True
+    ):
+        sequence[name] = entry
+    return sequence
+
+
+@every_case
+@torch.no_grad()
+def test_acting_with_kept_frames_equals_the_full_pass(case: Pair) -> None:
+    network, steps = network_of(case), sequences(case, 2, 6, "same")
+    in_keys = [*history_keys(CASES[case]), *network.history_encoder.context]
+    backbone = Backbone(network, in_keys, ["features"])
+    expected = network(*(steps[key] for key in in_keys))
+    with backbone.acting():
+        for step in range(6):
+            features = backbone(steps[:, step].clone())["features"]
+            torch.testing.assert_close(features, expected[:, step])
+    # Flat frames of several observations would be of several widths, so others are chosen.
+    assert backbone.keeps_frames == ("several" in case or case[0] != "flat")
+
+
+@pytest.mark.parametrize("case", OF_KINDS, ids="+".join)
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@torch.no_grad()
+def test_sequences_equal_single_steps(case: Pair, padding: Any) -> None:
+    """Of arrays and images: tests/modules/test_sequences.py."""
+    network, keys = network_of(case), history_keys(CASES[case])
+    steps = sequences(case, 2, 6, padding)
+    expected = network(*(steps[key] for key in keys))
+    with set_recurrent_mode(True):
+        for known in (None, padding):
+            features = Backbone(network, keys, padding=known)(steps.clone())["features"]
+            torch.testing.assert_close(features, expected)
+        if padding == "same":
+            features = Backbone(network, keys)(steps.exclude("history"))["features"]
+            torch.testing.assert_close(features, expected)
+
+
+@every_case
+@torch.no_grad()
+def test_copies_compute_the_same_and_are_apart(case: Pair) -> None:
+    network, fresh, inputs = network_of(case), build(case, seed=1).double(), inputs_of(case, 2)
+    expected = network(*inputs)
+    assert not torch.equal(fresh(*inputs), expected)
+    with TensorDict.from_module(fresh).data.clone().to_module(network):  # as TorchRL's losses do
+        torch.testing.assert_close(network(*inputs), fresh(*inputs))
     file = io.BytesIO()
     torch.save(network.state_dict(), file)
     file.seek(0)
     fresh.load_state_dict(torch.load(file, weights_only=True))
-    assert torch.equal(fresh(*inputs), network(*inputs))
+    for other in (fresh, copy.deepcopy(network)):
+        assert torch.equal(other(*inputs), expected)
+        randomize(other, seed=3)
+    assert torch.equal(network(*inputs), expected)
 
 
-@pytest.mark.parametrize("pair", TRACED, ids="+".join)
-def test_export(pair: Pair) -> None:
-    network, inputs = network_of(pair), inputs_of(pair, 2)
+@traced_cases
+@torch.no_grad()
+def test_other_float_types_stay_close(case: Pair) -> None:
+    network, inputs = network_of(case), inputs_of(case, 8)
+    expected = network(*inputs)
+
+    def error(features: Tensor) -> float:
+        return ((features.double() - expected).norm() / expected.norm()).item()
+
+    for dtype, most in ((torch.bfloat16, 0.1), (torch.float32, 1e-5)):
+        network = build(case).to(dtype)
+        features = network(*(x.to(dtype) if x.is_floating_point() else x for x in inputs))
+        assert features.dtype == dtype
+        assert error(features) < most
+    with torch.autocast("cpu", torch.bfloat16):
+        features = network(*(x.float() if x.is_floating_point() else x for x in inputs))
+    assert 1e-5 < error(features) < 0.1  # it did run in bfloat16
+
+
+@traced_cases
+@torch.no_grad()
+def test_export(case: Pair) -> None:
+    network, inputs = network_of(case), inputs_of(case, 2)
     exported = torch.export.export(network, tuple(inputs)).module()
     torch.testing.assert_close(exported(*inputs), network(*inputs))
 
 
-@pytest.mark.parametrize("pair", TRACED, ids="+".join)
+@traced_cases
 @pytest.mark.usefixtures("_fresh_compiler")
-def test_compile_in_one_graph(pair: Pair) -> None:
+def test_compile_in_one_graph(case: Pair) -> None:
     """The backward pass once for each history encoder: tracing it takes as long again."""
-    check_compiled(pair, "aot_eager", backward=pair[0] == "inner" or pair[1] in READ_FRAMES)
+    check_compiled(case, "aot_eager", backward=case[0] == "inner" or case[1] in STACKED)
 
 
 @pytest.mark.slow
@@ -220,34 +327,54 @@ def test_compile_in_one_graph(pair: Pair) -> None:
     shutil.which("c++") is None and shutil.which("g++") is None, reason="no C++ compiler"
 )
 @pytest.mark.parametrize(
-    "pair", [("linear", "coberl"), ("linear", "decision-transformer")], ids="+".join
+    "case", [("linear", "coberl"), ("linear", "decision-transformer")], ids="+".join
 )
 @pytest.mark.usefixtures("_fresh_compiler")
-def test_real_compilation(pair: Pair) -> None:
+def test_real_compilation(case: Pair) -> None:
     """Enhanced_TIT and its gradients are compiled in tests/recipes/ppo/test_rollout.py."""
-    check_compiled(pair, "inductor", backward=pair[1] != "coberl")
+    check_compiled(case, "inductor", backward="coberl" not in case)
 
 
-def check_compiled(pair: Pair, backend: str, *, backward: bool) -> None:
-    network, inputs = network_of(pair), inputs_of(pair, 2)
+def check_compiled(case: Pair, backend: str, *, backward: bool) -> None:
+    network, inputs = network_of(case), inputs_of(case, 2)
     compiled = torch.compile(network, fullgraph=True, backend=backend)
     results = []
     for call in (network, compiled):
-        inputs[0] = inputs[0].detach().requires_grad_(backward)
         with torch.set_grad_enabled(backward):
             results.append([call(*inputs)])
         if backward:
-            weights = [inputs[0], *network.parameters()]
             loss = results[-1][0].square().sum()
+            weights = list(network.parameters())
             results[-1] += torch.autograd.grad(loss, weights, materialize_grads=True)
     torch.testing.assert_close(results[1], results[0])
 
 
+@pytest.mark.usefixtures("_fresh_compiler", "float64")
+def test_compile_and_export_with_any_batch_size() -> None:
+    module = EnhancedTIT((5,), 3, patch_size=2, temporal_positions="learned").eval()
+    graphs = []
+
+    def backend(graph: torch.fx.GraphModule, _: object) -> Callable[..., Any]:
+        graphs.append(graph)
+        return graph.forward
+
+    compiled = torch.compile(module, fullgraph=True, backend=backend, dynamic=True)
+    batch = torch.export.Dim("batch")
+    exported = torch.export.export(
+        module, (torch.randn(4, 3, 5),), dynamic_shapes={"inputs": ({0: batch},)}
+    ).module()
+    for size in (7, 4, 9):
+        history = torch.randn(size, 3, 5)
+        torch.testing.assert_close(compiled(history), module(history))
+        torch.testing.assert_close(exported(history), module(history))
+    assert len(graphs) == 1
+
+
 # On CPUs, PyTorch's attention kernel runs once per set of parameters, and says so.
 @pytest.mark.filterwarnings("ignore:There is a performance drop")
-@every_pair
-def test_vmap_over_stacked_parameters(pair: Pair) -> None:
-    networks, inputs = [network_of(pair), build(pair, seed=1).double()], inputs_of(pair, 2)
+@every_case
+def test_vmap_over_stacked_parameters(case: Pair) -> None:
+    networks, inputs = [network_of(case), build(case, seed=1).double()], inputs_of(case, 2)
     state = stack_module_state(networks)
 
     def call(parameters: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:
@@ -257,115 +384,113 @@ def test_vmap_over_stacked_parameters(pair: Pair) -> None:
     torch.testing.assert_close(torch.vmap(call)(*state), expected)
 
 
-def test_several_observations_stand_side_by_side() -> None:
-    """Pixels and a state: two frame encoders, whose tokens one history encoder reads."""
-    shapes = {"pixels": (36, 36), "state": (6,)}
-    network = HistoryNetwork(
-        {"pixels": FRAMES["resnet"], "state": FRAMES["inner"]},
-        HISTORIES["paired-outer"],
-        observation_shape=shapes,
-        num_frames=NUM_FRAMES,
-    ).double()
-    assert list(network.frame_encoders) == list(shapes)
-    pixels, state = (
-        torch.randn(2, 9, *shape, dtype=torch.float64, requires_grad=True)
-        for shape in shapes.values()
-    )
-    window = slice(0, NUM_FRAMES)
-    tokens = network.encode_frames(pixels[:, window], state[:, window])
-    assert tokens.shape == (2, NUM_FRAMES, 1 + 2, WIDTH)
-    alone = network.frame_encoders["pixels"](pixels[:, window])
-    torch.testing.assert_close(tokens[:, :, :1], alone)
-    features = network(pixels[:, window], state[:, window])
-    for gradient in torch.autograd.grad(features.square().sum(), [pixels, state]):
-        assert gradient[:, window].flatten(2).any(-1).all()
+@pytest.mark.filterwarnings("ignore:There is a performance drop")
+@pytest.mark.parametrize("kind", ["attention_dropout", "ffn_dropout"])
+@pytest.mark.parametrize("part", ["inner", "outer"])
+def test_vmap_drops_differently_for_each(kind: str, part: str) -> None:
+    dropout: dict[str, Any] = {f"{kind}_{part}": 0.5}
+    modules = [EnhancedTIT((5,), 3, patch_size=2, **dropout) for _ in range(2)]
+    modules[1].load_state_dict(modules[0].state_dict())
+    history = torch.randn(4, 3, 5)
+    first, second = torch.vmap(
+        lambda p, b: functional_call(modules[0], (p, b), (history,)), randomness="different"
+    )(*stack_module_state(modules))
+    assert not torch.allclose(first, second)
 
-    backbone = Backbone(network, ["pixels", ("nested", "state")], ["features"])
+
+def test_acting_encodes_each_frame_of_each_observation_once() -> None:
+    case = ("inner", "paired-outer", "several")
+    network, keys = build(case).double(), history_keys(SEVERAL)
+    steps, counts = sequences(case, 2, 6, "same"), dict.fromkeys(SEVERAL, 0)
+    for name, encoder in zip(SEVERAL, network.frames, strict=True):
+
+        def count(module: Any, inputs: Any, name: str = name) -> None:
+            observation_ndim = len(module.observation_shape)
+            counts[name] += inputs[0].shape[: inputs[0].ndim - observation_ndim].numel()
+
+        encoder.register_forward_pre_hook(count)
+    backbone = Backbone(network, keys)
     with torch.no_grad(), backbone.acting():
         for step in range(6):
-            window = slice(step, step + NUM_FRAMES)
-            entries = {"pixels": pixels[:, window], "nested": {"state": state[:, window]}}
-            features = backbone(TensorDict(entries, [2]))["features"]
-            torch.testing.assert_close(features, network(pixels[:, window], state[:, window]))
+            backbone(steps[:, step].clone())
+    # Of two environments: six steps, and no more for the padding of the episodes that began.
+    assert counts == dict.fromkeys(SEVERAL, 12)
 
 
-def test_two_trunks_act_apart() -> None:
-    system = settings.Network(
-        frame=FRAMES["inner"],
-        history=HISTORIES["outer"],
-        num_frames=NUM_FRAMES,
-        trunks="separate",
-    )
-    network = build_network(system, (6,)).double()
+def test_two_trunks_read_sequences_and_act_apart() -> None:
+    case = ("flat", "d2rl", "several")
+    network = build(case, trunks="separate").double()
     assert isinstance(network, TwoTrunks)
-    frames = torch.randn(2, 9, 6, dtype=torch.float64)
-    policy, value = network(frames[:, :NUM_FRAMES])
-    assert not torch.allclose(policy, value)
-    policy.square().sum().backward()
-    assert all(p.grad is not None for p in network.policy.parameters())
-    assert all(p.grad is None for p in network.value.parameters())
-    assert isinstance(build_network(system, (6,), trunks="shared"), HistoryNetwork)
-
-    backbone = Backbone(network, ["history"], ["policy_features", "value_features"])
+    keys, steps = history_keys(SEVERAL), sequences(case, 2, 6, "same")
+    expected = network(*(steps[key] for key in keys))
+    assert not torch.allclose(*expected)
+    backbone = Backbone(network, keys, ["policy", "value"], padding="same")
+    with set_recurrent_mode(True):
+        read = [backbone(steps.clone())]
     with torch.no_grad(), backbone.acting():
-        for step in range(6):
-            history = frames[:, step : step + NUM_FRAMES]
-            features = backbone(TensorDict({"history": history}, [2]))
-            for name, expected in zip(("policy", "value"), network(history), strict=True):
-                torch.testing.assert_close(features[f"{name}_features"], expected)
+        read.append(torch.stack([backbone(steps[:, step].clone()) for step in range(6)], 1))
+    for outputs in read:
+        for name, features in zip(("policy", "value"), expected, strict=True):
+            torch.testing.assert_close(outputs[name], features)
+    expected[0].square().sum().backward()
+    assert all(p.grad is None for p in network.value.parameters())
+    shared = settings.Network(
+        frame=FRAMES["linear"], history=HISTORIES["mlp"], trunks="separate", num_frames=2
+    )
+    assert isinstance(build_network(shared, (6,), trunks="shared"), HistoryNetwork)
 
 
 @pytest.mark.parametrize(
-    "pair", [*((frame, "lstm") for frame in FRAMES), ("linear", "gru")], ids="+".join
+    "case",
+    [*((f, "lstm") for f in FRAMES), ("linear", "gru"), ("linear", "lstm", "categories")],
+    ids="+".join,
 )
-def test_a_carried_state_reads_a_sequence_as_single_steps(pair: Pair) -> None:
+def test_a_carried_state_reads_a_sequence_as_single_steps(case: Pair) -> None:
     """With one frame an LSTM carries its state, whichever frame encoder stands before it."""
-    network = build(pair, num_frames=1).double()
-    encoder = network.history_encoder
-    assert isinstance(encoder, RecurrentEncoder)
-    backbone = Backbone(network, ["history"], ["features"])
+    backbone = Backbone(build(case, num_frames=1).double(), ["history"], ["features"])
     assert backbone.is_recurrent
-    steps = 5
-    is_init = torch.zeros(2, steps, 1, dtype=torch.bool)
-    is_init[:, 0] = is_init[0, 3] = True
-    sequence = TensorDict(
-        {
-            "history": torch.randn(2, steps, 1, *shape_of(pair), dtype=torch.float64),
-            "is_init": is_init,
-            **{
-                key: torch.zeros(2, steps, *shape, dtype=torch.float64)
-                for key, shape in encoder.state_shapes.items()
-            },
-        },
-        [2, steps],
-    )
+    steps = sequences(case, 2, 5, "same").exclude("observation")
+    shape = read_observations(CASES[case])["observation"].shape
+    steps["history"] = steps["history"].unflatten(2, (NUM_FRAMES,))[:, :, -1:]
+    assert steps["history"].shape == (2, 5, 1, *shape)
+    for key, state_shape in backbone.state_shapes.items():
+        steps[key] = torch.zeros(2, 5, *state_shape, dtype=torch.float64)
     with set_recurrent_mode(True):
-        expected = backbone(sequence.clone())["features"]
-    state = sequence[:, 0].select(*encoder.state_shapes)
-    for step in range(steps):
-        entries = sequence[:, step].clone().update(state)
-        entries = backbone(entries)
-        torch.testing.assert_close(entries["features"], expected[:, step])
-        state = entries["next"].select(*encoder.state_shapes)
+        expected = backbone(steps.clone())["features"]
+    state = steps[:, 0].select(*backbone.state_shapes)
+    for step in range(5):
+        outputs = backbone(steps[:, step].clone().update(state))
+        torch.testing.assert_close(outputs["features"], expected[:, step])
+        state = outputs["next"].select(*backbone.state_shapes)
 
 
-WRONG_PAIRS: dict[str, tuple[Any, Any, Any, str]] = {
+PIXELS_AND_STATE = {"pixels": (36, 36), "state": (6,)}
+WRONG: dict[str, tuple[Any, Any, Any, str]] = {
+    **{
+        f"{frame}+{history}": (
+            FRAMES[frame],
+            HISTORIES[history],
+            (36, 36),
+            "stacks the frames themselves, not tokens: choose flat frames of one observation",
+        )
+        for frame, history in REFUSED
+    },
     "several observations, stacked": (
         settings.Flat(),
         settings.StackedCNN(),
         {"left": (36, 36), "right": (36, 36)},
-        "StackedCNN stacks the frames themselves, not tokens: choose flat frames of one observ",
+        "StackedCNN stacks the frames themselves, not tokens",
     ),
     "widths differ": (
         {"pixels": settings.ResNetFrames(embed_dim=8), "state": settings.Linear(embed_dim=16)},
         settings.Outer(),
-        {"pixels": (36, 36), "state": (6,)},
+        PIXELS_AND_STATE,
         r"tokens of the widths 8 \(pixels\) and 16 \(state\) cannot stand side by side: give both",
     ),
     "an encoder is missing": (
         {"pixels": settings.ResNetFrames()},
         settings.Outer(),
-        {"pixels": (36, 36), "state": (6,)},
+        PIXELS_AND_STATE,
         "there are frame encoders for pixels, but observations pixels, state: name one for each",
     ),
     "heads do not divide the width of tokens": (
@@ -395,14 +520,20 @@ WRONG_PAIRS: dict[str, tuple[Any, Any, Any, str]] = {
     "images are too small": (
         settings.NatureCNNFrames(),
         settings.Outer(),
-        (3, 20, 84),
-        "images of 20 x 84 pixels are too small .* must have at least 36",
+        (3, 35, 84),
+        "images of 35 x 84 pixels are too small .* must have at least 36",
+    ),
+    "images are too small for the residual network": (
+        settings.ResNetFrames(),
+        settings.Outer(),
+        (7, 84),
+        "images of 7 x 84 pixels are too small .* must have at least 8",
     ),
     "convolutions on arrays": (
         settings.ResNetFrames(),
         settings.Outer(),
         (6,),
-        r"observation_shape \(6,\) is that of an array, but this encoder reads images",
+        r"resnet frames do not read an array of shape \(6,\): take inner, linear or flat frames",
     ),
     "stacked convolutions on arrays": (
         settings.Flat(),
@@ -428,12 +559,18 @@ WRONG_PAIRS: dict[str, tuple[Any, Any, Any, str]] = {
         (6,),
         "Decision Transformer reads actions and returns .*: give action_dim",
     ),
+    "a module in the place of settings": (
+        torch.nn.Linear(6, 8),
+        settings.Outer(),
+        (6,),
+        "a network is built from settings, such as .*, but Linear.* is no FrameSettings",
+    ),
 }
 
 
-@pytest.mark.parametrize("case", WRONG_PAIRS)
-def test_parts_that_do_not_fit_each_other_or_the_observation(case: str) -> None:
-    frame, history, shape, message = WRONG_PAIRS[case]
+@pytest.mark.parametrize("case", WRONG)
+def test_parts_that_do_not_fit_each_other_or_the_observation(case: Pair) -> None:
+    frame, history, shape, message = WRONG[case]
     with pytest.raises(ValueError, match=message) as error:
         HistoryNetwork(frame, history, observation_shape=shape, num_frames=NUM_FRAMES)
     assert "\n" not in str(error.value)
@@ -441,14 +578,38 @@ def test_parts_that_do_not_fit_each_other_or_the_observation(case: str) -> None:
 
 @pytest.mark.parametrize("num_frames", [0, -1, True, 2.0, "4"])
 def test_number_of_frames(num_frames: Any) -> None:
-    with pytest.raises(ValueError, match="num_frames is the number K of observations and must be"):
+    with pytest.raises(ValueError, match="num_frames"):
         HistoryNetwork(
             settings.Linear(), settings.Outer(), observation_shape=(6,), num_frames=num_frames
         )
 
 
-def test_as_many_histories_as_observations() -> None:
-    network = network_of(("linear", "mlp"))
-    history = inputs_of(("linear", "mlp"), 2)[0]
-    with pytest.raises(ValueError, match=r"reads 1 histories \(observation\), not 2"):
-        network.encode_frames(history, history)
+def test_observations_by_name() -> None:
+    case = ("inner", "paired-outer", "several")
+    network = network_of(case)
+    assert list(network.observations) == list(SEVERAL)
+    assert list(network.frame_encoders) == ["image", "arm/left", "row_of"]
+    inputs = inputs_of(case, 2)
+    tokens = network.encode_frames(*inputs)
+    apart = [encoder(x) for encoder, x in zip(network.frames, inputs, strict=True)]
+    torch.testing.assert_close(tokens, torch.cat(apart, -2))
+    message = r"reads 3 histories \(image, arm/left, row.of\), not 1"
+    with pytest.raises(ValueError, match=message):
+        network(torch.zeros(1, NUM_FRAMES, 6))
+
+
+@pytest.mark.parametrize(
+    ("observation", "history", "message"),
+    [
+        (ROWS, torch.zeros(2, 3, 3), r"float32 does not fit a row of categories \(4, 3, 5 values"),
+        ((3,), torch.zeros(2, 3, 3).long(), r"build the network with their spec \(MultiCateg"),
+        ((3,), torch.zeros(2, 3, 3).double(), "DoubleToFloat"),
+    ],
+)
+def test_histories_of_another_dtype(observation: Any, history: Tensor, message: str) -> None:
+    network = HistoryNetwork(
+        FRAMES["linear"], HISTORIES["outer"], observation_shape=observation, num_frames=3
+    )
+    for call in (network, lambda x: network.check_frames(x.flatten(0, 1))):
+        with pytest.raises(TypeError, match=message):
+            call(history)

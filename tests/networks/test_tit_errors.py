@@ -7,8 +7,6 @@ from typing import Any
 import pytest
 import torch
 
-from torchrl_tit.layers import SelfAttention
-from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.networks import EnhancedTIT, VanillaTIT
 
 BOTH = pytest.mark.parametrize("kind", [EnhancedTIT, VanillaTIT])
@@ -31,25 +29,23 @@ WRONG_SETTINGS: list[tuple[tuple[int, ...], int, dict[str, Any], str]] = [
     ((4,), 1, {"activation_head": "Tanh"}, r"'Tanh', not one of .*'tanh'"),
     *(
         ((4,), 1, {f"{kind}_dropout_{part}": p}, rf"{kind}_dropout .* \[0, 1\), not {p}")
-        for kind in ("attention", "ffn")
-        for part in ("inner", "outer")
-        for p in (-0.1, 1.0, float("nan"))
+        for kind, part, p in [
+            ("attention", "inner", -0.1),
+            ("attention", "outer", 1.0),
+            ("ffn", "inner", float("nan")),
+            ("ffn", "outer", 1.0),
+        ]
     ),
     *(
-        (
-            (4,),
-            1,
-            {name: 0},
-            rf"{name.removesuffix('_inner').removesuffix('_outer')} must be at least 1, not 0",
-        )
-        for name in (
-            "patch_size",
-            "embed_dim",
-            "num_blocks",
-            "ffn_expansion_inner",
-            "ffn_expansion_outer",
-            "features_dim",
-        )
+        ((4,), 1, {name: 0}, rf"{field} must be at least 1, not 0")
+        for name, field in [
+            ("patch_size", "patch_size"),
+            ("embed_dim", "embed_dim"),
+            ("num_blocks", "num_blocks"),
+            ("ffn_expansion_inner", "ffn_expansion"),
+            ("ffn_expansion_outer", "ffn_expansion"),
+            ("features_dim", "features_dim"),
+        ]
     ),
 ]
 
@@ -72,9 +68,7 @@ def test_nothing_left() -> None:
 
 @BOTH
 def test_unknown_hyperparameter_is_named(kind: type[Any]) -> None:
-    with pytest.raises(
-        TypeError, match=rf"{kind.__name__}\(\) got an unexpected .* argument 'embed_dims'"
-    ):
+    with pytest.raises(TypeError, match=r"got an unexpected keyword argument 'embed_dims'"):
         kind((4,), embed_dims=64)
 
 
@@ -116,16 +110,6 @@ def test_autocast_does_not_convert_these(dtype: torch.dtype) -> None:
 def test_float32_into_a_network_of_float64() -> None:
     with pytest.raises(TypeError, match=r"torch.float32 .* network of torch.float64"):
         EnhancedTIT((3,), 2).double()(torch.zeros(5, 2, 3))
-
-
-def test_attention_heads() -> None:
-    with pytest.raises(ValueError, match=r"width 10 cannot be split over 4 attention heads"):
-        SelfAttention(10, 4)
-
-
-def test_activation() -> None:
-    with pytest.raises(ValueError, match=r"unknown activation 'swish': choose one of \('gelu'"):
-        make_activation("swish")  # type: ignore[arg-type]
 
 
 def test_representation_shows_what_the_network_is() -> None:

@@ -11,7 +11,7 @@ from recipes.recipe import Recipe
 from recipes.registry import get_recipe
 from torchrl_tit.networks import MLP
 from torchrl_tit.settings import FrameSettings, Head, HistorySettings, Inner, Network, Outer
-from torchrl_tit.settings.fields import checked, field_types
+from torchrl_tit.settings.checks import checked, field_types
 from torchrl_tit.settings.networks import mlp
 
 HALF: Any = 2.5

@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from torchrl_tit.settings import FrameSettings
-from torchrl_tit.settings.imports import import_allowed
-from torchrl_tit.settings.plugins import load_plugins
+from torchrl_tit.settings.imports import import_allowed, load_plugins
 
 PART = """
 from dataclasses import dataclass
@@ -58,7 +57,7 @@ def test_two_plugins_with_one_name_are_named_where_it_is_used(install):
 
 def test_a_name_of_ours_cannot_be_taken(own_modules):
     (own_modules / "taken.py").write_text(PART.format(name="inner"))
-    message = r"'taken' cannot be .*'inner', in torchrl_tit.settings.frames.Inner and in taken.Own"
+    message = r"'taken' cannot be .*'inner', in torchrl_tit.settings.encoders.Inner and in taken.O"
     with pytest.raises(ImportError, match=message):
         import_allowed("taken")
 

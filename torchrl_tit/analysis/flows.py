@@ -19,7 +19,7 @@ from torchrl_tit.histories.catformer import Catformer
 from torchrl_tit.histories.coberl import CoBERL
 from torchrl_tit.histories.decision_transformer import DecisionTransformer
 from torchrl_tit.histories.encoder import HistoryEncoder, RecurrentEncoder
-from torchrl_tit.layers.block import TransformerBlock
+from torchrl_tit.layers.blocks import TransformerBlock
 from torchrl_tit.networks import HistoryNetwork, build_network
 
 Kind: TypeAlias = Literal["spatial", "temporal"]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchrl_tit.envs import is_atari, make_games
 from torchrl_tit.envs.gymnasium_tasks import make_unchecked
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 
 FLAGS = ("terminals", "timeouts")
 

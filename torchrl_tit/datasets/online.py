@@ -21,7 +21,7 @@ from torchrl_tit.datasets.storages import (
     nest,
     take,
 )
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Batch, Frames
 from torchrl_tit.windows import Padding, Windows, find_windows
 

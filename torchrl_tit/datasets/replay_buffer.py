@@ -11,7 +11,7 @@ from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 
 from torchrl_tit.datasets.online import OnlineHistoryStorage
 from torchrl_tit.datasets.storages import EpisodeStorage
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Batch
 
 AnySeed = Annotated[int, Meta(ge=0, le=2**62)]

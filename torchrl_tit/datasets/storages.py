@@ -16,7 +16,7 @@ from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 
 from torchrl_tit.datasets.checks import DatasetError
 from torchrl_tit.datasets.episodes import Episodes
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Frames, Positive, Real
 from torchrl_tit.windows import Padding, find_windows
 

@@ -26,7 +26,7 @@ from torchrl_tit.datasets.checks import (
 )
 from torchrl_tit.datasets.episodes import Episodes, memory_mapped_rows, rows_per_chunk
 from torchrl_tit.datasets.hdf5_files import damage_named
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Steps
 
 Gaps = Literal["error", "cut"]

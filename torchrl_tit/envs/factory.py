@@ -19,7 +19,7 @@ from torchrl_tit.envs.spaces import observation_keys as keys_of
 from torchrl_tit.envs.torchrl_tasks import make_torchrl_tasks
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.extras import install
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Copies, Seed
 from torchrl_tit.transforms.hide_velocities import HideVelocities
 from torchrl_tit.transforms.history import History

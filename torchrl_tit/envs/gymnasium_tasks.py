@@ -15,7 +15,7 @@ import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from torchrl_tit.envs.names import Wrap, task_spec
-from torchrl_tit.settings.plugins import load_plugins
+from torchrl_tit.settings.imports import load_plugins
 
 VectorizationMode = Literal["sync", "async"]
 

@@ -13,9 +13,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from torchrl_tit.extras import install
-from torchrl_tit.settings.imports import import_module, import_named
+from torchrl_tit.settings.imports import import_module, import_named, load_plugins
 from torchrl_tit.settings.literals import parse_call
-from torchrl_tit.settings.plugins import load_plugins
 
 Wrap = Callable[[gymnasium.Env], gymnasium.Env]
 

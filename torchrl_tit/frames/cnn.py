@@ -8,10 +8,9 @@ from typing import ClassVar
 from torch import Tensor, nn
 
 from torchrl_tit import settings
-from torchrl_tit.frames.encoder import FrameEncoder, check_image_shape
+from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.observation import Kind
-from torchrl_tit.layers.images import as_images, stacked_shape
-from torchrl_tit.layers.torsos import TORSOS
+from torchrl_tit.layers.images import ConvolutionalTorso, as_images
 
 
 class CNNFrameEncoder(FrameEncoder):
@@ -41,10 +40,8 @@ class CNNFrameEncoder(FrameEncoder):
         settings: settings.ResNetFrames | settings.NatureCNNFrames,
         observation_shape: Sequence[int],
     ) -> None:
-        torso = TORSOS[settings.name]
-        shape = check_image_shape(observation_shape, torso.smallest_image)
-        super().__init__(shape, num_tokens=1, width=settings.embed_dim)
-        self.torso = torso(*stacked_shape(shape))
+        super().__init__(observation_shape, num_tokens=1, width=settings.embed_dim)
+        self.torso = ConvolutionalTorso(settings.name, self.observation_shape)
         self.linear = nn.Linear(self.torso.out_features, settings.embed_dim)
 
     def forward(self, observation: Tensor) -> Tensor:

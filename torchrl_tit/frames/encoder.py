@@ -8,6 +8,7 @@ from typing import ClassVar
 from torch import Tensor, nn
 
 from torchrl_tit.frames.observation import Kind, check_observation_shape
+from torchrl_tit.layers.attention import attention_maps
 
 
 class FrameEncoder(nn.Module):
@@ -67,28 +68,20 @@ class FrameEncoder(nn.Module):
         Returns:
             float [..., L, D].
         """
-        raise NotImplementedError
+        raise NotImplementedError(
+            "there is no forward, which maps [..., *observation_shape] to tokens [..., L, D]"
+        )
 
     def attention_maps(self, observation: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, float [..., heads, S, S]; default: none."""
-        return []
+        """Returns the attention weights of each attention layer of this library in it.
 
+        Args:
+            observation: as in ``forward``.
 
-def check_image_shape(shape: Sequence[int], smallest: int) -> tuple[int, ...]:
-    """Returns the shape of an image as a tuple.
-
-    Raises:
-        ValueError: if it is the shape of an array, or has fewer than ``smallest`` pixels per side.
-    """
-    shape = check_observation_shape(shape)
-    if len(shape) == 1:
-        raise ValueError(
-            f"observation_shape {shape} is that of an array, but this encoder reads images (H, W) "
-            "or (C, H, W): for arrays take inner or linear frames, or stack them for an mlp"
-        )
-    if min(shape[-2:]) < smallest:
-        raise ValueError(
-            f"images of {shape[-2]} x {shape[-1]} pixels are too small for these convolutions: "
-            f"both sides must have at least {smallest}"
-        )
-    return shape
+        Returns:
+            float [..., heads, S, S] of each layer, in the order of their calls. For an inner
+            transformer S = 1 + patches: position 0 is the class token, patches follow row by row.
+        """
+        leading = observation.shape[: observation.ndim - len(self.observation_shape)]
+        maps = attention_maps(self, observation)
+        return [weights.reshape(*leading, *weights.shape[-3:]) for weights in maps]

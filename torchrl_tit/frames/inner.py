@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.observation import Kind, check_observation_shape
-from torchrl_tit.layers.block import TransformerBlock
+from torchrl_tit.layers.blocks import TransformerBlock
 from torchrl_tit.layers.patches import find_patch_size, make_patch_embedding
 
 
@@ -76,13 +76,13 @@ class InnerTransformer(FrameEncoder):
             else None
         )
         self.blocks = nn.ModuleList(
-            TransformerBlock.from_settings(settings, settings.embed_dim)
+            TransformerBlock(settings.embed_dim, **settings.block())
             for _ in range(1 if settings.share_blocks else settings.num_blocks)
         )
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises class token and positions: normal with a standard deviation of 0.02."""
+        """Initializes class token and positions: normal with a standard deviation of 0.02."""
         nn.init.normal_(self.class_token, std=0.02)
         if self.positions is not None:
             nn.init.normal_(self.positions, std=0.02)
@@ -98,55 +98,24 @@ class InnerTransformer(FrameEncoder):
         Returns:
             Class tokens, float [..., L, D], or [..., 1, D] of the last block only.
         """
-        class_token, patches, leading = self._tokens(observation)
-        if self.num_blocks == 1:  # before it, the class token is the same for all observations
-            x = self._block(0).read_first(class_token, patches)  # [N, 1, D]
-            return x.reshape(*leading, 1, x.shape[-1])
-        x = _join(class_token, patches)
+        frame_ndim = len(self.observation_shape) + (self.num_frames is not None)
+        leading = observation.shape[: observation.ndim - frame_ndim]
+        shape = observation.shape[observation.ndim - frame_ndim :]
+        # Arrays become [N, channels, D], images [N, channels, H, W]: frames are channels too.
+        space = 1 if len(self.observation_shape) == 1 else 2
+        x = observation.reshape(math.prod(leading), math.prod(shape[:-space]), *shape[-space:])
+        patches = self.patch_embedding(x)  # [N, patches, D]
+        x = torch.cat([self.class_token.expand(patches.shape[0], -1, -1), patches], dim=1)
+        x = x if self.positions is None else x + self.positions
         class_tokens = []
         for index in range(self.num_blocks):
             last = index == self.num_blocks - 1
             x = self._block(index)(x, read="first" if last else "all")
             if last or self.every_block:
                 class_tokens.append(x[:, 0])
-        return torch.stack(class_tokens, dim=1).reshape(*leading, self.num_tokens, x.shape[-1])
-
-    def attention_maps(self, observation: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, L x float [..., heads, S, S].
-
-        S = 1 + patches; position 0 is the class token, the patches follow row by row.
-        """
-        class_token, patches, leading = self._tokens(observation)
-        x = _join(class_token, patches)
-        maps = []
-        for index in range(self.num_blocks):
-            block = self._block(index)
-            weights = block.attention_weights(x)
-            maps.append(weights.reshape(*leading, *weights.shape[1:]))
-            x = block(x)
-        return maps
+        return torch.stack(class_tokens, dim=1).reshape(*leading, self.num_tokens, self.width)
 
     def _block(self, index: int) -> TransformerBlock:
         block = self.blocks[index % len(self.blocks)]
         assert isinstance(block, TransformerBlock)
         return block
-
-    def _tokens(self, observation: Tensor) -> tuple[Tensor, Tensor, tuple[int, ...]]:
-        """[..., *observation] -> class token [1, 1, D], patches [N, patches, D], leading shape."""
-        frame_ndim = len(self.observation_shape) + (self.num_frames is not None)
-        leading = observation.shape[: observation.ndim - frame_ndim]
-        shape = observation.shape[observation.ndim - frame_ndim :]
-        # Arrays become [N, channels, D], images [N, channels, H, W]: frames are channels too.
-        space = 1 if len(self.observation_shape) == 1 else 2
-        channels = math.prod(shape[:-space])
-        x = observation.reshape(math.prod(leading), channels, *shape[-space:])
-        patches = self.patch_embedding(x)
-        if self.positions is None:
-            return self.class_token, patches, tuple(leading)
-        class_token = self.class_token + self.positions[:, :1]
-        return class_token, patches + self.positions[:, 1:], tuple(leading)
-
-
-def _join(class_token: Tensor, patches: Tensor) -> Tensor:
-    """[1, 1, D] and [N, patches, D] -> [N, 1 + patches, D]."""
-    return torch.cat([class_token.expand(patches.shape[0], -1, -1), patches], dim=1)

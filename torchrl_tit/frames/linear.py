@@ -55,7 +55,7 @@ class LinearFrameEncoder(FrameEncoder):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises the weights of categories. Others are those of the linear layer."""
+        """Initializes the weights of categories. Others are those of the linear layer."""
         if self.index is not None:  # as many inputs are 1 as there are entries
             bound = 1 / math.sqrt(len(self.index.first))
             nn.init.uniform_(self.linear.weight, -bound, bound)

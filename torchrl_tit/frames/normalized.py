@@ -1,4 +1,4 @@
-"""Normalises observations by their mean and standard deviation for a frame encoder."""
+"""Normalizes observations by their mean and standard deviation for a frame encoder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _IMAGES = 256
 
 
 class NormalizedFrames(FrameEncoder):
-    """A frame encoder that reads observations normalised by their mean and standard deviation.
+    """A frame encoder that reads observations normalized by their mean and standard deviation.
 
     The statistics are running ones (:meth:`update`), or those of a data set
     (:meth:`set_statistics`). Until then, observations are read as they are. Each entry of an array
@@ -30,7 +30,7 @@ class NormalizedFrames(FrameEncoder):
 
     Args:
         encoder: the frame encoder.
-        limit: bound to which normalised entries are clipped; infinite for none.
+        limit: bound to which normalized entries are clipped; infinite for none.
         eps: is added to the standard deviation; None adds 1e-8 to the variance, as `VecNormalize`
             does. It decides how entries are read that never changed so far.
 
@@ -91,7 +91,7 @@ class NormalizedFrames(FrameEncoder):
         self.count.copy_(total)
 
     def normalize(self, observation: Tensor) -> Tensor:
-        """Normalises observations, float or uint8 [..., *observation_shape] -> float."""
+        """Normalizes observations, float or uint8 [..., *observation_shape] -> float."""
         floats = bytes_to_floats(observation, self.mean.dtype)
         root, eps = (1e-8, 0.0) if self.eps is None else (0.0, self.eps)
         normal = standardize(floats, self.mean, (self.variance + root).sqrt(), eps)
@@ -100,7 +100,3 @@ class NormalizedFrames(FrameEncoder):
     def forward(self, observation: Tensor) -> Tensor:
         """See :meth:`FrameEncoder.forward`."""
         return self.encoder(self.normalize(observation))
-
-    def attention_maps(self, observation: Tensor) -> list[Tensor]:
-        """See :meth:`FrameEncoder.attention_maps`."""
-        return self.encoder.attention_maps(self.normalize(observation))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
@@ -49,12 +47,8 @@ class CatformerAttention(nn.Module):
         )
 
     def forward(self, x: Tensor, read: Read = "all") -> Tensor:
-        """Float [N, K, in_dim] -> float [N, K or 1, D]."""
+        """Float [..., K, in_dim] -> float [..., K or 1, D]."""
         return self.attention(self.norm(self.projection(x)), read)
-
-    def attention_weights(self, x: Tensor) -> Tensor:
-        """Returns the attention weights of this layer, float [N, heads, K, K]."""
-        return self.attention.weights(self.norm(self.projection(x)))
 
 
 class Catformer(HistoryEncoder):
@@ -63,7 +57,7 @@ class Catformer(HistoryEncoder):
     Davis et al., "Catformer: Designing Stable Transformers via Sensitivity Analysis", ICML 2021, as
     built for the baseline of arXiv 2212.14538. Attention and FFN layers alternate, without
     residuals: each layer after the first reads the concatenated outputs of all previous layers
-    (without the tokens themselves). The weights have PyTorch's default initialisation. If frames
+    (without the tokens themselves). The weights have PyTorch's default initialization. If frames
     have several tokens, a linear layer merges them into one.
 
     Args:
@@ -112,41 +106,21 @@ class Catformer(HistoryEncoder):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises learned temporal positions: normal with a standard deviation of 0.02."""
+        """Initializes learned temporal positions: normal with a standard deviation of 0.02."""
         if self.positions is not None:
             nn.init.normal_(self.positions, std=0.02)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., D]."""
-        x, leading = self._steps(tokens)  # [N, K, D]
-        outputs: list[Tensor] = []  # of all layers so far, [N, K, D] each
+        x = self.one_token(tokens)  # [..., K, D]
+        x = x if self.positions is None else x + self.positions[0]
+        outputs: list[Tensor] = []  # of all layers so far, [..., K, D] each
         for index, (attention, ffn) in enumerate(zip(self.attentions, self.ffns, strict=True)):
             x = torch.cat(outputs, dim=-1) if outputs else x
             if index == len(self.ffns) - 1:  # the last two layers compute only the newest frame
-                outputs = [output[:, -1:] for output in outputs]
+                outputs = [output[..., -1:, :] for output in outputs]
                 outputs.append(attention(x, read="last"))
             else:
                 outputs.append(attention(x))
             outputs.append(ffn(torch.cat(outputs, dim=-1)))
-        return outputs[-1].reshape(*leading, self.out_features)
-
-    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each attention layer, float [..., heads, K, K]."""
-        x, leading = self._steps(tokens)
-        outputs: list[Tensor] = []
-        maps = []
-        for attention, ffn in zip(self.attentions, self.ffns, strict=True):
-            x = torch.cat(outputs, dim=-1) if outputs else x
-            assert isinstance(attention, CatformerAttention)
-            weights = attention.attention_weights(x)
-            maps.append(weights.reshape(*leading, *weights.shape[1:]))
-            outputs.append(attention(x))
-            outputs.append(ffn(torch.cat(outputs, dim=-1)))
-        return maps
-
-    def _steps(self, tokens: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-        """[..., K, L, D] -> [N, K, D] with learned temporal positions, leading shape."""
-        x = self.one_token(tokens)
-        leading = tuple(x.shape[:-2])
-        x = x.reshape(math.prod(leading), *x.shape[-2:])
-        return x if self.positions is None else x + self.positions, leading
+        return outputs[-1].squeeze(-2)

@@ -9,7 +9,7 @@ from torchrl.modules import LSTM
 from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryShape
 from torchrl_tit.histories.gtrxl import GatedTransformerEncoder
-from torchrl_tit.layers.gated_block import GRUGate
+from torchrl_tit.layers.blocks import GRUGate
 
 
 class CoBERL(GatedTransformerEncoder):
@@ -18,7 +18,7 @@ class CoBERL(GatedTransformerEncoder):
     Banino et al., "CoBERL: Contrastive BERT for Reinforcement Learning", arXiv 2107.05431, figure
     1; a baseline of arXiv 2212.14538. The gate lets the LSTM read the tokens themselves until the
     transformer's output is useful. The LSTM's state is zero at the start of each history. The
-    weights have PyTorch's default initialisation. If frames have several tokens, a linear layer
+    weights have PyTorch's default initialization. If frames have several tokens, a linear layer
     merges them into one.
 
     Args:
@@ -44,14 +44,15 @@ class CoBERL(GatedTransformerEncoder):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises the mask token: normal with a standard deviation of 0.02."""
+        """Initializes the mask token: normal with a standard deviation of 0.02."""
         nn.init.normal_(self.mask_token, std=0.02)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> state of the LSTM, float [..., E]."""
-        x, leading = self._steps(self.one_token(tokens))  # [N, K, D]
-        states, _ = self.lstm(self.gate(x, self._transform(x, causal=True)))  # [N, K, E]
-        return states[:, -1].reshape(*leading, self.out_features)
+        x = self.one_token(tokens)  # [..., K, D]
+        x = self.gate(x, self._transform(x, causal=True))
+        states, _ = self.lstm(x.reshape(-1, *x.shape[-2:]))  # [N, K, E]
+        return states[:, -1].reshape(*x.shape[:-2], self.out_features)
 
     def predict_masked(self, tokens: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Predicts every frame's encoding from both sides, with the masked frames hidden.
@@ -68,11 +69,10 @@ class CoBERL(GatedTransformerEncoder):
         """
         encodings = self.one_token(tokens)
         hidden = torch.where(mask.unsqueeze(-1), self.mask_token.to(encodings.dtype), encodings)
-        x, _ = self._steps(hidden)
-        return encodings, self._transform(x, causal=False).reshape(encodings.shape)
+        return encodings, self._transform(hidden, causal=False)
 
     def _transform(self, x: Tensor, *, causal: bool) -> Tensor:
-        """The gated blocks on [N, K, D]."""
+        """The gated blocks on [..., K, D]."""
         for block in self.blocks:
             x = block(x, causal=causal)
         return x

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
-from torchrl_tit.layers.dropout import Dropout
-from torchrl_tit.layers.gpt2_block import GPT2Block
+from torchrl_tit.layers.blocks import GPT2Block
 
 _STATES = slice(1, None, 3)
 """Positions of the states in a sequence of return, state, action, return, state, action, ..."""
@@ -27,7 +24,7 @@ class DecisionTransformer(HistoryEncoder):
     Chen et al., "Decision Transformer: Reinforcement Learning via Sequence Modeling", arXiv
     2106.01345, section 3. With a linear frame encoder it is DT; with an inner transformer it is
     DT_TIT of arXiv 2212.14538. The original's predictions of states and returns, which are never
-    trained, are left out. GPT-2 blocks are initialised as in GPT-2, all other layers as in PyTorch.
+    trained, are left out. GPT-2 blocks are initialized as in GPT-2, all other layers as in PyTorch.
 
     The last block computes only the state tokens, because only these are read. No state sees the
     action of the last step, so that action is not read.
@@ -80,7 +77,7 @@ class DecisionTransformer(HistoryEncoder):
             nn.Embedding(settings.max_ep_len, width) if settings.timestep_embedding else None
         )
         self.embedding_norm = nn.LayerNorm(width)
-        self.dropout = Dropout(settings.dropout)
+        self.dropout = nn.Dropout(settings.dropout)
         self.blocks = nn.ModuleList(
             GPT2Block(
                 width,
@@ -141,35 +138,18 @@ class DecisionTransformer(HistoryEncoder):
         """
         return self._encode(tokens, action, return_to_go, timestep, mask, read=_STATES)
 
-    def attention_maps(  # type: ignore[override]
-        self,
-        tokens: Tensor,
-        action: Tensor,
-        return_to_go: Tensor,
-        timestep: Tensor,
-        mask: Tensor | None = None,
-    ) -> list[Tensor]:
+    def attention_maps(self, tokens: Tensor, *context: Tensor) -> list[Tensor]:
         """Returns how much each step's state attends to each step, float [..., heads, K, K].
 
         The weights of a step's return to go, state and action are added.
 
         Args:
             tokens: as in ``forward``.
-            action: as in ``forward``.
-            return_to_go: as in ``forward``.
-            timestep: as in ``forward``.
-            mask: as in ``forward``.
+            *context: the other inputs, as in ``forward``.
         """
-        leading = tokens.shape[:-3]
-        x, visible = self._sequence(tokens, action, return_to_go, timestep, mask)
-        maps = []
-        for block in self.blocks:
-            assert isinstance(block, GPT2Block)
-            weights = F.pad(block.attention_weights(x, visible)[..., _STATES, :], (0, 1))
-            weights = weights.unflatten(-1, (-1, 3)).sum(-1)  # [N, heads, K, K]
-            maps.append(weights.reshape(*leading, *weights.shape[1:]))
-            x = block(x, visible)
-        return maps
+        maps = super().attention_maps(tokens, *context)  # [..., heads, 3K - 1, 3K - 1] each
+        of_states = (F.pad(weights[..., _STATES, :], (0, 1)) for weights in maps)
+        return [weights.unflatten(-1, (-1, 3)).sum(-1) for weights in of_states]
 
     def _encode(
         self,
@@ -181,24 +161,8 @@ class DecisionTransformer(HistoryEncoder):
         read: slice,
     ) -> Tensor:
         """Features of the positions ``read`` of the sequence, float [..., positions, D]."""
-        leading = tokens.shape[:-3]
-        x, visible = self._sequence(tokens, action, return_to_go, timestep, mask)
-        for block in self.blocks[:-1]:
-            x = block(x, visible)
-        x = self.blocks[-1](x, visible, read)
-        return self.norm(x).reshape(*leading, x.shape[1], x.shape[2])
-
-    def _sequence(
-        self,
-        tokens: Tensor,
-        action: Tensor,
-        return_to_go: Tensor,
-        timestep: Tensor,
-        mask: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
-        """The tokens of the blocks, float [N, 3K - 1, D], and the attention mask, bool [...]."""
         state = self.one_token(tokens)  # [..., K, D]
-        *leading, steps, width = state.shape
+        *leading, steps, _ = state.shape
         action = self._as_vectors(action, (*leading, steps)).to(state.dtype)
         _check(action, (*leading, steps, self.action_dim), "action")
         _check(return_to_go, (*leading, steps, 1), "return_to_go")
@@ -208,16 +172,19 @@ class DecisionTransformer(HistoryEncoder):
         if self.timestep_embedding is not None:
             x = x + self._embed_time(timestep).unsqueeze(-2)
         # The sequence ends with the last state: no state sees the last action.
-        x = x.reshape(math.prod(leading), 3 * steps, width)[:, :-1]  # [N, 3K - 1, D]
-        visible = torch.ones(x.shape[1], x.shape[1], dtype=torch.bool, device=x.device).tril()
+        x = x.flatten(-3, -2)[..., :-1, :]  # [..., 3K - 1, D]
+        visible = torch.ones(2 * [3 * steps - 1], dtype=torch.bool, device=x.device).tril()
         if mask is not None:
             _check(mask, (*leading, steps), "mask")
             valid = mask.reshape(-1, 1, 1, steps).bool()
             valid = valid.repeat_interleave(3, dim=-1)[..., :-1]  # [N, 1, 1, 3K - 1]
             # Padding sees itself: a softmax over nothing would be NaN.
-            itself = torch.eye(x.shape[1], dtype=torch.bool, device=x.device)
+            itself = torch.eye(3 * steps - 1, dtype=torch.bool, device=x.device)
             visible = (visible & valid) | itself
-        return self.dropout(self.embedding_norm(x)), visible
+        x = self.dropout(self.embedding_norm(x))
+        for block in self.blocks[:-1]:
+            x = block(x, visible)
+        return self.norm(self.blocks[-1](x, visible, read))
 
     def _as_vectors(self, action: Tensor, steps_shape: tuple[int, ...]) -> Tensor:
         """Turns discrete actions [..., K] into one-hot vectors; leaves others unchanged."""

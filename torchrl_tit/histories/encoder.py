@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from torchrl_tit.layers.attention import attention_maps
 from torchrl_tit.windows import Windows
 
 
@@ -86,7 +87,7 @@ class HistoryEncoder(nn.Module):
         Returns:
             float [..., E].
         """
-        raise NotImplementedError
+        raise NotImplementedError("there is no forward, which maps [..., K, L, D] to [..., E]")
 
     def every_frame(self, tokens: Tensor) -> Tensor:
         """Encodes every frame from itself and the frames before it, for losses on whole windows.
@@ -115,9 +116,18 @@ class HistoryEncoder(nn.Module):
         """
         raise NotImplementedError
 
-    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, float [..., heads, K, K]; default: none."""
-        return []
+    def attention_maps(self, tokens: Tensor, *context: Tensor) -> list[Tensor]:
+        """Returns the attention weights of each attention layer of this library in it.
+
+        Args:
+            tokens: as in ``forward``.
+            *context: as in ``forward``.
+
+        Returns:
+            float [..., heads, K, K] of each layer, in the order of their calls.
+        """
+        maps = attention_maps(self, tokens, *context)
+        return [weights.reshape(*tokens.shape[:-3], *weights.shape[-3:]) for weights in maps]
 
 
 class RecurrentEncoder(HistoryEncoder):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 from torch import Tensor, nn
 
 from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
-from torchrl_tit.layers.gated_block import GatedTransformerBlock
+from torchrl_tit.layers.blocks import GatedTransformerBlock
 from torchrl_tit.layers.window_attention import worth_a_table
 from torchrl_tit.windows import Windows
 
@@ -44,22 +42,6 @@ class GatedTransformerEncoder(HistoryEncoder):
             for _ in range(settings.num_blocks)
         )
 
-    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, float [..., heads, K, K]."""
-        x, leading = self._steps(self.one_token(tokens))
-        maps = []
-        for block in self.blocks:
-            assert isinstance(block, GatedTransformerBlock)
-            weights = block.attention_weights(x)
-            maps.append(weights.reshape(*leading, *weights.shape[1:]))
-            x = block(x, causal=True)
-        return maps
-
-    def _steps(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-        """[..., K, D] -> [N, K, D], leading shape."""
-        leading = tuple(x.shape[:-2])
-        return x.reshape(math.prod(leading), *x.shape[-2:]), leading
-
 
 class GTrXL(GatedTransformerEncoder):
     """GTrXL's blocks over one token per frame, read at the newest frame.
@@ -77,7 +59,7 @@ class GTrXL(GatedTransformerEncoder):
     depends on these K frames alone, as for every encoder.
 
     The last block computes only the newest frame, because only this is read. The weights have
-    PyTorch's default initialisation.
+    PyTorch's default initialization.
 
     Args:
         settings: blocks, heads and gates.
@@ -99,11 +81,11 @@ class GTrXL(GatedTransformerEncoder):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., D]."""
-        x, leading = self._steps(self.one_token(tokens))  # [N, K, D]
+        x = self.one_token(tokens)  # [..., K, D]
         *earlier, last = self.blocks
         for block in earlier:
             x = block(x, causal=True)
-        return last(x, causal=True, read="last").reshape(*leading, self.out_features)
+        return last(x, causal=True, read="last").squeeze(-2)
 
     def reads_tables(self, windows: Windows) -> bool:
         """Whether the only block can project the tokens of a frame once for all windows.

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor, nn
 
 from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
-from torchrl_tit.layers.block import TransformerBlock
+from torchrl_tit.layers.blocks import TransformerBlock
 from torchrl_tit.layers.window_attention import worth_a_table
 from torchrl_tit.windows import Windows
 
@@ -45,9 +43,9 @@ class OuterTransformer(HistoryEncoder):
             else None
         )
         self.blocks = nn.ModuleList(
-            TransformerBlock.from_settings(
-                settings,
+            TransformerBlock(
                 shape.width,
+                **settings.block(),
                 causal=True,
                 positions=settings.temporal_positions,
                 num_frames=shape.num_frames,
@@ -57,7 +55,7 @@ class OuterTransformer(HistoryEncoder):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises temporal positions: normal with a standard deviation of 0.02."""
+        """Initializes temporal positions: normal with a standard deviation of 0.02."""
         if self.positions is not None:
             nn.init.normal_(self.positions, std=0.02)
 
@@ -66,11 +64,9 @@ class OuterTransformer(HistoryEncoder):
         assert isinstance(block, TransformerBlock)
         return block
 
-    def _steps(self, tokens: Tensor) -> tuple[Tensor, tuple[int, ...]]:
-        """[..., K, L, D] -> [N, K, L, D] with temporal positions, leading shape."""
-        leading = tuple(tokens.shape[:-3])
-        x = tokens.reshape(math.prod(leading), *tokens.shape[-3:])
-        return x if self.positions is None else x + self.positions, leading
+    def _with_positions(self, tokens: Tensor) -> Tensor:
+        """Adds learned temporal positions, if any, to [..., K, L, D]."""
+        return tokens if self.positions is None else tokens + self.positions
 
 
 class PairedOuterTransformer(OuterTransformer):
@@ -103,9 +99,9 @@ class PairedOuterTransformer(OuterTransformer):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., L * D]."""
-        x, leading = self._steps(tokens)
-        newest = [self._block(i)(x[:, :, i], read="last") for i in range(self.num_blocks)]
-        return torch.cat(newest, dim=-1).reshape(*leading, self.out_features)
+        steps = self._with_positions(tokens).unbind(-2)
+        newest = [self._block(i)(x, read="last") for i, x in enumerate(steps)]
+        return torch.cat(newest, dim=-1).squeeze(-2)
 
     def reads_tables(self, windows: Windows) -> bool:
         """Whether each block can project the tokens of a frame once for all windows.
@@ -116,16 +112,9 @@ class PairedOuterTransformer(OuterTransformer):
 
     def read_table(self, tokens: Tensor, windows: Windows) -> Tensor:
         """Tokens of a table of frames, float [R, L, D] -> float [N, T, L * D]."""
-        newest = [
-            self._block(i).read_windows(tokens[:, i], windows) for i in range(self.num_blocks)
-        ]
+        steps = tokens.unbind(-2)
+        newest = [self._block(i).read_windows(x, windows) for i, x in enumerate(steps)]
         return torch.cat(newest, dim=-1)
-
-    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, L x float [..., heads, K, K]."""
-        x, leading = self._steps(tokens)
-        maps = (self._block(i).attention_weights(x[:, :, i]) for i in range(self.num_blocks))
-        return [weights.reshape(*leading, *weights.shape[1:]) for weights in maps]
 
 
 class ChainedOuterTransformer(PairedOuterTransformer):
@@ -161,25 +150,14 @@ class ChainedOuterTransformer(PairedOuterTransformer):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., L * D]."""
-        tokens, leading = self._steps(tokens)
-        x, newest = tokens[:, :, 0], []
-        for index in range(self.num_blocks - 1):
+        x, *later = self._with_positions(tokens).unbind(-2)
+        newest = []
+        for index, token in enumerate(later):
             x = self._block(index)(x)
-            newest.append(x[:, -1:])
-            x = x + tokens[:, :, index + 1]
+            newest.append(x[..., -1:, :])
+            x = x + token
         newest.append(self._block(self.num_blocks - 1)(x, read="last"))
-        return torch.cat(newest, dim=-1).reshape(*leading, self.out_features)
-
-    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, L x float [..., heads, K, K]."""
-        tokens, leading = self._steps(tokens)
-        x, maps = torch.zeros_like(tokens[:, :, 0]), []
-        for index in range(self.num_blocks):
-            x = x + tokens[:, :, index]
-            weights = self._block(index).attention_weights(x)
-            maps.append(weights.reshape(*leading, *weights.shape[1:]))
-            x = self._block(index)(x)
-        return maps
+        return torch.cat(newest, dim=-1).squeeze(-2)
 
 
 class StackedOuterTransformer(OuterTransformer):
@@ -210,23 +188,11 @@ class StackedOuterTransformer(OuterTransformer):
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., D] (dense: [..., blocks * D])."""
-        x, leading = self._steps(self.one_token(tokens).unsqueeze(-2))
-        x = x[:, :, 0]
+        x = self._with_positions(self.one_token(tokens).unsqueeze(-2)).squeeze(-2)
         newest = []
         for index in range(self.num_blocks):
             last = index == self.num_blocks - 1
             x = self._block(index)(x, read="last" if last else "all")
             if last or self.dense:
-                newest.append(x[:, -1])
-        return torch.cat(newest, dim=-1).reshape(*leading, self.out_features)
-
-    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, L x float [..., heads, K, K]."""
-        x, leading = self._steps(self.one_token(tokens).unsqueeze(-2))
-        x = x[:, :, 0]
-        maps = []
-        for index in range(self.num_blocks):
-            weights = self._block(index).attention_weights(x)
-            maps.append(weights.reshape(*leading, *weights.shape[1:]))
-            x = self._block(index)(x)
-        return maps
+                newest.append(x[..., -1, :])
+        return torch.cat(newest, dim=-1)

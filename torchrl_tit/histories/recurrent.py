@@ -45,7 +45,7 @@ class _TorchRLEncoder(RecurrentEncoder):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises the layers: orthogonal weights, biases 0."""
+        """Initializes the layers: orthogonal weights, biases 0."""
         for name, parameter in self._layers.named_parameters():
             if name.startswith("weight"):
                 nn.init.orthogonal_(parameter)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchrl_tit import settings
-from torchrl_tit.frames.encoder import check_image_shape
 from torchrl_tit.frames.inner import InnerTransformer
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape
-from torchrl_tit.layers.images import as_images, stacked_shape
-from torchrl_tit.layers.torsos import TORSOS
+from torchrl_tit.layers.images import ConvolutionalTorso, as_images
 
 
 class StackedInnerTransformer(HistoryEncoder):
@@ -43,10 +41,6 @@ class StackedInnerTransformer(HistoryEncoder):
         """[..., K, 1, entries], float or uint8 -> class tokens of L blocks, float [..., L * D]."""
         return self.inner(self._frames(tokens)).flatten(-2)
 
-    def attention_maps(self, tokens: Tensor) -> list[Tensor]:
-        """Returns the attention weights of each block, L x float [..., heads, S, S]."""
-        return self.inner.attention_maps(self._frames(tokens))
-
     def _frames(self, tokens: Tensor) -> Tensor:
         """[..., K, 1, entries] -> [..., K, *frame_shape]."""
         return tokens.squeeze(-2).unflatten(-1, self.frame_shape)
@@ -74,11 +68,8 @@ class StackedCNN(HistoryEncoder):
     reads_frames = True
 
     def __init__(self, settings: settings.StackedCNN, shape: HistoryShape) -> None:
-        torso_class = TORSOS[settings.torso]
-        frame_shape = check_image_shape(
-            shape.require_frames(type(self).__name__), torso_class.smallest_image
-        )
-        torso = torso_class(*stacked_shape(frame_shape, shape.num_frames))
+        frame_shape = shape.require_frames(type(self).__name__)
+        torso = ConvolutionalTorso(settings.torso, frame_shape, shape.num_frames)
         super().__init__(shape, out_features=torso.out_features)
         self.torso = torso
         self.frame_shape = frame_shape

@@ -2,21 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import get_args
-
 from torch import nn
 
-from torchrl_tit.settings import Activation
-
-_ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
-    "gelu": nn.GELU,
-    "gelu_tanh": partial(nn.GELU, approximate="tanh"),
-    "relu": nn.ReLU,
-    "silu": nn.SiLU,
-    "tanh": nn.Tanh,
-}
+from torchrl_tit.settings.encoders import Activation
 
 
 def make_activation(name: Activation) -> nn.Module:
@@ -29,13 +17,10 @@ def make_activation(name: Activation) -> nn.Module:
     Returns:
         A parameterless module, elementwise on any shape.
 
-    Raises:
-        ValueError: if the name is unknown.
-
     Example:
         >>> make_activation("relu")
         ReLU()
     """
-    if name not in _ACTIVATIONS:
-        raise ValueError(f"unknown activation {name!r}: choose one of {get_args(Activation)}")
-    return _ACTIVATIONS[name]()
+    if name == "gelu_tanh":
+        return nn.GELU(approximate="tanh")
+    return {"gelu": nn.GELU, "relu": nn.ReLU, "silu": nn.SiLU, "tanh": nn.Tanh}[name]()

@@ -1,19 +1,17 @@
-"""Multi-head self-attention that computes only the positions that are read."""
+"""Multi-head self-attention, plain and with relative positions, at the positions that are read."""
 
 from __future__ import annotations
 
 import math
-from typing import Literal
+from contextlib import ExitStack
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchrl_tit.layers.dropout import Dropout
-from torchrl_tit.layers.positions import RelativeBias, Rotary
-from torchrl_tit.settings.arguments import checked_arguments
-from torchrl_tit.settings.histories import TemporalPositions
-from torchrl_tit.settings.numbers import Count, Frames, Probability, Width
+from torchrl_tit.layers.positions import RelativeBias, Rotary, sinusoids
+from torchrl_tit.settings.encoders import TemporalPositions
 
 Read = Literal["all", "first", "last"]
 """Positions of a sequence that are read: all, the first (class token), the last (newest step)."""
@@ -23,6 +21,15 @@ READ_SLICES: dict[Read, slice] = {
     "first": slice(0, 1),
     "last": slice(-1, None),
 }
+
+
+def check_heads(embed_dim: int, num_heads: int) -> None:
+    """Raises ValueError unless a number of heads divides the width."""
+    if num_heads < 1 or embed_dim % num_heads:
+        raise ValueError(
+            f"the width {embed_dim} cannot be split over {num_heads} attention heads: "
+            "choose a number of heads that divides embed_dim"
+        )
 
 
 class SelfAttention(nn.Module):
@@ -54,24 +61,19 @@ class SelfAttention(nn.Module):
         (torch.Size([8, 5, 32]), torch.Size([8, 1, 32]))
     """
 
-    @checked_arguments
     def __init__(
         self,
-        embed_dim: Width,
-        num_heads: Count,
+        embed_dim: int,
+        num_heads: int,
         *,
         causal: bool = False,
-        dropout: Probability = 0.0,
-        out_dim: Width | None = None,
+        dropout: float = 0.0,
+        out_dim: int | None = None,
         positions: TemporalPositions = "none",
-        num_frames: Frames = 1,
+        num_frames: int = 1,
     ) -> None:
         super().__init__()
-        if embed_dim % num_heads:
-            raise ValueError(
-                f"the width {embed_dim} cannot be split over {num_heads} attention heads: "
-                "choose a number of heads that divides embed_dim"
-            )
+        check_heads(embed_dim, num_heads)
         if positions == "relative" and not causal:
             raise ValueError("relative positions are distances to the past: choose causal=True")
         self.num_heads = num_heads
@@ -80,13 +82,13 @@ class SelfAttention(nn.Module):
         self.in_proj_bias = nn.Parameter(torch.empty(3 * embed_dim))
         self.out_proj = nn.Linear(embed_dim, out_dim or embed_dim)
         # A module, because TorchRL's losses look for nn.Dropout to set vmap's randomness.
-        self.dropout = Dropout(dropout)
+        self.dropout = nn.Dropout(dropout)
         self.relative = RelativeBias(num_heads, num_frames) if positions == "relative" else None
         self.rotary = Rotary(embed_dim // num_heads, num_frames) if positions == "rotary" else None
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises as ``nn.MultiheadAttention`` does: Xavier for the input projections."""
+        """Initializes as ``nn.MultiheadAttention`` does: Xavier for the input projections."""
         nn.init.xavier_uniform_(self.in_proj_weight)
         nn.init.zeros_(self.in_proj_bias)
         self.out_proj.reset_parameters()
@@ -96,15 +98,17 @@ class SelfAttention(nn.Module):
         """Attends over a sequence.
 
         Args:
-            x: tokens, float [N, S, D].
+            x: tokens, float [..., S, D].
             read: which positions to return, by name or as a slice of S.
-            mask: bool [..., S, S], to be broadcast to [N, heads, S, S]: True where a position (row)
-                sees another (column). Each must see at least one. Replaces the causal mask, if any;
-                "relative" positions keep it, as they have no bias for the future.
+            mask: bool, to be broadcast to [N, heads, S, S], where N is the product of the leading
+                dimensions: True where a position (row) sees another (column). Each must see at
+                least one. Replaces the causal mask, if any; "relative" positions keep it, as they
+                have no bias for the future.
 
         Returns:
-            float [N, positions read, D].
+            float [..., positions read, D].
         """
+        leading, x = x.shape[:-2], _flatten(x)  # [N, S, D], which PyTorch's kernels want
         positions = READ_SLICES[read] if isinstance(read, str) else read
         # The last position sees all others, so it needs no mask.
         causal = self.causal and mask is None and read != "last"
@@ -120,45 +124,22 @@ class SelfAttention(nn.Module):
             mixed = self._attend_one(x, positions)
         else:
             mixed = self._attend(x, positions, mask, causal)
-        return self.out_proj(mixed)  # [N, positions, out_dim]
+        mixed = self.out_proj(mixed)  # [N, positions, out_dim]
+        return mixed.reshape(*leading, *mixed.shape[1:])
 
-    def read_first(self, first: Tensor, rest: Tensor) -> Tensor:
-        """Reads the first position, which must be the same in all sequences: it is projected once.
-
-        The same as ``forward(torch.cat([first.expand(N, 1, D), rest], dim=1), "first")`` with
-        attention that is not causal.
-
-        Args:
-            first: float [1, 1, D].
-            rest: tokens after it, float [N, S - 1, D].
-
-        Returns:
-            float [N, 1, D].
-        """
-        count, width = rest.shape[0], first.shape[-1]
-        # All sequences share one query, so it is projected instead of the keys:
-        # q (K x) = (q K) x. The keys' bias adds the same constant to all scores of a head, so the
-        # softmax ignores it.
-        query = self.project(first, 0, 1).reshape(self.num_heads, 1, -1)
-        keys = self.in_proj_weight[width : 2 * width].unflatten(0, (self.num_heads, -1))
-        probe = (query @ keys).squeeze(1).t() / math.sqrt(keys.shape[1])  # [D, heads]
-        scores = torch.cat([(first @ probe).expand(count, -1, -1), rest @ probe], dim=1)
-        weights = self.dropout(scores.softmax(dim=1)).unsqueeze(-1)  # [N, S, heads, 1]
-        own, other = (
-            self.project(x, 2, 3).unflatten(-1, (self.num_heads, -1)) for x in (first, rest)
-        )  # values, [1, 1, heads, D / heads] and [N, S - 1, heads, D / heads]
-        mixed = weights[:, :1] * own + (weights[:, 1:] * other).sum(dim=1, keepdim=True)
-        return self.out_proj(mixed.flatten(2))
-
-    def weights(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Returns the attention weights, float [N, heads, S, S], rows (queries) summing to 1.
+    def weights(self, x: Tensor, read: Read | slice = "all", mask: Tensor | None = None) -> Tensor:
+        """Returns the attention weights, float [..., heads, S, S], rows (queries) summing to 1.
 
         Args:
             x: tokens, as in ``forward``.
+            read: ignored: the weights of all positions are returned.
             mask: as in ``forward``.
         """
+        leading, x = x.shape[:-2], _flatten(x)
         query, key, _ = self._heads(x, READ_SLICES["all"])
-        return self._weights(query, key, self._mask(x, mask, self.causal and mask is None))
+        mask = self._mask(x, mask, self.causal and mask is None)
+        weights = self._weights(query, key, mask)
+        return weights.reshape(*leading, *weights.shape[1:])
 
     def window_scores(
         self, query: Tensor, key: Tensor, oldest_key: Tensor, back: Tensor, num_frames: int
@@ -275,8 +256,8 @@ class SelfAttention(nn.Module):
         return self.rotary(query, length, positions), self.rotary(key, length), value
 
     def split_heads(self, x: Tensor) -> Tensor:
-        """[N, S, D] -> [N, heads, S, D / heads]."""
-        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+        """[..., S, D] -> [..., heads, S, D / heads]."""
+        return x.unflatten(-1, (self.num_heads, -1)).transpose(-3, -2)
 
     def _mask(self, x: Tensor, mask: Tensor | None, causal: bool) -> Tensor | None:
         """The bias added to the scores, float [..., S, S], or their mask, bool [..., S, S].
@@ -298,3 +279,163 @@ class SelfAttention(nn.Module):
             boolean = mask.dtype == torch.bool
             scores = scores.masked_fill(~mask, -math.inf) if boolean else scores + mask
         return scores.softmax(dim=-1)
+
+
+class RelativeSelfAttention(nn.Module):
+    r"""Multi-head self-attention with relative position encodings.
+
+    Step i weighs step j by the softmax over j of
+
+    .. math:: ((q_i + u)^\top k_j + (q_i + v)^\top W_R R_{i-j}) / \sqrt{d}
+
+    with sinusoids R of the distance and learned vectors u and v (arXiv 1901.02860, section 3.3;
+    without the memory of earlier segments).
+
+    Args:
+        embed_dim: width D of a token.
+        num_heads: number of heads; must divide ``embed_dim``.
+        num_frames: number K of tokens, one for each frame.
+
+    Raises:
+        ValueError: if ``num_heads`` does not divide ``embed_dim``.
+
+    Example:
+        >>> attention = RelativeSelfAttention(embed_dim=32, num_heads=4, num_frames=5)
+        >>> x = torch.randn(8, 5, 32)
+        >>> attention(x, causal=True).shape, attention(x, causal=True, read="last").shape
+        (torch.Size([8, 5, 32]), torch.Size([8, 1, 32]))
+    """
+
+    distances: Tensor
+    index: Tensor
+
+    def __init__(self, embed_dim: int, num_heads: int, num_frames: int) -> None:
+        super().__init__()
+        check_heads(embed_dim, num_heads)
+        self.num_heads = num_heads
+        self.head_dim = embed_dim // num_heads
+        self.query_key_value = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
+        self.distance_key = nn.Linear(embed_dim, embed_dim, bias=False)  # W_R
+        self.content_bias = nn.Parameter(torch.empty(num_heads, 1, self.head_dim))  # u
+        self.distance_bias = nn.Parameter(torch.empty(num_heads, 1, self.head_dim))  # v
+        self.out_proj = nn.Linear(embed_dim, embed_dim, bias=False)
+        # Row d of the table is the distance d - (K - 1): from K - 1 steps ahead to K - 1 back.
+        span = torch.arange(1 - num_frames, num_frames)
+        self.register_buffer("distances", sinusoids(span, embed_dim), persistent=False)
+        frames = torch.arange(num_frames)
+        index = frames[:, None] - frames + num_frames - 1  # [K, K]
+        self.register_buffer("index", index, persistent=False)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initializes u and v with zeros. The linear layers initialize themselves."""
+        nn.init.zeros_(self.content_bias)
+        nn.init.zeros_(self.distance_bias)
+
+    def forward(self, x: Tensor, *, causal: bool, read: Read = "all") -> Tensor:
+        """Attends over the steps.
+
+        Args:
+            x: tokens, float [..., K, D].
+            causal: whether a step sees only itself and earlier ones.
+            read: which steps to compute and return: all, the first or the last.
+
+        Returns:
+            float [..., K or 1, D].
+        """
+        query, key, value = self._heads(x, read)
+        mixed = self._weights(query, key, causal, read) @ value  # [..., heads, steps, D / heads]
+        return self.out_proj(mixed.transpose(-3, -2).flatten(-2))
+
+    def weights(self, x: Tensor, *, causal: bool, read: Read = "all") -> Tensor:
+        """Returns the attention weights, float [..., heads, K, K], rows (queries) summing to 1.
+
+        Args:
+            x: as in ``forward``.
+            causal: as in ``forward``.
+            read: ignored: the weights of all steps are returned.
+        """
+        query, key, _ = self._heads(x, "all")
+        return self._weights(query, key, causal, "all")
+
+    def _heads(self, x: Tensor, read: Read) -> list[Tensor]:
+        """Queries of the steps read, keys and values of all, [..., heads, steps, D / heads]."""
+        if read == "all":
+            heads = self.project(x, 0, 3).chunk(3, dim=-1)
+        else:
+            query = self.project(x[..., READ_SLICES[read], :], 0, 1)
+            heads = (query, *self.project(x, 1, 3).chunk(2, dim=-1))
+        return [self.split_heads(y) for y in heads]
+
+    def project(self, x: Tensor, start: int, stop: int) -> Tensor:
+        """Applies the projections from ``start`` to ``stop`` of (query, key, value) at once."""
+        return F.linear(x, self.query_key_value.weight[start * x.shape[-1] : stop * x.shape[-1]])
+
+    def split_heads(self, x: Tensor) -> Tensor:
+        """[..., S, D] -> [..., heads, S, D / heads]."""
+        return x.unflatten(-1, (self.num_heads, -1)).transpose(-3, -2)
+
+    def window_scores(
+        self, query: Tensor, key: Tensor, oldest_key: Tensor, back: Tensor, num_frames: int
+    ) -> tuple[Tensor, Tensor]:
+        """Scores of the newest frames of windows: see :meth:`SelfAttention.window_scores`."""
+        scale = 1 / math.sqrt(self.head_dim)
+        distance = self._distance_scores(query)[..., num_frames - 1 :] * scale  # 0 to K - 1 back
+        content = (query + self.content_bias) * scale
+        index = back.clamp(0, num_frames - 1).unsqueeze(1).expand(-1, self.num_heads, -1, -1)
+        scores = content @ key.mT + distance.gather(-1, index)
+        return scores, (content * oldest_key).sum(-1, keepdim=True) + distance.flip(-1)
+
+    def _distance_scores(self, query: Tensor) -> Tensor:
+        """Products (q + v) . W_R R, [..., heads, S, 2K - 1]: from K - 1 ahead to K - 1 back."""
+        key = self.distance_key(self.distances.to(query.dtype))  # [2K - 1, D]
+        key = key.unflatten(-1, (self.num_heads, -1)).permute(1, 2, 0)
+        return (query + self.distance_bias) @ key
+
+    def _weights(self, query: Tensor, key: Tensor, causal: bool, read: Read) -> Tensor:
+        rows = READ_SLICES[read]
+        content = (query + self.content_bias) @ key.mT  # [..., heads, steps, K]
+        distance = self._distance_scores(query)  # [..., heads, steps, 2K - 1]
+        distance = distance.gather(-1, self.index[rows].expand(*content.shape[:-2], -1, -1))
+        scores = (content + distance) / math.sqrt(self.head_dim)
+        if causal:
+            future = torch.ones_like(self.index, dtype=torch.bool).triu(1)[rows]
+            scores = scores.masked_fill(future, -math.inf)
+        return scores.softmax(dim=-1)
+
+
+def _flatten(x: Tensor) -> Tensor:
+    """[..., S, D] -> [N, S, D], also without leading dimensions or entries."""
+    return x.reshape(math.prod(x.shape[:-2]), *x.shape[-2:])
+
+
+def attention_maps(module: nn.Module, *inputs: Tensor) -> list[Tensor]:
+    """Calls a module, and returns the weights of its attention layers in the order of their calls.
+
+    This is slower than a plain call, which does not compute all attention weights.
+
+    Args:
+        module: any module; the attention layers in it are found.
+        *inputs: what it reads.
+
+    Returns:
+        float [..., heads, S, S] of each call of a layer, rows (queries) summing to 1.
+
+    Example:
+        >>> (weights,) = attention_maps(SelfAttention(32, 4), torch.randn(8, 5, 32))
+        >>> weights.shape
+        torch.Size([8, 4, 5, 5])
+    """
+    maps: list[Tensor] = []
+
+    def record(layer: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        assert isinstance(layer, SelfAttention | RelativeSelfAttention)
+        maps.append(layer.weights(*args, **kwargs))
+
+    with ExitStack() as hooks:
+        for layer in module.modules():
+            if isinstance(layer, SelfAttention | RelativeSelfAttention):
+                handle = layer.register_forward_pre_hook(record, with_kwargs=True)
+                hooks.callback(handle.remove)
+        module(*inputs)
+    return maps

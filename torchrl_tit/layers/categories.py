@@ -10,9 +10,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchrl_tit.settings.arguments import checked_arguments
-from torchrl_tit.settings.numbers import Size, Width
-
 
 class CategoryIndex(nn.Module):
     """Numbers the values of all entries of a row consecutively, from the first entry to the last.
@@ -61,8 +58,7 @@ class CategoryPatchEmbedding(nn.Module):
         torch.Size([8, 2, 32])
     """
 
-    @checked_arguments
-    def __init__(self, counts: Sequence[int], patch_size: Size, embed_dim: Width) -> None:
+    def __init__(self, counts: Sequence[int], patch_size: int, embed_dim: int) -> None:
         super().__init__()
         self.patch_size = patch_size
         self.num_patches = math.ceil(len(counts) / patch_size)

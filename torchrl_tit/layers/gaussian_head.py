@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from torchrl_tit.settings.arguments import checked_arguments
-from torchrl_tit.settings.numbers import Size
-
 _LOG_STD_MIN, _LOG_STD_MAX = -5.0, 2.0
 
 
@@ -14,7 +11,7 @@ class GaussianHead(nn.Module):
     """Mean and standard deviation of each entry of an action, before a tanh squashes it.
 
     Zheng et al., "Online Decision Transformer", arXiv 2202.05607, and its authors' code: two linear
-    layers with orthogonal initialisation; a tanh keeps the logarithm of the standard deviation
+    layers with orthogonal initialization; a tanh keeps the logarithm of the standard deviation
     between -5 and 2.
 
     Args:
@@ -28,15 +25,14 @@ class GaussianHead(nn.Module):
         (torch.Size([8, 20, 3]), True)
     """
 
-    @checked_arguments
-    def __init__(self, in_features: Size, action_dim: Size) -> None:
+    def __init__(self, in_features: int, action_dim: int) -> None:
         super().__init__()
         self.mean = nn.Linear(in_features, action_dim)
         self.log_std = nn.Linear(in_features, action_dim)
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises the weights orthogonally and the biases with zeros."""
+        """Initializes the weights orthogonally and the biases with zeros."""
         for layer in (self.mean, self.log_std):
             nn.init.orthogonal_(layer.weight)
             nn.init.zeros_(layer.bias)
@@ -52,7 +48,7 @@ class ClampedGaussianHead(nn.Module):
     """Mean and standard deviation of each entry of an action, before a tanh squashes it.
 
     Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905, and their
-    code: two linear layers with PyTorch's default initialisation; the logarithm of the standard
+    code: two linear layers with PyTorch's default initialization; the logarithm of the standard
     deviation is clamped to -20..2.
 
     Args:
@@ -66,8 +62,7 @@ class ClampedGaussianHead(nn.Module):
         (torch.Size([8, 3]), torch.Size([8, 3]))
     """
 
-    @checked_arguments
-    def __init__(self, in_features: Size, action_dim: Size) -> None:
+    def __init__(self, in_features: int, action_dim: int) -> None:
         super().__init__()
         self.mean = nn.Linear(in_features, action_dim)
         self.log_std = nn.Linear(in_features, action_dim)

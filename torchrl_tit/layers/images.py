@@ -1,4 +1,4 @@
-"""Helpers of the convolutional networks: uint8 inputs, and frames as a batch or as channels."""
+"""Images: uint8 inputs, frames as a batch or as channels, and the convolutions of the baselines."""
 
 from __future__ import annotations
 
@@ -57,26 +57,83 @@ def as_images(x: Tensor, ndim: int) -> tuple[Tensor, tuple[int, ...]]:
     return x.reshape(math.prod(leading), channels, *x.shape[-2:]), leading
 
 
-def stacked_shape(
-    observation_shape: Sequence[int], num_frames: int = 1
-) -> tuple[int, tuple[int, int]]:
-    """Returns channels and (height, width) of images that are stacked as channels.
+class ResidualBlock(nn.Module):
+    """``x + relu(conv3x3(x))``.
+
+    Args:
+        channels: channels of input and output.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(channels, channels, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Float [N, channels, H, W] -> the same."""
+        return x + self.conv(x).relu()
+
+
+_KERNELS = {"nature-cnn": [(8, 4), (4, 2), (3, 1)], "resnet": [(8, 4)]}
+"""Size and stride of the convolutions that make an image smaller."""
+
+
+class ConvolutionalTorso(nn.Module):
+    """The convolutions of a baseline, and the sizes of images that they read.
+
+    "nature-cnn" has three with relu: 32 filters of 8x8 and stride 4, 64 of 4x4 and stride 2, 64 of
+    3x3 (Mnih et al., "Human-level control through deep reinforcement learning", Nature 518, 2015).
+    "resnet" has one of 64 filters of 8x8 and stride 4 with relu, and two residual blocks, as the
+    authors of arXiv 2212.14538 built it for ResNet and Catformer.
+
+    Args:
+        name: which convolutions.
+        observation_shape: (H, W) or (C, H, W), at least 36 pixels per side ("resnet": 8).
+        num_frames: observations that are stacked as channels.
+
+    Raises:
+        ValueError: if observations are not images of that size.
 
     Example:
-        >>> stacked_shape((3, 84, 84), num_frames=4)
-        (12, (84, 84))
+        >>> torso = ConvolutionalTorso("nature-cnn", (84, 84), num_frames=4)
+        >>> torso(torch.zeros(2, 4, 84, 84)).shape
+        torch.Size([2, 3136])
     """
-    height, width = observation_shape[-2:]
-    return num_frames * math.prod(observation_shape[:-2]), (height, width)
 
+    def __init__(self, name: str, observation_shape: Sequence[int], num_frames: int = 1) -> None:
+        super().__init__()
+        if len(observation_shape) == 1:
+            raise ValueError(
+                f"observation_shape {tuple(observation_shape)} is that of an array, but this "
+                "encoder reads images (H, W) or (C, H, W): for arrays take inner or linear frames, "
+                "or stack them for an mlp"
+            )
+        smallest, sides = 1, list(observation_shape[-2:])
+        for kernel, stride in reversed(_KERNELS[name]):
+            smallest = (smallest - 1) * stride + kernel
+        if min(sides) < smallest:
+            raise ValueError(
+                f"images of {sides[0]} x {sides[1]} pixels are too small for these convolutions: "
+                f"both sides must have at least {smallest}"
+            )
+        for kernel, stride in _KERNELS[name]:
+            sides = [(side - kernel) // stride + 1 for side in sides]
+        self.out_features = 64 * math.prod(sides)
+        channels = num_frames * math.prod(observation_shape[:-2])
+        layers: list[nn.Module]
+        if name == "nature-cnn":
+            layers = [
+                ImageConv2d(channels, 32, 8, stride=4),
+                nn.ReLU(),
+                nn.Conv2d(32, 64, 4, stride=2),
+                nn.ReLU(),
+                nn.Conv2d(64, 64, 3),
+                nn.ReLU(),
+            ]
+        else:
+            layers = [ImageConv2d(channels, 64, 8, stride=4), nn.ReLU()]
+            layers += [ResidualBlock(64), ResidualBlock(64)]
+        self.layers = nn.Sequential(*layers, nn.Flatten())
 
-def convolved_size(size: int, kernels: Sequence[tuple[int, int]]) -> int:
-    """Returns the side length that ``size`` pixels have after (kernel, stride) convolutions.
-
-    Example:
-        >>> convolved_size(84, [(8, 4), (4, 2), (3, 1)])
-        7
-    """
-    for kernel, stride in kernels:
-        size = (size - kernel) // stride + 1
-    return size
+    def forward(self, x: Tensor) -> Tensor:
+        """[N, channels, H, W], float or uint8 -> float [N, out_features]."""
+        return self.layers(x)

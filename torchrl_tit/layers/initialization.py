@@ -1,20 +1,17 @@
-"""The two initialisations of the paper's experiments."""
+"""The two initializations of the paper's experiments."""
 
 from __future__ import annotations
 
 from torch import nn
 
 from torchrl_tit.layers.patches import ImagePatchEmbedding
-from torchrl_tit.settings.arguments import checked_arguments
-from torchrl_tit.settings.numbers import Weight
 
 
-@checked_arguments
-def init_normal_(module: nn.Module, std: Weight = 0.02) -> None:
-    """Initialises like the authors' networks: linear and embedding weights normal, biases 0.
+def init_normal_(module: nn.Module, std: float = 0.02) -> None:
+    """Initializes like the authors' networks: linear and embedding weights normal, biases 0.
 
     LayerNorms become 1 and 0. Convolutions, patch embeddings and the input projections of
-    attention keep PyTorch's defaults; class tokens and position encodings are initialised by their
+    attention keep PyTorch's defaults; class tokens and position encodings are initialized by their
     modules. (The authors use a truncated normal, whose absolute bounds do not matter at 0.02.)
 
     Args:
@@ -36,9 +33,8 @@ def init_normal_(module: nn.Module, std: Weight = 0.02) -> None:
             child.reset_parameters()
 
 
-@checked_arguments
-def init_orthogonal_(module: nn.Module, gain: Weight = 2**0.5) -> None:
-    """Initialises like Stable-Baselines3, which trained the paper's online networks.
+def init_orthogonal_(module: nn.Module, gain: float = 2**0.5) -> None:
+    """Initializes like Stable-Baselines3, which trained the paper's online networks.
 
     The weights of every linear layer (including output projections of attention) and 2-d
     convolution (including image patch embeddings) become orthogonal, their biases 0. The array

@@ -11,8 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_tit.layers.categories import CategoryPatchEmbedding
-from torchrl_tit.settings.arguments import checked_arguments
-from torchrl_tit.settings.numbers import Size, Width
 
 _MOST_CATEGORY_PATCHES = 16
 _IMAGE_PATCHES = 49  # as in the paper's Atari games: 84 pixels in patches of 12
@@ -42,14 +40,13 @@ class ArrayPatchEmbedding(nn.Module):
         torch.Size([8, 3, 32])
     """
 
-    @checked_arguments
     def __init__(
         self,
-        size: Size,
-        patch_size: Size,
-        embed_dim: Width,
+        size: int,
+        patch_size: int,
+        embed_dim: int,
         *,
-        channels: Size = 1,
+        channels: int = 1,
         own_weights: bool = False,
     ) -> None:
         super().__init__()
@@ -67,7 +64,7 @@ class ArrayPatchEmbedding(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises like ``nn.Conv1d``, and a bias like the token of an entry of size 1."""
+        """Initializes like ``nn.Conv1d``, and a bias like the token of an entry of size 1."""
         bound = 1 / math.sqrt(self.weight.shape[-2:].numel())
         nn.init.uniform_(self.weight, -bound, bound)
         if self.bias is not None:
@@ -110,9 +107,8 @@ class ImagePatchEmbedding(nn.Module):
         torch.Size([8, 49, 64])
     """
 
-    @checked_arguments
     def __init__(
-        self, channels: Size, size: tuple[int, int], patch_size: Size, embed_dim: Width
+        self, channels: int, size: tuple[int, int], patch_size: int, embed_dim: int
     ) -> None:
         super().__init__()
         height, width = size
@@ -133,7 +129,7 @@ class ImagePatchEmbedding(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises like ``nn.Conv2d``."""
+        """Initializes like ``nn.Conv2d``."""
         nn.init.kaiming_uniform_(self.weight, a=math.sqrt(5))
 
     def extra_repr(self) -> str:

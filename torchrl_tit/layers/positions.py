@@ -8,9 +8,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchrl_tit.settings.arguments import checked_arguments
-from torchrl_tit.settings.numbers import Count, Frames, Width
-
 
 class RelativeBias(nn.Module):
     """Adds a learned number to the attention score of two steps, for each head and distance.
@@ -31,14 +28,13 @@ class RelativeBias(nn.Module):
         [[2.0, 1.0, 0.0], [-2.0, -1.0, 0.0]]
     """
 
-    @checked_arguments
-    def __init__(self, num_heads: Count, num_frames: Frames) -> None:
+    def __init__(self, num_heads: int, num_frames: int) -> None:
         super().__init__()
         self.bias = nn.Parameter(torch.empty(num_heads, num_frames))  # entry d: d steps back
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises the biases with zeros."""
+        """Initializes the biases with zeros."""
         nn.init.zeros_(self.bias)
 
     def forward(self, length: int) -> Tensor:
@@ -93,8 +89,7 @@ class Rotary(nn.Module):
     cos: Tensor
     sin: Tensor
 
-    @checked_arguments
-    def __init__(self, head_dim: Width, num_frames: Frames) -> None:
+    def __init__(self, head_dim: int, num_frames: int) -> None:
         super().__init__()
         if head_dim % 2:
             raise ValueError(

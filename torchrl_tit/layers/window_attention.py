@@ -7,8 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchrl_tit.layers.attention import SelfAttention
-from torchrl_tit.layers.relative_attention import RelativeSelfAttention
+from torchrl_tit.layers.attention import RelativeSelfAttention, SelfAttention
 from torchrl_tit.windows import Windows
 
 _LARGEST_SPAN = 16

@@ -34,7 +34,7 @@ from torchrl_tit.modules.distributions import (
 )
 from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
 from torchrl_tit.modules.torch_internals import is_transformed
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Size, Weight
 
 

@@ -1,44 +1,21 @@
 """Networks: plain ``nn.Module``s, tensors in, tensors out."""
 
+from torchrl_tit.networks import named
 from torchrl_tit.networks.by_kind import chosen_by_kind, frames_by_kind
 from torchrl_tit.networks.history_network import (
     AttentionMaps,
     HistoryNetwork,
     TwoTrunks,
     build_network,
+    masked_predictions,
 )
-from torchrl_tit.networks.masked_predictions import masked_predictions
-from torchrl_tit.networks.systems import (
-    D2RL,
-    DTTIT,
-    MLP,
-    Catformer,
-    CoBERL,
-    DecisionTransformer,
-    EnhancedTIT,
-    GTrXL,
-    NatureCNN,
-    OFENet,
-    ResNet,
-    VanillaTIT,
-)
+from torchrl_tit.networks.named import *  # noqa: F403
 
 __all__ = [
-    "D2RL",
-    "DTTIT",
-    "MLP",
+    *named.__all__,
     "AttentionMaps",
-    "Catformer",
-    "CoBERL",
-    "DecisionTransformer",
-    "EnhancedTIT",
-    "GTrXL",
     "HistoryNetwork",
-    "NatureCNN",
-    "OFENet",
-    "ResNet",
     "TwoTrunks",
-    "VanillaTIT",
     "build_network",
     "chosen_by_kind",
     "frames_by_kind",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 
 import torch
@@ -10,8 +11,7 @@ import torch
 from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.observation import Observation, Observations, read_observations
-from torchrl_tit.networks.frame_encoders import build_frame
-from torchrl_tit.networks.own_encoders import BrokenEncoderError
+from torchrl_tit.networks.building import BrokenEncoderError, build_frame
 from torchrl_tit.settings import FrameSettings
 from torchrl_tit.settings.checks import nearest
 
@@ -60,15 +60,19 @@ def frames_by_kind(
                 f"frames names the observation {name!r}, which the task does not have: "
                 f"{nearest(name, observations)}"
             )
-    others = [name for name in observations if name not in network.frames]
     if len(observations) == 1:
         return {name: network.frames.get(name, network.frame) for name in observations}
-    _check_history(network, observations)
-    width = _width(network, observations, others)
-    chosen = {
-        name: _first_that_reads(network.frame, width, observations[name], name) for name in others
+    if getattr(settings.resolve(network.history.builds), "reads_frames", False):
+        raise ValueError(
+            f"{network.history.name} stacks the frames of one observation, but the task has "
+            f"several ({', '.join(observations)}): choose one of them (--observation-keys), or "
+            "another history encoder"
+        )
+    width = _width(network, observations)
+    return {
+        name: network.frames.get(name) or _first_that_reads(network.frame, width, seen, name)
+        for name, seen in observations.items()
     }
-    return {name: network.frames.get(name) or chosen[name] for name in observations}
 
 
 def chosen_by_kind(network: settings.Network, frames: Mapping[str, FrameSettings]) -> str:
@@ -83,32 +87,24 @@ def chosen_by_kind(network: settings.Network, frames: Mapping[str, FrameSettings
         >>> chosen_by_kind(mlp(), frames_by_kind(mlp(), {"arm": (7,), "ball": (3,)}))
         'arm: linear (embed_dim 64, bias True); ball: linear (embed_dim 64, bias True)'
     """
-    return "; ".join(
-        f"{name}: {_describe(frame)}"
-        for name, frame in frames.items()
-        if frame != network.frames.get(name, network.frame)
-    )
+    described = []
+    for name, frame in frames.items():
+        if frame != network.frames.get(name, network.frame):
+            differing = [
+                f"{field.name} {getattr(frame, field.name)}"
+                for field in fields(frame)
+                if getattr(frame, field.name) != field.default
+            ]
+            described.append(f"{name}: {frame.name} ({', '.join(differing)})".replace(" ()", ""))
+    return "; ".join(described)
 
 
-def _check_history(network: settings.Network, observations: Mapping[str, Observation]) -> None:
-    encoder = settings.resolve(network.history.builds)
-    if getattr(encoder, "reads_frames", False):
-        raise ValueError(
-            f"{network.history.name} stacks the frames of one observation, but the task has "
-            f"several ({', '.join(observations)}): choose one of them (--observation-keys), or "
-            "another history encoder"
-        )
-
-
-def _width(
-    network: settings.Network, observations: Mapping[str, Observation], others: Iterable[str]
-) -> int:
-    """The width of a token, which all frame encoders share."""
-    named = [(network.frames[name], name) for name in network.frames]
-    default = (
-        [] if isinstance(network.frame, settings.Flat) else [(network.frame, n) for n in others]
-    )
-    for frame, name in (*named, *default):
+def _width(network: settings.Network, observations: Mapping[str, Observation]) -> int:
+    """The width of a token, which all frame encoders share: of those named, else of the first."""
+    candidates = [(frame, name) for name, frame in network.frames.items()]
+    if not isinstance(network.frame, settings.Flat):
+        candidates += [(network.frame, name) for name in observations if name not in network.frames]
+    for frame, name in candidates:
         encoder = _try(frame, observations[name])
         if isinstance(encoder, FrameEncoder):
             return encoder.width
@@ -118,15 +114,15 @@ def _width(
 def _first_that_reads(
     frame: FrameSettings, width: int, observation: Observation, name: str
 ) -> FrameSettings:
-    refusals = []
+    refusal = None
     for candidate in _candidates(frame, width, observation):
         encoder = _try(candidate, observation)
-        if not isinstance(encoder, ValueError):
+        if isinstance(encoder, FrameEncoder):
             return candidate
-        refusals.append(encoder)
+        refusal = encoder
     raise ValueError(
         f"no frame encoder here reads {name}, {observation}: name one in frames "
-        f"(--backbone.frames.{name}), or leave it out (--observation-keys): {refusals[-1]}"
+        f"(--backbone.frames.{name}), or leave it out (--observation-keys): {refusal}"
     )
 
 
@@ -134,9 +130,11 @@ def _candidates(
     frame: FrameSettings, width: int, observation: Observation
 ) -> Iterator[FrameSettings]:
     patch_size = getattr(frame, "patch_size", None)
-    if not isinstance(frame, settings.Flat) and not _too_many_patches(patch_size, observation):
+    pixels = math.prod(observation.shape[-2:]) if observation.kind == "image" else 0
+    too_many_patches = isinstance(patch_size, int) and pixels > _MOST_PATCHES * patch_size**2
+    if not isinstance(frame, settings.Flat) and not too_many_patches:
         yield frame
-    if "patch_size" in {field.name for field in fields(frame)}:
+    if hasattr(frame, "patch_size"):
         yield replace(frame, patch_size="auto")  # type: ignore[call-arg]
     if observation.kind != "image":
         yield settings.Linear(embed_dim=width, bias=True)
@@ -144,14 +142,6 @@ def _candidates(
     if min(observation.shape[-2:]) >= _CNN_PIXELS:
         yield settings.NatureCNNFrames(embed_dim=width)
     yield settings.Inner(embed_dim=width, patch_size="auto", every_block=False)
-
-
-def _too_many_patches(patch_size: object, observation: Observation) -> bool:
-    """Whether a patch size meant for other observations splits an image too finely."""
-    if observation.kind != "image" or not isinstance(patch_size, int):
-        return False
-    height, width = observation.shape[-2:]
-    return height * width > _MOST_PATCHES * patch_size**2
 
 
 def _try(frame: FrameSettings, observation: Observation) -> FrameEncoder | ValueError:
@@ -171,13 +161,3 @@ def _try(frame: FrameSettings, observation: Observation) -> FrameEncoder | Value
         raise
     except ValueError as error:
         return error
-
-
-def _describe(frame: FrameSettings) -> str:
-    """The name of an encoder, and its settings that are not the default."""
-    differing = [
-        f"{field.name} {getattr(frame, field.name)}"
-        for field in fields(frame)
-        if getattr(frame, field.name) != field.default
-    ]
-    return f"{frame.name} ({', '.join(differing)})" if differing else frame.name

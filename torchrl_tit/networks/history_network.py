@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -13,13 +13,14 @@ from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.flat import Flat
 from torchrl_tit.frames.observation import Observation, Observations, read_observations
-from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, RecurrentEncoder
+from torchrl_tit.histories.encoder import HistoryShape, RecurrentEncoder
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.images import bytes_to_floats
 from torchrl_tit.layers.initialization import init_normal_
+from torchrl_tit.networks.building import build_frames, build_history, module_names
 from torchrl_tit.networks.by_kind import frames_by_kind
-from torchrl_tit.networks.frame_encoders import build_frames, module_names
-from torchrl_tit.networks.own_encoders import build_part, check_contract, check_features, is_own
+from torchrl_tit.settings.checks import checked
+from torchrl_tit.settings.numbers import Frames
 from torchrl_tit.windows import Windows
 
 
@@ -60,9 +61,9 @@ class HistoryNetwork(nn.Module):
             :func:`~torchrl_tit.frames.read_observation`); or a mapping from names to these.
         num_frames: number K >= 1 of observations.
         head: settings of the head.
-        initialization: "normal" initialises the weights as the authors of TIT do
+        initialization: "normal" initializes the weights as the authors of TIT do
             (:func:`~torchrl_tit.layers.init_normal_`), "default" keeps each layer's own
-            initialisation.
+            initialization.
         action_dim: entries of an action, for history encoders that read actions.
 
     Raises:
@@ -87,46 +88,39 @@ class HistoryNetwork(nn.Module):
         observation_shape: Observations,
         num_frames: int = 1,
         head: settings.Head | None = None,
-        initialization: str = "default",
+        initialization: Literal["normal", "default"] = "default",
         action_dim: int | None = None,
     ) -> None:
         super().__init__()
-        if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 1:
-            raise ValueError(
-                f"num_frames is the number K of observations and must be at least 1, not "
-                f"{num_frames!r}"
-            )
-        chosen = list(frame.values()) if isinstance(frame, Mapping) else [frame]
-        for part, kind in [
-            *((part, settings.FrameSettings) for part in chosen),
-            (history, settings.HistorySettings),
-        ]:
-            if not isinstance(part, kind):
-                raise ValueError(
-                    f"a network is built from settings, such as Inner() and PairedOuter(), but "
-                    f"{part!r} is no {kind.__name__}"
-                )
-        self.num_frames = num_frames
         self.observations = read_observations(observation_shape)
         """The observations that the network reads, by name."""
-        encoders = build_frames(frame, self.observations)
         self.frame_settings = (
-            dict(frame) if isinstance(frame, Mapping) else dict.fromkeys(encoders, frame)
+            dict(frame) if isinstance(frame, Mapping) else dict.fromkeys(self.observations, frame)
         )
         """The settings of each frame encoder, by the name of its observation."""
+        parts = [(part, settings.FrameSettings) for part in self.frame_settings.values()]
+        for part, kind in [*parts, (history, settings.HistorySettings)]:
+            if not isinstance(part, kind):
+                raise ValueError(
+                    "a network is built from settings, such as Inner() and PairedOuter(), but "
+                    f"{part!r} is no {kind.__name__}"
+                )
+        self.num_frames = checked("num_frames", num_frames, Frames)
+        self.initialization = initialization
+        encoders = build_frames(self.frame_settings, self.observations)
         self.frame_encoders = nn.ModuleDict(
             dict(zip(module_names(encoders), encoders.values(), strict=True))
         )
-        shape = _history_shape(encoders, num_frames, action_dim)
-        self.history_encoder = _build_history(history, shape)
+        self.history_encoder = build_history(
+            history, _history_shape(encoders, num_frames, action_dim)
+        )
         self.head, self.features_dim = _make_head(
             self.history_encoder.out_features, head or settings.Head()
         )
-        self.initialization = initialization
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialises as ``initialization`` says, after all layers have initialised themselves."""
+        """Initializes as ``initialization`` says, after all layers have initialized themselves."""
         if self.initialization == "normal":
             init_normal_(self)
 
@@ -274,33 +268,37 @@ class HistoryNetwork(nn.Module):
 
     def check(self, *histories: Tensor) -> None:
         """Raises ValueError or TypeError if histories do not fit this network."""
-        self._check_count(histories)
-        dtype = weights_dtype(self)
-        for observation, history in zip(self.observations.values(), histories, strict=True):
-            ndim = len(observation.shape) + 1
+        for observation, history in self._zip_observations(histories):
             num_frames = self.num_frames
-            if self.history_encoder.reads_any_length and history.ndim >= ndim:
-                num_frames = history.shape[-ndim]
-            check_history(history, num_frames, observation, dtype)
+            if self.history_encoder.reads_any_length and history.ndim > len(observation.shape):
+                num_frames = history.shape[-len(observation.shape) - 1]
+            expected = (num_frames, *observation.shape)
+            if tuple(history.shape[-len(expected) :]) != expected:
+                raise ValueError(
+                    f"a history of shape {tuple(history.shape)} does not fit this network: "
+                    f"expected [..., {', '.join(map(str, expected))}], which is {num_frames} "
+                    f"observations of shape {observation.shape}, oldest first (torchrl_tit.History "
+                    "stacks them)"
+                )
+            _check_dtype(history, observation, weights_dtype(self))
 
     def check_frames(self, *frames: Tensor) -> None:
         """Raises ValueError or TypeError if tables of frames do not fit this network."""
-        self._check_count(frames)
-        dtype = weights_dtype(self)
-        for observation, table in zip(self.observations.values(), frames, strict=True):
+        for observation, table in self._zip_observations(frames):
             if tuple(table.shape[1:]) != observation.shape:
                 raise ValueError(
                     f"observations of shape {tuple(table.shape[1:])} do not fit this network: "
                     f"expected {observation.shape}"
                 )
-            _check_dtype(table, observation, dtype)
+            _check_dtype(table, observation, weights_dtype(self))
 
-    def _check_count(self, histories: Sequence[Tensor]) -> None:
-        if len(histories) != len(self.frame_encoders):
+    def _zip_observations(self, inputs: Sequence[Tensor]) -> Iterable[tuple[Observation, Tensor]]:
+        if len(inputs) != len(self.observations):
             raise ValueError(
-                f"this network reads {len(self.frame_encoders)} histories "
-                f"({', '.join(self.observations)}), not {len(histories)}"
+                f"this network reads {len(self.observations)} histories "
+                f"({', '.join(self.observations)}), not {len(inputs)}"
             )
+        return zip(self.observations.values(), inputs, strict=True)
 
     @property
     def keeps_frames(self) -> bool:
@@ -404,6 +402,41 @@ def build_trunk(
     )
 
 
+def masked_predictions(
+    network: HistoryNetwork, histories: Tensor | Sequence[Tensor], mask: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Encodes every frame, and predicts the encodings with the masked frames hidden.
+
+    For :func:`~torchrl_tit.objectives.contrastive_prediction_loss` (arXiv 2107.05431, section 2.1).
+
+    Args:
+        network: a network whose history encoder has ``predict_masked``, such as CoBERL.
+        histories: a history [..., K, *observation_shape], or one for each observation.
+        mask: bool [..., K], True where a frame is hidden (15% of them in the paper).
+
+    Returns:
+        The encodings of the frames and their predictions, float [..., K, D] each.
+
+    Raises:
+        TypeError: if the history encoder cannot predict masked frames.
+
+    Example:
+        >>> from torchrl_tit.networks import CoBERL
+        >>> network, history = CoBERL((20, 20), num_frames=4), torch.rand(2, 4, 20, 20)
+        >>> encodings, predictions = masked_predictions(network, history, torch.rand(2, 4) < 0.15)
+        >>> encodings.shape, predictions.shape
+        (torch.Size([2, 4, 256]), torch.Size([2, 4, 256]))
+    """
+    predict_masked = getattr(network.history_encoder, "predict_masked", None)
+    if predict_masked is None:
+        raise TypeError(
+            f"{type(network.history_encoder).__name__} cannot predict masked frames, which the "
+            "contrastive loss compares: take coberl as the history encoder"
+        )
+    histories = [histories] if isinstance(histories, Tensor) else histories
+    return predict_masked(network.as_floats(network.encode_frames(*histories)), mask)
+
+
 def weights_dtype(network: nn.Module) -> torch.dtype:
     """Returns the float type of a network's weights.
 
@@ -415,27 +448,6 @@ def weights_dtype(network: nn.Module) -> torch.dtype:
     parts = (getattr(network, "head", network), network)
     weights = (getattr(x, name, None) for name in names for part in parts for x in part.modules())
     return next(weight.dtype for weight in weights if isinstance(weight, Tensor))
-
-
-def check_history(
-    history: Tensor, num_frames: int, observation: Observation, dtype: torch.dtype
-) -> None:
-    """Raises ValueError or TypeError if a history does not fit a network.
-
-    Args:
-        history: the input.
-        num_frames: number K of observations that it reads.
-        observation: what one of them is.
-        dtype: type of the network's weights.
-    """
-    expected = (num_frames, *observation.shape)
-    if tuple(history.shape[-len(expected) :]) != expected:
-        raise ValueError(
-            f"a history of shape {tuple(history.shape)} does not fit this network: expected "
-            f"[..., {', '.join(map(str, expected))}], which is {num_frames} observations of shape "
-            f"{observation.shape}, oldest first (torchrl_tit.History stacks them)"
-        )
-    _check_dtype(history, observation, dtype)
 
 
 def _check_dtype(history: Tensor, observation: Observation, dtype: torch.dtype) -> None:
@@ -487,16 +499,6 @@ def _history_shape(
         frame_shape=first.frame_shape if len(encoders) == 1 and isinstance(first, Flat) else None,
         action_dim=action_dim,
     )
-
-
-def _build_history(history: settings.HistorySettings, shape: HistoryShape) -> HistoryEncoder:
-    """Builds the history encoder; raises ValueError if it breaks its contract."""
-    encoder = build_part(history, shape)
-    if is_own(encoder):
-        check_contract(encoder, HistoryEncoder, ("shape", "out_features"), history)
-        check_features(encoder, shape)
-    assert isinstance(encoder, HistoryEncoder)
-    return encoder
 
 
 def _make_head(in_features: int, head: settings.Head) -> tuple[nn.Module, int]:

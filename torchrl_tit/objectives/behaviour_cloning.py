@@ -10,7 +10,7 @@ from torch import nn
 from torchrl.modules import Actor, Delta, TanhDelta
 from torchrl.objectives import BCLoss
 
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 
 
 class LikelihoodBCLoss(BCLoss):

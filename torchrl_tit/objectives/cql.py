@@ -16,7 +16,7 @@ from torchrl.objectives import CQLLoss, DiscreteCQLLoss, distance_loss
 
 from torchrl_tit.modules.action_specs import check_bounds
 from torchrl_tit.modules.many_actions import ManyActions
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Count, Positive, Real, Weight
 
 OverCritics = Literal["mean", "sum"]

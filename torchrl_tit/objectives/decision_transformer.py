@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule, dispatch
 from torch.nn import functional as F
 from torchrl.objectives import DTLoss
 
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 
 
 class MaskedDTLoss(DTLoss):

@@ -1,33 +1,191 @@
-"""Checks shared by several settings: each raises ValueError naming the field and its value."""
+"""Checks values by their types, where they enter: fields of settings, and arguments of functions.
+
+msgspec checks a value's type and bounds (:mod:`torchrl_tit.settings.numbers`), so that each field
+and each argument declares in one place what it accepts. Every number must be finite.
+"""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import inspect
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache, wraps
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import msgspec
+
+P = ParamSpec("P")
+R = TypeVar("R")
+_PLAIN = (bool, float, int, str, NoneType)
 
 
-def check_at_least(settings: object, **minima: float) -> None:
-    """Raises ValueError if a field is below its minimum or not a number.
+def check_fields(settings: object) -> None:
+    """Checks the type and the bounds of each field.
+
+    Args:
+        settings: a dataclass; nested dataclasses have already checked themselves.
+
+    Raises:
+        ValueError: if a field has the wrong type or is out of bounds.
 
     Example:
-        >>> from types import SimpleNamespace
-        >>> check_at_least(SimpleNamespace(num_frames=0), num_frames=1)
+        >>> from torchrl_tit.settings import Inner
+        >>> Inner(patch_size=2.5)
         Traceback (most recent call last):
             ...
-        ValueError: num_frames must be at least 1, not 0
+        ValueError: field 'patch_size' is 2.5: Expected `int | str | null`, got `float`
+        >>> Inner(num_heads=0)
+        Traceback (most recent call last):
+            ...
+        ValueError: num_heads must be at least 1, not 0
     """
-    for field, minimum in minima.items():
-        value = getattr(settings, field)
-        if not value >= minimum:
-            raise ValueError(f"{field} must be at least {minimum}, not {value}")
+    for name, kind in field_types(type(settings)).items():
+        value = getattr(settings, name)
+        if is_dataclass(value) and isinstance(kind, type) and not isinstance(value, kind):
+            raise ValueError(
+                f"field {name!r} must be settings of type {kind.__name__}, not "
+                f"{type(value).__name__}"
+            )
+        if not is_dataclass(value) and get_origin(kind) is not Mapping:
+            checked(name, value, kind)
 
 
-def check_at_most(settings: object, **maxima: float) -> None:
-    """Raises ValueError if a field is above its maximum or not a number."""
-    for field, maximum in maxima.items():
-        value = getattr(settings, field)
-        if not value <= maximum:
-            raise ValueError(f"{field} must be at most {maximum}, not {value}")
+@cache
+def field_types(kind: type) -> dict[str, Any]:
+    """Returns the fields of a dataclass with their types, bounds included."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in fields(kind)}
+
+
+def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
+    """Makes a function check its arguments first, with an error message of one line.
+
+    Arguments annotated as numbers, strings, choices (``Literal``) or unions of these are checked;
+    others are left to the function.
+
+    Args:
+        function: the function whose arguments to check; for a class, its ``__init__``.
+
+    Raises:
+        ValueError: when the function is called, if an argument has the wrong type, is not finite or
+            is out of bounds.
+
+    Example:
+        >>> from torchrl_tit.settings.numbers import Width
+        >>> @checked_arguments
+        ... def make_layer(width: Width, kind: Literal["plain", "gated"] = "plain"):
+        ...     return width
+        >>> make_layer(64)
+        64
+        >>> make_layer(0)
+        Traceback (most recent call last):
+            ...
+        ValueError: width must be at least 1, not 0
+    """
+    signature = inspect.signature(function)
+
+    @cache
+    def kinds() -> dict[str, Any]:
+        hints = get_type_hints(function, include_extras=True)
+        return {name: kind for name, kind in hints.items() if name != "return" and _is_plain(kind)}
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            given = signature.bind(*args, **kwargs).arguments
+        except TypeError:
+            return function(*args, **kwargs)  # raises Python's own error
+        for name, kind in kinds().items():
+            if name in given:
+                value: Any = given[name]
+                # NumPy's numbers are accepted like Python's.
+                checked(name, value.item() if hasattr(value, "item") else value, kind)
+        return function(*args, **kwargs)
+
+    return call
+
+
+def checked(name: str, value: object, kind: Any) -> Any:
+    """Returns a value converted to a type.
+
+    Args:
+        name: the field's full name, for error messages.
+        value: the value.
+        kind: the type, with or without bounds.
+
+    Raises:
+        ValueError: if the value has the wrong type, is not finite or is out of bounds.
+
+    Example:
+        >>> from torchrl_tit.settings.numbers import Fraction
+        >>> checked("gamma", 1, Fraction)
+        1.0
+        >>> checked("gamma", 1.5, Fraction)
+        Traceback (most recent call last):
+            ...
+        ValueError: gamma must be at most 1, not 1.5
+    """
+    if is_dataclass(kind):
+        name_of_kind = getattr(kind, "__name__", kind)
+        raise ValueError(f"field {name!r} must be settings of a {name_of_kind}, not {value!r}")
+    try:
+        converted = msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise ValueError(_reason(name, value, kind, str(error))) from error
+    parts = converted if isinstance(converted, tuple) else (converted,)
+    if any(isinstance(part, float) and not math.isfinite(part) for part in parts):
+        raise ValueError(f"{name} must be finite, not {value}")
+    return converted
+
+
+def _reason(name: str, value: object, kind: Any, error: str) -> str:
+    """Says in plain words what is wrong with a value."""
+    literals = [part for part in _parts(kind) if get_origin(part) is Literal]
+    if isinstance(value, str) and literals:
+        choices = tuple(choice for literal in literals for choice in get_args(literal))
+        return f"field {name!r} is {value!r}, not one of {choices}"
+    extras = [extra for part in _parts(kind) for extra in getattr(part, "__metadata__", ())]
+    for bounds in extras:
+        if not isinstance(bounds, msgspec.Meta) or isinstance(value, bool):
+            continue
+        if bounds.description is not None and isinstance(value, int | float | list | tuple):
+            return f"{name} must be {bounds.description}, not {value}"
+        if not isinstance(value, int | float):
+            continue
+        if bounds.gt == 0 and not value > 0:
+            return f"{name} must be positive, not {value}"
+        if bounds.ge is not None and not value >= bounds.ge:
+            return f"{name} must be at least {bounds.ge}, not {value}"
+        if bounds.le is not None and not value <= bounds.le:
+            return f"{name} must be at most {bounds.le}, not {value}"
+    return f"field {name!r} is {value!r}: {error}"
+
+
+def _is_plain(kind: Any) -> bool:
+    """Whether values of a type can be checked: numbers, strings, choices and unions of them."""
+    made_of = (Annotated, Literal, UnionType, Union)
+    return all(part in _PLAIN or get_origin(part) in made_of for part in _parts(kind))
+
+
+def _parts(kind: Any) -> Iterator[Any]:
+    """Yields a type and those that it is made of, the outermost first."""
+    yield kind
+    if get_origin(kind) is not Literal:
+        for part in get_args(kind)[: 1 if get_origin(kind) is Annotated else None]:
+            yield from _parts(part)
 
 
 def printable(text: str) -> str:

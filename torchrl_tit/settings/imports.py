@@ -1,16 +1,26 @@
-"""Imports by name, and the modules that users named in their own words."""
+"""Imports by name: the modules that users named in their own words, and installed plugins.
+
+What a file may name beside them is said in :mod:`recipes.trust`.
+"""
 
 from __future__ import annotations
 
 import importlib
 import os
 import sys
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+GROUP = "torchrl_tit.plugins"
+"""The group of entry points: each names a module, whose import registers what it defines."""
+
 # An environment variable, so that child processes may import the same modules.
 _VARIABLE = "TORCHRL_TIT_IMPORTS"
+
+_failures: dict[str, str] | None = None
+"""Why modules of plugins could not be imported; None before they are."""
 
 
 def allow(module: str) -> None:
@@ -78,21 +88,32 @@ def import_allowed(module: str) -> ModuleType:
 
 
 def import_named(target: str) -> Any:
-    """Imports the object that "module:attribute" names.
+    """Imports the object that "module:attribute" names, in the words of a user.
 
     Raises:
         ValueError: if the target has another form.
         ImportError: if the module does not exist, raises an error, or lacks the attribute.
-
-    Example:
-        >>> import_named("math:pi")
-        3.141592653589793
     """
     module, colon, attribute = target.partition(":")
     if not (module and colon and attribute.isidentifier()):
         raise ValueError(f"{target!r} names nothing to import: expected module:attribute")
+    import_module(module)
+    return resolve(target)
+
+
+def resolve(target: str) -> Any:
+    """Imports the object that "module:attribute" names, of code that is trusted.
+
+    Raises:
+        ImportError: if there is no such module, or it lacks the attribute.
+
+    Example:
+        >>> resolve("math:pi")
+        3.141592653589793
+    """
+    module, _, attribute = target.partition(":")
     try:
-        return getattr(import_module(module), attribute)
+        return getattr(importlib.import_module(module), attribute)
     except AttributeError as error:
         raise ImportError(
             f"module {module} has no {attribute!r}, which {target!r} names"
@@ -110,6 +131,31 @@ def import_module(name: str) -> ModuleType:
         return importlib.import_module(name)
     except Exception as error:  # a user's module can raise anything
         raise ImportError(_reason(name, error)) from error
+
+
+def load_plugins() -> list[str]:
+    """Imports the modules that installed packages and the user have named, once.
+
+    It is called only for names that are otherwise unknown, so that other commands neither wait for
+    a plugin nor fail because of it.
+
+    Returns:
+        For each module that cannot be imported, a line that names its package and entry point.
+    """
+    global _failures
+    if _failures is None:
+        _failures = {}  # before the imports, which may look up names themselves
+        for module in allowed_modules():  # of the process that started this one
+            import_allowed(module)
+        for point in entry_points(group=GROUP):
+            try:
+                import_module(point.module)
+            except ImportError as error:
+                package = point.dist.name if point.dist else "an unknown package"
+                _failures[point.value] = (
+                    f"the entry point {point.name!r} of the package {package} failed: {error}"
+                )
+    return list(_failures.values())
 
 
 def _reason(name: str, error: Exception) -> str:

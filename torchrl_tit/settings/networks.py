@@ -6,34 +6,31 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
-from torchrl_tit.settings.fields import check_fields
-from torchrl_tit.settings.frames import (
-    Activation,
-    Flat,
-    FrameSettings,
-    Inner,
-    Linear,
-    ResNetFrames,
-)
-from torchrl_tit.settings.histories import (
+from torchrl_tit.settings.checks import check_fields
+from torchrl_tit.settings.encoders import (
     D2RL,
     GRU,
     LSTM,
     MLP,
+    Activation,
     Catformer,
     CoBERL,
     DecisionTransformer,
+    Flat,
+    FrameSettings,
     GTrXL,
     HistorySettings,
+    Inner,
+    Linear,
     OFENet,
     Outer,
     PairedOuter,
+    ResNetFrames,
     StackedCNN,
     StackedInner,
     TemporalPositions,
 )
 from torchrl_tit.settings.numbers import Frames, Width
-from torchrl_tit.settings.per_key import PerKey
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +58,7 @@ class Network:
     """The frame encoder, which turns one observation into tokens. If a task has several
     observations, it encodes those that it can read and that ``frames`` does not name; the others
     get an encoder of the same width, chosen by their kind."""
-    frames: Mapping[str, FrameSettings] = field(default_factory=lambda: PerKey({}))
+    frames: Mapping[str, FrameSettings] = field(default_factory=dict, hash=False)
     """Frame encoders by the name of their observation, for tasks with several observations."""
     history: HistorySettings
     """The history encoder, which turns the tokens of the last K frames into one vector."""
@@ -72,11 +69,20 @@ class Network:
     trunks: Literal["shared", "separate"] = "shared"
     """Whether policy and value share one network or have one each."""
     initialization: Literal["normal", "default"] = "default"
-    """Initialisation of the weights: normal with a standard deviation of 0.02, as in the authors'
+    """Initialization of the weights: normal with a standard deviation of 0.02, as in the authors'
     code, or the default of each layer."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "frames", PerKey(self.frames))
+        if not isinstance(self.frames, Mapping):
+            raise ValueError(
+                f"frames are settings by the name of an observation, not {self.frames!r}"
+            )
+        for name, frame in self.frames.items():
+            if not isinstance(name, str) or not isinstance(frame, FrameSettings):
+                raise ValueError(
+                    f"frames[{name!r}] must be the settings of a frame encoder, such as "
+                    f"torchrl_tit.settings.Inner(), not {frame!r}"
+                )
         check_fields(self)
         self.history.check_num_frames(self.num_frames)
 

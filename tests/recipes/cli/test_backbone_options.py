@@ -141,7 +141,7 @@ def test_what_only_fits_with_a_later_option(tmp_path, monkeypatch, capsys):
         ),
         (["history"], "--backbone.history needs a name: choose from outer, paired-outer"),
         (["history", "--num-envs"], "--backbone.history needs a name"),
-        (["frame", "resnet"], "for arrays take inner or linear frames"),  # CartPole has no images
+        (["frame", "resnet"], "take inner, linear or flat frames"),  # CartPole has no images
         (["history", "catformer"], "num_frames is 1: set it to 2 or more"),
         (["frame", "linear", "--backbone.frame.num-blocks", "2"], "--backbone.frame.num-blocks"),
         (["history", "decision-transformer"], "use a dt or odt recipe"),

@@ -1,5 +1,6 @@
 """What a PPO run encodes while it acts: the newest frames, and no others."""
 
+import importlib
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -11,7 +12,6 @@ from recipes.run import Run
 from recipes.runner import evaluate, train
 from tests.modules.frames import CountedFrames
 from torchrl_tit.checkpoint import load_checkpoint
-from torchrl_tit.modules import acting_collector
 from torchrl_tit.settings.networks import enhanced_tit
 
 RECIPE = PPO(
@@ -62,6 +62,7 @@ def test_keeping_frames_changes_no_result(tmp_path, monkeypatch):
             return load_checkpoint(run.checkpoints)[1]["networks"]
 
     kept = weights("kept")
-    monkeypatch.setattr(acting_collector, "acting", lambda policy: nullcontext())
+    module = importlib.import_module("torchrl_tit.modules.acting")  # not the function
+    monkeypatch.setattr(module, "acting", lambda policy: nullcontext())
     for name, weight in weights("plain").items():
         torch.testing.assert_close(kept[name], weight, rtol=0, atol=2e-5)

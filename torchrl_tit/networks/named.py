@@ -1,11 +1,11 @@
-"""The systems of the paper by name: each is a pair of encoders.
+"""The networks of the paper and further baselines by name.
 
-:mod:`torchrl_tit.settings.networks` documents the source and the hyperparameters of each.
+:mod:`torchrl_tit.settings.networks` describes each: its source, its pair of encoders, and its
+hyperparameters. A name here builds the network that such a description says.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -13,16 +13,41 @@ from torchrl_tit import settings
 from torchrl_tit.frames.observation import Observations
 from torchrl_tit.networks.by_kind import frames_by_kind
 from torchrl_tit.networks.history_network import HistoryNetwork, TwoTrunks, build_trunk
-from torchrl_tit.settings import networks as systems
+from torchrl_tit.settings import networks
+
+__all__ = [
+    "D2RL",
+    "DTTIT",
+    "MLP",
+    "Catformer",
+    "CoBERL",
+    "DecisionTransformer",
+    "EnhancedTIT",
+    "GTrXL",
+    "NatureCNN",
+    "OFENet",
+    "ResNet",
+    "VanillaTIT",
+]
 
 
-class System(HistoryNetwork):
-    """A named network, described by a function of :mod:`torchrl_tit.settings.networks`.
+class _Named:
+    describe: ClassVar[Callable[..., settings.Network]]
+    """The function that describes the network."""
+
+    def __init_subclass__(cls, *, describe: Callable[..., settings.Network] | None = None) -> None:
+        super().__init_subclass__()
+        if describe is not None:
+            cls.describe = staticmethod(describe)
+
+
+class NamedNetwork(_Named, HistoryNetwork):
+    """A network that a function of :mod:`torchrl_tit.settings.networks` describes.
 
     Args:
         observation_shape: (D,) for arrays, (H, W) or (C, H, W) for images, the spec of an
             observation, or a mapping from names to these.
-        num_frames: number K of observations; if not given, the default of the function.
+        num_frames: number K of observations; by default that of the function.
         action_dim: entries of an action, for history encoders that read actions.
         **hyperparameters: further arguments of the function.
 
@@ -30,9 +55,6 @@ class System(HistoryNetwork):
         ValueError: if a hyperparameter is invalid; the message names it.
         TypeError: if there is no such hyperparameter.
     """
-
-    system: ClassVar[Callable[..., settings.Network]]
-    """The function that describes the network."""
 
     def __init__(
         self,
@@ -42,9 +64,8 @@ class System(HistoryNetwork):
         action_dim: int | None = None,
         **hyperparameters: Any,
     ) -> None:
-        if num_frames is not None:
-            hyperparameters["num_frames"] = num_frames
-        network = _describe(self, **hyperparameters)
+        given = {} if num_frames is None else {"num_frames": num_frames}
+        network = self.describe(**given, **hyperparameters)
         super().__init__(
             frames_by_kind(network, observation_shape),
             network.history,
@@ -56,16 +77,7 @@ class System(HistoryNetwork):
         )
 
 
-def _describe(system: System | TwoTrunkSystem, **hyperparameters: Any) -> settings.Network:
-    """Returns the settings of a system; a TypeError names its class, as that of a call does."""
-    try:
-        return system.system(**hyperparameters)
-    except TypeError as error:  # raised by the function that takes the hyperparameters in the end
-        message = re.sub(r"^[\w.]+\(\)", f"{type(system).__name__}()", str(error))
-        raise TypeError(message) from None
-
-
-class VanillaTIT(System):
+class VanillaTIT(NamedNetwork, describe=networks.vanilla_tit):
     """Vanilla_TIT: L inner blocks on each observation, then L outer blocks on the history.
 
     arXiv 2212.14538, section "Vanilla_TIT", figure 1. The weights start as in the authors' code.
@@ -86,10 +98,8 @@ class VanillaTIT(System):
         torch.Size([16, 64])
     """
 
-    system = staticmethod(systems.vanilla_tit)
 
-
-class EnhancedTIT(System):
+class EnhancedTIT(NamedNetwork, describe=networks.enhanced_tit):
     """Enhanced_TIT: an outer block beside every inner block, all outer outputs concatenated.
 
     arXiv 2212.14538, section "Enhanced_TIT", figure 2. The weights start as in the authors' code.
@@ -113,10 +123,8 @@ class EnhancedTIT(System):
         [50, 50]
     """
 
-    system = staticmethod(systems.enhanced_tit)
 
-
-class NatureCNN(System):
+class NatureCNN(NamedNetwork, describe=networks.nature_cnn):
     """NatureCNN: see :func:`~torchrl_tit.settings.networks.nature_cnn`.
 
     Example:
@@ -126,10 +134,8 @@ class NatureCNN(System):
         torch.Size([2, 512])
     """
 
-    system = staticmethod(systems.nature_cnn)
 
-
-class ResNet(System):
+class ResNet(NamedNetwork, describe=networks.resnet):
     """ResNet: see :func:`~torchrl_tit.settings.networks.resnet`.
 
     Example:
@@ -139,10 +145,8 @@ class ResNet(System):
         torch.Size([2, 512])
     """
 
-    system = staticmethod(systems.resnet)
 
-
-class Catformer(System):
+class Catformer(NamedNetwork, describe=networks.catformer):
     """Catformer: see :func:`~torchrl_tit.settings.networks.catformer`.
 
     Example:
@@ -152,10 +156,8 @@ class Catformer(System):
         torch.Size([2, 512])
     """
 
-    system = staticmethod(systems.catformer)
 
-
-class CoBERL(System):
+class CoBERL(NamedNetwork, describe=networks.coberl):
     """CoBERL: see :func:`~torchrl_tit.settings.networks.coberl`.
 
     Its contrastive loss reads :func:`~torchrl_tit.networks.masked_predictions`.
@@ -167,10 +169,8 @@ class CoBERL(System):
         torch.Size([2, 512])
     """
 
-    system = staticmethod(systems.coberl)
 
-
-class GTrXL(System):
+class GTrXL(NamedNetwork, describe=networks.gtrxl):
     """GTrXL: see :func:`~torchrl_tit.settings.networks.gtrxl`.
 
     Example:
@@ -180,10 +180,8 @@ class GTrXL(System):
         torch.Size([2, 512])
     """
 
-    system = staticmethod(systems.gtrxl)
 
-
-class DecisionTransformer(System):
+class DecisionTransformer(NamedNetwork, describe=networks.decision_transformer):
     """Decision Transformer: see :func:`~torchrl_tit.settings.networks.decision_transformer`.
 
     Example:
@@ -194,19 +192,8 @@ class DecisionTransformer(System):
         torch.Size([2, 128])
     """
 
-    system = staticmethod(systems.decision_transformer)
 
-    def __init__(
-        self,
-        observation_shape: Observations,
-        action_dim: int,
-        num_frames: int | None = None,
-        **hyperparameters: Any,
-    ) -> None:
-        super().__init__(observation_shape, num_frames, action_dim=action_dim, **hyperparameters)
-
-
-class DTTIT(DecisionTransformer):
+class DTTIT(NamedNetwork, describe=networks.dt_tit):
     """DT_TIT: see :func:`~torchrl_tit.settings.networks.dt_tit`.
 
     Example:
@@ -217,22 +204,18 @@ class DTTIT(DecisionTransformer):
         torch.Size([2, 128])
     """
 
-    system = staticmethod(systems.dt_tit)
 
-
-class TwoTrunkSystem(TwoTrunks):
-    """Two networks by name, one for the policy and one for values: see :class:`System`."""
-
-    system: ClassVar[Callable[..., settings.Network]]
+class NamedTrunks(_Named, TwoTrunks):
+    """Two networks by name, one for the policy and one for values: see :class:`NamedNetwork`."""
 
     def __init__(
         self, observation_shape: Observations, num_frames: int = 1, **hyperparameters: Any
     ) -> None:
-        network = _describe(self, num_frames=num_frames, **hyperparameters)
+        network = self.describe(num_frames=num_frames, **hyperparameters)
         super().__init__(*(build_trunk(network, observation_shape) for _ in range(2)))
 
 
-class MLP(TwoTrunkSystem):
+class MLP(NamedTrunks, describe=networks.mlp):
     """MLP: see :func:`~torchrl_tit.settings.networks.mlp`.
 
     Example:
@@ -242,10 +225,8 @@ class MLP(TwoTrunkSystem):
         (torch.Size([16, 64]), torch.Size([16, 64]))
     """
 
-    system = staticmethod(systems.mlp)
 
-
-class OFENet(TwoTrunkSystem):
+class OFENet(NamedTrunks, describe=networks.ofenet):
     """OFENet: see :func:`~torchrl_tit.settings.networks.ofenet`.
 
     Example:
@@ -255,10 +236,8 @@ class OFENet(TwoTrunkSystem):
         (torch.Size([16, 139]), torch.Size([16, 139]))
     """
 
-    system = staticmethod(systems.ofenet)
 
-
-class D2RL(TwoTrunkSystem):
+class D2RL(NamedTrunks, describe=networks.d2rl):
     """D2RL: see :func:`~torchrl_tit.settings.networks.d2rl`.
 
     Example:
@@ -267,5 +246,3 @@ class D2RL(TwoTrunkSystem):
         >>> policy.shape, value.shape
         (torch.Size([16, 75]), torch.Size([16, 75]))
     """
-
-    system = staticmethod(systems.d2rl)

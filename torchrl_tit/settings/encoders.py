@@ -1,17 +1,144 @@
-"""Settings of history encoders, which turn the tokens of K frames into one feature vector."""
+"""Settings of encoders: frame encoders read one observation, history encoders the tokens of K.
+
+None of them needs PyTorch: each names the module that it configures, which is imported when it is
+built (:meth:`~torchrl_tit.settings.parts.Part.build`).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from torchrl_tit.settings.frames import Activation, PatchTransformerSettings, TransformerSettings
 from torchrl_tit.settings.numbers import Count, Probability, Real, Steps, Width
 from torchrl_tit.settings.parts import Part
+
+__all__ = [
+    "D2RL",
+    "GRU",
+    "LSTM",
+    "MLP",
+    "Activation",
+    "Catformer",
+    "ChainedOuter",
+    "CoBERL",
+    "DecisionTransformer",
+    "Flat",
+    "FrameSettings",
+    "GTrXL",
+    "HistorySettings",
+    "Inner",
+    "Linear",
+    "NatureCNNFrames",
+    "OFENet",
+    "Outer",
+    "PairedOuter",
+    "ResNetFrames",
+    "StackedCNN",
+    "StackedInner",
+    "TemporalPositions",
+]
+
+Activation = Literal["gelu", "gelu_tanh", "relu", "silu", "tanh"]
+"""Activation functions: see :func:`~torchrl_tit.layers.activations.make_activation`."""
 
 TemporalPositions = Literal["none", "learned", "relative", "rotary"]
 """How attention tells the K frames apart: not at all, by a learned encoding that is added to the
 tokens, by a learned bias for each distance and head, or by rotated queries and keys."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSettings(Part, kind="frame encoder"):
+    """Settings of a frame encoder: [..., *observation_shape] -> tokens [..., L, D]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flat(FrameSettings, name="flat", builds="torchrl_tit.frames.flat:Flat"):
+    """The raw observation as a single token, for encoders that stack frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Linear(FrameSettings, name="linear", builds="torchrl_tit.frames.linear:LinearFrameEncoder"):
+    """One token: a linear layer on all entries of the observation."""
+
+    embed_dim: Width = 32
+    """Width D of the token."""
+    bias: bool = False
+    """Whether the layer has a bias."""
+    activation: Literal["none", "gelu", "gelu_tanh", "relu", "silu", "tanh"] = "none"
+    """Activation after the layer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TransformerSettings:
+    """Settings that inner and outer blocks share."""
+
+    num_heads: Count = 1
+    """Attention heads of a block; must divide the width."""
+    ffn_expansion: Count = 4
+    """Hidden width of a block's FFN as a multiple of the width."""
+    activation: Activation = "gelu"
+    """Activation in a block's FFN."""
+    attention_dropout: Probability = 0.0
+    """Dropout on the attention weights."""
+    ffn_dropout: Probability = 0.0
+    """Dropout on the FFN outputs."""
+    share_blocks: bool = False
+    """Whether all blocks share their weights."""
+
+    def block(self) -> dict[str, Any]:
+        """Returns the arguments of a :class:`~torchrl_tit.layers.TransformerBlock` by name."""
+        names = ("num_heads", "ffn_expansion", "activation", "attention_dropout", "ffn_dropout")
+        return {name: getattr(self, name) for name in names}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchTransformerSettings(TransformerSettings):
+    """Settings of a transformer on the patches of observations."""
+
+    patch_size: Width | Literal["auto"] | None = 1
+    """Entries per patch of an array, or pixels per side of an image patch. If not given, the patch
+    is the whole observation (images must then be square). "auto" uses one patch for an array, at
+    most 16 patches for categories, and about 49 for an image."""
+    embed_dim: Width = 32
+    """Width D of a token."""
+    patch_weights: Literal["shared", "own"] = "shared"
+    """Whether all patches of an array share one embedding, which has no bias, or each patch has its
+    own weights and bias, all of the same size (the feature tokenizer of arXiv 2106.11959). With
+    shared weights and patches of one entry, attention sees little more than each entry's sign."""
+    num_blocks: Count = 2
+    """Number of blocks."""
+    position_encoding: bool = True
+    """Whether patches and class token get a learned position encoding."""
+    every_block: bool = True
+    """Whether to output the class token of every block, or of the last one only."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inner(
+    PatchTransformerSettings,
+    FrameSettings,
+    name="inner",
+    builds="torchrl_tit.frames.inner:InnerTransformer",
+):
+    """The inner transformer of TIT (arXiv 2212.14538), which outputs its class tokens."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResNetFrames(FrameSettings, name="resnet", builds="torchrl_tit.frames.cnn:CNNFrameEncoder"):
+    """One token per image: the baselines' residual network followed by a linear layer."""
+
+    embed_dim: Width = 256
+    """Width D of the token."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NatureCNNFrames(
+    FrameSettings, name="nature-cnn", builds="torchrl_tit.frames.cnn:CNNFrameEncoder"
+):
+    """One token per image: NatureCNN's convolutions followed by a linear layer."""
+
+    embed_dim: Width = 256
+    """Width D of the token."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,9 +149,16 @@ class HistorySettings(Part, kind="history encoder"):
     """Whether it reads past actions and returns to go in addition to the tokens."""
     is_recurrent: ClassVar[bool] = False
     """Whether it carries a state from step to step when it reads one frame."""
+    needs_several_frames: ClassVar[bool] = False
+    """Whether it makes no sense with one frame."""
 
     def check_num_frames(self, num_frames: int) -> None:
         """Raises ValueError if the encoder cannot read that many frames."""
+        if self.needs_several_frames and num_frames < 2:
+            raise ValueError(
+                f"{self.name} is a transformer over time, but num_frames is {num_frames}: set it "
+                "to 2 or more"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,9 +287,7 @@ class Catformer(
     """How the K frames are told apart: by a learned encoding, a learned bias for each distance
     ("relative"), rotations (RoPE), or not at all."""
 
-    def check_num_frames(self, num_frames: int) -> None:
-        """Raises ValueError if there is only one frame."""
-        _check_several_frames(self.name, num_frames)
+    needs_several_frames = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,9 +303,7 @@ class GatedTransformerSettings(HistorySettings):
     gate_bias: Real = 0.0
     """Initial bias of all gates; 2 starts them near the identity, as in GTrXL's paper."""
 
-    def check_num_frames(self, num_frames: int) -> None:
-        """Raises ValueError if there is only one frame."""
-        _check_several_frames(self.name, num_frames)
+    needs_several_frames = True
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -250,11 +380,3 @@ class DecisionTransformer(
                 f"num_frames {num_frames} is more than max_ep_len {self.max_ep_len}: lower it, or "
                 "raise max_ep_len to the length of the longest episode"
             )
-
-
-def _check_several_frames(name: str, num_frames: int) -> None:
-    if num_frames < 2:
-        raise ValueError(
-            f"{name} is a transformer over time, but num_frames is {num_frames}: set it to 2 or "
-            "more"
-        )

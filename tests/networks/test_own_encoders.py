@@ -1,0 +1,177 @@
+"""An encoder of a user's own that does not keep its contract is found when it is built."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import nn
+from torchrl.data import MultiCategorical
+
+from torchrl_tit import settings
+from torchrl_tit.frames import FrameEncoder
+from torchrl_tit.histories import HistoryEncoder
+from torchrl_tit.networks import build_network, frames_by_kind
+from torchrl_tit.settings import FrameSettings, HistorySettings, Network
+
+CATEGORIES = MultiCategorical([4])
+
+
+class Own(FrameEncoder):
+    """Two tokens of an array; what is wrong with it is a setting."""
+
+    kinds = ("array",)
+
+    def __init__(self, settings, observation_shape):
+        super().__init__(observation_shape, num_tokens=2, width=8)
+        self.wrong = settings.wrong
+        self.linear = nn.Linear(observation_shape[0], 2 * 8)
+        self.norm = nn.BatchNorm1d(16)
+        self.dropout = nn.Dropout(0.5)
+        if self.wrong == "needs numbers":
+            self.linear.weight.detach().sum().item()
+
+    def forward(self, observation):
+        tokens = self.linear(observation)
+        if self.wrong == "shape":
+            return tokens
+        if self.wrong == "type":
+            return [tokens]
+        if self.wrong == "leading":
+            tokens = tokens.reshape(len(observation), -1)
+            return self.norm(tokens).unflatten(-1, (2, 8))
+        return self.dropout(tokens).unflatten(-1, (2, 8))
+
+
+class Broken(FrameEncoder):
+    """Its constructor is wrong in one way or another."""
+
+    kinds = ("array", "categories")
+
+    def __init__(self, settings, observation_shape):
+        if settings.wrong == "layer first":
+            self.linear = nn.Linear(4, 8)
+        if settings.wrong == "raises":
+            raise KeyError("no weights\nfor this")
+        if settings.wrong != "no constructor":
+            super().__init__(observation_shape, num_tokens=1, width=8)
+
+
+class OwnPast(HistoryEncoder):
+    """A linear layer on the newest token; what is wrong with it is a setting."""
+
+    def __init__(self, settings, shape):
+        if settings.wrong == "raises":
+            raise KeyError("no weights")
+        if settings.wrong != "no constructor":
+            size = 9 if settings.wrong == "out_features" else 8
+            super().__init__(shape, out_features=size)
+            width = shape.width + (settings.wrong == "width")
+            self.linear = nn.Linear(width, 8)
+
+    def forward(self, tokens):
+        return self.linear(tokens[..., -1, 0, :])
+
+
+class SilentPast(HistoryEncoder):
+    def __init__(self, settings, shape):
+        super().__init__(shape, out_features=8)
+
+
+class NoEncoder(nn.Module):
+    def __init__(self, settings, shape):
+        super().__init__()
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnFrames(FrameSettings, name="tests-own", builds=f"{__name__}:Own"):
+    wrong: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BrokenFrames(FrameSettings, name="tests-broken", builds=f"{__name__}:Broken"):
+    wrong: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OtherFrames(FrameSettings, name="tests-other", builds=f"{__name__}:NoEncoder"):
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnHistory(HistorySettings, name="tests-own", builds=f"{__name__}:OwnPast"):
+    wrong: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SilentHistory(HistorySettings, name="tests-silent", builds=f"{__name__}:SilentPast"):
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
+class OtherHistory(HistorySettings, name="tests-other", builds=f"{__name__}:NoEncoder"):
+    pass
+
+
+def build(part, observation=(4,)):
+    frame = part if isinstance(part, FrameSettings) else settings.Linear()
+    history = part if isinstance(part, HistorySettings) else settings.Outer(num_blocks=1)
+    return build_network(Network(frame=frame, history=history, num_frames=3), observation)
+
+
+@pytest.mark.parametrize("wrong", ["", "needs numbers"])
+def test_settings_and_shape_are_enough(wrong):
+    state = torch.get_rng_state()
+    frame = OwnFrames(wrong=wrong)
+    chosen = frames_by_kind(
+        Network(frame=frame, history=settings.Outer()), {"arm": (4,), "row": CATEGORIES}
+    )
+    assert chosen == {"arm": frame, "row": settings.Linear(embed_dim=8, bias=True)}
+    assert torch.equal(torch.get_rng_state(), state)
+    encoder = build(frame).frames[0]
+    assert encoder.training
+    assert encoder.dropout.training
+    assert not encoder.norm.running_mean.any()
+    assert encoder(torch.zeros(5, 3, 4)).shape == (5, 3, 2, 8)
+    assert build(OwnHistory()).history_encoder(torch.zeros(5, 3, 1, 32)).shape == (5, 8)
+
+
+@pytest.mark.parametrize(
+    ("part", "observation", "message"),
+    [
+        (OwnFrames(wrong="shape"), (4,), r"Own maps zeros of shape \(1, 2, 4\) to \(1, 2, 16\), "
+         r"not to \(1, 2, 2, 8\): it must map .* to tokens \[..., num_tokens, width\]"),
+        (OwnFrames(wrong="type"), (4,), r"Own maps zeros of shape \(1, 2, 4\) to list, not to"),
+        (OwnFrames(wrong="leading"), (4,), r"Own fails on zeros of shape \(1, 2, 4\): "),
+        (OwnFrames(), (3, 8, 8), r"tests-own frames do not read an image of shape \(3, 8, 8\)"),
+        (OwnFrames(), CATEGORIES, r"do not read a row of categories \(4 values\)"),
+        (OtherFrames(), (4,), "builds a NoEncoder, which is no FrameEncoder: derive it from "
+         "torchrl_tit.frames.FrameEncoder"),
+        (BrokenFrames(wrong="no constructor"), (4,), r"Broken does not call FrameEncoder's "
+         r"constructor: call super\(\).__init__\(observation_shape"),
+        (BrokenFrames(wrong="layer first"), (4,), r"cannot be built: AttributeError: .* before "
+         r"Module.__init__\(\) call"),
+        (BrokenFrames(wrong="raises"), (4,), r"frame encoder tests-broken \(.*:Broken\) cannot be "
+         r"built: KeyError: 'no weights"),
+        (BrokenFrames(), (4,), r"Broken fails on zeros .*: there is no forward, which maps"),
+        (BrokenFrames(), CATEGORIES, "an encoder of categories takes them as an argument"),
+        (OwnHistory(wrong="out_features"), (4,), r"OwnPast maps zeros of shape \(1, 2, 3, 1, 32\) "
+         r"to \(1, 2, 8\), not to \(1, 2, 9\): it must map .* to \[..., out_features\]"),
+        (OwnHistory(wrong="width"), (4,), r"OwnPast fails on zeros of shape .*: RuntimeError: "),
+        (OwnHistory(wrong="no constructor"), (4,), "does not call HistoryEncoder's constructor"),
+        (OwnHistory(wrong="raises"), (4,), r"history encoder tests-own \(.*:OwnPast\) cannot be "
+         "built: KeyError: 'no weights'"),
+        (SilentHistory(), (4,), r"SilentPast fails on zeros .*: there is no forward, which maps"),
+        (OtherHistory(), (4,), "builds a NoEncoder, which is no HistoryEncoder: derive it from "
+         "torchrl_tit.histories.HistoryEncoder"),
+    ],
+)  # fmt: skip
+def test_what_does_not_keep_the_contract(part, observation, message):
+    with pytest.raises(ValueError, match=message) as error:
+        build(part, observation)
+    assert "\n" not in str(error.value)
+
+
+def test_one_that_cannot_be_built_is_not_replaced():
+    network = Network(frame=BrokenFrames(wrong="raises"), history=settings.Outer())
+    with pytest.raises(ValueError, match=r"tests-broken .* cannot be built: KeyError"):
+        frames_by_kind(network, {"arm": (4,), "row": CATEGORIES})
