@@ -27,7 +27,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PRECIOUS: $(VENV)/installed-%
 # The tests come last, also under `make -j`: their closing line ends the log.
 .NOTPARALLEL:
-.PHONY: help demo demo-memory test lint types unit slow numerics versions kill fuzz soak browser bench docs format hooks clean
+.PHONY: help demo demo-memory test lint types unit slow numerics versions kill fuzz soak bench docs format hooks clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -88,10 +88,6 @@ fuzz: $(VENV)/installed-test  ## Give 1,000 wrong inputs to recipes, networks, d
 
 soak: $(VENV)/installed-test  ## Watch memory, files and speed of four runs for MINUTES=120
 	$(ONE_THREAD) $(BIN)/python -m tests.reliability.soak --runs $(RUNS)/soak --minutes $(MINUTES) $(ARGS)
-
-# Debian: apt-get install chromium chromium-driver
-browser: $(VENV)/installed-browser  ## Look at reports in headless Chromium, which has to be there
-	BROWSER_TESTS=1 $(PYTEST) tests/recipes/results -n 0 -m browser $(ARGS)
 
 bench: $(VENV)/installed-bench  ## Measure speed against other libraries
 	$(BIN)/python -m pip install --no-deps -r benchmarks/d3rlpy.txt

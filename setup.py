@@ -15,13 +15,6 @@ setup(
     package_data={
         "torchrl_tit": ["py.typed"],
         "torchrl_tit.agents": ["*/*.json", "*/*.md", "*/*.safetensors"],
-        "torchrl_tit.recipes": [
-            "*/*.csv",
-            "*/*.json",
-            "*/*.md",
-            "*/*/*.css",
-            "*/*/*.html",
-            "*/*/*.js",
-        ],
+        "torchrl_tit.recipes": ["*/*.csv", "*/*.html", "*/*.json", "*/*.md"],
     },
 )

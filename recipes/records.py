@@ -17,7 +17,6 @@ import hashlib
 import io
 import json
 import lzma
-import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -291,17 +290,8 @@ def _curve(metrics: list[dict[str, float]]) -> str:
     """The text of a ``metrics.csv`` without what is left out."""
     if not metrics:
         return ""
-    rows = [dict(row) for row in metrics]
-    if "steps_per_second" not in rows[0] and "time" in rows[0]:  # a run from an earlier version
-        before = rows[0]
-        for row in rows:
-            seconds = row["time"] - before["time"]
-            row["steps_per_second"] = (
-                (row["step"] - before["step"]) / seconds if seconds > 0 else math.nan
-            )
-            before = row
-    names = [name for name in rows[0] if name not in LEFT_OUT and name != "step"]
-    lines = [[f"{row['step']:.0f}", *(f"{row[name]:.4g}" for name in names)] for row in rows]
+    names = [name for name in metrics[0] if name not in LEFT_OUT and name != "step"]
+    lines = [[f"{row['step']:.0f}", *(f"{row[name]:.4g}" for name in names)] for row in metrics]
     return _to_csv([["step", *names], *lines])
 
 

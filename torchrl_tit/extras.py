@@ -19,7 +19,6 @@ EXTRAS = {
     "onnxruntime": "onnx",
     "onnxscript": "onnx",
     "optuna": "tune",
-    "plotly": "report",
     "popgym": "popgym",
     "pytorch_optimizer": "offline",
     "ray": "ray",

@@ -38,7 +38,7 @@ import numpy as np
 
 from recipes.records import Records
 from recipes.results.interval import interval_of
-from recipes.results.reported import paper_results, plain_name
+from recipes.results.table import paper_results, plain_name
 from torchrl_tit.files import write_text_atomic
 
 ROOT = Path(__file__).parents[2]

@@ -27,9 +27,7 @@ def compare(arguments: list[str]) -> None:
         fail(f"{options.runs[0]} is not a run folder, but a log: name the folder beside it")
     experiments = group_runs(find_runs(folders.values()))
     check_together(experiments)
-    curves = {experiment.label: experiment.runs for experiment in experiments}
-    offline = experiments[0].settings.offline
-    plot_comparison(curves, options.out, title=options.title, offline=offline)
+    plot_comparison(experiments, options.out, title=options.title)
     say(f"written to {options.out}")
 
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 from torchrl_tit.settings.checks import printable
 
+from ..metrics import parse_metrics
 from ..recipe import Recipe, experiment_of
 from ..recipe_json import recipe_to_json
 from ..records import TABLE, Records, find_records
@@ -119,6 +122,34 @@ def check_together(experiments: Sequence[Experiment]) -> None:
                 f"{names}: environment steps and gradient steps do not share an axis; compare the "
                 "runs of each kind"
             )
+
+
+def read_metrics(run: Run) -> list[dict[str, float]]:
+    """Reads the rows of a run's metrics; none if it has none yet.
+
+    Runs of earlier versions lack ``steps_per_second``, which follows from ``step`` and ``time``.
+
+    Raises:
+        ValueError: if a row is damaged.
+    """
+    rows = parse_metrics(run.read("metrics.csv"), run.folder / "metrics.csv")
+    if rows and "steps_per_second" not in rows[0] and "time" in rows[0]:
+        for row, before in zip(rows, [rows[0], *rows], strict=False):
+            seconds = row["time"] - before["time"]
+            steps = row["step"] - before["step"]
+            row["steps_per_second"] = steps / seconds if seconds > 0 else math.nan
+    return rows
+
+
+def common_part(names: Sequence[str]) -> str:
+    """Returns the part up to a "/" that names have in common.
+
+    Example:
+        >>> common_part(["ppo/cartpole/mlp", "ppo/cartpole/lstm"])
+        'ppo/cartpole/'
+    """
+    levels = zip(*(name.split("/")[:-1] for name in names), strict=False)
+    return "".join(f"{level[0]}/" for level in takewhile(lambda one: len({*one}) == 1, levels))
 
 
 def label(name: str, changes: str) -> str:

@@ -1,33 +1,248 @@
-"""Films and pictures of what a trained agent looks at."""
+"""What a trained agent looks at: explained steps, and films and pictures of them."""
 
 from __future__ import annotations
 
+import sys
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal, get_args
 
-import imageio.v2 as imageio
 import numpy as np
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, distributions
 from torchrl.envs import EnvBase
 
+from torchrl_tit.analysis import (
+    Target,
+    grad_cam,
+    integrated_gradients,
+    map_attention,
+    outer_attention,
+)
+from torchrl_tit.analysis.layers import image_layers
+from torchrl_tit.analysis.targets import evaluating, find_network, histories_of, run_policy
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.files import whole_or_not_at_all
 
-from .explained_page import Page
-from .explained_step import Explainer, read_value
-from .film import make_rendered, open_film, take_picture
+from .explained_page import Choice, ExplainedStep, Page, Seen
+from .film import FILMS, make_rendered, new_film, take_picture
 
-_FILMS = (".gif", ".mp4")
-_SUFFIXES = (*_FILMS, ".png")
+MapKind = Literal["grad-cam", "integrated-gradients", "attention"]
+
+
+class Explainer:
+    """Explains steps of a policy.
+
+    Args:
+        policy: the policy.
+        target: what is explained; see :data:`~torchrl_tit.analysis.targets.Target`.
+        kind: kind of maps: Grad-CAM of images, integrated gradients, or attention rolled out over
+            the inner blocks. By default Grad-CAM of images that a convolution or an inner
+            transformer reads, and integrated gradients of everything else but categories.
+        layer: name of another layer for Grad-CAM.
+
+    Raises:
+        ValueError: if the policy has no network of this library, or there is no such kind.
+    """
+
+    def __init__(
+        self,
+        policy: TensorDictModuleBase,
+        *,
+        target: Target = "action",
+        kind: MapKind | None = None,
+        layer: str | None = None,
+    ) -> None:
+        if kind is not None and kind not in get_args(MapKind):
+            raise ValueError(f"maps are one of {', '.join(get_args(MapKind))}, not {kind!r}")
+        if layer is not None and kind not in (None, "grad-cam"):
+            raise ValueError(f"a layer is for grad-cam, not for {kind}: leave one of them out")
+        self.policy = policy
+        self.target = target
+        self.layer = layer
+        self.network = find_network(policy, target)
+        if kind is None and layer is not None:
+            kind = "grad-cam"
+        self.kind = kind
+
+    def explain(self, tensordict: TensorDictBase) -> ExplainedStep:
+        """Explains a step.
+
+        Args:
+            tensordict: tensordict of one environment, [1], after the policy has acted.
+
+        Raises:
+            ValueError: if there are no such maps for this network, or its policy does not compute
+                the target.
+        """
+        state = tensordict.detach()
+        with evaluating(self.policy), torch.no_grad():
+            outputs, distribution = run_policy(self.policy, state)
+        histories = histories_of(self.policy, state)
+        seen = {}
+        frames = dict(zip(self.network.observations, histories, strict=False))
+        for name, maps in self._maps(state, histories).items():
+            seen[name] = Seen(_array(frames[name][0]), _array(maps[0]))
+        try:
+            attention = _array(outer_attention(self.network, *histories)[0])
+        except ValueError:  # there is none
+            attention = None
+        return ExplainedStep(
+            seen, attention, describe_choice(outputs, distribution), read_value(outputs)
+        )
+
+    def _maps(self, state: TensorDictBase, histories: Sequence[Tensor]) -> dict[str, Tensor]:
+        """The maps by the name of the observation, [1, K or 1, ...] each."""
+        if self.kind == "attention":
+            kinds = {name: seen.kind for name, seen in self.network.observations.items()}
+            maps = map_attention(self.network, *histories)
+            return {k: x if kinds[k] == "image" else x.flatten(-2) for k, x in maps.items()}
+        if self.kind == "grad-cam":
+            return grad_cam(self.policy, state, target=self.target, layer=self.layer)
+        rest = {n for n, seen in self.network.observations.items() if seen.kind != "categories"}
+        found: dict[str, Tensor] = {}
+        if self.kind is None and (images := image_layers(self.network)):
+            found = grad_cam(self.policy, state, target=self.target)
+            rest -= set(images)
+        if rest:
+            shares = integrated_gradients(self.policy, state, target=self.target)
+            for name in rest:
+                observation = self.network.observations[name]
+                share = shares[name]
+                if observation.kind == "image":  # channels of a pixel count together
+                    share = share.abs().flatten(2, -3).sum(2) if share.ndim > 4 else share.abs()
+                found[name] = share
+        return {name: found[name] for name in self.network.observations if name in found}
+
+
+def describe_choice(
+    outputs: TensorDictBase, distribution: distributions.Distribution | None
+) -> Choice:
+    """Describes an action and what it was chosen from.
+
+    Args:
+        outputs: what the policy wrote, [1].
+        distribution: distribution of its actions, if there is one.
+    """
+    action = outputs["action"][0]
+    base: Any = getattr(distribution, "base_dist", distribution)
+    if action.is_floating_point():
+        entries = action.flatten()
+        scale = getattr(base, "scale", None) if isinstance(base, distributions.Normal) else None
+        return Choice(
+            "action" if scale is None else "action, and its spread",
+            [str(i) for i in range(len(entries))],
+            _array(entries),
+            None if scale is None else _array(scale[0].flatten()),
+            [True] * len(entries),
+        )
+    if distribution is None:
+        values = outputs["action_value"][0]
+        chosen = [i == int(action) for i in range(len(values))]
+        return Choice("values of actions", _numbers(values), _array(values), None, chosen)
+    probabilities = base.probs[0]
+    if isinstance(base, distributions.Bernoulli):
+        on = action.flatten().bool().tolist()
+        flat = probabilities.flatten()
+        return Choice("probabilities of on", _numbers(flat), _array(flat), None, on)
+    if probabilities.ndim == 1:
+        index = int(action.int().argmax()) if action.ndim else int(action)
+        chosen = [i == index for i in range(len(probabilities))]
+        return Choice(
+            "action probabilities", _numbers(probabilities), _array(probabilities), None, chosen
+        )
+    components = probabilities.flatten(0, -2)
+    likely = components.argmax(-1)
+    # A component with fewer options than another is padded with probabilities of 0.
+    pairs = [(c, o) for c, row in enumerate(components) for o in range(_options(row))]
+    return Choice(
+        "action probabilities",
+        [f"{c}: {o}" for c, o in pairs],
+        np.array([float(components[c, o]) for c, o in pairs]),
+        None,
+        [int(likely[c]) == o for c, o in pairs],
+    )
+
+
+def _options(probabilities: Tensor) -> int:
+    """The number of options up to the last possible one."""
+    return int(probabilities.nonzero().max()) + 1
+
+
+def read_value(outputs: TensorDictBase) -> float | None:
+    """Returns the value that a policy wrote, if it computes any: the state's, or the action's."""
+    for key in ("state_value", "chosen_action_value"):
+        value = outputs.get(key, None)
+        if value is not None:
+            return float(value.flatten()[0])
+    return None
+
+
+def _numbers(values: Tensor) -> list[str]:
+    return [str(i) for i in range(len(values))]
+
+
+def _array(x: Tensor) -> np.ndarray:
+    return x.detach().cpu().numpy()
+
+
+def explain_episode(
+    env: Any,
+    explainer: Explainer,
+    name: str | Path,
+    steps: Sequence[int],
+    show: Callable[[int, ExplainedStep, np.ndarray], None],
+    *,
+    title: str,
+    seed: int = 0,
+    dpi: int = 80,
+) -> int:
+    """Plays an episode with the most likely actions, and explains some of its steps.
+
+    Args:
+        env: the task, of one copy, which can be rendered.
+        explainer: what explains the policy.
+        name: name of the policy in messages.
+        steps: which steps to explain, in order and counted from 0; the episode is not played
+            beyond the last one.
+        show: called with the number of each of these steps, the step, and its page, uint8 [height,
+            width, 3].
+        title: title of the pages.
+        seed: seed of the episode.
+        dpi: dots per inch of the pages.
+
+    Returns:
+        The number of steps that were played.
+    """
+    page: Page | None = None
+    values: list[Any] = []
+    recent: deque[np.ndarray] = deque(maxlen=explainer.network.num_frames)
+
+    def explained(tensordict: TensorDictBase) -> TensorDictBase:
+        nonlocal page
+        number = len(values)
+        acted = explainer.policy(tensordict)
+        values.append(read_value(acted))
+        if number > steps[0] - explainer.network.num_frames:
+            recent.append(np.asarray(take_picture(env, name)))
+        if number in steps:
+            step = explainer.explain(acted)
+            page = page or Page(step, title, dpi)
+            show(number, step, page.draw(step, [*recent], values, number))
+        if number == steps[-1]:
+            raise _Enough
+        return acted
+
+    with suppress(_Enough):
+        evaluate(env, explained, 1, seed=seed)
+    return len(values)
 
 
 class _Enough(Exception):
-    """Everything that was requested is drawn."""
+    """Everything that was requested is shown."""
 
 
 def explain_policy(
@@ -54,7 +269,7 @@ def explain_policy(
         step: for a picture, the step to show, counted from 0, which is the default.
         max_steps: for a film, the maximum number of steps to show; by default the whole episode.
         title: name of the policy on the page; by default ``name``.
-        **explanation: arguments of :class:`~recipes.results.explained_step.Explainer`.
+        **explanation: arguments of :class:`Explainer`.
 
     Returns:
         The number of steps that are shown.
@@ -65,73 +280,43 @@ def explain_policy(
             cannot be rendered, or there are no such maps for the network.
     """
     check_explanation(out, step, max_steps)
+    first = step or 0
+    steps = range(first, first + 1) if out.suffix == ".png" else range(max_steps or sys.maxsize)
+    shown = 0
     explainer = Explainer(policy, **explanation)
-    first = 0 if step is None else step
-    last = first if out.suffix == ".png" else None if max_steps is None else max_steps - 1
-    env = make_rendered(make_env, name)
-    base: Any = env.base_env  # transforms have no pictures
-    count = shown = 0
-    page: Page | None = None
-    values: list[Any] = []
-    recent: deque[np.ndarray] = deque(maxlen=explainer.network.num_frames)
-    try:
-        with (
-            whole_or_not_at_all(out) as hidden,
-            # The writer infers the format from the suffix, which the hidden name lacks.
-            TemporaryDirectory(prefix=".", dir=out.absolute().parent) as folder,
-        ):
-            reel = Path(folder, out.name)
-            with _open(reel, base.render_fps) as pictures:
+    with (
+        closing(make_rendered(make_env, name)) as env,
+        new_film(out, env.base_env.render_fps) as pictures,
+    ):
 
-                def explained(tensordict: TensorDictBase) -> TensorDictBase:
-                    nonlocal count, shown, page
-                    number, count = count, count + 1
-                    acted = policy(tensordict)
-                    values.append(read_value(acted))
-                    if number > first - explainer.network.num_frames:
-                        recent.append(np.asarray(take_picture(base, name)))
-                    if number < first:
-                        return acted
-                    step = explainer.explain(acted)
-                    page = page or Page(step, title or str(name))
-                    pictures.append_data(page.draw(step, [*recent], values, number))
-                    shown += 1
-                    if number == last:
-                        raise _Enough
-                    return acted
+        def show(number: int, step: ExplainedStep, page: np.ndarray) -> None:
+            nonlocal shown
+            pictures.append_data(page)
+            shown += 1
 
-                with suppress(_Enough):
-                    evaluate(env, explained, 1, seed=seed)
-                if not shown:
-                    raise ValueError(
-                        f"the episode of seed {seed} has {count} steps, so there is no step "
-                        f"{first}: choose one below {count}"
-                    )
-            reel.rename(hidden)
-    finally:
-        env.close()
+        count = explain_episode(
+            env, explainer, name, steps, show, title=title or str(name), seed=seed
+        )
+        if not shown:
+            raise ValueError(
+                f"the episode of seed {seed} has {count} steps, so there is no step {first}: "
+                f"choose one below {count}"
+            )
     return shown
 
 
 def check_explanation(out: Path, step: int | None, max_steps: int | None) -> None:
     """Raises ValueError if a file, or the steps to show in it, are invalid."""
-    if out.suffix not in _SUFFIXES:
+    if out.suffix not in (*FILMS, ".png"):
         raise ValueError(
             f"an explanation is a film (.gif, .mp4) or a picture of one step (.png), not "
             f"{out.name!r}"
         )
-    if step is not None and out.suffix in _FILMS:
+    if step is not None and out.suffix in FILMS:
         raise ValueError(f"step {step} is one step, so it is a picture: write it to a .png")
-    if max_steps is not None and out.suffix not in _FILMS:
+    if max_steps is not None and out.suffix not in FILMS:
         raise ValueError(f"max_steps {max_steps} is the length of a film, not of a .png: use step")
     if step is not None and step < 0:
         raise ValueError(f"steps are counted from 0, so there is no step {step}")
     if max_steps is not None and max_steps < 1:
         raise ValueError(f"max_steps must be at least 1, not {max_steps}")
-
-
-def _open(file: Path, fps: float) -> Any:
-    """Opens a film, or a picture, which holds only one frame."""
-    if file.suffix == ".png":
-        return imageio.get_writer(file, format="PNG-PIL", mode="i")
-    return open_film(file, fps)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,25 +22,25 @@ from ..recipe import Recipe
 from ..run import Run
 from ..runner import load_trained
 
-_SUFFIXES = (".gif", ".mp4")
+FILMS = (".gif", ".mp4")
 
 
 def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float]:
     """Films a run's newest agent while it plays as in the evaluation.
 
     Args:
-        recipe: The run's recipe; episode i begins from its ``evaluation_seed + i``.
-        run: A run folder with a checkpoint.
-        video: The GIF or MP4 file to write, which must not exist yet.
-        episodes: Number of episodes, shown one after another in one film.
+        recipe: the run's recipe; episode i begins from its ``evaluation_seed + i``.
+        run: a run folder with a checkpoint.
+        video: the GIF or MP4 file to write, which must not exist yet.
+        episodes: number of episodes, shown one after another in one film.
 
     Returns:
         The return of each episode.
 
     Raises:
-        FileExistsError: If there is such a file already.
-        FileNotFoundError: If there is no checkpoint.
-        ValueError: If the file is of another kind, ``episodes`` is less than 1, the task cannot be
+        FileExistsError: if there is such a file already.
+        FileNotFoundError: if there is no checkpoint.
+        ValueError: if the file is of another kind, ``episodes`` is less than 1, the task cannot be
             rendered, or something that rendering needs is missing: a package, or OpenGL for a
             MuJoCo task.
     """
@@ -51,8 +52,8 @@ def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float
 
 def check_film(video: Path) -> None:
     """Raises ValueError if a file is neither a GIF nor an MP4."""
-    if video.suffix not in _SUFFIXES:
-        raise ValueError(f"a film is one of {', '.join(_SUFFIXES)}, not {video.name!r}")
+    if video.suffix not in FILMS:
+        raise ValueError(f"a film is one of {', '.join(FILMS)}, not {video.name!r}")
 
 
 def film_policy(
@@ -67,50 +68,40 @@ def film_policy(
     """Films a policy while it plays with its most likely actions.
 
     Args:
-        make_env: Makes the task, given the number of copies and ``render_mode``.
-        policy: The policy.
-        name: Name of the policy in messages.
-        video: As in :func:`film`.
-        episodes: Number of episodes, shown one after another in one film.
-        seed: Seed of the first episode; episode i begins from ``seed + i``.
-        max_pictures: Length of the film, after which the policy plays on without being filmed; by
+        make_env: makes the task, given the number of copies and ``render_mode``.
+        policy: the policy.
+        name: name of the policy in messages.
+        video: as in :func:`film`.
+        episodes: number of episodes, shown one after another in one film.
+        seed: seed of the first episode; episode i begins from ``seed + i``.
+        max_pictures: length of the film, after which the policy plays on without being filmed; by
             default, everything is shown.
 
     Returns:
         The return of each episode.
 
     Raises:
-        FileExistsError: If there is such a file already.
-        ValueError: As in :func:`film`.
+        FileExistsError: if there is such a file already.
+        ValueError: as in :func:`film`.
     """
     check_film(video)
-    env = make_rendered(make_env, name)
-    base: Any = env.base_env  # transforms have no pictures
-    try:
-        with (
-            whole_or_not_at_all(video) as hidden,
-            # The writer infers the format from the suffix, which the hidden name lacks.
-            TemporaryDirectory(prefix=".", dir=video.absolute().parent) as folder,
-        ):
-            reel = Path(folder, video.name)
-            with open_film(reel, base.render_fps) as pictures:
-                left = math.inf if max_pictures is None else max_pictures
+    left = math.inf if max_pictures is None else max_pictures
+    with (
+        closing(make_rendered(make_env, name)) as env,
+        new_film(video, env.base_env.render_fps) as pictures,
+    ):
 
-                def filmed(tensordict: TensorDictBase) -> TensorDictBase:
-                    nonlocal left
-                    if left > 0:
-                        pictures.append_data(take_picture(base, name))
-                        left -= 1
-                    return policy(tensordict)
+        def filmed(tensordict: TensorDictBase) -> TensorDictBase:
+            nonlocal left
+            if left > 0:
+                pictures.append_data(take_picture(env, name))
+                left -= 1
+            return policy(tensordict)
 
-                returns = evaluate(env, filmed, episodes, seed=seed)
-            reel.rename(hidden)
-    finally:
-        env.close()
-    return returns.tolist()
+        return evaluate(env, filmed, episodes, seed=seed).tolist()
 
 
-def make_rendered(make_env: Callable[..., EnvBase], name: str | Path) -> EnvBase:
+def make_rendered(make_env: Callable[..., EnvBase], name: str | Path) -> Any:
     """Makes one copy of a task that can be rendered; raises ValueError if it cannot."""
     try:
         return make_env(1, render_mode="rgb_array")
@@ -121,7 +112,7 @@ def make_rendered(make_env: Callable[..., EnvBase], name: str | Path) -> EnvBase
 def take_picture(env: Any, name: str | Path) -> Any:
     """Renders a task, uint8 [height, width, 3]; raises ValueError if it cannot be rendered."""
     try:
-        return env.render()[0]
+        return env.base_env.render()[0]  # transforms have no pictures
     except Exception as error:  # each task has its own renderer, with its own errors
         raise ValueError(
             f"{name} cannot be rendered: {str(error).rstrip('.')}; for MuJoCo without a "
@@ -129,8 +120,26 @@ def take_picture(env: Any, name: str | Path) -> Any:
         ) from error
 
 
-def open_film(video: Path, fps: float) -> Any:
-    """Opens a GIF or MP4 that takes pictures one by one, so that a long film needs no memory."""
+@contextmanager
+def new_film(out: Path, fps: float) -> Iterator[Any]:
+    """Opens a new GIF, MP4 or PNG, which takes pictures one by one: long films need no memory.
+
+    If anything is raised meanwhile, no file is left behind.
+    """
+    with (
+        whole_or_not_at_all(out) as hidden,
+        # The writer infers the format from the suffix, which the hidden name lacks.
+        TemporaryDirectory(prefix=".", dir=out.absolute().parent) as folder,
+    ):
+        reel = Path(folder, out.name)
+        with _open(reel, fps) as pictures:
+            yield pictures
+        reel.rename(hidden)
+
+
+def _open(video: Path, fps: float) -> Any:
+    if video.suffix == ".png":
+        return imageio.get_writer(video, format="PNG-PIL", mode="i")
     if video.suffix == ".gif":
         return imageio.get_writer(video, format="GIF", mode="I", duration=1000 / fps, loop=0)
     if importlib.util.find_spec("imageio_ffmpeg") is None:

@@ -1,27 +1,108 @@
-"""Figures of learning curves."""
+"""Figures of runs: learning curves, other metrics, and tables, drawn with Matplotlib."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import takewhile
+from dataclasses import dataclass
 from pathlib import Path
-from textwrap import wrap
+from textwrap import fill
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from torchrl_tit.files import write_bytes_atomic
 
-from ..metrics import parse_metrics, read_metrics
 from ..run import Run
-from .cell import Cell
+from .experiments import Experiment, common_part, read_metrics
+from .interval import intervals_of
+from .table import Cell
 
-# Maximum length of names, in letters, for which two fit side by side below a figure.
-_WIDEST_OF_TWO = 40
-# Maximum number of letters in a line beside a panel.
-_WIDEST_LABEL = 26
+NEARLY = 0.9
+"""A run that has fewer steps than this share of its longest sibling is left out of bold lines."""
+WINDOW = 5
+"""Batches over which returns of training are averaged in bold lines."""
+_LINES = ("-", "--", ":", "-.")
+_MOST_SINGLE = 9  # more runs would hide the bold lines
+_POINTS = 400  # of a curve; of longer ones, neighbors are averaged
+_GRID = 200  # points at which runs with different steps are compared
+_WIDEST = 60  # letters in a line of a legend
+_WIDEST_LABEL = 26  # letters in a line beside a panel
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A metric of a run where it is known, or its interquartile mean over runs.
+
+    Args:
+        steps: float [points].
+        values: float [points].
+    """
+
+    steps: np.ndarray
+    values: np.ndarray
+
+
+def curve_of(rows: Iterable[Mapping[str, float]], column: str = "return_mean") -> Curve:
+    """Returns a metric at the steps where it is known; of more than 400 rows, means of neighbors.
+
+    Args:
+        rows: the rows of a ``metrics.csv``.
+        column: the metric.
+
+    Example:
+        >>> curve_of([{"step": 1, "return_mean": np.nan}, {"step": 2, "return_mean": 9.0}]).values
+        array([9.])
+    """
+    pairs = [(row["step"], row[column]) for row in rows if np.isfinite(row.get(column, np.nan))]
+    steps, values = np.array(pairs).reshape(-1, 2).T
+    if (size := -(-len(steps) // _POINTS)) > 1:
+        starts = np.arange(0, len(steps), size)
+        counts = np.diff(starts, append=len(steps))
+        values = np.add.reduceat(values, starts) / counts
+        steps = steps[starts + counts - 1]
+    return Curve(steps, values)
+
+
+def draw_curves(
+    axes: Axes, groups: Mapping[str, Sequence[Curve]], window: int = 1
+) -> dict[str, Curve]:
+    """Draws curves: thin lines for single runs, bold ones for interquartile means with bands.
+
+    Bands are 95% bootstrap intervals. If all runs together are more than nine, there are no thin
+    lines.
+
+    Args:
+        axes: where to draw.
+        groups: the curves of each group's runs by the group's name. Runs that have fewer than 90%
+            of the steps of the longest one are left out of bold lines.
+        window: points over which bold lines are averaged.
+
+    Returns:
+        The bold line of each group that has one.
+    """
+    known = {name: [run for run in runs if len(run.steps)] for name, runs in groups.items()}
+    few = sum(map(len, known.values())) <= _MOST_SINGLE
+    bold = {}
+    for index, (name, runs) in enumerate(known.items()):
+        if not runs:
+            continue
+        color, line = f"C{index % 10}", _LINES[index // 10 % len(_LINES)]
+        for run in runs if few and (len(runs) > 1 or window > 1) else ():
+            axes.plot(run.steps, run.values, c=color, ls=line, lw=1, alpha=0.35)
+        longest = max(run.steps[-1] for run in runs)
+        whole = [run for run in runs if run.steps[-1] >= NEARLY * longest]
+        steps, values = _on_one_grid([_smoothed(run, window) for run in whole])
+        middle, low, high = intervals_of(values)
+        label = f"{name} ({len(whole)} runs)" if len(whole) > 1 else name
+        marker = "o" if len(steps) == 1 else None  # a line through one point is invisible
+        axes.plot(steps, middle, c=color, ls=line, lw=2, marker=marker, label=_plain(label))
+        if len(whole) > 1:
+            axes.fill_between(steps, low, high, color=color, alpha=0.2, lw=0)
+        bold[name] = Curve(steps, middle)
+    return bold
 
 
 def plot_run(run: Run) -> None:
@@ -30,87 +111,41 @@ def plot_run(run: Run) -> None:
     Args:
         run: a run folder with metrics.
     """
-    recipe = run.recipe
-    plot_learning_curve(
-        run.folder / "metrics.csv", run.curve, title=recipe.name, offline=recipe.offline
-    )
-
-
-def plot_learning_curve(
-    metrics: Path, picture: Path, *, title: str, window: int = 5, offline: bool = False
-) -> None:
-    """Draws returns of training episodes over environment steps.
-
-    Args:
-        metrics: a run's ``metrics.csv`` with the columns ``step`` and ``return_mean``.
-        picture: the PNG file to write.
-        title: title of the figure.
-        window: batches over which the bold line is averaged.
-        offline: whether to draw evaluation episodes over gradient steps instead.
-    """
-    steps, returns = _curve(read_metrics(metrics))
-    smooth = np.array([returns[max(0, i - window + 1) : i + 1].mean() for i in range(len(returns))])
-    figure = _figure(title, offline)
-    (axes,) = figure.axes
-    batch, batches = ("an evaluation", "evaluations") if offline else ("a batch", "batches")
-    if not len(steps):
+    offline = run.recipe.offline
+    figure, axes = new_chart(run.recipe.name, offline)
+    name = "evaluations" if offline else f"mean of {WINDOW} batches"
+    if draw_curves(axes, {name: [curve_of(read_metrics(run))]}, 1 if offline else WINDOW):
+        add_legend(figure)
+    else:
         axes.text(0.5, 0.5, "no episode has ended", ha="center", transform=axes.transAxes)
-    marker = "o" if len(steps) == 1 else "None"  # a line through one point is invisible
-    axes.plot(
-        steps, returns, marker=marker, ls="-", c="C0", alpha=0.35, lw=1, label=f"mean of {batch}"
-    )
-    axes.plot(
-        steps, smooth, marker=marker, ls="-", c="C0", lw=2, label=f"mean of {window} {batches}"
-    )
-    _write(figure, picture)
+    save_figure(figure, run.curve)
 
 
-def plot_comparison(
-    curves: Mapping[str, Sequence[Run]],
-    picture: Path,
-    *,
-    title: str,
-    points: int = 200,
-    offline: bool = False,
-) -> None:
-    """Draws learning curves of several groups of runs: mean over the runs, band of one deviation.
+def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: str) -> None:
+    """Draws learning curves of experiments: interquartile means over runs, with 95% intervals.
 
     Args:
-        curves: the runs (seeds) of each group, by the group's name; the names' common prefix, up to
-            a "/", appears only in the title.
+        experiments: the experiments; what their names have in common appears only in the title.
         picture: the PNG file to write.
         title: title of the figure, instead of the common part of the names.
-        points: steps at which the runs are compared; between batches, returns are interpolated.
-        offline: as for :func:`plot_learning_curve`.
 
     Raises:
         ValueError: if there is no return to draw.
     """
-    levels = zip(*(name.split("/")[:-1] for name in curves), strict=False)
-    shared = takewhile(lambda level: len(curves) > 1 and len(set(level)) == 1, levels)
-    common = "".join(f"{level[0]}/" for level in shared)
-    figure = _figure(title or common.rstrip("/"), offline)
-    (axes,) = figure.axes
-    for name, runs in curves.items():
-        rows = (parse_metrics(run.read("metrics.csv"), run.folder / "metrics.csv") for run in runs)
-        known = [(steps, returns) for steps, returns in map(_curve, rows) if len(steps)]
-        if not known:
-            continue
-        grid = np.linspace(
-            max(steps[0] for steps, _ in known), min(steps[-1] for steps, _ in known), points
-        )
-        returns = np.stack([np.interp(grid, *run) for run in known])
-        mean, deviation = returns.mean(0), returns.std(0)
-        label = name.removeprefix(common) + (f" ({len(known)} runs)" if len(known) > 1 else "")
-        marker = "o" if grid[0] == grid[-1] else "None"
-        (line,) = axes.plot(grid, mean, marker=marker, ls="-", linewidth=2, label=label)
-        axes.fill_between(
-            grid, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.2, linewidth=0
-        )
-    if not axes.lines:
-        folders = ", ".join(str(run.folder) for runs in curves.values() for run in runs)
+    offline = experiments[0].settings.offline
+    common = common_part([experiment.name for experiment in experiments])
+    figure, axes = new_chart(title or common.rstrip("/"), offline)
+    curves = {
+        experiment.label.removeprefix(common): [
+            curve_of(read_metrics(run)) for run in experiment.runs
+        ]
+        for experiment in experiments
+    }
+    if not draw_curves(axes, curves, 1 if offline else WINDOW):
+        folders = ", ".join(str(run.folder) for one in experiments for run in one.runs)
         raise ValueError(f"there is nothing to draw: no episode has ended in {folders}")
-    _write(figure, picture)
+    add_legend(figure)
+    save_figure(figure, picture)
 
 
 def plot_table(cells: Sequence[Cell], picture: Path) -> None:
@@ -123,39 +158,28 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     tasks: dict[tuple[str, str], list[Cell]] = {}  # of one measure: scores are not returns
     for cell in cells:
         tasks.setdefault((cell.recipe.rpartition("/")[0], cell.measure), []).append(cell)
-    columns = min(3, len(tasks))
-    rows = -(-len(tasks) // columns)
     labels = {
-        (task, measure): [_break(cell.label.removeprefix(f"{task}/")) for cell in group]
+        (task, measure): [
+            fill(_plain(cell.label.removeprefix(f"{task}/")), _WIDEST_LABEL) for cell in group
+        ]
         for (task, measure), group in tasks.items()
     }
     breaks = max(label.count("\n") for group in labels.values() for label in group)
     height = 0.6 + (0.32 + 0.16 * breaks) * max(map(len, tasks.values()))
+    columns = min(3, len(tasks))
+    rows = -(-len(tasks) // columns)
     figure = new_figure((4.2 * columns, height * rows + 0.6))
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
     for axes, ((task, measure), group) in zip(panels, tasks.items(), strict=False):
         places = np.arange(len(group))
+        iqm, low, high = np.array([(cell.iqm, cell.low, cell.high) for cell in group]).T
         # A single run has no interval.
-        below = [cell.iqm - cell.low if cell.runs > 1 else 0 for cell in group]
-        above = [cell.high - cell.iqm if cell.runs > 1 else 0 for cell in group]
+        ends = np.nan_to_num([iqm - low, high - iqm])
         axes.errorbar(
-            [cell.iqm for cell in group],
-            places,
-            xerr=[below, above],
-            fmt="o",
-            color="C0",
-            capsize=3,
-            label="interquartile mean, 95%",
+            iqm, places, xerr=ends, fmt="o", c="C0", capsize=3, label="interquartile mean, 95%"
         )
-        axes.errorbar(
-            [cell.paper_mean for cell in group],
-            places + 0.22,
-            xerr=[cell.paper_std for cell in group],
-            fmt="s",
-            color="grey",
-            markersize=4,
-            label="paper",
-        )
+        paper, spread = np.array([(cell.paper_mean, cell.paper_std) for cell in group]).T
+        axes.errorbar(paper, places + 0.22, xerr=spread, fmt="s", c="grey", ms=4, label="paper")
         axes.set_yticks(places, labels[task, measure])
         axes.set(title=task, xlabel=measure, ylim=(len(group) - 0.4, -0.6))
         axes.grid(alpha=0.3)
@@ -165,15 +189,30 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     save_figure(figure, picture)
 
 
-def _curve(metrics: Iterable[dict[str, float]]) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and returns of the batches in which an episode ended."""
-    rows = [row for row in metrics if not np.isnan(row["return_mean"])]
-    return np.array([row["step"] for row in rows]), np.array([row["return_mean"] for row in rows])
+def new_chart(title: str, offline: bool, of_returns: bool = True) -> tuple[Figure, Axes]:
+    """Returns a figure with axes for a metric over the steps."""
+    figure = new_figure((7, 4))
+    axes = figure.add_subplot()
+    steps, episodes = ("gradient", "evaluation") if offline else ("environment", "training")
+    axes.set(title=_plain(title), xlabel=f"{steps} steps")
+    if of_returns:
+        axes.set_ylabel(f"return of {episodes} episodes")
+    axes.grid(alpha=0.3)
+    return figure, axes
 
 
-def _break(label: str) -> str:
-    """Breaks a label into lines that leave room for the panel."""
-    return "\n".join(wrap(label, _WIDEST_LABEL))
+def add_legend(figure: Figure) -> None:
+    """Adds a legend: in the axes, or below them where it would hide the curves."""
+    (axes,) = figure.axes
+    handles, labels = axes.get_legend_handles_labels()
+    labels = [fill(label, _WIDEST) for label in labels]
+    if len(handles) > 2:
+        columns = 2 if max(map(len, labels)) <= _WIDEST / 2 else 1
+        lines = sum(label.count("\n") + 1 for label in labels) / columns
+        figure.set_figheight(4 + 0.3 * lines)
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
+    else:
+        axes.legend(handles, labels, frameon=False)
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
@@ -183,29 +222,38 @@ def new_figure(size: tuple[float, float]) -> Figure:
     return figure
 
 
-def _figure(title: str, offline: bool) -> Figure:
-    figure = new_figure((7, 4))
-    axes = figure.add_subplot()
-    steps, episodes = ("gradient", "evaluation") if offline else ("environment", "training")
-    axes.set(title=title, xlabel=f"{steps} steps", ylabel=f"return of {episodes} episodes")
-    axes.grid(alpha=0.3)
-    return figure
-
-
-def _write(figure: Figure, picture: Path) -> None:
-    (axes,) = figure.axes
-    handles, labels = axes.get_legend_handles_labels()
-    if len(handles) > 2:  # they would hide the curves
-        columns = 2 if max(map(len, labels)) <= _WIDEST_OF_TWO else 1
-        figure.set_figheight(4 + 0.3 * len(handles) / columns)
-        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False)
-    else:
-        axes.legend(frameon=False)
-    save_figure(figure, picture)
-
-
 def save_figure(figure: Figure, picture: Path) -> None:
     """Writes a figure as PNG, whole or not at all."""
+    write_bytes_atomic(picture, to_bytes(figure, "png"))
+
+
+def to_bytes(figure: Figure, kind: str) -> bytes:
+    """Returns a figure as the content of a file, "png" or "svg"."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", bbox_inches="tight")
-    write_bytes_atomic(picture, buffer.getvalue())
+    metadata = {"Date": None} if kind == "svg" else None
+    figure.savefig(buffer, format=kind, bbox_inches="tight", metadata=metadata)
+    return buffer.getvalue()
+
+
+def _on_one_grid(curves: Sequence[Curve]) -> tuple[np.ndarray, np.ndarray]:
+    """The steps that curves have in common, and their values there, [curves, steps]."""
+    first = curves[0].steps
+    if all(np.array_equal(curve.steps, first) for curve in curves):
+        return first, np.stack([curve.values for curve in curves])
+    start = max(curve.steps[0] for curve in curves)
+    end = max(start, min(curve.steps[-1] for curve in curves))
+    grid = np.linspace(start, end, _GRID)
+    return grid, np.stack([np.interp(grid, curve.steps, curve.values) for curve in curves])
+
+
+def _smoothed(curve: Curve, window: int) -> Curve:
+    """The means of each value and those before it."""
+    sums = np.cumsum([0.0, *curve.values])
+    ends = np.arange(1, len(sums))
+    starts = np.maximum(ends - window, 0)
+    return Curve(curve.steps, (sums[ends] - sums[starts]) / (ends - starts))
+
+
+def _plain(text: str) -> str:
+    """A name of others, in which Matplotlib would read "$" as the beginning of a formula."""
+    return text.replace("$", r"\$")

@@ -9,11 +9,10 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ..metrics import parse_metrics
 from ..records import Record, Records, make_record
 from ..registry import RECIPES
 from ..run import Run
-from .experiments import changes_of, find_runs
+from .experiments import changes_of, find_runs, read_metrics
 
 
 def record_runs(
@@ -80,7 +79,7 @@ def _read(run: Run, name: str) -> dict[str, Any]:
 
 def _metrics(run: Run) -> list[dict[str, float]]:
     """The rows of a run's metrics, with the columns of its other files beside them."""
-    rows = parse_metrics(run.read("metrics.csv"), run.folder / "metrics.csv")
+    rows = read_metrics(run)
     for path in sorted(run.folder.glob("*.csv")):
         others: dict[float, dict[str, str]] = {}
         if path.name != "metrics.csv":

@@ -1,25 +1,106 @@
-"""From run folders to the paper's tables."""
+"""The tables of the paper for runs, beside what the paper and others report."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import cache
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
 from torchrl_tit.datasets import has_reference
 
+from ..dataset_recipe import DatasetRecipe
 from ..recipe import Recipe
+from ..registry import RECIPES
 from ..run import Run
-from .cell import Cell
-from .experiments import Experiment, find_runs, group_runs
+from .experiments import Experiment, find_runs, group_runs, label
 from .interval import interval_of
-from .reported import Published, paper_results, plain_name, reported_of
 
 OTHER = "not in the paper"
+HEADER = (
+    *("recipe", "runs", "mean ± over runs", "± over episodes"),
+    *("interquartile mean [95%]", "paper"),
+)
+"""The header of :func:`to_columns`."""
+_TASK = (
+    *("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions"),
+    "backbone",
+)
+"""The fields that determine which task is learned, and by which network."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """The result of an experiment in the paper's tables."""
+
+    table: str
+    mean: float
+    std: float
+
+
+@dataclass(frozen=True)
+class Published:
+    """The result of another implementation with the same kind of network."""
+
+    source: str
+    """Who reports it."""
+    url: str
+    """Where."""
+    mean: float
+    std: float
+    note: str
+    """How it was measured: version of the task, steps, seeds."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """All runs of the same settings: one cell of a table.
+
+    A run's value is the mean return of its evaluation, or its best normalised score if it has one
+    (offline recipes).
+    """
+
+    table: str
+    """The paper's table that it belongs to."""
+    recipe: str
+    runs: int
+    steps: int
+    """Training steps; the minimum over the runs."""
+    mean: float
+    """Mean of the runs' values."""
+    std: float
+    """Standard deviation of the runs' values (population)."""
+    std_episodes: float
+    """Standard deviation over the episodes of a run, as the paper's online tables seem to report
+    it; the mean over the runs."""
+    iqm: float
+    """Interquartile mean of the runs' values (arXiv 2108.13264)."""
+    low: float
+    """Lower end of its 95% confidence interval, by bootstrap over runs; NaN for a single run."""
+    high: float
+    """Upper end."""
+    paper_mean: float
+    """The paper's value; NaN if it has none. Recipes with other settings (-protocol, -tuned) have
+    the value of the plain recipe."""
+    paper_std: float
+    changes: str = ""
+    """Fields in which the runs differ from the recipe of that name, with the runs' values."""
+
+    measure: str = "return"
+    """What the values are: "return" or "normalized score"."""
+
+    published: tuple[Published, ...] = ()
+    """What others report for the same task and kind of network."""
+
+    @property
+    def label(self) -> str:
+        """The recipe's name, and the changed fields."""
+        return label(self.recipe, self.changes)
 
 
 def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
@@ -88,15 +169,29 @@ def to_markdown(cells: Sequence[Cell]) -> str:
     parts = []
     for table in dict.fromkeys(cell.table for cell in cells):
         rows = [cell for cell in cells if cell.table == table]
-        columns = ["recipe", "runs", "mean ± over runs", "± over episodes"]
-        columns += ["interquartile mean [95%]", "paper"]
-        published = any(cell.published for cell in rows)
-        columns += ["published"] if published else []
+        is_published = any(cell.published for cell in rows)
+        columns = [*HEADER, "published"] if is_published else HEADER
         lines = [f"### {table[0].upper()}{table[1:]}\n", _line(columns)]
         lines += ["|---" * len(columns) + "|"]
-        lines += [_line(_row(cell)[: len(columns)]) for cell in rows]
+        for cell in rows:
+            published = [", ".join(map(_published, cell.published))] if is_published else []
+            lines.append(_line([*to_columns(cell), *published]))
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)
+
+
+def to_columns(cell: Cell) -> list[str]:
+    """Writes the numbers of a cell as text, under :data:`HEADER`."""
+    interval = f" [{_number(cell.low)}, {_number(cell.high)}]" if cell.runs > 1 else ""
+    known = cell.paper_mean == cell.paper_mean
+    return [
+        cell.label,
+        str(cell.runs),
+        f"{_number(cell.mean)} ± {_number(cell.std)}",
+        _number(cell.std_episodes),
+        f"{_number(cell.iqm)}{interval}",
+        f"{_number(cell.paper_mean)} ± {_number(cell.paper_std)}" if known else "",
+    ]
 
 
 def to_csv(cells: Sequence[Cell]) -> str:
@@ -113,6 +208,63 @@ def to_csv(cells: Sequence[Cell]) -> str:
         )
         writer.writerow({k: "" if v != v else v for k, v in values.items()})
     return buffer.getvalue()
+
+
+@cache
+def paper_results() -> dict[str, Result]:
+    """What the paper reports, by the recipe's name.
+
+    arXiv 2212.14538, tables of section 4 and the ablation; the standard deviations of Decision
+    Transformer are taken from the curves that its authors published, since the paper applied the
+    score's offset to them.
+
+    Example:
+        >>> paper_results()["ppo/mountaincar/enhanced-tit"].mean
+        -97.0
+    """
+    return {
+        row["recipe"]: Result(row["table"], float(row["mean"]), float(row["std"]))
+        for row in _rows("paper_results.csv")
+    }
+
+
+@cache
+def published_results() -> dict[str, tuple[Published, ...]]:
+    """What others have published, by the name of the recipe with the same task and network.
+
+    Example:
+        >>> [result.source for result in published_results()["ppo/acrobot/mlp"]]
+        ['CleanRL', 'RL Zoo']
+    """
+    results: dict[str, tuple[Published, ...]] = {}
+    for row in _rows("published_results.csv"):
+        name = row["recipe"]
+        mean, std = float(row["mean"]), float(row["std"])
+        result = Published(row["source"], row["url"], mean, std, row["note"])
+        results[name] = (*results.get(name, ()), result)
+    return results
+
+
+def reported_of(recipe: Recipe) -> tuple[Result | None, tuple[Published, ...]]:
+    """What the paper and others report, if task, network and data are those of the recipe's name.
+
+    Args:
+        recipe: the settings of a run.
+    """
+    plain = plain_name(recipe.name)
+    named = RECIPES.get(recipe.name) or RECIPES.get(plain)
+    if named is None or any(getattr(recipe, x, None) != getattr(named, x, None) for x in _TASK):
+        return None, ()
+    if isinstance(recipe, DatasetRecipe) and _stem(recipe.dataset) not in plain.split("/"):
+        return None, ()
+    return paper_results().get(plain), published_results().get(plain, ())
+
+
+def plain_name(name: str) -> str:
+    """The name without the suffix that marks other settings: "-tuned", "-protocol"."""
+    if name in paper_results():
+        return name
+    return name.removesuffix("-tuned").removesuffix("-protocol")
 
 
 def _value(evaluation: dict) -> float:
@@ -153,20 +305,6 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
     )
 
 
-def _row(cell: Cell) -> list[str]:
-    interval = f" [{_number(cell.low)}, {_number(cell.high)}]" if cell.runs > 1 else ""
-    known = cell.paper_mean == cell.paper_mean
-    return [
-        cell.label,
-        str(cell.runs),
-        f"{_number(cell.mean)} ± {_number(cell.std)}",
-        _number(cell.std_episodes),
-        f"{_number(cell.iqm)}{interval}",
-        f"{_number(cell.paper_mean)} ± {_number(cell.paper_std)}" if known else "",
-        ", ".join(map(_published, cell.published)),
-    ]
-
-
 def _published(result: Published) -> str:
     numbers = f"{_number(result.mean)} ± {_number(result.std)}"
     return f"[{result.source}]({result.url}) {numbers} ({result.note})"
@@ -179,3 +317,13 @@ def _line(columns: Sequence[str]) -> str:
 def _number(value: float) -> str:
     """Formats a number: whole from 100 on, with one decimal below."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
+
+
+def _rows(file: str) -> Iterator[dict[str, str]]:
+    text = resources.files(__package__).joinpath(file).read_text(encoding="utf-8")
+    yield from csv.DictReader(io.StringIO(text))
+
+
+def _stem(dataset: str) -> str:
+    """A data set's name, also if it is given as D4RL's file: "hopper_medium-v2.hdf5"."""
+    return Path(dataset).name.removesuffix(".hdf5").replace("_", "-")

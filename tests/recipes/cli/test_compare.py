@@ -33,7 +33,9 @@ def drawn(monkeypatch):
         found = {}
         monkeypatch.setattr(
             "recipes.cli.compare.plot_comparison",
-            lambda curves, picture, **options: found.update(curves),
+            lambda experiments, picture, title: found.update(
+                {experiment.label: experiment.runs for experiment in experiments}
+            ),
         )
         main(["compare", *folders])
         return {name: [str(run.folder) for run in runs] for name, runs in found.items()}

@@ -66,7 +66,7 @@ def test_a_whole_episode_and_a_picture_of_a_step_of_it(cartpole, tmp_path, capsy
     drawn = []
 
     class Small:
-        def __init__(self, step, title):
+        def __init__(self, step, title, dpi):
             drawn.append(title)
 
         def draw(self, step, pictures, values, number):

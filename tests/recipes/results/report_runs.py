@@ -31,11 +31,16 @@ def metrics_of(seed, rows=60, steps=1024):
     }
 
 
-def write_run(
-    folder, name="ppo/cartpole/enhanced-tit", seed=0, metrics=None, returns=None, **fields
-):
-    """Writes a run folder without a checkpoint; returns it."""
-    recipe = replace(get_recipe(name), seed=seed, **fields)
+def write_run(folder, of, seed=0, returns=None, metrics=None, evaluation=None, **fields):
+    """Writes a run folder without a checkpoint; returns it.
+
+    Args:
+        returns: those of its evaluation, repeated as often as the recipe has episodes.
+        metrics: the columns of its metrics.
+        evaluation: other entries of its evaluation.
+        **fields: other fields of the recipe.
+    """
+    recipe = replace(get_recipe(of), seed=seed, **fields)
     folder.mkdir(parents=True)
     (folder / "recipe.json").write_text(recipe_to_json(recipe))
     columns = metrics_of(seed) if metrics is None else metrics
@@ -44,17 +49,18 @@ def write_run(
         writer.writerow(columns)
         writer.writerows(zip(*columns.values(), strict=True))
     if returns is not None:
-        evaluation = {
+        returns = list(map(float, returns)) * (recipe.evaluation_episodes // len(returns))
+        whole = {
             "mean": float(np.mean(returns)),
             "std": float(np.std(returns)),
             "episodes": len(returns),
             "env": recipe.env,
             "steps": recipe.final_step,
-            "returns": list(map(float, returns)),
+            "returns": returns,
             "seed": recipe.evaluation_seed,
             "weights": "last",
         }
-        (folder / "evaluation.json").write_text(json.dumps(evaluation))
+        (folder / "evaluation.json").write_text(json.dumps(whole | (evaluation or {})))
     versions = {"python": "3.11.7", "torch": "2.13.0", "torchrl-tit": "0.1.0"}
     (folder / "versions.json").write_text(json.dumps(versions))
     return folder

@@ -15,7 +15,7 @@ RECIPE = PPO(name="a", env="CartPole-v1", backbone=mlp())
 
 def test_whatever_their_seed_and_machine(tmp_path):
     one = Run(tmp_path / "0", RECIPE)
-    other = Run(tmp_path / "1", replace(RECIPE, seed=1, device="cpu"))
+    other = Run(tmp_path / "1", replace(RECIPE, seed=1, device="cpu", threads=2, compile="on"))
     third = Run(tmp_path / "2", replace(RECIPE, learning_rate=0.1))
     assert [(e.label, e.runs) for e in group_runs([one, third, other])] == [
         ("a", (one, other)),

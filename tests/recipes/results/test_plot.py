@@ -1,64 +1,105 @@
-"""Pictures of learning curves."""
+"""Pictures of learning curves and tables."""
 
 from itertools import combinations
-from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from recipes.registry import get_recipe
-from recipes.results.cell import Cell
-from recipes.results.plot import plot_comparison, plot_learning_curve, plot_table
+from recipes.results import plot
+from recipes.results.experiments import Experiment
+from recipes.results.plot import Curve, curve_of, draw_curves, new_chart, plot_comparison, plot_run
+from recipes.results.table import Cell
 from recipes.run import Run
+from tests.recipes.results.report_runs import write_run
+
+TWO = {"step": [1, 2], "time": [0, 1], "return_mean": [1.0, 3.0]}
 
 
-def run_in(folder: Path) -> Run:
-    return Run(folder, get_recipe("ppo/cartpole/mlp"))
+def experiments_of(folder, *names):
+    run = Run.open(write_run(folder, "ppo/cartpole/mlp", metrics=TWO))
+    return [Experiment(run.recipe, name, "", (run,)) for name in names]
 
 
-def height(folder: Path, groups: int) -> int:
-    """Pixels of the picture of some groups of runs."""
-    metrics, picture = folder / "metrics.csv", folder / f"{groups}.png"
-    metrics.write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
-    plot_comparison({f"run {i}": [run_in(folder)] for i in range(groups)}, picture, title="")
-    return len(imread(picture))
+@pytest.fixture
+def figures(monkeypatch):
+    """Figures instead of files."""
+    found = []
+    monkeypatch.setattr(plot, "save_figure", lambda figure, picture: found.append(figure))
+    return found
 
 
 def test_the_legend_of_many_curves_has_a_place_of_its_own(tmp_path):
-    assert height(tmp_path, 1) == height(tmp_path, 2) < height(tmp_path, 3) < height(tmp_path, 9)
+    def height(count):
+        picture = tmp_path / f"{count}.png"
+        runs = experiments_of(tmp_path / str(count), *map("run {}".format, range(count)))
+        plot_comparison(runs, picture, title="")
+        return len(imread(picture))
+
+    assert height(1) == height(2) < height(3) < height(9)
 
 
-@pytest.mark.parametrize("length", [5, 39, 45, 90])
+@pytest.mark.parametrize("length", [5, 45, 90])
 def test_the_legend_is_in_the_picture(length, tmp_path):
-    metrics, picture = tmp_path / "metrics.csv", tmp_path / "curves.png"
-    metrics.write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
-    runs = [run_in(tmp_path)]
-    plot_comparison({f"{i} {'n' * length}": runs for i in range(4)}, picture, title="")
-    shape = imread(picture)[..., :3]
+    names = [f"{i} {'n' * length} {'m' * length}" for i in range(4)]
+    plot_comparison(experiments_of(tmp_path / "run", *names), tmp_path / "curves.png", title="")
+    shape = imread(tmp_path / "curves.png")[..., :3]
     assert all(edge.min() == 1 for edge in (shape[:, 0], shape[:, -1], shape[0], shape[-1]))
 
 
-def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, monkeypatch):
-    metrics = tmp_path / "metrics.csv"
-    metrics.write_text("step,time,return_mean\n1,0,1.0\n2,1,3.0\n")
-    figures = []
-    monkeypatch.setattr(
-        "recipes.results.plot._write", lambda figure, picture: figures.append(figure)
-    )
-    names = ["ppo/cartpole/mlp", "ppo/cartpole/mlp-stack-8", "ppo/cartpole/lstm"]
-    run = run_in(tmp_path)
+def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, figures):
+    names = ["ppo/cartpole/mlp", "ppo/cartpole/$5", "ppo/cartpole/lstm"]
+    runs = experiments_of(tmp_path / "run", *names)
     for title in ("", "mine"):
-        plot_comparison({name: [run] for name in names}, tmp_path / "a.png", title=title)
-    plot_comparison({names[0]: [run_in(tmp_path)]}, tmp_path / "a.png", title="")
-    drawn = [
-        (axes.get_title(), axes.get_legend_handles_labels()[1])
-        for (axes,) in (figure.axes for figure in figures)
-    ]
-    labels = ["mlp", "mlp-stack-8", "lstm"]
-    assert drawn == [("ppo/cartpole", labels), ("mine", labels), ("", [f"{names[0]}"])]
+        plot_comparison(runs, tmp_path / "a.png", title=title)
+    drawn = [(f.axes[0].get_title(), f.axes[0].get_legend_handles_labels()[1]) for f in figures]
+    labels = ["mlp", r"\$5", "lstm"]
+    assert drawn == [("ppo/cartpole", labels), ("mine", labels)]
 
 
-def test_what_was_changed_has_room_beside_its_panel(tmp_path, monkeypatch):
+def test_bold_lines_are_interquartile_means_of_runs_that_are_as_far():
+    steps = np.arange(1.0, 11)
+    runs = [Curve(steps, steps * factor) for factor in (1.0, 2.0, 3.0, 30.0)]
+    _, axes = new_chart("", offline=False)
+    bold = draw_curves(axes, {"a": [*runs, Curve(steps[:8], steps[:8])], "none": []})
+    assert bold.keys() == {"a"}
+    assert np.allclose(bold["a"].values, 2.5 * steps)
+    labels = [line.get_label() for line in axes.lines]
+    assert len(labels) == 6  # of single runs, and the bold one
+    assert labels[-1] == "a (4 runs)"
+    band = np.asarray(axes.collections[0].get_paths()[0].vertices)
+    assert band[:, 1].max() <= 300
+
+
+def test_runs_with_other_steps_are_interpolated_and_returns_averaged():
+    _, axes = new_chart("", offline=False)
+    runs = [Curve(np.array([0.0, 10]), np.array([0.0, 10])), Curve(np.array([2.0, 9]), np.ones(2))]
+    bold = draw_curves(axes, {"a": runs})["a"]
+    assert (bold.steps[0], bold.steps[-1]) == (2, 9)
+    assert np.allclose(bold.values, (bold.steps + 1) / 2)
+    values = np.arange(8.0)
+    bold = draw_curves(axes, {"a": [Curve(values, values)]}, window=5)["a"]
+    assert np.allclose(bold.values, [0, 0.5, 1, 1.5, 2, 3, 4, 5])
+
+
+def test_long_curves_are_thinned_by_means_of_neighbors():
+    rows = [{"step": step, "return_mean": step % 3} for step in range(1, 1201)]
+    curve = curve_of([*rows, {"step": 1201, "return_mean": np.nan}, {"step": 1202}])
+    assert np.allclose(curve.values, 1)
+    assert (len(curve.steps), curve.steps[-1]) == (400, 1200)
+
+
+@pytest.mark.parametrize("values", [[2.0], [], [np.nan]])
+def test_a_run_of_one_batch_is_seen(values, tmp_path, figures):
+    metrics = {"step": [1] * len(values), "return_mean": values}
+    plot_run(Run.open(write_run(tmp_path / "run", "ppo/cartpole/mlp", metrics=metrics)))
+    (axes,) = figures[0].axes
+    point = values == [2.0]
+    assert [line.get_marker() for line in axes.lines[-1:]] == ["o"] * point
+    assert [text.get_text() for text in axes.texts] == ["no episode has ended"] * (not point)
+
+
+def test_what_was_changed_has_room_beside_its_panel(tmp_path, figures):
     """Names of cells overlap neither another panel nor each other, and show what was changed."""
     changes = "env ALE/Pong-v5, num_envs 2, total_steps 128, steps_per_batch 64, epochs 3"
     cells = [
@@ -66,37 +107,13 @@ def test_what_was_changed_has_room_beside_its_panel(tmp_path, monkeypatch):
         for task in ("a", "b", "c")
         for text in ("", changes)
     ]
-    figures = []
-    monkeypatch.setattr(
-        "recipes.results.plot.save_figure", lambda figure, path: figures.append(figure)
-    )
-    plot_table(cells, tmp_path / "table.png")
+    plot.plot_table(cells, tmp_path / "table.png")
     (figure,) = figures
     figure.canvas.draw()
     boxes = []
     for axes in figure.axes:
         labels = axes.get_yticklabels()
-        assert [label.get_text().replace("\n", " ") for label in labels] == [
-            "enhanced-tit",
-            f"enhanced-tit ({changes})",
-        ]
+        texts = [label.get_text().replace("\n", " ") for label in labels]
+        assert texts == ["enhanced-tit", f"enhanced-tit ({changes})"]
         boxes += [axes.bbox, *(label.get_window_extent() for label in labels)]
     assert not any(box.overlaps(other) for box, other in combinations(boxes, 2))
-
-
-@pytest.mark.parametrize("rows", ["1,0,2.0\n", "", "1,0,nan\n"])
-def test_a_run_of_one_batch_is_seen(rows, tmp_path, monkeypatch):
-    metrics = tmp_path / "metrics.csv"
-    metrics.write_text(f"step,time,return_mean\n{rows}")
-    figures = []
-    monkeypatch.setattr(
-        "recipes.results.plot.save_figure", lambda figure, _: figures.append(figure)
-    )
-    plot_learning_curve(metrics, tmp_path / "curve.png", title="")
-    (axes,) = figures[0].axes
-    point = "2.0" in rows
-    assert {line.get_marker() for line in axes.lines} == {"o" if point else "None"}
-    assert [text.get_text() for text in axes.texts] == ([] if point else ["no episode has ended"])
-    if point:
-        plot_comparison({"run": [run_in(tmp_path)]}, tmp_path / "curve.png", title="")
-        assert figures[1].axes[0].lines[0].get_marker() == "o"
