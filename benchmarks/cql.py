@@ -12,9 +12,9 @@ needed here. Install it without its dependencies:
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -32,9 +32,9 @@ from recipes.recipe import Compile
 from recipes.registry import RECIPES
 from torchrl_tit.networks import build_network
 
-from .report import publish, spread, table
+from .measuring import publish, ratios, spread, table, take_turns
 
-ROUNDS, STEPS = 10, 3
+ROUNDS, SECONDS = 10, 1.0
 OBSERVATION, ACTION = 11, 3
 
 
@@ -169,56 +169,37 @@ def make_floor() -> Callable[[TensorDictBase], Any]:
     return products
 
 
-def ratios(one: Sequence[float], other: Sequence[float]) -> list[float]:
-    """Element-wise quotients."""
-    return [a / b for a, b in zip(one, other, strict=True)]
-
-
-def differences(one: Sequence[float], other: Sequence[float]) -> list[float]:
-    """Element-wise differences."""
-    return [a - b for a, b in zip(one, other, strict=True)]
-
-
 def main(out: Path | None) -> None:
     """Measures on one thread, alternating, and reports."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
+    batch = make_batch()
     updates = {
         "d3rlpy": make_theirs(),
         "this library": make_ours("off"),
         "this library, its policy compiled": make_ours("on"),
         "the critics' matrix products alone": make_floor(),
     }
-    theirs, *ours, floor = updates
-    batches = [make_batch() for _ in range(STEPS)]
-    times: dict[str, list[float]] = {name: [] for name in updates}
-    for update in updates.values():
-        update(batches[0])
-    for _ in range(ROUNDS):
-        for name, update in updates.items():
-            start = time.process_time()  # excludes other processes on the machine
-            for batch in batches:
-                update(batch)
-            times[name].append((time.process_time() - start) / STEPS)
+    steps = {name: partial(update, batch) for name, update in updates.items()}
+    times = take_turns(steps, ROUNDS, SECONDS)
+    theirs, *ours, floor = times
+    above = {
+        name: [a - b for a, b in zip(times[name], times[floor], strict=True)]
+        for name in (theirs, *ours)
+    }
     whole = {name: ratios(times[theirs], times[name]) for name in ours}
-    above = {name: differences(times[name], times[floor]) for name in (theirs, *ours)}
     rest = {name: ratios(above[theirs], above[name]) for name in ours}
     rows = [
-        [
-            name,
-            spread([1000 * t for t in seconds]),
-            spread(whole[name], 2) if name in ours else "",
-            spread(rest[name], 2) if name in ours else "",
-        ]
-        for name, seconds in times.items()
+        [name, spread(taken), spread(whole.get(name, []), 2), spread(rest.get(name, []), 2)]
+        for name, taken in times.items()
     ]
     markdown = (
         "# Conservative Q-learning\n\n"
         "One update of CQL_TIT with the networks of the paper's hopper-medium-replay, batch 256, "
         "one thread,\nprocessor time, compile time apart. "
-        f"{ROUNDS} rounds of {STEPS} updates each, alternating: median (range), round by\nround "
-        "for ratios.\n\n"
+        f"{ROUNDS} rounds of at least {SECONDS} seconds, alternating: median (range), round by"
+        "\nround for ratios.\n\n"
         + table(["", "ms an update", "times as fast as d3rlpy", "without the products"], rows)
     )
-    numbers = {"seconds": times, "ratios": whole, "ratios_beside_the_floor": rest}
+    numbers = {"ms": times, "ratios": whole, "ratios_beside_the_floor": rest}
     publish("cql", markdown, numbers, out)

@@ -8,17 +8,13 @@ floor is the time that our step's matrix products take at the rate of one large 
 
 from __future__ import annotations
 
-import statistics
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torch.utils.flop_counter import FlopCounterMode
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Compose, TargetReturn, TransformedEnv
 from torchrl.modules import DTActor, ProbabilisticActor, TanhDelta
@@ -32,10 +28,25 @@ from torchrl_tit.networks import DTTIT, DecisionTransformer, HistoryNetwork
 from torchrl_tit.objectives import MaskedDTLoss
 from torchrl_tit.transforms import SequenceHistory
 
-from .report import publish, spread, table
+from .measuring import (
+    count_flops,
+    milliseconds,
+    peak_flops,
+    publish,
+    ratios,
+    spread,
+    table,
+    take_turns,
+)
 
-ROUNDS, STEPS, EPISODES = 10, 4, 100
+ROUNDS, SECONDS, EPISODES = 10, 1.0, 100
 NETWORKS = {"DT": DecisionTransformer, "DT_TIT": DTTIT}
+TITLES = {
+    "TorchRL": "`DTActor` in `DTLoss`",
+    "DT": "DT of this library",
+    "DT_TIT": "DT_TIT of this library",
+    "floor": "matrix products of DT's step alone",
+}
 TASKS = {"HalfCheetah-v5": 30, "Hopper-v5": 200}  # with the longest episode
 
 
@@ -96,76 +107,29 @@ def make_step(loss: nn.Module, buffer: ReplayBuffer) -> Callable[[], None]:
     return step
 
 
-def seconds(function: Callable[[], Any], repeats: int = 1) -> float:
-    """Seconds of processor time of one call, which other processes do not affect."""
-    start = time.process_time()
-    for _ in range(repeats):
-        function()
-    return (time.process_time() - start) / repeats
-
-
-def matrix_rate() -> float:
-    """Floating-point operations per second of a product of the step's largest sizes."""
-    a, b = torch.randn(64 * 59, 128), torch.randn(128, 512)
-    return 2 * a.shape[0] * b.numel() / min(seconds(lambda: a @ b, 20) for _ in range(3))
-
-
-def count_operations(buffer: ReplayBuffer) -> int:
-    """Floating-point operations in the matrix products of DT's gradient step."""
-    predictor, batch = make_dt_predictor(*make_network("DT")), buffer.sample()
-    with FlopCounterMode(display=False) as counter:
-        predictor(batch)["action"].sum().backward()
-    return counter.get_total_flops()
-
-
-def measure_training() -> tuple[list[list[object]], dict[str, Any]]:
-    """A row for each network, and the numbers."""
+def measure_training() -> dict[str, list[float]]:
+    """Milliseconds of a gradient step of each program in each round, and of the floor."""
     buffer = make_buffer()
     losses = {name: MaskedDTLoss(make_dt_predictor(*make_network(name))) for name in NETWORKS}
     steps = {"TorchRL": make_step(make_peer(), buffer)}
     steps |= {name: make_step(loss, buffer) for name, loss in losses.items()}
-    operations = count_operations(buffer)
-    times: dict[str, list[float]] = {name: [] for name in (*steps, "floor")}
-    rates = []
-    for _ in range(ROUNDS):
-        rates.append(matrix_rate())
-        for name, step in steps.items():
-            times[name].append(seconds(step, STEPS))
-        times["floor"].append(operations / rates[-1])
-    rows: list[list[object]] = []
-    for name, taken in times.items():
-        ratios = [peer / own for peer, own in zip(times["TorchRL"], taken, strict=True)]
-        ratio = "" if name == "TorchRL" else spread(ratios, 2)
-        rows.append([TITLES[name], spread([1000 * t for t in taken]), ratio])
-    return rows, {"seconds": times, "floor_operations": operations, "operations_per_second": rates}
+    predictor, batch = make_dt_predictor(*make_network("DT")), buffer.sample()
+    flops = count_flops(lambda: predictor(batch)["action"].sum().backward())
+    floor = 1000 * flops / peak_flops(64 * 59, 128, 512)  # the step's largest sizes
+    return {**take_turns(steps, ROUNDS, SECONDS), "floor": [floor] * ROUNDS}
 
 
-TITLES = {
-    "TorchRL": "`DTActor` in `DTLoss`",
-    "DT": "DT of this library",
-    "DT_TIT": "DT_TIT of this library",
-    "floor": "matrix products of DT's step alone",
-}
-
-
-def measure_evaluation() -> tuple[list[list[object]], dict[str, Any]]:
-    """A row for each task and network, and the numbers."""
-    rows: list[list[object]] = []
-    numbers: dict[str, Any] = {}
-    for task, longest in TASKS.items():
-        for name in NETWORKS:
-            torch.manual_seed(0)
-            single = make_evaluation_env(task, longest, 1)
-            (size,) = single.observation_spec["observation"].shape[1:]
-            action_dim = single.action_spec_unbatched.shape[0]
-            actor = make_dt_actor(*make_network(name, size, action_dim))
-            many = make_evaluation_env(task, longest, EPISODES)
-            with acting(actor):
-                apart = seconds(partial(evaluate, single, actor, EPISODES))
-                beside = seconds(partial(evaluate, many, actor, EPISODES, shrink=True))
-            rows.append([task, name, f"{apart:.1f}", f"{beside:.1f}", f"{apart / beside:.1f}"])
-            numbers[f"{task} {name}"] = {"one_after_another": apart, "side_by_side": beside}
-    return rows, numbers
+def measure_evaluation(task: str, longest: int, name: str) -> tuple[float, float]:
+    """Seconds of a hundred episodes one after another, and side by side."""
+    torch.manual_seed(0)
+    single = make_evaluation_env(task, longest, 1)
+    (size,) = single.observation_spec["observation"].shape[1:]
+    actor = make_dt_actor(*make_network(name, size, single.action_spec_unbatched.shape[0]))
+    many = make_evaluation_env(task, longest, EPISODES)
+    with acting(actor):
+        apart = milliseconds(partial(evaluate, single, actor, EPISODES), 0) / 1000
+        beside = milliseconds(partial(evaluate, many, actor, EPISODES, shrink=True), 0) / 1000
+    return apart, beside
 
 
 def make_evaluation_env(task: str, longest: int, num_envs: int) -> TransformedEnv:
@@ -178,17 +142,25 @@ def main(out: Path | None) -> None:
     """Measures on one thread and reports."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
-    training, training_numbers = measure_training()
-    evaluation, evaluation_numbers = measure_evaluation()
-    peer = statistics.median(training_numbers["seconds"]["TorchRL"])
-    ours = statistics.median(training_numbers["seconds"]["DT"])
+    times = measure_training()
+    peer = times["TorchRL"]
+    training = [
+        [TITLES[name], spread(taken), "" if taken is peer else spread(ratios(peer, taken), 2)]
+        for name, taken in times.items()
+    ]
+    evaluation = {
+        f"{task} {name}": measure_evaluation(task, longest, name)
+        for task, longest in TASKS.items()
+        for name in NETWORKS
+    }
+    rows = [[k, f"{a:.1f}", f"{b:.1f}", f"{a / b:.1f}"] for k, (a, b) in evaluation.items()]
     markdown = (
         "# Decision Transformer\n\n"
         "## A training step\n\n"
         "Batch 64, 20 steps, width 128, 3 layers, 1 head, dropout 0.1, Hopper's sizes; forward, "
         "backward,\nclipping and fused AdamW, one thread, processor time. "
-        f"{ROUNDS} rounds of {STEPS} steps each,\nalternating: median (range), ratios round by "
-        f"round; {peer / ours:.2f} times by the medians.\n\n"
+        f"{ROUNDS} rounds of at least {SECONDS} seconds,\nalternating: median (range), ratios "
+        "round by round.\n\n"
         + table(["", "ms a step", "times as fast as `DTActor`"], training)
         + "\nOurs computes an embedding of time steps and a mask of padding in addition, and of "
         "the last\nblock only the state tokens, which are all that is read.\n\n"
@@ -196,7 +168,8 @@ def main(out: Path | None) -> None:
         "Untrained networks, one thread, processor time: the same episodes in one environment, "
         "one after\nanother, and in as many environments side by side. HalfCheetah's episodes have "
         f"{TASKS['HalfCheetah-v5']} steps each,\nHopper's differ in length.\n\n"
-        + table(["task", "network", "one by one, s", "side by side, s", "ratio"], evaluation)
+        + table(["task and network", "one by one, s", "side by side, s", "ratio"], rows)
     )
-    numbers = {"training": training_numbers, "evaluation_seconds": evaluation_numbers}
+    seconds = {name: [one / 1000 for one in taken] for name, taken in times.items()}
+    numbers = {"training": {"seconds": seconds}, "evaluation_seconds": evaluation}
     publish("decision_transformer", markdown, numbers, out)

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,10 +24,10 @@ from torchrl_tit.export import export_policy
 from torchrl_tit.export.formats import FORMATS
 from torchrl_tit.modules import Backbone, acting, make_actor
 
-from .cases import Case
-from .report import publish, spread, table
+from .measuring import publish, ratios, spread, table, take_turns
+from .straightforward import Case
 
-STEPS, REPEATS = 30, 5
+STEPS, ROUNDS = 30, 5
 SIZES = (1, 8)
 CASES = [
     Case("Enhanced", "arrays", 4, max(SIZES)),
@@ -72,23 +70,13 @@ def exported(file: Path, facts: dict[str, Any], num_frames: int) -> Act:
     return act
 
 
-def seconds(act: Act, frames: Tensor, num_frames: int) -> float:
-    """The seconds that a step takes."""
-    count = frames.shape[1] - num_frames + 1
-    act(frames[:, :num_frames], True)
-    start = time.thread_time()
-    for step in range(1, count):
-        act(frames[:, : num_frames + step], False)
-    return (time.thread_time() - start) / (count - 1)
-
-
 @torch.no_grad()
-def measure(case: Case, steps: int, repeats: int) -> dict[str, Any]:
+def measure(case: Case, steps: int, rounds: int) -> dict[str, Any]:
     """Exports the policy of a case in every way; measures sizes, and steps per second, alternating.
 
     Returns:
         For each form, "kB" (None for the live policy) and, for each number of environments, the
-        total steps per second of each repeat.
+        total steps per second of each round.
     """
     torch.manual_seed(0)
     num_frames = case.num_frames
@@ -100,8 +88,7 @@ def measure(case: Case, steps: int, repeats: int) -> dict[str, Any]:
     policy = TensorDictSequential(Backbone(network), actor).eval()
     acts: dict[str, Act] = {"live": live(policy, num_frames)}
     kilobytes: dict[str, int | None] = {"live": None}
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        stack.enter_context(acting(policy))
+    with tempfile.TemporaryDirectory() as folder, acting(policy):
         for suffix in FORMATS:
             for step_by_step in (False, True)[:num_frames]:
                 name = f"{suffix}{', step by step' if step_by_step else ''}"
@@ -109,42 +96,40 @@ def measure(case: Case, steps: int, repeats: int) -> dict[str, Any]:
                 facts = export_policy(policy, task, file, step_by_step=step_by_step)
                 kilobytes[name] = file.stat().st_size // 1000
                 acts[name] = exported(file, facts, num_frames)
-        rates: dict[str, dict[int, list[float]]] = {name: {n: [] for n in SIZES} for name in acts}
-        for _ in range(repeats):
-            frames = case.frames(steps + num_frames)
-            for size in SIZES:
-                for name, act in acts.items():
-                    rates[name][size].append(size / seconds(act, frames[:size], num_frames))
+        rates: dict[str, dict[int, list[float]]] = {name: {} for name in acts}
+        for size in SIZES:
+            frames = case.frames(steps + num_frames)[:size]
+            plays = {name: partial(play, act, frames, num_frames) for name, act in acts.items()}
+            for name, times in take_turns(plays, rounds, 0).items():
+                rates[name][size] = [1000 * size * (steps + 1) / one for one in times]
     return {name: {"kB": kilobytes[name], "rates": rates[name]} for name in acts}
+
+
+def play(act: Act, frames: Tensor, num_frames: int) -> list[Tensor]:
+    """Acts on frames that advance by one; returns the actions."""
+    ends = range(num_frames, frames.shape[1] + 1)
+    return [act(frames[:, :end], end == num_frames) for end in ends]
 
 
 def main(out: Path | None) -> None:
     """Measures on one thread and reports."""
     torch.set_num_threads(1)
-    measured = [measure(case, STEPS, REPEATS) for case in CASES]
-    rows = [
-        [
-            case.inputs,
-            case.num_frames,
-            name,
-            "" if found["kB"] is None else found["kB"],
-            *(spread(found["rates"][size]) for size in SIZES),
-            f"{_median(found, 1) / _median(row['live'], 1):.1f}",
-        ]
-        for case, row in zip(CASES, measured, strict=True)
-        for name, found in row.items()
-    ]
+    rows = []
+    numbers = []
+    for case in CASES:
+        forms = measure(case, STEPS, ROUNDS)
+        numbers.append({**case.record(), "forms": forms})
+        for name, found in forms.items():
+            rates = [found["rates"][size] for size in SIZES]
+            times_live = statistics.median(ratios(rates[0], forms["live"]["rates"][SIZES[0]]))
+            of = [case.inputs, case.num_frames, name, "" if name == "live" else found["kB"]]
+            rows.append([*of, *map(spread, rates), f"{times_live:.1f}"])
     environments = [f"steps/s, {n} env{'s' * (n > 1)}" for n in SIZES]
     markdown = (
         "# Exported policies\n\nEnhanced_TIT with the paper's sizes. Steps a second of all "
-        f"environments together: median (range) of {REPEATS} rounds of {STEPS} steps, "
-        "alternating, by the\nprocessor time of one thread. The last column is the ratio of "
-        "the medians for one environment.\n\n"
+        f"environments together: median (range) of {ROUNDS} rounds of {STEPS} steps, "
+        "alternating, by the\nprocessor time of one thread. The last column is the median ratio "
+        "for one environment.\n\n"
         + table(["inputs", "K", "form", "kB", *environments, "times live"], rows)
     )
-    numbers = [{**case.record(), "forms": row} for case, row in zip(CASES, measured, strict=True)]
     publish("export", markdown, {"rows": numbers}, out)
-
-
-def _median(found: dict[str, Any], size: int) -> float:
-    return statistics.median(found["rates"][size])

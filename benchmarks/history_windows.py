@@ -3,15 +3,14 @@
 Both sample batches of 256 transitions, with the histories of the observation and of the next one,
 from the same episodes in memory, on one thread, alternating. CatFrames' sampler draws whole slices
 of K transitions and stacks within them, so it never samples the first K - 1 steps of an episode.
+Beside it, the bytes of a stored transition: ours stores each observation once.
 """
 
 from __future__ import annotations
 
 import statistics
-import time
-from collections.abc import Callable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -20,9 +19,9 @@ from torchrl.envs.transforms import CatFrames, Compose, UnsqueezeTransform
 
 from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays, make_replay_buffer
 
-from .report import publish, spread, table
+from .measuring import publish, ratios, spread, table, take_turns
 
-BATCH, REPEATS, SECONDS = 256, 5, 1.0
+BATCH, ROUNDS, SECONDS = 256, 5, 1.0
 CASES = {  # observation shape, dtype, transitions, K
     "arrays of 11, K = 4": ((11,), torch.float32, 100_000, 4),
     "arrays of 11, K = 16": ((11,), torch.float32, 100_000, 16),
@@ -91,13 +90,23 @@ def make_catframes(stream: dict[str, torch.Tensor], num_frames: int) -> ReplayBu
     return buffer
 
 
-def windows_per_second(sample: Callable[[], Any]) -> float:
-    """Measures the transitions sampled per second."""
-    batches, start = 0, time.perf_counter()
-    while (elapsed := time.perf_counter() - start) < SECONDS:
-        assert len(sample()) == BATCH
-        batches += 1
-    return batches * BATCH / elapsed
+def bytes_of(tensors: Iterable[torch.Tensor]) -> int:
+    """Counts the bytes of tensors; shared memory counts once."""
+    storages = (tensor.untyped_storage() for tensor in tensors)
+    return sum({storage.data_ptr(): storage.nbytes() for storage in storages}.values())
+
+
+def bytes_per_step(stream: dict[str, torch.Tensor], num_frames: int) -> tuple[float, float]:
+    """Measures the bytes of a stored transition: ours, and where histories are stored stacked."""
+    steps = len(stream["rewards"])
+    episodes = episodes_from_arrays(**stream)
+    storage = HistoryStorage(episodes, num_frames)
+    index = [value for value in vars(storage).values() if isinstance(value, torch.Tensor)]
+    ours = bytes_of([*episodes.rows.values(include_nested=True, leaves_only=True), *index])
+    others = [stream[name] for name in ("actions", "rewards", "terminals", "terminals")]
+    frame = stream["observations"][0].nbytes
+    stacked = 2 * num_frames * frame + sum(tensor[0].nbytes for tensor in others)
+    return ours / steps, stacked
 
 
 def main(out: Path | None) -> None:
@@ -110,23 +119,23 @@ def main(out: Path | None) -> None:
         ours, theirs = make_ours(stream, num_frames), make_catframes(stream, num_frames)
         for buffer in (ours, theirs):
             assert buffer.sample()["next", "history"].shape == (BATCH, num_frames, *shape)
-        pairs = [
-            (windows_per_second(ours.sample), windows_per_second(theirs.sample))
-            for _ in range(REPEATS)
-        ]
-        ratios = [a / b for a, b in pairs]
-        speeds = [list(column) for column in zip(*pairs, strict=True)]
-        rows.append([case, spread(speeds[0]), spread(speeds[1]), spread(ratios, 1)])
+        times = take_turns({"ours": ours.sample, "theirs": theirs.sample}, ROUNDS, SECONDS)
+        speeds = [[1000 * BATCH / one for one in times[name]] for name in ("ours", "theirs")]
+        found = ratios(*speeds)
+        sizes = bytes_per_step(stream, num_frames)
+        rows.append([case, *map(spread, speeds), spread(found, 1), *(f"{x:.0f}" for x in sizes)])
         numbers[case] = {
             "our_windows_per_second": speeds[0],
             "catframes_windows_per_second": speeds[1],
-            "ratios": ratios,
-            "median_ratio": statistics.median(ratios),
+            "ratios": found,
+            "median_ratio": statistics.median(found),
+            "bytes": {"ours": sizes[0], "stacked": sizes[1]},
         }
+    header = ["", "HistoryStorage", "CatFrames in a replay buffer", "ratio, pair by pair"]
+    header += ["bytes a transition", "stacked frames"]
     markdown = (
         "# Histories cut from stored episodes\n\n"
-        f"Batches of {BATCH} transitions with both histories; {REPEATS} rounds of {SECONDS:.0f} "
-        "second each, alternating: median (range).\n\n"
-        + table(["", "HistoryStorage", "CatFrames in a replay buffer", "ratio, pair by pair"], rows)
+        f"Transitions a second in batches of {BATCH} with both histories; {ROUNDS} rounds of "
+        f"{SECONDS:.0f} second each, alternating: median (range).\n\n" + table(header, rows)
     )
     publish("history_windows", markdown, numbers, out)

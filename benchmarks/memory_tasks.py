@@ -4,7 +4,7 @@ Each recipe is trained with each seed in a run folder. A run that was stopped go
 command is repeated. An episode is successful if it returns more than ``--threshold``, whose default
 fits MiniGrid-Memory and the T-Maze.
 
-Training ends early once 98 % of the last 500 episodes were successful, and then 98 % of as many
+Training ends early once 98% of the last 500 episodes were successful, and then 98% of as many
 episodes as the recipe's evaluation has, with the most likely actions and seeds of their own. If
 those fail, training goes on for at least 500 episodes. In the end, the final weights are evaluated.
 There is
@@ -12,13 +12,12 @@ There is
 - a row in ``runs.csv`` for each run; runs that have one are not repeated;
 - ``successes.csv`` in each run's folder: episodes and successes of each batch.
 
-At the end, a table of all rows is printed: interquartile means over the seeds, with 95 % intervals.
+At the end, a table of all rows is printed: interquartile means over the seeds, with 95% intervals.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -36,7 +35,7 @@ from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.evaluation import finished_returns
 from torchrl_tit.files import write_text_atomic
 
-from .rows import add_missing_rows
+from .measuring import add_missing_rows, read_rows, table
 
 SOLVED, EPISODES = 0.98, 500
 REACHED, WINDOW = 0.9, 100
@@ -48,13 +47,6 @@ COLUMNS = ["recipe", "seed", "weights", "steps", "steps_to_0.9", "success", "ret
 
 Batch = tuple[int, int, int]
 """The step at the end of a batch, the episodes that ended in it, and their successes."""
-
-
-def read_batches(path: Path) -> list[Batch]:
-    """Reads a run's ``successes.csv``."""
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = [*csv.reader(file)][1:]
-    return [(int(step), int(episodes), int(right)) for step, episodes, right in rows]
 
 
 def shares(batches: Iterable[Batch]) -> Iterator[tuple[int, float]]:
@@ -84,9 +76,9 @@ class Successes(Callback):
         self.batches: list[Batch] = []
         self._last: deque[bool] = deque(maxlen=EPISODES)
         if step:
-            for at, count, right in read_batches(path):
-                if at <= step:
-                    self.add(at, count, right)
+            for row in read_rows(path):
+                if int(row["step"]) <= step:
+                    self.add(*map(int, row.values()))
 
     def collected(self, step: int, batch: Any) -> None:
         """Counts the episodes that ended in a batch."""
@@ -107,7 +99,7 @@ class Successes(Callback):
         write_text_atomic(self.path, "".join(",".join(map(str, row)) + "\n" for row in rows))
 
     def reached(self) -> int | None:
-        """Returns the first step with 90 % of successes in the last 100 or more episodes."""
+        """Returns the first step with 90% of successes in the last 100 or more episodes."""
         return next((step for step, share in shares(self.batches) if share >= REACHED), None)
 
     def add(self, step: int, episodes: int, right: int) -> None:
@@ -146,10 +138,7 @@ def measure(recipe: Recipe, folder: Path, threshold: float) -> list[object]:
 
 def to_markdown(rows: Sequence[dict[str, str]]) -> str:
     """Writes a table of ``runs.csv``, a row for each recipe."""
-    lines = [
-        "| recipe | weights | seeds | success | return | steps to 0.9, thousands |",
-        "|---|---|---|---|---|---|",
-    ]
+    lines = []
     for name in dict.fromkeys(row["recipe"] for row in rows):
         runs = [row for row in rows if row["recipe"] == name]
         success, returned = (
@@ -159,9 +148,9 @@ def to_markdown(rows: Sequence[dict[str, str]]) -> str:
         steps = [f"{interval_of(reached):.0f}"] if reached else []
         if missing := len(runs) - len(reached):
             steps.append(f"not by {missing} of {len(runs)}")
-        cells = [name, runs[0]["weights"], len(runs), success, returned, ", ".join(steps)]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([name, runs[0]["weights"], len(runs), success, returned, ", ".join(steps)])
+    header = ["recipe", "weights", "seeds", "success", "return", "steps to 0.9, thousands"]
+    return table(header, lines)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -184,8 +173,7 @@ def main(arguments: list[str] | None = None) -> None:
     runs = [(name, seed) for seed in options.seeds for name in recipes]
     path = options.out / "runs.csv"
     add_missing_rows(path, COLUMNS, runs, measure_run)
-    with path.open(newline="", encoding="utf-8") as file:
-        print(to_markdown(list(csv.DictReader(file))), end="")
+    print(to_markdown(read_rows(path)), end="")
 
 
 if __name__ == "__main__":

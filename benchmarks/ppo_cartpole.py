@@ -8,84 +8,59 @@ and update together, without the first batch, in which libraries warm up and com
 
 from __future__ import annotations
 
-import os
-import statistics
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any
-from unittest.mock import patch
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecFrameStack
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
-from torchrl.collectors import Collector
+from torch import Tensor
 
 from recipes import ppo, runner
-from recipes.algorithm import make_algorithm
 from recipes.callback import Callback
 from recipes.metrics import read_metrics
-from recipes.ppo import PPOAlgorithm, algorithm
 from recipes.recipe import Compile
 from recipes.registry import get_recipe
-from recipes.results.plot import save_figure
 from recipes.run import Run
-from torchrl_tit.envs import TransformedVectorEnv
-from torchrl_tit.modules import Backbone
 
-from .report import publish, spread, table
+from .measuring import empty_compile_cache, publish, ratios, spread, table
 from .straightforward import StraightforwardTIT
 
 STEPS, ENVS = 2048, 8
-
-
-@dataclass(frozen=True)
-class Setting:
-    """A number of frames, and for how long and how often it is measured."""
-
-    num_frames: int
-    batches: int
-    repeats: int
-
-
-SETTINGS = [
-    Setting(num_frames=1, batches=5, repeats=5),
-    Setting(num_frames=8, batches=3, repeats=3),
-]
+SETTINGS = {1: (5, 5), 8: (3, 3)}
+"""How many batches a run has, and how many rounds there are, by the number of frames."""
+MODES: dict[str, Compile] = {"compiled": "on", "ours": "off"}
+TITLES = {
+    "sb3": "Stable-Baselines3, straightforward network",
+    "compiled": "this library, compiled",
+    "ours": "this library, `--compile off`",
+}
 
 
 @dataclass
-class Outcome:
-    """Speed and return of a run."""
-
-    laps: list[tuple[float, float]]
+class Laps:
     """Wall time and processor time at the end of each batch, in seconds."""
-    first_batch: float
-    """Wall time of the first batch, in seconds."""
-    training_return: float
+
+    start: float = field(default_factory=time.perf_counter)
+    ends: list[tuple[float, float]] = field(default_factory=list)
+    training_return: float = float("nan")
     """Mean return of the episodes that ended in the last batch."""
-    parameters: int
+
+    def add(self) -> None:
+        self.ends.append((time.perf_counter(), time.process_time()))
 
     def speed(self, clock: int = 0) -> float:
         """Environment steps per second of wall time (0) or processor time (1)."""
-        seconds = self.laps[-1][clock] - self.laps[0][clock]
-        return (len(self.laps) - 1) * STEPS / seconds
-
-
-def lap() -> tuple[float, float]:
-    """Wall time and processor time now, in seconds."""
-    return time.perf_counter(), time.process_time()
+        return (len(self.ends) - 1) * STEPS / (self.ends[-1][clock] - self.ends[0][clock])
 
 
 class Extractor(BaseFeaturesExtractor):
@@ -100,17 +75,17 @@ class Extractor(BaseFeaturesExtractor):
         return self.network(observation.unflatten(1, (self.num_frames, -1)))
 
 
-class Batches(BaseCallback):
+class TheirLaps(BaseCallback):
     """Records when each batch and its update end, and the returns of the last batch."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.laps: list[tuple[float, float]] = []
+        self.laps = Laps()
         self.returns: list[float] = []
 
     def _on_rollout_start(self) -> None:
         if self.num_timesteps:
-            self.laps.append(lap())
+            self.laps.add()
         self.returns.clear()
 
     def _on_step(self) -> bool:
@@ -118,242 +93,113 @@ class Batches(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        self.laps.append(lap())
+        self.laps.add()
+        self.laps.training_return = fmean(self.returns)
 
 
-def run_sb3(setting: Setting, seed: int) -> Outcome:
+class OurLaps(Callback):
+    """Records when each update ends."""
+
+    def __init__(self) -> None:
+        self.laps = Laps()
+
+    def updated(self, step: int, policy: TensorDictModuleBase) -> bool:
+        self.laps.add()
+        return False
+
+
+def run_sb3(num_frames: int, batches: int, seed: int) -> Laps:
     """Trains Stable-Baselines3 with the straightforward network."""
     env = make_vec_env("CartPole-v1", ENVS, seed=seed)
+    network = {
+        "features_extractor_class": Extractor,
+        "features_extractor_kwargs": {"num_frames": num_frames},
+        "net_arch": [],
+    }
     agent = PPO(
         "MlpPolicy",
-        VecFrameStack(env, setting.num_frames) if setting.num_frames > 1 else env,
+        VecFrameStack(env, num_frames) if num_frames > 1 else env,
         n_steps=STEPS // ENVS,
-        batch_size=64,
-        n_epochs=10,
         seed=seed,
         device="cpu",
-        policy_kwargs={
-            "features_extractor_class": Extractor,
-            "features_extractor_kwargs": {"num_frames": setting.num_frames},
-            "net_arch": [],
-        },
+        policy_kwargs=network,
     )
-    batches = Batches()
-    start, _ = lap()
-    agent.learn(setting.batches * STEPS, callback=batches)
-    parameters = sum(parameter.numel() for parameter in agent.policy.parameters())
-    first = batches.laps[0][0] - start
-    return Outcome(batches.laps, first, statistics.mean(batches.returns), parameters)
+    callback = TheirLaps()
+    agent.learn(batches * STEPS, callback=callback)
+    return callback.laps
 
 
-def run_ours(
-    setting: Setting, seed: int, compile: Compile, timers: Timers | None = None
-) -> Outcome:
+def run_ours(num_frames: int, batches: int, seed: int, compile: Compile) -> Laps:
     """Trains the recipe as the command line does, with checkpoints and metrics."""
     named = get_recipe("ppo/cartpole/enhanced-tit-protocol")
     assert isinstance(named, ppo.PPO)
     recipe = replace(
         named,
-        backbone=replace(named.backbone, num_frames=setting.num_frames),
+        backbone=replace(named.backbone, num_frames=num_frames),
         num_envs=ENVS,
         steps_per_batch=STEPS,
-        total_steps=setting.batches * STEPS,
+        total_steps=batches * STEPS,
         seed=seed,
         compile=compile,
     )
-    laps = Laps(timers)
+    callback = OurLaps()
     with tempfile.TemporaryDirectory() as folder, Run.create(Path(folder, "run"), recipe) as run:
-        start, _ = lap()
-        runner.train(recipe, run, [laps])
-        last = read_metrics(run.folder / "metrics.csv")[-1]
-    networks = make_algorithm(recipe).model
-    assert isinstance(networks, nn.Module)
-    parameters = sum(parameter.numel() for parameter in networks.parameters())
-    return Outcome(laps.laps, laps.laps[0][0] - start, last["return_mean"], parameters)
-
-
-class Laps(Callback):
-    """Records when each update ends; timers start after the first one."""
-
-    def __init__(self, timers: Timers | None) -> None:
-        self.laps: list[tuple[float, float]] = []
-        self.timers = timers
-
-    def updated(self, step: int, policy: TensorDictModuleBase) -> bool:
-        self.laps.append(lap())
-        if self.timers is not None and len(self.laps) == 1:
-            self.timers.seconds.clear()
-        return False
-
-
-class Timers:
-    """Adds up the seconds that pass in functions."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = defaultdict(float)
-
-    def around(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
-        def timed(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                # The backbone runs in both; only the update has gradients.
-                key = part.format("update" if torch.is_grad_enabled() else "collect")
-                self.seconds[key] += time.perf_counter() - start
-
-        return timed
-
-
-def profile(setting: Setting, compile: Compile) -> dict[str, float]:
-    """Measures the share of each part in our time, without the first batch."""
-    timers = Timers()
-    prepare = PPOAlgorithm.prepare
-
-    def prepare_timed(self: PPOAlgorithm, *args: Any) -> None:
-        prepare(self, *args)
-        self.objective = timers.around(self.objective, "update: forward")
-
-    parts: list[tuple[Any, str, str]] = [
-        (Collector, "rollout", "collect"),
-        (TransformedVectorEnv, "step_and_maybe_reset", "collect: environments"),
-        (algorithm, "add_advantages", "advantages"),
-        (Tensor, "backward", "update: backward"),
-        (nn.utils, "clip_grad_norm_", "update: gradient norm"),
-        (torch.optim.Adam, "step", "update: optimizer"),
-    ]
-    if compile == "off":  # parts of compiled code cannot be timed
-        parts.append((Backbone, "forward", "{}: backbone"))
-    with ExitStack() as stack:
-        for owner, name, part in parts:
-            function = timers.around(getattr(owner, name), part)
-            stack.enter_context(patch.object(owner, name, function))
-        stack.enter_context(patch.object(PPOAlgorithm, "prepare", prepare_timed))
-        laps = run_ours(setting, 0, compile, timers).laps
-    seconds = dict(timers.seconds)
-    acting = seconds.get("collect: backbone", 0)
-    encoding = seconds.get("update: backbone", 0)
-    seconds["collect: the rest"] = (
-        seconds.pop("collect") - seconds["collect: environments"] - acting
-    )
-    seconds["update: heads and loss"] = seconds.pop("update: forward") - encoding
-    whole = laps[-1][0] - laps[0][0]
-    seconds["minibatches, checks, metrics, checkpoints"] = whole - sum(seconds.values())
-    return {part: passed / whole for part, passed in sorted(seconds.items())}
-
-
-def draw(shares: dict[str, dict[str, float]], picture: Path) -> None:
-    """Draws each part's share of the time of a PPO step, one bar for each mode."""
-    figure = Figure(figsize=(8, 3.2), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    names = {"compiled": "compiled", "ours": "--compile off"}
-    parts = sorted({part for share in shares.values() for part in share})
-    start = [0.0] * len(names)
-    for index, part in enumerate(parts):
-        widths = [100 * shares[name].get(part, 0) for name in names]
-        axes.barh(list(names.values()), widths, left=start, color=f"C{index}", label=part)
-        start = [left + width for left, width in zip(start, widths, strict=True)]
-    axes.set(xlabel="% of the time of a PPO step", xlim=(0, 100))
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=3, frameon=False)
-    save_figure(figure, picture)
+        runner.train(recipe, run, [callback])
+        callback.laps.training_return = read_metrics(run.folder / "metrics.csv")[-1]["return_mean"]
+    return callback.laps
 
 
 def main(out: Path | None) -> None:
-    """Measures on one thread, with an empty compile cache."""
+    """Measures on one thread, with an empty compile cache, and reports."""
     torch.set_num_threads(1)
-    with (
-        tempfile.TemporaryDirectory() as cache,
-        patch.dict(os.environ, TORCHINDUCTOR_CACHE_DIR=cache),
-    ):
-        measure(out)
-
-
-def measure(out: Path | None) -> None:
-    """Measures, alternating, and reports."""
-    sections, numbers = [], {}
-    for setting in SETTINGS:
-        runs = take_turns(setting)
-        sections.append(section(setting, runs))
-        numbers[f"K = {setting.num_frames}"] = {
-            name: {
-                "steps_per_second": [outcome.speed() for outcome in outcomes],
-                "steps_per_second_of_processor_time": [outcome.speed(1) for outcome in outcomes],
-                "training_return": [outcome.training_return for outcome in outcomes],
-                "first_batch_seconds": [outcome.first_batch for outcome in outcomes],
-            }
-            for name, outcomes in runs.items()
-        }
-    shares = {name: profile(SETTINGS[0], mode) for name, mode in MODES.items()}
     markdown = (
         "# PPO on CartPole-v1, end to end\n\n"
         f"Enhanced_TIT (width 32, 2 blocks, 1 head, features 64), {ENVS} environments, {STEPS} "
         "steps a batch,\nminibatches of 64, 10 epochs, one thread. Runs alternate, and the first "
         "batch of each is left out. Medians\nand ranges; ratios are taken round by round. The "
-        "return is that of the episodes that ended in the last\nbatch.\n\n"
-        + "\n".join(sections)
-        + "\nCompiling is on by default in runs of 10,000 gradient steps or more (100k steps have "
-        "15,680), where there\nis a C++ compiler.\n\nWhere our time goes with K = 1 (separate "
-        "runs, with timers):\n\n"
-        + table(
-            ["part", "compiled", "`--compile off`"],
-            [
-                [
-                    part,
-                    *(f"{100 * share[part]:.0f} %" if part in share else "" for share in columns),
-                ]
-                for columns in [(shares["compiled"], shares["ours"])]
-                for part in shares["ours"]
-            ],
-        )
-        + "\nIn compiled runs, the backbone is part of *the rest* and of *heads and loss*.\n"
+        "return is that of the episodes that ended in the last\nbatch.\n"
     )
-    publish("ppo_cartpole", markdown, {**numbers, "shares": shares}, out)
-    if out is not None:
-        draw(shares, out / "ppo_cartpole.png")
+    numbers = {}
+    for num_frames, (batches, rounds) in SETTINGS.items():
+        with empty_compile_cache():
+            runs = take_turns(num_frames, batches, rounds)
+        speeds = {name: [laps.speed() for laps in found] for name, found in runs.items()}
+        processor = {name: [laps.speed(1) for laps in found] for name, found in runs.items()}
+        returns = {name: [one.training_return for one in found] for name, found in runs.items()}
+        first = {name: [x.ends[0][0] - x.start for x in found] for name, found in runs.items()}
+        rows = [
+            [
+                TITLES[name],
+                spread(speeds[name]),
+                spread(ratios(speeds[name], speeds["sb3"]), 2),
+                spread(ratios(processor[name], processor["sb3"]), 2),
+                spread(returns[name]),
+            ]
+            for name in TITLES
+        ]
+        header = ["", "steps a second", "ratio", "ratio of processor time"]
+        markdown += (
+            f"\nK = {num_frames}: {rounds} rounds of {batches} batches; compiling took "
+            f"{first['compiled'][0]:.0f} seconds in the first batch, with nothing cached.\n\n"
+            + table([*header, "return after training"], rows)
+        )
+        numbers[f"K = {num_frames}"] = {
+            name: {
+                "steps_per_second": speeds[name],
+                "steps_per_second_of_processor_time": processor[name],
+                "training_return": returns[name],
+                "first_batch_seconds": first[name],
+            }
+            for name in TITLES
+        }
+    publish("ppo_cartpole", markdown, numbers, out)
 
 
-MODES: dict[str, Compile] = {"ours": "off", "compiled": "on"}
-
-
-def take_turns(setting: Setting) -> dict[str, list[Outcome]]:
+def take_turns(num_frames: int, batches: int, rounds: int) -> dict[str, list[Laps]]:
     """Runs both libraries in turns."""
-    runs: dict[str, list[Outcome]] = defaultdict(list)
-    for repeat in range(setting.repeats):
-        runs["sb3"].append(run_sb3(setting, repeat))
+    runs: dict[str, list[Laps]] = defaultdict(list)
+    for seed in range(rounds):
+        runs["sb3"].append(run_sb3(num_frames, batches, seed))
         for name, mode in MODES.items():
-            runs[name].append(run_ours(setting, repeat, mode))
+            runs[name].append(run_ours(num_frames, batches, seed, mode))
     return runs
-
-
-def section(setting: Setting, runs: dict[str, list[Outcome]]) -> str:
-    """Makes the table for a number of frames."""
-    (parameters,) = {outcome.parameters for outcomes in runs.values() for outcome in outcomes}
-    return (
-        f"K = {setting.num_frames}: {parameters} parameters with the heads, {setting.repeats} "
-        f"rounds of {setting.batches} batches; compiling took "
-        f"{runs['compiled'][0].first_batch:.0f} seconds\nthe first time, with nothing cached, in "
-        "the first batch.\n\n"
-        + table(
-            ["", "steps a second", "ratio", "ratio of processor time", "return after training"],
-            [
-                row("Stable-Baselines3, straightforward network", runs["sb3"], runs["sb3"]),
-                row("this library, compiled", runs["compiled"], runs["sb3"]),
-                row("this library, `--compile off`", runs["ours"], runs["sb3"]),
-            ],
-        )
-    )
-
-
-def row(name: str, runs: list[Outcome], peers: list[Outcome]) -> list[str]:
-    """Makes a row of the table: speed, its ratios to a peer's, and the return."""
-    ratios = (
-        [run.speed(clock) / peer.speed(clock) for run, peer in zip(runs, peers, strict=True)]
-        for clock in (0, 1)
-    )
-    return [
-        name,
-        spread([run.speed() for run in runs]),
-        *("" if runs is peers else spread(ratio, 2) for ratio in ratios),
-        spread([run.training_return for run in runs]),
-    ]

@@ -32,8 +32,8 @@ from torch import Tensor, nn
 from recipes.presets.ppo_memory import MEMORY_RECIPES
 from torchrl_tit.tasks import FirstActions
 
+from .measuring import add_missing_rows
 from .memory_tasks import SOLVED, VALIDATION_SEED, Successes
-from .rows import add_missing_rows
 from .sb3_returns import EVALUATION_SEED
 
 COLUMNS = [

@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from .rows import add_missing_rows
+from .measuring import add_missing_rows
 
 COLUMNS = [
     "env",

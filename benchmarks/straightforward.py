@@ -1,12 +1,18 @@
-"""Straightforward implementations of both TITs, on nn.MultiheadAttention.
+"""The networks that benchmarks measure: ours, and straightforward ones on nn.MultiheadAttention.
 
-Every block computes every token of every frame of the window.
+Every block of a straightforward network computes every token of every frame of the window.
 """
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
 import torch
 from torch import Tensor, nn
+
+from torchrl_tit import EnhancedTIT, VanillaTIT
+from torchrl_tit.networks import HistoryNetwork
 
 
 class Block(nn.Module):
@@ -89,3 +95,64 @@ class StraightforwardTIT(nn.Module):
                 x = outer(x)  # [B, K, D]
             outputs.append(x[:, -1])
         return self.head(torch.cat(outputs, dim=-1))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A network and its inputs: four entries as in CartPole, or the paper's Atari images."""
+
+    variant: Literal["Enhanced", "Vanilla"]
+    inputs: Literal["arrays", "images"]
+    num_frames: int
+    batch: int
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        return (4,) if self.inputs == "arrays" else (84, 84)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        if self.inputs == "arrays":
+            return {"patch": 1, "width": 32, "heads": 1, "blocks": 2, "features": 64}
+        return {"patch": 12, "width": 64, "heads": 4, "blocks": 2, "features": 512}
+
+    def ours(self) -> HistoryNetwork:
+        """Our network, without dropout."""
+        build = EnhancedTIT if self.variant == "Enhanced" else VanillaTIT
+        sizes = self.sizes
+        return build(
+            self.observation_shape,
+            self.num_frames,
+            patch_size=sizes["patch"],
+            embed_dim=sizes["width"],
+            num_heads_inner=sizes["heads"],
+            num_heads_outer=sizes["heads"],
+            num_blocks=sizes["blocks"],
+            features_dim=sizes["features"],
+            activation_head="tanh" if self.inputs == "arrays" else "gelu",
+        )
+
+    def straightforward(self) -> StraightforwardTIT:
+        """The same network, with as many weights."""
+        sizes = self.sizes
+        return StraightforwardTIT(
+            self.observation_shape,
+            patch_size=sizes["patch"],
+            embed_dim=sizes["width"],
+            num_heads=sizes["heads"],
+            num_blocks=sizes["blocks"],
+            features_dim=sizes["features"],
+            head=nn.Tanh if self.inputs == "arrays" else nn.GELU,
+            enhanced=self.variant == "Enhanced",
+        )
+
+    def frames(self, steps: int) -> Tensor:
+        """Random observations, [batch, steps, *observation_shape]."""
+        shape = (self.batch, steps, *self.observation_shape)
+        if self.inputs == "images":
+            return torch.randint(0, 256, shape, dtype=torch.uint8)
+        return torch.randn(shape)
+
+    def record(self) -> dict[str, Any]:
+        """The case for JSON."""
+        return {**asdict(self), **self.sizes}

@@ -7,13 +7,8 @@ from typing import Any
 
 import pytest
 
-from benchmarks.figure_claims import main
+from benchmarks.figure_claims import FigureClaims, main, measure_figure_claims, to_markdown
 from recipes.ppo import PPO
-from recipes.results.figure_claims import (
-    FigureClaims,
-    measure_figure_claims,
-    to_markdown,
-)
 from recipes.results.interval import interval_of
 from recipes.run import Run
 from tests.recipes.untrained import untrained
@@ -60,7 +55,7 @@ def test_measured(runs, index):
     ]
     claims = min(found, key=lambda claims: claims.empty_maps)
     assert claims.empty_maps < 1
-    assert 0 < claims.area_of_objects < 0.6
+    assert 0 < claims.area_of_objects < 0.9
     assert 0 <= claims.share_on_objects <= 1
     assert 0 <= claims.change <= 1
     assert 0 <= claims.change_of_any <= 1

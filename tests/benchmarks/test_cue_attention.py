@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.cue_attention import main
-from recipes.ppo import PPO
-from recipes.registry import get_recipe
-from recipes.results import cue_attention
-from recipes.results.cue_attention import (
+from benchmarks import cue_attention
+from benchmarks.cue_attention import (
     Decision,
+    main,
     measure_decisions,
     plot_decisions,
     to_markdown,
 )
+from recipes.ppo import PPO
+from recipes.registry import get_recipe
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
