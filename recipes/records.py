@@ -12,8 +12,6 @@ are checkpoints.
 from __future__ import annotations
 
 import csv
-import datetime
-import hashlib
 import io
 import json
 import lzma
@@ -62,7 +60,8 @@ _DAMAGE = (
 """How reading a file of others can fail."""
 _MOST_BYTES = 2**26  # far more than any table unpacks to
 
-_OF_EVALUATION = ("steps", "mean", "std", "returns")
+OF_EVALUATION = ("steps", "mean", "std", "returns")
+"""The entries of evaluation.json that have a column."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +173,7 @@ class Records:
         _write_xz(self.folder / CURVES, _join({run: one.curve for run, one in found.items()}))
         # The table comes last: what the other files hold beyond it is not read.
         rows = [[one.row[column] for column in COLUMNS] for one in found.values()]
-        write_text_atomic(self.folder / TABLE, _to_csv([COLUMNS, *rows]))
+        write_text_atomic(self.folder / TABLE, to_csv([COLUMNS, *rows]))
         self.rows = {run: record.row for run, record in found.items()}
         self.__dict__.pop("_recipes", None)
         self.__dict__.pop("_curves", None)
@@ -201,7 +200,7 @@ class Records:
                 # Empty is a metric that the run does not have; one without a value at a step is
                 # nan.
                 kept = [i for i, cell in enumerate(lines[0]) if i and cell]
-                curves[run] = _to_csv([[line[i] for i in kept] for line in [header, *lines]])
+                curves[run] = to_csv([[line[i] for i in kept] for line in [header, *lines]])
             return curves
 
 
@@ -227,72 +226,12 @@ def find_records(path: Path) -> tuple[Records, str] | None:
     return None
 
 
-def make_record(
-    run: str,
-    recipe: dict[str, Any],
-    changes: Mapping[str, Any],
-    versions: Mapping[str, Any],
-    evaluation: Mapping[str, Any] | None,
-    earlier_lengths: Iterable[tuple[int, int]],
-    metrics: list[dict[str, float]],
-    commit: str = "",
-) -> Record:
-    """Makes the record of a run from what its folder holds.
-
-    Args:
-        run: its name in the table.
-        recipe: its ``recipe.json``.
-        changes: the fields in which it differs from the recipe of its name.
-        versions: its ``versions.json``.
-        evaluation: its ``evaluation.json``, if it is evaluated.
-        earlier_lengths: its ``earlier_lengths.json``.
-        metrics: the rows of its ``metrics.csv``.
-        commit: the commit that has its code or its full record, if known.
-    """
-    settings = {name: value for name, value in recipe.items() if name != "seed"}
-    key = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
-    found = dict(evaluation or {})
-    row = {
-        "run": run,
-        "recipe": str(recipe.get("name", "")),
-        "changes": _dumps(changes),
-        "seed": str(recipe.get("seed", 0)),
-        "settings": key,
-        "ended": _ended(metrics),
-        "commit": commit,
-        "versions": _dumps(versions),
-        "earlier_lengths": _dumps(list(earlier_lengths)),
-    }
-    if found:
-        found["returns"] = [float(f"{value:.6g}") for value in found["returns"]]
-        row |= {name: json.dumps(found.pop(name), separators=(",", ":")) for name in _OF_EVALUATION}
-    row["evaluation"] = _dumps(found)
-    return Record({column: row.get(column, "") for column in COLUMNS}, settings, _curve(metrics))
-
-
 def _evaluation(row: dict[str, str]) -> str:
     if not row["returns"]:
         return ""
-    known = {name: json.loads(row[name]) for name in _OF_EVALUATION}
+    known = {name: json.loads(row[name]) for name in OF_EVALUATION}
     others = json.loads(row["evaluation"]) if row["evaluation"] else {}
     return json.dumps({**known, **others})
-
-
-def _ended(metrics: list[dict[str, float]]) -> str:
-    if not metrics or "time" not in metrics[-1]:
-        return ""
-    return datetime.datetime.fromtimestamp(metrics[-1]["time"], datetime.UTC).strftime(
-        "%Y-%m-%dT%H:%M:%S"
-    )
-
-
-def _curve(metrics: list[dict[str, float]]) -> str:
-    """The text of a ``metrics.csv`` without what is left out."""
-    if not metrics:
-        return ""
-    names = [name for name in metrics[0] if name not in LEFT_OUT and name != "step"]
-    lines = [[f"{row['step']:.0f}", *(f"{row[name]:.4g}" for name in names)] for row in metrics]
-    return _to_csv([["step", *names], *lines])
 
 
 def _join(curves: Mapping[str, str]) -> str:
@@ -304,15 +243,11 @@ def _join(curves: Mapping[str, str]) -> str:
         for run, rows in tables.items()
         for row in rows
     ]
-    return _to_csv([["run", *names], *lines])
+    return to_csv([["run", *names], *lines])
 
 
-def _dumps(value: Any) -> str:
-    """Writes JSON; nothing for what is empty."""
-    return json.dumps(value, separators=(",", ":")) if value else ""
-
-
-def _to_csv(rows: Iterable[Iterable[Any]]) -> str:
+def to_csv(rows: Iterable[Iterable[Any]]) -> str:
+    """Writes rows as CSV."""
     buffer = io.StringIO()
     csv.writer(buffer, lineterminator="\n").writerows(rows)
     return buffer.getvalue()

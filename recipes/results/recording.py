@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import csv
+import datetime
+import hashlib
 import io
 import json
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ..records import Record, Records, make_record
+from ..records import COLUMNS, LEFT_OUT, OF_EVALUATION, Record, Records, to_csv
 from ..registry import RECIPES
 from ..run import Run
 from .experiments import changes_of, find_runs, read_metrics
@@ -57,16 +59,40 @@ def _record(name: str, run: Run, commit: str) -> Record:
     if not metrics:
         raise ValueError(f"{run.folder} has no metrics yet: train it first, or leave it out")
     named = dict(RECIPES).get(run.recipe.name)
-    return make_record(
-        name,
-        _read(run, "recipe.json"),
-        changes_of(named, run.recipe) if named else {},
-        _read(run, "versions.json"),
-        run.read_evaluation(),
-        run.earlier_lengths(),
-        metrics,
-        commit,
-    )
+    recipe, found = _read(run, "recipe.json"), run.read_evaluation() or {}
+    settings = {field: value for field, value in recipe.items() if field != "seed"}
+    row = {
+        "run": name,
+        "recipe": run.recipe.name,
+        "changes": _dumps(changes_of(named, run.recipe) if named else {}),
+        "seed": str(run.recipe.seed),
+        "settings": hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12],
+        "ended": _ended(metrics),
+        "commit": commit,
+        "versions": _dumps(_read(run, "versions.json")),
+        "earlier_lengths": _dumps(run.earlier_lengths()),
+    }
+    if found:
+        found["returns"] = [float(f"{value:.6g}") for value in found["returns"]]
+        row |= {entry: _dumps(found.pop(entry)) for entry in OF_EVALUATION}
+    row["evaluation"] = _dumps(found)
+    columns = [column for column in metrics[0] if column not in LEFT_OUT and column != "step"]
+    lines = [[f"{one['step']:.0f}", *(f"{one[x]:.4g}" for x in columns)] for one in metrics]
+    curve = to_csv([["step", *columns], *lines])
+    return Record({column: row.get(column, "") for column in COLUMNS}, settings, curve)
+
+
+def _ended(metrics: list[dict[str, float]]) -> str:
+    """The UTC time of the last row, if it is known."""
+    if "time" not in metrics[-1]:
+        return ""
+    ended = datetime.datetime.fromtimestamp(metrics[-1]["time"], datetime.UTC)
+    return ended.strftime("%Y-%m-%dT%H:%M:%S")
+
+
+def _dumps(value: Any) -> str:
+    """Writes JSON; nothing for an empty list or object."""
+    return "" if value in ({}, []) else json.dumps(value, separators=(",", ":"))
 
 
 def _read(run: Run, name: str) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from datetime import timedelta
 from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -518,7 +519,7 @@ def _run(group: Group, data: RunData) -> list[str]:
         f"{data.steps:,}",
         f"{number(evaluation['mean'])} ± {number(evaluation['std'])}" if evaluation else "-",
         str(evaluation["episodes"]) if evaluation else "-",
-        duration(seconds) if seconds else "-",
+        str(timedelta(seconds=round(seconds))) if seconds else "-",
         f"{data.steps / seconds:,.0f}" if seconds else "-",
     ]
 
@@ -546,20 +547,6 @@ def number(value: float) -> str:
     if value != value:
         return "-"
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
-
-
-def duration(seconds: float) -> str:
-    """Formats a duration.
-
-    Example:
-        >>> duration(432)
-        '7 min 12 s'
-    """
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
 
 
 def _text(value: Any) -> str:

@@ -26,34 +26,39 @@ def described(distribution, action, **outputs):
 LOGITS = torch.tensor([[0.1, 0.2, 0.7]]).log()
 
 
+SEVERAL = torch.tensor([[[0.25, 0.75, 0.0], [0.5, 0.25, 0.25]]]).log()
+OPTIONS = ["0: 0", "0: 1", "1: 0", "1: 1", "1: 2"]
+ONE, TWO = [False, True, False], [False, True, True, False, False]
+
+
 @pytest.mark.parametrize(
-    ("distribution", "action"),
+    ("distribution", "action", "labels", "heights", "chosen"),
     [
-        (Categorical(logits=LOGITS), 1),
-        (MaskedCategorical(logits=LOGITS, mask=torch.ones(1, 3, dtype=torch.bool)), 1),
-        (OneHotCategorical(logits=LOGITS), [0, 1, 0]),
+        (Categorical(logits=LOGITS), 1, list("012"), [0.1, 0.2, 0.7], ONE),
+        (
+            MaskedCategorical(logits=LOGITS, mask=torch.ones(1, 3, dtype=torch.bool)),
+            1,
+            list("012"),
+            [0.1, 0.2, 0.7],
+            ONE,
+        ),
+        (OneHotCategorical(logits=LOGITS), ONE, list("012"), [0.1, 0.2, 0.7], ONE),
+        (IndependentCategorical(SEVERAL), [1, 0], OPTIONS, [0.25, 0.75, 0.5, 0.25, 0.25], TWO),
+        (
+            IndependentOneHotCategorical(SEVERAL, sizes=(2, 3)),
+            TWO,
+            OPTIONS,
+            [0.25, 0.75, 0.5, 0.25, 0.25],
+            TWO,
+        ),
     ],
 )
-def test_one_choice(distribution, action):
+def test_choices_among_options(distribution, action, labels, heights, chosen):
     choice = described(distribution, action)
     assert choice.title == "action probabilities"
-    assert choice.labels == ["0", "1", "2"]
-    np.testing.assert_allclose(choice.heights, [0.1, 0.2, 0.7], atol=1e-6)
-    assert choice.chosen == [False, True, False]
-
-
-def test_several_choices():
-    logits = torch.tensor([[[0.25, 0.75, 0.0], [0.5, 0.25, 0.25]]]).log()
-    choices = [
-        described(IndependentCategorical(logits), [1, 0]),
-        described(
-            IndependentOneHotCategorical(logits, sizes=(2, 3)), [False, True, True, False, False]
-        ),
-    ]
-    for choice in choices:
-        assert choice.labels == ["0: 0", "0: 1", "1: 0", "1: 1", "1: 2"]
-        np.testing.assert_allclose(choice.heights, [0.25, 0.75, 0.5, 0.25, 0.25], atol=1e-6)
-        assert choice.chosen == [False, True, True, False, False]
+    assert choice.labels == labels
+    np.testing.assert_allclose(choice.heights, heights, atol=1e-6)
+    assert choice.chosen == chosen
 
 
 def test_switches():

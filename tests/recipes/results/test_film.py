@@ -1,16 +1,19 @@
 """Films of trained agents."""
 
+from functools import partial
+
 import imageio.v3 as imageio
-import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
 from recipes import runner
+from recipes.algorithm import make_algorithm
 from recipes.cli import main
 from recipes.ppo import PPO
+from recipes.results.film import film_policy
 from recipes.run import Run
 from recipes.runner import load_trained
-from tests.recipes.cql.cql_runs import make_cartpole_data, make_discrete_cql
+from tests.recipes.cql.cql_runs import make_cartpole_data
 from tests.recipes.dataset_runs import train
 from tests.recipes.decision_transformer.sequence_runs import SMALL as SMALL_DT
 from tests.recipes.decision_transformer.sequence_runs import make_dt
@@ -58,21 +61,16 @@ def test_one_picture_a_step(cartpole, tmp_path, capsys, suffix):
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
 
 
-def make_cartpole_dt(folder):
-    return make_dt(
-        folder,
-        dataset=str(make_cartpole_data(folder)),
+def test_a_run_on_data(tmp_path, capsys):
+    pytest.importorskip("pygame")
+    recipe = make_dt(
+        tmp_path,
+        dataset=str(make_cartpole_data(tmp_path)),
         env="CartPole-v1",
         target_returns=(20.0,),
         backbone=decision_transformer(**SMALL_DT),
         action_space="discrete",
     )
-
-
-@pytest.mark.parametrize("make", [make_discrete_cql, make_cartpole_dt])
-def test_runs_on_data(make, tmp_path, capsys):
-    pytest.importorskip("pygame")
-    recipe = make(tmp_path)
     run = train(recipe, tmp_path / "run")
     film = tmp_path / "film.gif"
     main(["render", str(run.folder), "--out", str(film)])
@@ -81,24 +79,18 @@ def test_runs_on_data(make, tmp_path, capsys):
     assert sum(durations(film)) == 20 * played
 
 
-def test_atari(tmp_path, capsys):
+def test_atari(tmp_path):
     pytest.importorskip("ale_py")
     backbone = enhanced_tit(2, patch_size=42, embed_dim=8, num_blocks=1, features_dim=8)
-    run = trained(tmp_path / "run", env="ALE/Breakout-v5", num_envs=2, backbone=backbone)
-    # Films only the start, as a game can be long where an agent does nothing.
-    _, algorithm, _ = load_trained(run)
-    env = algorithm.make_env(1, 0, render_mode="rgb_array", max_num_frames_per_episode=400)
-    screens = []
-
-    def filmed(root):
-        screens.append(env.base_env.render()[0])
-        return algorithm.policy(root)
-
-    evaluate(env, filmed, 1)
-    assert env.base_env.render_fps == 15
-    assert np.stack(screens).shape[1:] == (210, 160, 3)
-    assert (screens[0] != screens[-1]).any()
-    env.close()
+    recipe = PPO(env="ALE/Breakout-v5", num_envs=2, backbone=backbone)
+    algorithm = make_algorithm(recipe)
+    # Only the start, as a game can be long where an agent does nothing.
+    make_env = partial(algorithm.make_env, max_num_frames_per_episode=400)
+    film_policy(make_env, algorithm.policy, "it", tmp_path / "film.gif", max_pictures=30)
+    pictures = imageio.imread(tmp_path / "film.gif")
+    assert len(pictures) <= 30
+    assert pictures.shape[1:] == (210, 160, 3)
+    assert (pictures[0] != pictures[-1]).any()
 
 
 def test_bad_input(cartpole, tmp_path, capsys):
@@ -119,6 +111,9 @@ def test_bad_input(cartpole, tmp_path, capsys):
     assert film.read_bytes() == b"mine"
     empty = Run.create(tmp_path / "run", cartpole.recipe)
     assert "holds no checkpoint" in error(empty.folder, "--out", tmp_path / "other.gif")
+    assert "film.gif cannot be written: there is no folder" in error(
+        folder, "--out", tmp_path / "missing" / "film.gif"
+    )
 
 
 def test_pictures_that_cannot_be_drawn(cartpole, tmp_path, capsys, monkeypatch):
@@ -135,12 +130,6 @@ def test_pictures_that_cannot_be_drawn(cartpole, tmp_path, capsys, monkeypatch):
     assert "cannot be rendered: OpenGL has not been loaded; for MuJoCo without a screen" in error
     assert "MUJOCO_GL to egl" in error
     assert not any(tmp_path.iterdir())
-
-
-def test_a_folder_that_is_missing(cartpole, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        main(["render", str(cartpole.folder), "--out", str(tmp_path / "missing" / "film.gif")])
-    assert "film.gif cannot be written: there is no folder" in capsys.readouterr().err
 
 
 def test_tasks_without_pictures(cartpole):
