@@ -110,7 +110,8 @@ class Page:
         heights = [3, 2] if lower else [3]
         rows = self._figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         self._task, *self._seen, self._choice = rows[0].subplots(1, 2 + len(step.seen))
-        self._timeline = self._trace = None
+        self._timeline: Any = None
+        self._trace: Any = None
         if lower:
             parts = rows[1].subfigures(1, len(lower), squeeze=False, width_ratios=lower)[0]
             if over_time:

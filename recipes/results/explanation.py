@@ -129,47 +129,31 @@ def describe_choice(
     """
     action = outputs["action"][0]
     base: Any = getattr(distribution, "base_dist", distribution)
+    title, labels, spreads = "action probabilities", None, None
     if action.is_floating_point():
-        entries = action.flatten()
-        scale = getattr(base, "scale", None) if isinstance(base, distributions.Normal) else None
-        return Choice(
-            "action" if scale is None else "action, and its spread",
-            [str(i) for i in range(len(entries))],
-            _array(entries),
-            None if scale is None else _array(scale[0].flatten()),
-            [True] * len(entries),
-        )
-    if distribution is None:
-        values = outputs["action_value"][0]
-        chosen = [i == int(action) for i in range(len(values))]
-        return Choice("values of actions", _numbers(values), _array(values), None, chosen)
-    probabilities = base.probs[0]
-    if isinstance(base, distributions.Bernoulli):
-        on = action.flatten().bool().tolist()
-        flat = probabilities.flatten()
-        return Choice("probabilities of on", _numbers(flat), _array(flat), None, on)
-    if probabilities.ndim == 1:
+        title, heights = "action", action.flatten()
+        chosen = [True] * len(heights)
+        if isinstance(base, distributions.Normal):
+            title, spreads = "action, and its spread", _array(base.scale[0].flatten())
+    elif distribution is None:
+        title, heights = "values of actions", outputs["action_value"][0]
+        chosen = [i == int(action) for i in range(len(heights))]
+    elif isinstance(base, distributions.Bernoulli):
+        title, heights = "probabilities of on", base.probs[0].flatten()
+        chosen = action.flatten().bool().tolist()
+    elif base.probs.ndim == 2:
+        heights = base.probs[0]
         index = int(action.int().argmax()) if action.ndim else int(action)
-        chosen = [i == index for i in range(len(probabilities))]
-        return Choice(
-            "action probabilities", _numbers(probabilities), _array(probabilities), None, chosen
-        )
-    components = probabilities.flatten(0, -2)
-    likely = components.argmax(-1)
-    # A component with fewer options than another is padded with probabilities of 0.
-    pairs = [(c, o) for c, row in enumerate(components) for o in range(_options(row))]
-    return Choice(
-        "action probabilities",
-        [f"{c}: {o}" for c, o in pairs],
-        np.array([float(components[c, o]) for c, o in pairs]),
-        None,
-        [int(likely[c]) == o for c, o in pairs],
-    )
-
-
-def _options(probabilities: Tensor) -> int:
-    """The number of options up to the last possible one."""
-    return int(probabilities.nonzero().max()) + 1
+        chosen = [i == index for i in range(len(heights))]
+    else:  # several choices; one with fewer options than another is padded with zeros
+        rows = base.probs[0].flatten(0, -2)
+        options = [int(row.nonzero().max()) + 1 for row in rows]
+        labels = [f"{i}: {option}" for i, count in enumerate(options) for option in range(count)]
+        heights = torch.cat([row[:count] for row, count in zip(rows, options, strict=True)])
+        likely = rows.argmax(-1).tolist()
+        chosen = [option == likely[i] for i, n in enumerate(options) for option in range(n)]
+    labels = labels or [str(i) for i in range(len(heights))]
+    return Choice(title, labels, _array(heights), spreads, chosen)
 
 
 def read_value(outputs: TensorDictBase) -> float | None:
@@ -179,10 +163,6 @@ def read_value(outputs: TensorDictBase) -> float | None:
         if value is not None:
             return float(value.flatten()[0])
     return None
-
-
-def _numbers(values: Tensor) -> list[str]:
-    return [str(i) for i in range(len(values))]
 
 
 def _array(x: Tensor) -> np.ndarray:

@@ -345,9 +345,10 @@ def _chart(groups: Sequence[Group], column: str) -> tuple[Chart, dict[str, Curve
     values = np.concatenate([curve.values for runs in curves.values() for curve in runs])
     if _cut(axes, values):
         notes += "A few extreme values lie outside the axis. "
+    limits = _limits(recipe, column)
     low, high = axes.get_ylim()
-    for bound, _ in _limits(recipe, column):
-        if low <= bound <= high and all(_limits(g.recipe, column) for g in groups):
+    for bound, _ in limits if all(_limits(g.recipe, column) == limits for g in groups) else ():
+        if low <= bound <= high:
             axes.axhline(bound, c="0.4", lw=1, ls="--", zorder=0)
             notes += "The dashed line is the healthy limit. "
     texts = [

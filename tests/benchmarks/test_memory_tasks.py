@@ -1,12 +1,12 @@
 """Runs on memory tasks end early where they are solved, and go on where they were stopped."""
 
-import csv
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from benchmarks import memory_tasks
+from benchmarks.measuring import read_rows
 from benchmarks.memory_tasks import EPISODES, Successes
 from recipes import runner
 from recipes.registry import find_recipe
@@ -26,11 +26,6 @@ SHORT: dict[str, Any] = {
 }
 
 
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture
 def short(monkeypatch):
     monkeypatch.setattr(
@@ -41,10 +36,10 @@ def short(monkeypatch):
 def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
     words = [NAME, "--seeds", "0", "--out", str(tmp_path)]
     memory_tasks.main(words)
-    [row] = rows_of(tmp_path / "runs.csv")
+    [row] = read_rows(tmp_path / "runs.csv")
     assert (row["recipe"], row["seed"], row["steps"]) == (NAME, "0", "512")
     assert float(row["success"]) in (0, 1 / 3, 2 / 3, 1)
-    batches = rows_of(tmp_path / NAME / "seed-0" / "successes.csv")
+    batches = read_rows(tmp_path / NAME / "seed-0" / "successes.csv")
     assert [int(batch["step"]) for batch in batches] == [128, 256, 384, 512]
     assert sum(int(batch["episodes"]) for batch in batches) >= 44  # of 11 steps
     printed = capsys.readouterr().out
@@ -58,7 +53,7 @@ def test_training_ends_where_the_task_is_solved(short, tmp_path, monkeypatch):
     monkeypatch.setattr(memory_tasks, "EPISODES", 20)
     words = [NAME, "--seeds", "0", "--threshold", "-2", "--out", str(tmp_path)]
     memory_tasks.main(words)  # all returns are at least -1
-    [row] = rows_of(tmp_path / "runs.csv")
+    [row] = read_rows(tmp_path / "runs.csv")
     assert (row["steps"], row["success"]) == ("256", "1.0")
     assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
 
@@ -77,9 +72,9 @@ def test_training_goes_on_if_the_most_likely_actions_fail(short, tmp_path, monke
 
     monkeypatch.setattr(runner, "evaluate", checked)
     memory_tasks.main([NAME, "--seeds", "0", "--threshold", "-2", "--out", str(tmp_path)])
-    [row] = rows_of(tmp_path / "runs.csv")
+    [row] = read_rows(tmp_path / "runs.csv")
     assert (row["steps"], row["success"]) == ("512", "1.0")  # twice as many episodes
-    batches = rows_of(tmp_path / NAME / "seed-0" / "successes.csv")
+    batches = read_rows(tmp_path / NAME / "seed-0" / "successes.csv")
     assert [int(batch["step"]) for batch in batches] == [128, 256, 384, 512]
 
 
@@ -98,7 +93,7 @@ def test_a_stopped_run_goes_on(short, tmp_path):
         runner.train(recipe, run, [Stop(run.folder / "successes.csv", 0, 0.0)])
     memory_tasks.measure(recipe, tmp_path / "run", 0.0)
     memory_tasks.measure(recipe, tmp_path / "whole", 0.0)
-    stopped, whole = (rows_of(tmp_path / name / "successes.csv") for name in ("run", "whole"))
+    stopped, whole = (read_rows(tmp_path / name / "successes.csv") for name in ("run", "whole"))
     assert [row["step"] for row in stopped] == [row["step"] for row in whole]
     assert stopped[:2] == whole[:2]  # then with new episodes
 

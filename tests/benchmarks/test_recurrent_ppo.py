@@ -1,7 +1,5 @@
 """What RecurrentPPO reaches on MiniGrid-Memory is written as each run ends, and not run twice."""
 
-import csv
-
 import pytest
 import torch
 from gymnasium.spaces import Box, Discrete
@@ -9,11 +7,7 @@ from gymnasium.spaces import Box, Discrete
 pytest.importorskip("minigrid")
 
 from benchmarks import memory_tasks, recurrent_ppo
-
-
-def rows_of(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+from benchmarks.measuring import read_rows
 
 
 @pytest.fixture
@@ -29,7 +23,7 @@ def test_a_row_a_run_and_none_twice(settings, short, tmp_path, monkeypatch, caps
     words = ["--total-steps", "256", "--episodes", "2", "--out", str(out), "--seeds", "0"]
     words += ["--settings", settings]
     recurrent_ppo.main(words)
-    [row] = rows_of(out)
+    [row] = read_rows(out)
     assert list(row) == recurrent_ppo.COLUMNS
     assert (row["size"], row["seed"]) == ("7", "0")
     assert (row["total_steps"], row["settings"], row["steps"]) == ("256", settings, "256")
