@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from statistics import mean
 
@@ -24,8 +25,8 @@ from recipes.run import Run
 from recipes.runner import load_trained
 from torchrl_tit.analysis import outer_attention
 from torchrl_tit.analysis.targets import find_network, histories_of
-from torchrl_tit.evaluation import evaluate
 
+from .figure_claims import play_episodes
 from .measuring import folder, publish, table
 
 
@@ -78,27 +79,20 @@ def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None)
     network = find_network(policy)
     first = run.recipe.evaluation_seed if seed is None else seed
     found = []
+    shown: list[bool] = []
     with closing(algorithm.make_env(1)) as env:
         shows_cue = _cue_of(run.recipe.env, env)
-        for number in range(episodes):
-            states: list[TensorDictBase] = []
-            shown: list[bool] = []
 
-            def acted(
-                tensordict: TensorDictBase,
-                states: list[TensorDictBase] = states,
-                shown: list[bool] = shown,
-            ) -> TensorDictBase:
-                shown.append(shows_cue(len(shown)))
-                outputs = policy(tensordict)
-                states.append(outputs.clone())
-                return outputs
+        def watched(tensordict: TensorDictBase) -> TensorDictBase:
+            shown.append(shows_cue(len(shown)))
+            return policy(tensordict)
 
-            outcome = evaluate(env, acted, 1, seed=first + number)
+        for states, outcome in islice(play_episodes(env, watched, first), episodes):
             attention = outer_attention(network, *histories_of(policy, states[-1]))
             copies = max(network.num_frames - len(shown), 0)
             cue = [shown[0]] * copies + shown[-network.num_frames :]
-            found.append(Decision(outcome.item() > 0, attention[0].mean(1).tolist(), cue))
+            found.append(Decision(outcome > 0, attention[0].mean(1).tolist(), cue))
+            shown.clear()
     return found
 
 

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase, lazy_stack
-from tensordict.nn import TensorDictModuleBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -101,10 +100,18 @@ def measure_figure_claims(
         raise ValueError(f"{run.folder}: its network reads no image that Grad-CAM can map")
     index = list(network.observations).index(image)
     seed = run.recipe.evaluation_seed if seed is None else seed
-    states, episode = _play(algorithm.make_env, policy, steps, seed)
+    states: list[TensorDictBase] = []
+    numbers: list[int] = []
+    with closing(algorithm.make_env(1)) as env:
+        played = enumerate(play_episodes(env, policy, seed))
+        while len(states) < steps:
+            number, (found, _) = next(played)
+            states += found
+            numbers += [number] * len(found)
+    episode = torch.tensor(numbers[:steps])
     maps, frames, shares = [], [], []
-    for start in range(0, len(states), _BATCH):
-        batch = lazy_stack(states[start : start + _BATCH]).contiguous()
+    for start in range(0, steps, _BATCH):
+        batch = torch.cat(states[start : min(start + _BATCH, steps)])
         histories = histories_of(policy, batch)
         maps.append(grad_cam(policy, batch, target=target)[image][:, -1])
         frames.append(histories[index][:, -1])
@@ -145,34 +152,25 @@ def to_markdown(groups: dict[str, list[FigureClaims]]) -> str:
     return text
 
 
-class _Enough(Exception):
-    """There are as many steps as were requested."""
+def play_episodes(
+    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], seed: int
+) -> Iterator[tuple[list[TensorDictBase], float]]:
+    """Plays one episode after another with the most likely actions, seeded with ``seed + i``.
 
-
-def _play(
-    make_env: Callable[[int], EnvBase], policy: TensorDictModuleBase, steps: int, seed: int
-) -> tuple[list[TensorDictBase], Tensor]:
-    """Plays for a number of steps; returns what the policy read and wrote, and their episodes."""
+    Yields:
+        What the policy read and wrote in each step, [1] each, and the return.
+    """
     states: list[TensorDictBase] = []
-    episodes: list[int] = []
-    env = make_env(1)
-    try:
-        for number in itertools.count():
 
-            def acted(tensordict: TensorDictBase, number: int = number) -> TensorDictBase:
-                outputs = policy(tensordict)
-                states.append(outputs[0].clone())
-                episodes.append(number)
-                if len(states) == steps:
-                    raise _Enough
-                return outputs
+    def acted(tensordict: TensorDictBase) -> TensorDictBase:
+        outputs = policy(tensordict)
+        states.append(outputs.clone())
+        return outputs
 
-            evaluate(env, acted, 1, seed=seed + number)
-    except _Enough:
-        return states, torch.tensor(episodes)
-    finally:
-        env.close()
-    raise AssertionError
+    for number in itertools.count(seed):
+        states.clear()
+        outcome = evaluate(env, acted, 1, seed=number)
+        yield [*states], outcome.item()
 
 
 def _attention(shares: list[Tensor], episode: Tensor, num_frames: int) -> list[float] | None:

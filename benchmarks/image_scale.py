@@ -3,16 +3,16 @@
 ``python -m benchmarks.image_scale``: in MiniGrid-Memory S7 a script looks at the cue, walks to the
 junction and looks at one of the two objects there. A network learns from these episodes,
 supervised, whether that object is the cue. A row has the number of gradient steps until it is right
-in 97 % of the episodes that it was not trained on. The rows of a network and a seed differ only in
+in 97% of the episodes that it was not trained on. The rows of a network and a seed differ only in
 the scale of the pixels.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.layers.initialization import init_orthogonal_
 from torchrl_tit.networks import HistoryNetwork, build_network
 from torchrl_tit.settings import Flat, Network
+
+from .measuring import add_missing_rows
 
 COLUMNS = ["network", "pixels", "seed", "gradient_steps", "accuracy"]
 NUM_FRAMES = 16
@@ -146,29 +148,21 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=5512)
     parser.add_argument("--limit", type=int, default=3000, help="gradient steps of a row")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--out", type=Path, required=True, help="new CSV")
+    parser.add_argument("--out", type=Path, required=True, help="CSV that rows are added to")
     options = parser.parse_args(arguments)
-    if options.out.exists():
-        parser.error(f"--out {options.out} exists already: name a new file")
     if options.episodes <= HELD_OUT or options.limit < 1:
         parser.error(f"--episodes must be above {HELD_OUT}, and --limit at least 1")
     torch.set_num_threads(options.threads)
     episodes = Episodes(options.episodes)
     networks = memory_networks(NUM_FRAMES, patch_size=_TILE)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    with options.out.open("x", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        for name in ("lstm", "gtrxl", "enhanced-tit"):
-            for scale, pixels in PIXELS.items():
-                for seed in options.seeds:
-                    steps, accuracy = gradient_steps(
-                        networks[name], pixels, episodes, seed=seed, limit=options.limit
-                    )
-                    row = [name, scale, seed, steps, round(accuracy, 3)]
-                    writer.writerow(row)
-                    file.flush()
-                    print(*row, sep=", ", flush=True)
+
+    def measure(name: str, scale: str, seed: int) -> list[object]:
+        settings = {"seed": seed, "limit": options.limit}
+        steps, accuracy = gradient_steps(networks[name], PIXELS[scale], episodes, **settings)
+        return [name, scale, seed, steps, round(accuracy, 3)]
+
+    runs = product(("lstm", "gtrxl", "enhanced-tit"), PIXELS, options.seeds)
+    add_missing_rows(options.out, COLUMNS, runs, measure)
 
 
 if __name__ == "__main__":
