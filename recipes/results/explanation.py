@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -45,7 +45,7 @@ class Explainer:
         layer: name of another layer for Grad-CAM.
 
     Raises:
-        ValueError: if the policy has no network of this library, or there is no such kind.
+        ValueError: if the policy has no network of this library, or ``layer`` is for other maps.
     """
 
     def __init__(
@@ -56,17 +56,11 @@ class Explainer:
         kind: MapKind | None = None,
         layer: str | None = None,
     ) -> None:
-        if kind is not None and kind not in get_args(MapKind):
-            raise ValueError(f"maps are one of {', '.join(get_args(MapKind))}, not {kind!r}")
         if layer is not None and kind not in (None, "grad-cam"):
             raise ValueError(f"a layer is for grad-cam, not for {kind}: leave one of them out")
-        self.policy = policy
-        self.target = target
-        self.layer = layer
+        self.policy, self.target, self.layer = policy, target, layer
         self.network = find_network(policy, target)
-        if kind is None and layer is not None:
-            kind = "grad-cam"
-        self.kind = kind
+        self.kind = "grad-cam" if layer is not None else kind
 
     def explain(self, tensordict: TensorDictBase) -> ExplainedStep:
         """Explains a step.

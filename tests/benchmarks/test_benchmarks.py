@@ -6,6 +6,7 @@ import importlib
 import json
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
@@ -141,7 +142,7 @@ def test_rows_are_measured_once(tmp_path, capsys):
 
 
 def test_the_command(tmp_path, monkeypatch, capsys):
-    called = []
+    called: list[Any] = []
     for name in set(BENCHMARKS) - {"cql"}:  # which needs d3rlpy
         module = importlib.import_module(f"benchmarks.{name}")
         monkeypatch.setattr(module, "main", partial(called.append))

@@ -3,6 +3,7 @@
 import csv
 import io
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -242,7 +243,7 @@ def test_damaged_lengths_are_named(tmp_path, text):
 
 def test_changed_fields_are_named_and_make_another_cell(tmp_path):
     network = enhanced_tit(dense=False)
-    changes = {
+    changes: dict[str, dict[str, Any]] = {
         "ppo/cartpole/mlp": {"total_steps": 1000, "backbone": mlp(hidden_dim=256)},
         "ppo/cartpole/enhanced-tit-protocol": {"backbone": network},
         "ppo/cartpole/enhanced-tit": {"backbone": replace(network, frame=Linear(embed_dim=8))},
