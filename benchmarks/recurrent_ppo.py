@@ -29,7 +29,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
 
-from recipes.presets.ppo_memory import MEMORY_RECIPES
+from recipes.ppo import PPO
+from recipes.registry import get_recipe
 from torchrl_tit.tasks import FirstActions
 
 from .measuring import add_missing_rows
@@ -91,7 +92,8 @@ class Tiles(BaseFeaturesExtractor):
         return self.layers(observations)
 
 
-_RECIPE = MEMORY_RECIPES["ppo/memory-s7/lstm"]
+_RECIPE = get_recipe("ppo/memory-s7/lstm")
+assert isinstance(_RECIPE, PPO)
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {"n_epochs": 4},  # instead of 10
     "recipe": {
