@@ -15,7 +15,7 @@ share_modules(__name__)
 _HOMES = {
     "Algorithm": "algorithm",
     "Callback": "callback",
-    "DatasetAlgorithm": "dataset_algorithm",
+    "DatasetAlgorithm": "offline",
     "DatasetRecipe": "dataset_recipe",
     "NotFiniteError": "algorithm",
     "Outcome": "outcomes",

@@ -209,6 +209,6 @@ def get_recipe_class(algorithm: str) -> type[Recipe]:
     Raises:
         ValueError: if there is no such algorithm, or more than one.
     """
-    if algorithm in _MODULES:
+    if str(algorithm) in _MODULES:
         importlib.import_module(f".{_MODULES[algorithm]}", __package__)
     return Recipe.registered.find(algorithm)

@@ -13,6 +13,7 @@ EXTRAS = {
     "imageio_ffmpeg": "render",
     "jinja2": "report",
     "matplotlib": "recipes",
+    "PIL": "offline",
     "minari": "offline",
     "minigrid": "minigrid",
     "onnx": "onnx",
