@@ -13,7 +13,6 @@ EXTRAS = {
     "imageio_ffmpeg": "render",
     "jinja2": "report",
     "matplotlib": "recipes",
-    "PIL": "offline",
     "minari": "offline",
     "minigrid": "minigrid",
     "onnx": "onnx",
