@@ -1,7 +1,4 @@
-"""`data`: parses the arguments, and only then imports the rest.
-
-Help and errors are therefore fast: they do not need PyTorch.
-"""
+"""`data`: describes data sets, converts them, or makes them."""
 
 from __future__ import annotations
 
@@ -11,11 +8,23 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from torch import Tensor
 
-from torchrl_tit.settings import resolve
+from torchrl_tit.datasets import (
+    Episodes,
+    has_reference,
+    load_episodes,
+    normalized_score,
+    write_hdf5,
+    write_minari,
+)
+from torchrl_tit.datasets.sources import HDF5_SUFFIXES
+from torchrl_tit.settings.checks import printable
 from torchrl_tit.settings.imports import import_options
 
 from ..collect import Collection
+from ..collect.collect import collect
+from ..trust import may_name_task
 from .arguments import Parser, note, parse_fields, program, say
 
 
@@ -25,7 +34,18 @@ def data(arguments: list[str]) -> None:
         return _collect(arguments[1:])
     parser = Parser(f"{program()} data")
     _add_options(parser)
-    say(resolve(f"{__package__}.data_sets:run")(parser.parse_args(arguments)))
+    options = parser.parse_args(arguments)
+    reading = {
+        "task": options.env,
+        "max_episode_steps": options.max_episode_steps,
+        "gaps": options.gaps,
+        "directory": options.directory,
+    }
+    if options.command == "info":
+        say(describe(load_episodes(options.source, **reading)))
+    else:
+        episodes = load_episodes(options.source, dtype=None, **reading)
+        say(convert_episodes(episodes, options.target, options.env))
 
 
 def _collect(arguments: list[str]) -> None:
@@ -41,7 +61,6 @@ def _collect(arguments: list[str]) -> None:
     )
     words = [*program().split(), "data", "collect", *arguments, *import_options()]
     try:
-        collect = resolve(f"{__package__}.data_sets:collect")
         lines = collect(parsed.collection, parsed.out, shlex.join(words))
     except KeyboardInterrupt:
         note("stopped; the same command resumes", "")
@@ -72,3 +91,113 @@ def _add_options(parser: argparse.ArgumentParser) -> None:
         )
         command.add_argument("--directory", type=Path, help="folder for temporary files")
     convert.add_argument("target", help="HDF5 file, Minari folder (/PATH-v0 or ./PATH-v0) or name")
+
+
+def describe(episodes: Episodes) -> str:
+    """Describes the size and the contents of a data set.
+
+    Args:
+        episodes: The data.
+
+    Returns:
+        Transitions, episodes, returns, normalised scores (if any), shapes and dtypes.
+
+    Example:
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> ends = [False, True, False, True]
+        >>> episodes = episodes_from_arrays([[1.0], [2.0], [3.0], [4.0]], [0, 1, 1, 0], ends, ends)
+        >>> print(describe(episodes))
+        source        the data
+        transitions   4
+        episodes      2 (2 terminated, 0 truncated, 0 unfinished)
+        length        min 2, mean 2.0, max 2
+        return        min 1.000, mean 1.000, max 1.000
+        score         no reference returns for this task
+        observation   [1] float32
+        action        [] int64
+        reward        [1] float32
+        note          without next_observations: what episodes ended in is unknown
+    """
+    terminated, finished = episodes.terminated, episodes.finished
+    lengths = episodes.lengths.double()
+    counts = {
+        "terminated": int(terminated.sum()),
+        "truncated": int((finished & ~terminated).sum()),
+        "unfinished": int((~finished).sum()),
+    }
+    kinds = ", ".join(f"{count} {name}" for name, count in counts.items())
+    lines = {
+        "source": episodes.source,
+        "transitions": str(episodes.num_transitions),
+        "episodes": f"{len(lengths)} ({kinds})",
+        "length": f"min {lengths.min():.0f}, mean {lengths.mean():.1f}, max {lengths.max():.0f}",
+        "return": "no episode is finished",
+        "score": "no reference returns for this task",
+    }
+    if finished.any():
+        returns = episodes.returns[finished]
+        lines["return"] = _range(returns)
+        if name := _scored_name(episodes):
+            scores = normalized_score(returns, name)
+            lines["score"] = _range(scores)
+    for field in ("observation", "action", "reward"):
+        values = episodes.rows[field]
+        lines[field] = f"{list(values.shape[1:])} {str(values.dtype).removeprefix('torch.')}"
+    if not episodes.final_known.all():
+        lines["note"] = "without next_observations: what episodes ended in is unknown"
+    if episodes.left_out:
+        lines["not read"] = ", ".join(episodes.left_out)
+    lines.update({name: str(value) for name, value in episodes.attributes.items()})
+    return "\n".join(f"{printable(name):<13} {printable(text)}" for name, text in lines.items())
+
+
+def convert_episodes(episodes: Episodes, target: str, env_name: str | None = None) -> str:
+    """Writes a data set as an HDF5 file in D4RL's layout or as a Minari data set.
+
+    Args:
+        episodes: The data.
+        target: A file ending in ".hdf5" or ".h5", or a folder or name for Minari.
+        env_name: The Gymnasium task that the data are from, for Minari; by default the recorded
+            one, if Gymnasium knows it.
+
+    Returns:
+        A message that says what was written and what was left out.
+
+    Raises:
+        FileExistsError: If there is something at the target already.
+        ValueError: If the target's name cannot be used, or the data do not fit its layout.
+        OSError: If it cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> target = Path(tempfile.mkdtemp()) / "a.hdf5"
+        >>> episodes = episodes_from_arrays([[1.0], [2.0]], [0, 1], [1.0, 1.0], [False, True])
+        >>> convert_episodes(episodes, str(target)).startswith("2 transitions in 1 episodes")
+        True
+    """
+    if Path(target).suffix in HDF5_SUFFIXES:
+        Path(target).absolute().parent.mkdir(parents=True, exist_ok=True)
+        write_hdf5(episodes, target)
+    else:
+        recorded = episodes.attributes.get("env_id")
+        known = str(recorded) if may_name_task(recorded) else None
+        write_minari(episodes, target, env_name or known)
+    text = (
+        f"{episodes.num_transitions} transitions in {len(episodes.lengths)} episodes written to "
+        f"{target}"
+    )
+    if episodes.left_out:
+        text += f"\nnot converted: {', '.join(episodes.left_out)}"
+    return text
+
+
+def _scored_name(episodes: Episodes) -> str | None:
+    """Returns the first of the data set's names that has reference returns."""
+    recorded = str(episodes.attributes.get("env_id", ""))
+    names = [episodes.source, Path(episodes.source).name, recorded]
+    return next((name for name in names if has_reference(name)), None)
+
+
+def _range(values: Tensor) -> str:
+    return f"min {values.min():.3f}, mean {values.mean():.3f}, max {values.max():.3f}"
