@@ -150,7 +150,7 @@ class AgentInTraining(Agent, Callback):
         self, algorithm: Algorithm[Any], settings: Collection, folder: Path, action_space: Space
     ) -> None:
         super().__init__(algorithm, settings)
-        self.last_step = min(self.recipe.final_step, settings.total_steps)
+        self.last_step: int = min(self.recipe.final_step, settings.total_steps)
         self._folder = folder
         self._action_space = action_space
         marks = (settings.medium_return, settings.expert_return)

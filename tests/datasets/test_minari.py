@@ -35,7 +35,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "minari" / NAME / "data"
 
 
-def make(episode: dict[str, Any] | list[dict[str, Any]], name: str = NAME, **settings: Any) -> Any:
+def make(episode: Any, name: str = NAME, **settings: Any) -> Any:
     """A data set that Minari itself writes."""
     episodes = episode if isinstance(episode, list) else [episode]
     buffers = [EpisodeBuffer(**each) for each in episodes]
@@ -187,7 +187,10 @@ def test_images_and_discrete_actions(shape: tuple[int, ...], jpeg: bool, tmp_pat
 @pytest.mark.parametrize("damage", [lambda x: x[:20], lambda x: x * 0, "size"])
 def test_images_that_cannot_be_decoded(damage: Any, folder: Path) -> None:
     steps = {"actions": [0], "rewards": [0.0], "terminations": [True], "truncations": [False]}
-    spaces = {"observation_space": Box(0, 255, (40, 48), np.uint8), "action_space": Discrete(2)}
+    spaces: dict[str, Any] = {
+        "observation_space": Box(0, 255, (40, 48), np.uint8),
+        "action_space": Discrete(2),
+    }
     make({"observations": np.zeros((2, 40, 48), np.uint8), **steps}, **spaces)
     path = folder / "metadata.json"
     if damage == "size":
@@ -204,7 +207,7 @@ def test_images_that_cannot_be_decoded(damage: Any, folder: Path) -> None:
 def test_states_that_are_one_number_become_columns() -> None:
     steps = {"actions": [0, 1], "rewards": [0.0, 1.0]}
     steps |= {"terminations": [False, True], "truncations": [False, False]}
-    spaces = {"observation_space": Discrete(9), "action_space": Discrete(2)}
+    spaces: dict[str, Any] = {"observation_space": Discrete(9), "action_space": Discrete(2)}
     make({"observations": np.array([5, 3, 8]), **steps}, **spaces)
     assert load_episodes(NAME).rows["observation"].tolist() == [[5], [3], [8]]
 
@@ -299,7 +302,10 @@ def test_damaged_sets(rolled: Transitions, folder: Path) -> None:
 def test_observations_of_several_arrays_are_refused() -> None:
     steps = {"actions": np.zeros((1, 1)), "rewards": [0.0]}
     steps |= {"terminations": [True], "truncations": [False]}
-    spaces = {"observation_space": Dict(a=Box(-1, 1, (2,))), "action_space": Box(-1, 1, (1,))}
+    spaces: dict[str, Any] = {
+        "observation_space": Dict(a=Box(-1, 1, (2,))),
+        "action_space": Box(-1, 1, (1,)),
+    }
     make({"observations": {"a": np.zeros((2, 2))}, **steps}, **spaces)
     with pytest.raises(DatasetError, match="its observations are a Dict space"):
         load_episodes(NAME)

@@ -160,12 +160,9 @@ def read_minari(name: str | os.PathLike[str], **settings: Any) -> Episodes:
             )
         if metadata.total_episodes == 0:
             raise DatasetError(source, "has no episodes.")
-        groups = [_group(source, file, number) for number in range(metadata.total_episodes)]
-        encoded = metadata.jpeg_encoding and len(space.shape) in (2, 3)
-        fields, lengths = _joined(source, groups, tuple(space.shape) if encoded else None)
-        for group in groups:
-            left_out |= {"infos"} & set(group)
-            left_out |= {"seed", "options"} & {key.split("/")[0] for key in group.attrs}
+        image = tuple(space.shape) if metadata.jpeg_encoding and len(space.shape) > 1 else None
+        fields, lengths, noted = _joined(source, file, metadata.total_episodes, image)
+        left_out |= noted
         declared = sum(
             field.dtype.itemsize * int(np.prod(field.shape)) for field in fields.values()
         )
@@ -213,71 +210,76 @@ def _folder(name: str | os.PathLike[str]) -> Path:
     return data
 
 
-def _group(source: str, file: h5py.File, number: int) -> h5py.Group:
-    """The group of an episode."""
-    group = find(source, file, f"episode_{number}")
-    if not isinstance(group, h5py.Group):
-        raise DatasetError(source, "is missing.", f"episode_{number}")
-    return group
-
-
 def _joined(
-    source: str, groups: list[h5py.Group], image: tuple[int, ...] | None
-) -> tuple[dict[str, JoinedField], NDArray]:
-    """The fields of all episodes in the layout of D4RL, and the length of each episode.
+    source: str, file: h5py.File, num_episodes: int, image: tuple[int, ...] | None
+) -> tuple[dict[str, JoinedField], NDArray, set[str]]:
+    """Joins the fields of all episodes in the layout of D4RL.
 
     Args:
         source: The data set, for error messages.
-        groups: The group of each episode.
+        file: The file with a group for each episode.
+        num_episodes: Number of episodes.
         image: Shape of an observation that may be stored as a JPEG image; None otherwise.
+
+    Returns:
+        The fields, the length of each episode, and the names of what is not read.
     """
     pieces: dict[str, list] = {name: [] for name in (*_NAMES, "next_observations")}
     rows: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
-    for number, group in enumerate(groups):
+    noted: set[str] = set()
+    for number in range(num_episodes):
         place = f"{source}: episode {number}"
+        group = find(source, file, f"episode_{number}")
+        if not isinstance(group, h5py.Group):
+            raise DatasetError(source, "is missing.", f"episode_{number}")
+        noted |= {"infos"} & set(group)
+        noted |= {"seed", "options"} & {key.split("/")[0] for key in group.attrs}
         found = {name: find(place, group, theirs) for name, (theirs, _) in _NAMES.items()}
         for name, field in found.items():
             if not isinstance(field, h5py.Dataset) or not field.shape:
                 raise DatasetError(place, "is not an array with one row per step.", _NAMES[name][0])
-            steps = len(found["rewards"])
+        steps = found["rewards"].shape[0]
+        for name, field in found.items():
             more = name == "observations"  # the final one
+            encoded = more and image is not None and field.ndim <= 2
+            # A state that is one number becomes a column.
+            row = image if encoded else field.shape[1:] or ((1,) if more else ())
+            dtype = np.dtype(np.uint8) if encoded else field.dtype
+            expected = rows.setdefault(name, (row, dtype))
+            problem = None
             if len(field) != steps + more or steps == 0:
                 problem = f"has {len(field)} rows, but needs {steps + more}, and one step at least."
-                raise DatasetError(place, problem, _NAMES[name][0])
-            if more and image is not None and field.ndim <= 2:
-                row, dtype, read = image, np.dtype(np.uint8), partial(_images, field, image)
-            else:  # a single number becomes a column
-                row, dtype = field.shape[1:] or ((1,) if more else ()), field.dtype
-                read = partial(_rows, field)
-            expected = rows.setdefault(name, (row, dtype))
-            if (row, dtype) != expected:
+            elif (row, dtype) != expected:
                 problem = (
                     f"has the dtype {dtype} and rows of the shape {list(row)}, but in "
                     f"episode 0 {expected[1]} and {list(expected[0])}."
                 )
+            if problem:
                 raise DatasetError(place, problem, _NAMES[name][0])
-            pieces[name].append((steps, read))
+            read = partial(_images if encoded else _rows, file, field.name, row)
+            pieces[name].append((steps, partial(read, 0)))
             if more:
-                pieces["next_observations"].append((steps, partial(_later, read)))
+                pieces["next_observations"].append((steps, partial(read, 1)))
     rows["next_observations"] = rows["observations"]
     fields = {name: JoinedField(parts, *rows[name]) for name, parts in pieces.items()}
-    return fields, np.array([steps for steps, _ in pieces["rewards"]])
+    return fields, np.array([steps for steps, _ in pieces["rewards"]]), noted
 
 
-def _rows(field: h5py.Dataset, start: int, stop: int) -> NDArray:
-    return field[start:stop]
+def _rows(
+    file: h5py.File, name: str, shape: tuple[int, ...], shift: int, start: int, stop: int
+) -> NDArray:
+    """Reads rows of a field, moved by some rows."""
+    return file[name][start + shift : stop + shift]
 
 
-def _later(read: Any, start: int, stop: int) -> NDArray:
-    return read(start + 1, stop + 1)
-
-
-def _images(field: h5py.Dataset, shape: tuple[int, ...], start: int, stop: int) -> NDArray:
-    """Decodes JPEG images, each of which is a row of bytes."""
-    images = np.empty((stop - start, *shape), np.uint8)
+def _images(
+    file: h5py.File, name: str, shape: tuple[int, ...], shift: int, start: int, stop: int
+) -> NDArray:
+    """Reads and decodes JPEG images, each of which is a row of bytes."""
+    field, images = file[name], np.empty((stop - start, *shape), np.uint8)
     for row in range(start, stop):
         try:
-            image = imread(bytes(field[row]), extension=".jpg")
+            image = imread(bytes(field[row + shift]), extension=".jpg")
         except Exception as error:  # whatever a damaged image raises, or one of too many pixels
             raise ValueError(str(error)) from error
         if image.shape != shape:
@@ -325,7 +327,7 @@ def write_minari(
         action_space = task_spaces(env_name).action
     else:
         action_space = Discrete(int(action.max()) + 1) if action.ndim == 1 else _box(action)
-    remade = env_name is not None and not is_atari(env_name)
+    remade = None if env_name is None or is_atari(env_name) else gymnasium.spec(env_name)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with whole_or_not_at_all(folder) as hidden, _errors_named(folder):
         hidden.mkdir()
@@ -333,7 +335,7 @@ def write_minari(
             hidden / "data",
             observation_space=_box(episodes.rows["observation"]),
             action_space=action_space,
-            env_spec=gymnasium.spec(env_name) if remade else None,
+            env_spec=remade,
             jpeg_encoding=False,  # images are stored losslessly
         )
         with new_hdf5(hidden / "data" / "main_data.hdf5", folder) as (file, check):

@@ -260,8 +260,9 @@ class OnlineHistoryStorage(LazyTensorStorage):
                 steps if self.ndim == 2 else steps.squeeze(-1),
             )
         self._count, self._start = stop, starts[-1]
-        table = super().get(slice(None)).flatten(0, self.ndim - 1)  # views
-        self._steps = dict(table.items(True, True))
+        if len(self._steps.get("episode", ())) < len(self):  # TorchRL shows what is filled
+            table = super().get(slice(None)).flatten(0, self.ndim - 1)  # views
+            self._steps = dict(table.items(True, True))
 
     def _newest(self) -> tuple[Tensor, TensorDict]:
         """The rows of the newest steps, int64 [envs], and the frames after them."""

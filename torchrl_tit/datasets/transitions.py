@@ -158,9 +158,8 @@ def episodes_from_transitions(
     last_steps = np.flatnonzero(ends)
     rows = memory_mapped_rows(reader.num_rows + len(last_steps), reader.row_fields(), directory)
     # The final observation of an episode is an additional row, so all later rows move by one.
-    row_of = np.arange(reader.num_rows)
-    row_of[1:] += ends[:-1].cumsum()
-    row_of = torch.from_numpy(row_of)
+    row_of = torch.arange(reader.num_rows)
+    row_of[1:] += torch.from_numpy(ends[:-1].cumsum())
     for name, kept in {
         "observations": "observation",
         "actions": "action",

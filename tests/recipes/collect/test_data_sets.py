@@ -65,7 +65,8 @@ def test_every_row_is_a_step_of_the_task(cartpole: Path, pendulum: Path, kind: s
         following, reward, *_ = env.step(data["actions"][row])
         np.testing.assert_allclose(following, data["next_observations"][row], atol=1e-4)
         np.testing.assert_allclose(reward, data["rewards"][row], atol=1e-3)
-    assert (data["actions"].dtype, data["actions"].shape[1:]) == (np.float32, (1,))
+    assert data["actions"].dtype == np.float32
+    assert data["actions"].shape[1:] == (1,)
     assert np.abs(data["actions"]).max() <= 2
     assert not data["terminals"].any()
     check_episodes(data)
