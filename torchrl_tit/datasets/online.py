@@ -254,7 +254,7 @@ class OnlineHistoryStorage(LazyTensorStorage):
         steps["episode"] = starts * self._envs + torch.arange(self._envs, device=self.device)
         if self._is_init:
             steps["is_init"] = (time == starts).unsqueeze(-1)
-        with _without_notice():
+        with contextlib.nullcontext() if self.initialized else _without_notice():
             super().set(
                 torch.arange(begin, stop) % self._num_times,
                 steps if self.ndim == 2 else steps.squeeze(-1),
