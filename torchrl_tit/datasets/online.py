@@ -371,9 +371,8 @@ class OnlineHistoryStorage(LazyTensorStorage):
         self._ends[self._rows(stop - len(ends) // envs, stop)] = ends
         kept, first = self._ends[self._ends >= 0], int(part["first_end_frame"])
         self._end_frames.first = int(kept.min()) if len(kept) else first
-        self._end_frames.stop = max(self._end_frames.stop, self._end_frames.first)
-        end_frames = _table(part["end_frames"], self.device)
-        self._end_frames.write(end_frames, first + torch.arange(len(end_frames)))
+        self._end_frames.stop = first  # the part has all later ones
+        self._end_frames.push(_table(part["end_frames"], self.device))
 
     def _check_part(self, part: dict[str, Any]) -> None:
         mine = {"max_size": self.max_size, "num_frames": self._num_frames, "num_envs": self._envs}
@@ -440,21 +439,16 @@ class EndFrames:
 
     def push(self, frames: TensorDictBase) -> Tensor:
         """Adds frames [N]; returns their numbers, int64 [N]."""
-        numbers = torch.arange(self.stop, self.stop + len(frames))
-        self.write(frames, numbers)
-        return numbers
-
-    def write(self, frames: TensorDictBase, numbers: Tensor) -> None:
-        """Writes the newest frames [N], with consecutive numbers."""
-        if not len(numbers):
-            return
-        stop = int(numbers[-1]) + 1
+        stop = self.stop + len(frames)
         if stop - self.first > len(self.table):
-            kept = torch.arange(self.first, self.stop)
-            table, self.table = self.table, self._room(2 * (stop - self.first))
-            self._write(table[kept % len(table)], kept)
-        self._write(frames, numbers)
-        self.stop = max(self.stop, stop)
+            kept, numbers = self.read(self.first), torch.arange(self.first, self.stop)
+            self.table = self.table[:1].expand(2 * (stop - self.first)).clone()
+            self.table[numbers % len(self.table)] = kept
+        numbers = torch.arange(self.stop, stop)
+        if len(numbers):
+            self.table[numbers % len(self.table)] = frames
+        self.stop = stop
+        return numbers
 
     def drop(self, count: int) -> None:
         """Forgets the oldest frames."""
@@ -463,12 +457,6 @@ class EndFrames:
     def read(self, first: int) -> TensorDict:
         """Copies the frames from number ``first`` on."""
         return self.table[torch.arange(first, self.stop) % len(self.table)]
-
-    def _write(self, frames: TensorDictBase, numbers: Tensor) -> None:
-        self.table[numbers % len(self.table)] = frames
-
-    def _room(self, count: int) -> TensorDict:
-        return self.table[:1].expand(count).clone()
 
 
 @contextlib.contextmanager
