@@ -6,6 +6,7 @@ Each function writes one into a folder, and returns it. ``make fuzz`` counts the
 import json
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ import h5py
 import numpy as np
 
 from torchrl_tit.datasets import episodes_from_arrays, write_minari
+
+Change = Callable[[h5py.File, Path], None]
 
 ENDLESS = 4 * 10**8
 SECRET = np.arange(40, dtype=np.float32)
@@ -30,7 +33,7 @@ def good_arrays(rows: int = 40) -> dict[str, np.ndarray]:
     }
 
 
-def _hdf5(folder: Path, change: Callable[[h5py.File, Path], None]) -> Path:
+def _hdf5(folder: Path, change: Change) -> Path:
     """A good file in D4RL's layout, changed; and beside it one that it must not read."""
     other = folder / "other"
     other.write_bytes(SECRET.tobytes())
@@ -72,7 +75,7 @@ def _circle(file: h5py.File, folder: Path) -> None:
     file["rewards"], file["more"] = h5py.SoftLink("/more"), h5py.SoftLink("/rewards")
 
 
-def _as(name: str, dtype: Any, add: Any = 0) -> Callable[[h5py.File, Path], None]:
+def _as(name: str, dtype: Any, add: Any = 0) -> Change:
     def change(file: h5py.File, folder: Path) -> None:
         values = file[name][()].astype(dtype) + np.array(add, dtype)
         del file[name]
@@ -115,7 +118,7 @@ def _compressed_twice(file: h5py.File, folder: Path) -> None:
 def _minari(
     folder: Path,
     metadata: Callable[[dict[str, Any]], Any] = lambda x: x,
-    change: Callable[[h5py.File, Path], None] = lambda file, folder: None,
+    change: Change = lambda file, folder: None,
 ) -> Path:
     """A good Minari data set, changed."""
     _hdf5(folder, lambda file, folder: None)
@@ -146,8 +149,8 @@ def _episode_elsewhere(file: h5py.File, folder: Path) -> None:
     file["episode_0"] = h5py.ExternalLink(str(folder / "other.hdf5"), "/")
 
 
-def _in_episode(change: Callable[[h5py.File, Path], None]) -> Callable[[h5py.File, Path], None]:
-    return lambda file, folder: change(file["episode_0"], folder)
+def _in_episode(change: Change, number: int = 0) -> Change:
+    return lambda file, folder: change(file[f"episode_{number}"], folder)
 
 
 def _long_episode(file: h5py.File, folder: Path) -> None:
@@ -201,70 +204,68 @@ def _nested(metadata: dict[str, Any]) -> dict[str, Any]:
     return metadata | {"observation_space": deep}
 
 
-HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
-    "external storage": (lambda f: _hdf5(f, _external), "takes its values from other files"),
-    "virtual data set": (lambda f: _hdf5(f, _virtual), "takes its values from other files"),
-    "external link": (lambda f: _hdf5(f, _external_link), "'rewards': is a link to another place"),
-    "external link on the way": (lambda f: _hdf5(f, _external_way), "'rewards': is a link to anot"),
-    "links in a circle": (lambda f: _hdf5(f, _circle), "'rewards': is a link to another place"),
+_TRANSITIONS: dict[str, tuple[Change, str]] = {
+    "external storage": (_external, "takes its values from other files"),
+    "virtual data set": (_virtual, "takes its values from other files"),
+    "external link": (_external_link, "'rewards': is a link to another place"),
+    "external link on the way": (_external_way, "'rewards': is a link to another place"),
+    "links in a circle": (_circle, "'rewards': is a link to another place"),
     "an integer of 64 bits": (
-        lambda f: _hdf5(f, _as("actions", np.uint64, 2**63 + 5)),
+        _as("actions", np.uint64, 2**63 + 5),
         "'actions', row 0: is 9223372036854775813, but all values must be at most 9223",
     ),
     "long doubles": (
-        lambda f: _hdf5(f, _as("observations", np.longdouble)),
+        _as("observations", np.longdouble),
         "'observations': has the dtype float128, which PyTorch lacks: store it as float64",
     ),
-    "4e8 rows in chunks": (lambda f: _hdf5(f, _endless), "declares 1600000000 bytes"),
-    "4e8 rows at once": (lambda f: _hdf5(f, _endless_at_once), "declares 1600000000 bytes"),
-    "a chunk of 2.5 GB": (lambda f: _hdf5(f, _one_chunk), "has chunks of 2500000000 bytes"),
-    "compressed twice": (lambda f: _hdf5(f, _compressed_twice), "declares 268435456 bytes"),
-    "an environment that runs": (lambda f: _minari(f, _runs_something), "missing required field"),
+    "4e8 rows in chunks": (_endless, "declares 1600000000 bytes"),
+    "4e8 rows at once": (_endless_at_once, "declares 1600000000 bytes"),
+    "a chunk of 2.5 GB": (_one_chunk, "has chunks of 2500000000 bytes"),
+    "compressed twice": (_compressed_twice, "declares 268435456 bytes"),
+}
+_METADATA: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+    "an environment that runs": (_runs_something, "missing required field"),
     "1e9 episodes": (
-        lambda f: _minari(f, lambda m: m | {"total_episodes": 10**9}),
+        lambda m: m | {"total_episodes": 10**9},
         "claim 1000000000 episodes, but there are 2",
     ),
-    "spaces in spaces": (lambda f: _minari(f, _nested), "is not a whole Minari data set"),
-    "metadata of a list": (lambda f: _minari(f, lambda m: [m]), "Expected `object`, got `array`"),
+    "spaces in spaces": (_nested, "is not a whole Minari data set"),
+    "metadata of a list": (lambda m: [m], "Expected `object`, got `array`"),
     "metadata of other kinds": (
-        lambda f: _minari(f, lambda m: m | {"author": 5}),
+        lambda m: m | {"author": 5},
         "not a whole Minari data set .*author",
     ),
-    "attributes of a list": (
-        lambda f: _minari(f, lambda m: m | {"attributes": [1]}),
-        "not a whole Minari data set .*attributes",
-    ),
-    "an environment of a number": (
-        lambda f: _minari(f, lambda m: m | {"env_spec": 5}),
-        "not a whole Minari data set .*env_spec",
-    ),
-    "an episode elsewhere": (
-        lambda f: _minari(f, change=_episode_elsewhere),
-        "'episode_0': is a link to another place",
-    ),
+    "attributes of a list": (lambda m: m | {"attributes": [1]}, "not a whole .*attributes"),
+    "an environment of a number": (lambda m: m | {"env_spec": 5}, "not a whole .*env_spec"),
+}
+_EPISODES: dict[str, tuple[Change, str]] = {
+    "an episode elsewhere": (_episode_elsewhere, "'episode_0': is a link to another place"),
     "a field elsewhere": (
-        lambda f: _minari(f, change=_in_episode(_external_link)),
+        _in_episode(_external_link),
         "episode 0: field 'rewards': is a link to another place",
     ),
     "a virtual field": (
-        lambda f: _minari(f, change=_in_episode(_virtual)),
+        _in_episode(_virtual),
         "episode 0: field 'rewards': takes its values from other files",
     ),
     "a later field of long doubles": (
-        lambda f: _minari(
-            f, change=lambda file, _: _as("rewards", np.longdouble)(file["episode_1"], f)
-        ),
+        _in_episode(_as("rewards", np.longdouble), 1),
         "episode 1: field 'rewards': has the dtype float128",
     ),
+}
+HOSTILE: dict[str, tuple[Callable[[Path], Path], str]] = {
+    **{name: (partial(_hdf5, change=c), message) for name, (c, message) in _TRANSITIONS.items()},
+    **{name: (partial(_minari, metadata=c), message) for name, (c, message) in _METADATA.items()},
+    **{name: (partial(_minari, change=c), message) for name, (c, message) in _EPISODES.items()},
 }
 """Each with a part of the message that refuses it."""
 
 HARMLESS: dict[str, Callable[[Path], Path]] = {
-    "a space of 1e10 entries": lambda f: _minari(f, _endless_space),
-    "many texts in an attribute": lambda f: _minari(f, change=_many_texts),
+    "a space of 1e10 entries": partial(_minari, metadata=_endless_space),
+    "many texts in an attribute": partial(_minari, change=_many_texts),
     "one text for a thousand": _one_text_for_all,
-    "groups in groups": lambda f: _minari(f, change=_deep_groups),
-    "groups in two places": lambda f: _minari(f, change=_doubling_groups),
-    "1e12 steps": lambda f: _minari(f, change=_long_episode),
+    "groups in groups": partial(_minari, change=_deep_groups),
+    "groups in two places": partial(_minari, change=_doubling_groups),
+    "1e12 steps": partial(_minari, change=_long_episode),
 }
 """What is not read of a data set cannot fill the memory."""
