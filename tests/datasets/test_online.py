@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
-from torchrl.data import ReplayBuffer, SliceSampler
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
 
 from recipes.replay import BufferState
 from tests.datasets.several import MOST_FRAMES, newest, play_several
@@ -252,7 +253,20 @@ def test_an_episode_that_a_resume_cut_off_stays_cut_off(envs: int | None, tmp_pa
         assert not copy["next", "terminated"].any()
 
 
-def test_what_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
+def test_torchrl_does_not_say_that_it_made_a_table(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would say so on the standard output, of commands that are read by programs."""
+    caplog.set_level(logging.INFO, "torchrl")
+    monkeypatch.setattr(logging.getLogger("torchrl"), "handlers", [caplog.handler])
+    steps = without_histories(play_several(3, 12, 2, "same"))
+    make(3, 31, 2).extend(steps)
+    assert not caplog.records
+    ReplayBuffer(storage=LazyTensorStorage(31, ndim=2)).extend(steps)
+    assert "Initialized LazyTensorStorage" in caplog.text
+
+
+def test_what_is_refused() -> None:
     steps = without_histories(play_several(3, 12, 2, "same"))
     buffer = make(3, 31, 2)
     storage = buffer.storage
@@ -264,7 +278,6 @@ def test_what_is_refused(capfd: pytest.CaptureFixture[str]) -> None:
     buffer = make(3, 31, 2)
     buffer.extend(steps[:, :9])
     storage = buffer.storage
-    assert capfd.readouterr().out == ""  # TorchRL does not say that it made a table
     assert storage.max_size == 33  # whole steps of all environments
     with pytest.raises(RuntimeError, match="cannot be changed"):
         storage[0] = steps[:, 0]

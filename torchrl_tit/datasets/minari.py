@@ -234,17 +234,17 @@ def _joined(
             raise DatasetError(source, "is missing.", f"episode_{number}")
         noted |= {"infos"} & set(group)
         noted |= {"seed", "options"} & {key.split("/")[0] for key in group.attrs}
-        found = {name: find(place, group, theirs) for name, (theirs, _) in _NAMES.items()}
+        found: dict[str, Any] = {n: find(place, group, theirs) for n, (theirs, _) in _NAMES.items()}
         for name, field in found.items():
             if not isinstance(field, h5py.Dataset) or not field.shape:
                 raise DatasetError(place, "is not an array with one row per step.", _NAMES[name][0])
         steps = found["rewards"].shape[0]
         for name, field in found.items():
             more = name == "observations"  # the final one
-            encoded = more and image is not None and field.ndim <= 2
             # A state that is one number becomes a column.
-            row = image if encoded else field.shape[1:] or ((1,) if more else ())
-            dtype = np.dtype(np.uint8) if encoded else field.dtype
+            row, dtype, read = field.shape[1:] or ((1,) if more else ()), field.dtype, _rows
+            if more and image is not None and field.ndim <= 2:
+                row, dtype, read = image, np.dtype(np.uint8), _images
             expected = rows.setdefault(name, (row, dtype))
             problem = None
             if len(field) != steps + more or steps == 0:
@@ -256,10 +256,10 @@ def _joined(
                 )
             if problem:
                 raise DatasetError(place, problem, _NAMES[name][0])
-            read = partial(_images if encoded else _rows, file, field.name, row)
-            pieces[name].append((steps, partial(read, 0)))
+            pieces[name].append((steps, partial(read, file, field.name, row, 0)))
             if more:
-                pieces["next_observations"].append((steps, partial(read, 1)))
+                later = partial(read, file, field.name, row, 1)
+                pieces["next_observations"].append((steps, later))
     rows["next_observations"] = rows["observations"]
     fields = {name: JoinedField(parts, *rows[name]) for name, parts in pieces.items()}
     return fields, np.array([steps for steps, _ in pieces["rewards"]]), noted
