@@ -91,14 +91,15 @@ def group_runs(runs: Iterable[Run]) -> list[Experiment]:
                 f"{run.recipe.name or 'the same settings'} with seed {run.recipe.seed}; "
                 "name one of them only"
             )
-    named = dict(RECIPES)
+    own: dict[str, Recipe] = {}
     experiments = []
     for settings, seeds in groups.items():
         first = next(iter(seeds.values()))
         name, changes = str(first.folder), ""
         if settings.name:
             name = settings.name
-            changes = changed_fields(named.setdefault(name, settings), settings)
+            named = RECIPES.get(name) or own.setdefault(name, settings)
+            changes = changed_fields(named, settings)
         experiments.append(Experiment(settings, name, changes, tuple(seeds.values())))
     return experiments
 

@@ -58,7 +58,7 @@ def _record(name: str, run: Run, commit: str) -> Record:
     metrics = _metrics(run)
     if not metrics:
         raise ValueError(f"{run.folder} has no metrics yet: train it first, or leave it out")
-    named = dict(RECIPES).get(run.recipe.name)
+    named = RECIPES.get(run.recipe.name)
     recipe, found = _read(run, "recipe.json"), run.read_evaluation() or {}
     settings = {field: value for field, value in recipe.items() if field != "seed"}
     row = {

@@ -471,7 +471,7 @@ def _settings(index: int, groups: Sequence[Group], media: Media) -> dict[str, An
     """The settings of a group, how they differ from the recipe of that name, and the command."""
     group = groups[index]
     recipe, backbone = group.recipe, group.recipe.backbone
-    named = dict(RECIPES).get(recipe.name)
+    named = RECIPES.get(recipe.name)
     old = fields_of(named) if named else {}
     changes = changes_of(named, recipe) if named else {}
     compared = (
