@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from .outcomes import Outcome
+from .evaluation import Outcome
 from .recipe import Recipe
 
 RecipeT = TypeVar("RecipeT", bound=Recipe)

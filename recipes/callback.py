@@ -7,7 +7,7 @@ from typing import Any
 
 from tensordict.nn import TensorDictModuleBase
 
-from .outcomes import Outcome
+from .evaluation import Outcome
 
 
 class Callback:

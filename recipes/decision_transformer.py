@@ -47,9 +47,9 @@ from torchrl_tit.transforms import SequenceHistory
 
 from .algorithm import Stateful, check_finite, total_loss
 from .dataset_recipe import DatasetRecipe
+from .evaluation import Outcome
 from .networks import normalize_frames
 from .offline import DatasetAlgorithm
-from .outcomes import Outcome
 from .task import make_task, task_limit
 
 ActionSpace = Literal["continuous", "gaussian", "discrete"]

@@ -27,8 +27,8 @@ from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
 from .algorithm import Algorithm, Stateful, check_finite, numbers
 from .dataset_recipe import DatasetRecipe
+from .evaluation import Outcome
 from .networks import make_backbone, make_critic
-from .outcomes import Outcome
 from .recipe import Padding
 from .task import make_task
 

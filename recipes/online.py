@@ -23,7 +23,7 @@ from torchrl_tit.modules import ActingCollector
 from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps
 
 from .algorithm import Algorithm
-from .outcomes import Outcome
+from .evaluation import Outcome
 from .ray_cluster import check_address
 from .ray_collector import ClusterCollector, check_cluster
 from .recipe import Padding, Recipe

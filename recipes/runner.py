@@ -28,10 +28,10 @@ from .algorithm import (
 )
 from .best import EPISODES, Best
 from .callback import Callback
+from .evaluation import Outcome, summarize
 from .free_memory import return_free_memory
 from .interrupt import Interrupt
 from .optional import tqdm
-from .outcomes import Outcome, summarize
 from .recipe import Recipe
 from .run import Run
 
@@ -328,7 +328,7 @@ def evaluate(
         best: whether to evaluate the best weights of the checkpoint instead of the last ones.
 
     Returns:
-        The entries of :func:`~recipes.outcomes.summarize`, the "seed" of the first episode, and
+        The entries of :func:`~recipes.evaluation.summarize`, the "seed" of the first episode, and
         which "weights" were evaluated: "last" or "best".
 
     Raises:

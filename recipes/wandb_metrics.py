@@ -15,8 +15,8 @@ from torchrl_tit.extras import install
 from torchrl_tit.files import write_text_atomic
 
 from .callback import Callback
+from .evaluation import Outcome
 from .metrics import read_metrics
-from .outcomes import Outcome
 from .recipe_json import recipe_to_json
 from .run import Run
 

@@ -21,8 +21,8 @@ from torch import nn
 from recipes import runner
 from recipes.algorithm import Algorithm, NotFiniteError, check_finite
 from recipes.callback import Callback
+from recipes.evaluation import Outcome
 from recipes.metrics import Metrics, read_metrics
-from recipes.outcomes import Outcome
 from recipes.recipe import Recipe
 from recipes.run import Run
 from recipes.runner import evaluate, load_trained, train
