@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tests.networks.reference import randomize
 from tests.networks.reference_decision_transformer import ReferenceDT
@@ -15,6 +15,53 @@ from torchrl_tit.interop import from_official
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
 KINDS = pytest.mark.parametrize("kind", ["dt", "dt_tit"])
+
+
+class TransformersDT(ReferenceDT):
+    """The reference's embeddings and heads around the library's GPT-2."""
+
+    def __init__(
+        self,
+        *sizes: int,
+        tit: bool,
+        dim: int = 16,
+        layers: int = 1,
+        heads: int = 1,
+        inner: int = 64,
+        activation: str = "relu",
+        max_ep_len: int = 50,
+    ) -> None:
+        super().__init__(*sizes, tit=tit, dim=dim, max_ep_len=max_ep_len)
+        settings: dict[str, Any] = {
+            "vocab_size": 1,
+            "n_embd": dim,
+            "n_layer": layers,
+            "n_head": heads,
+            "n_inner": inner,
+            "activation_function": activation,
+            "attn_implementation": "eager",
+        }
+        # Not at the top: it takes seconds to import, in every process that collects tests.
+        from transformers import GPT2Config, GPT2Model
+
+        config = GPT2Config(**settings)
+        self.gpt2 = GPT2Model(config)
+        self.transformer = nn.ModuleDict()
+
+    def forward(
+        self, states: Tensor, actions: Tensor, returns: Tensor, timesteps: Tensor, mask: Tensor
+    ) -> Tensor:
+        time = self.embed_timestep(timesteps)
+        embedded = [
+            self.embed_return(returns),
+            self.embed_states(states),
+            self.embed_action(actions),
+        ]
+        tokens = torch.stack([token + time for token in embedded], 2).flatten(1, 2)  # [B, 3K, D]
+        x = self.gpt2(
+            inputs_embeds=self.embed_ln(tokens), attention_mask=mask.repeat_interleave(3, 1)
+        ).last_hidden_state
+        return self.predict_action(x[:, 1::3])
 
 
 def make_inputs(batch: int, steps: int, state: int, action: int, limit: int) -> list[Tensor]:
@@ -37,43 +84,56 @@ def make_inputs(batch: int, steps: int, state: int, action: int, limit: int) -> 
 
 
 @KINDS
+@pytest.mark.parametrize("reference_class", [ReferenceDT, TransformersDT])
 @pytest.mark.parametrize(
     ("settings", "steps"),
     [
         ({}, 5),
-        ({"layers": 3, "heads": 4}, 20),
-        ({"layers": 2, "heads": 2, "inner": 40, "activation": "gelu"}, 7),
-        ({"activation": "gelu_new", "max_ep_len": 1000, "dim": 24}, 3),
-        ({"activation": "tanh", "heads": 16}, 1),
+        ({"layers": 3, "dim": 128, "inner": 512}, 20),  # the protocol's
+        ({"layers": 4, "heads": 4, "dim": 32}, 20),
+        ({"layers": 2, "heads": 8, "inner": 40, "activation": "gelu_new"}, 7),
+        ({"activation": "tanh", "heads": 16, "max_ep_len": 1000, "dim": 48}, 1),
     ],
 )
-def test_equals_the_reference(kind: str, settings: dict[str, Any], steps: int) -> None:
-    reference = ReferenceDT(11, 3, tit=kind == "dt_tit", **settings)
+def test_outputs_and_gradients_are_equal(
+    kind: str, reference_class: type[ReferenceDT], settings: dict[str, Any], steps: int
+) -> None:
+    reference = reference_class(11, 3, tit=kind == "dt_tit", **settings)
     randomize(reference)
-    config = {
+    params = {n.replace("gpt2.", "transformer."): x for n, x in reference.state_dict().items()}
+    if isinstance(reference, TransformersDT):  # the authors' copy of GPT-2 has no positions
+        torch.nn.init.zeros_(reference.gpt2.wpe.weight)
+    short = {
         "kind": kind,
+        "n_head": settings.get("heads", 1),
+        "activation": settings.get("activation", "relu"),
+        "context": steps,
+    }
+    config = {
+        **short,
         "state_dim": 11,
         "act_dim": 3,
         "embed_dim": settings.get("dim", 16),
         "n_layer": settings.get("layers", 1),
-        "n_head": settings.get("heads", 1),
         "n_inner": settings.get("inner", 64),
-        "activation": settings.get("activation", "relu"),
-        "context": steps,
         "max_ep_len": settings.get("max_ep_len", 50),
     }
-    derived = {"state_dim", "act_dim", "embed_dim", "n_layer", "n_inner", "context", "max_ep_len"}
-    short = {name: value for name, value in config.items() if name not in derived}
-    prefixed = {f"model.{name}": value for name, value in reference.state_dict().items()}
-    networks = from_official(config, reference.state_dict()), from_official(short, prefixed)
-    inputs = make_inputs(4, steps, 11, 3, config["max_ep_len"])
-    expected = reference.double()(*inputs)
-    valid = inputs[-1].bool()
-    assert expected[valid].std() > 0.1
-    for network in networks:
-        actions = network.double().eval()(*inputs)
+    prefixed = {f"model.{name}": value for name, value in params.items()}
+    networks = from_official(config, params), from_official(short, prefixed)
+    states, *others, mask = make_inputs(4, steps, 11, 3, config["max_ep_len"])
+    valid = mask.bool()
+    results = []
+    for module in (reference, *networks):
+        given = states.clone().requires_grad_()
+        actions = module.double().eval()(given, *others, mask)
         assert actions.isfinite().all()
-        torch.testing.assert_close(actions[valid], expected[valid], rtol=0, atol=1e-9)
+        probe = torch.randn(actions.shape, generator=torch.Generator().manual_seed(0)).double()
+        (actions * probe)[valid].sum().backward()
+        results.append((actions[valid].detach(), given.grad))
+    expected, *ours = results
+    assert expected[0].std() > 0.01
+    for found in ours:
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
 
 
 @KINDS
