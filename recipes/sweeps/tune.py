@@ -200,24 +200,24 @@ class Search:
         Raises:
             KeyboardInterrupt: after Ctrl-C, once all workers have stopped.
         """
-        ended = self._count_ended()
+        ended = sum(trial.state.is_finished() for trial in self.study.trials)
         with raise_on_signals(), tqdm(total=trials, initial=ended, unit=" trials") as progress:
             try:
+                self._show_best(progress)
                 while ended < trials:
                     room = min(workers, trials - ended)
                     while len(self._running) < room:
-                        trial = self.study.ask(self.space)
+                        drawn = self.study.ask(self.space)
                         self._write_trials()  # before anything of it starts
-                        self._running.append(_Trial(self, trial))
+                        self._running.append(_Trial(self, drawn))
                     time.sleep(0.2)
                     for trial in self._running[:room]:  # a killed search may have left more
                         if trial.advance():
                             self._running.remove(trial)
+                            ended += 1
+                            progress.update()
                             self._write_trials()
-                    progress.update(self._count_ended() - ended)
-                    ended = self._count_ended()
-                    if best := self.best():
-                        progress.set_postfix_str(f"best {best.value:.1f}, trial {best.number}")
+                            self._show_best(progress)
             except BaseException:
                 for trial in self._running:
                     trial.stop()
@@ -227,8 +227,9 @@ class Search:
         failed = self.study.get_trials(deepcopy=False, states=(TrialState.FAIL,))
         return [trial.number for trial in failed]
 
-    def _count_ended(self) -> int:
-        return sum(trial.state.is_finished() for trial in self.study.get_trials(deepcopy=False))
+    def _show_best(self, progress: tqdm[Any]) -> None:
+        if best := self.best():
+            progress.set_postfix_str(f"best {best.value:.1f}, trial {best.number}")
 
     def best(self) -> FrozenTrial | None:
         """The best trial so far, whose recipe is in ``best.json``; None before the first."""

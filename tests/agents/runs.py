@@ -5,10 +5,12 @@ from pathlib import Path
 import torch
 
 from recipes import runner
+from recipes.agents import pack
 from recipes.algorithm import make_algorithm
 from recipes.ppo import PPO
 from recipes.recipe import Recipe
 from recipes.run import Run
+from torchrl_tit.agents.folder import write_agent
 from torchrl_tit.settings.networks import enhanced_tit
 
 
@@ -32,4 +34,11 @@ def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
     record = runner.Record(recipe, algorithm).state_dict()
     run.save(7, {"networks": state, "record": record})
     run.save_evaluation(runner.evaluate(run))
+    return folder
+
+
+def packed(run: Path, folder: Path) -> Path:
+    """Makes an agent of a run."""
+    files, steps = pack(run, folder.name)
+    write_agent(folder, files, steps)
     return folder

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from tensordict.nn import set_interaction_type
 from tensordict.nn.probabilistic import InteractionType
 
@@ -17,11 +18,13 @@ from recipes.dqn import DQN
 from recipes.ppo import PPO
 from recipes.run import Run
 from recipes.sac import SAC
+from tests.agents.runs import packed
 from tests.recipes.cql.cql_runs import make_cartpole_data, make_cql, make_discrete_cql, tit
 from tests.recipes.dataset_runs import train
 from tests.recipes.decision_transformer.sequence_runs import SMALL, make_dt, make_odt
 from tests.recipes.offline.offline_runs import BC, IQL, TD3BC, make
 from torchrl_tit.agents import load_agent
+from torchrl_tit.agents.folder import WEIGHTS
 from torchrl_tit.export.comparison import COPIES, compare
 from torchrl_tit.export.parts import read_parts
 from torchrl_tit.export.policy import export_policy
@@ -111,11 +114,17 @@ def test_the_environment_leaves_observations_as_they_are(trained):
         assert (frames.variance < 0.9).any()
 
 
-def test_an_agent_acts_as_its_run_was_evaluated(trained):
+def test_an_agent_acts_as_its_run_was_evaluated(trained, tmp_path):
     with Run.open(trained.run.folder) as run:
-        evaluation = runner.evaluate(run)
-    seed, returns = trained.run.recipe.evaluation_seed, evaluation["returns"]
-    assert trained.agent.evaluate(2, seed=seed).tolist() == pytest.approx(returns[:2], rel=1e-5)
+        run.save_evaluation(runner.evaluate(run))
+    agent = load_agent(packed(run.folder, tmp_path / "agent"))
+    assert agent.evaluate().tolist() == pytest.approx(agent.evaluation["returns"], rel=1e-5)
+
+    saved = load_file(tmp_path / "agent" / WEIGHTS)
+    _, algorithm, _ = runner.load_trained(run)
+    everything = {tuple(x.flatten().tolist()) for x in algorithm.model.state_dict().values()}
+    assert all(tuple(weight.flatten().tolist()) in everything for weight in saved.values())
+    assert len(saved) == len(algorithm.policy.state_dict())
 
 
 @pytest.mark.parametrize("step_by_step", [False, True], ids=["windows", "steps"])

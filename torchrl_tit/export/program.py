@@ -121,9 +121,8 @@ class Program(nn.Module, ABC):
         features, carried = self.read(inputs)
         further = {key: inputs[name] for name, key in parts.further.items()}
         entries = {parts.features_key: features, **further}
-        if (
-            self.trunk.history_encoder.context
-        ):  # the head of a Decision Transformer checks their kind
+        if self.trunk.history_encoder.context:
+            # The head of a Decision Transformer checks the kind of its actions.
             entries[unravel_key(parts.backbone.history_keys[1])] = inputs["actions"]
         action, parameters = self.head(entries, inputs.get(NOISE))
         carried = self.act(carried, action)

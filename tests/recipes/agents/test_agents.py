@@ -11,14 +11,10 @@ from torchrl.envs import GymEnv, TransformedEnv
 
 from recipes.agents import pack
 from recipes.bc import BC
-from recipes.cql import CQL, DiscreteCQL
 from recipes.decision_transformer import DT
-from recipes.dqn import DQN
 from recipes.ppo import PPO
-from recipes.run import Run
-from recipes.runner import load_trained
 from recipes.sac import SAC
-from tests.agents.runs import make_run
+from tests.agents.runs import make_run, packed
 from torchrl_tit import load_agent
 from torchrl_tit.agents import AgentError, TrainedAgent
 from torchrl_tit.agents.folder import CONTENTS, EVALUATION, RECIPE, WEIGHTS, write_agent
@@ -37,9 +33,6 @@ RECIPES: dict[str, Any] = {
     "history": None,  # PPO's with an Enhanced_TIT
     "state": PPO(env="CartPole-v1", backbone=lstm(hidden_dim=8), hide_velocities=True, **EPISODES),
     "squashed": SAC(env="Pendulum-v1", backbone=SMALL, critic_hidden=(8,), **EPISODES),
-    "values": DQN(env="CartPole-v1", backbone=SMALL, **EPISODES),
-    "cql": CQL(env="Pendulum-v1", backbone=SMALL, critic_hidden=(8,), **DATA),
-    "values-of-data": DiscreteCQL(env="CartPole-v1", backbone=SMALL, **DATA),
     "statistics": BC(env="Pendulum-v1", backbone=SMALL, normalize_observations=True, **DATA),
     "returns-to-go": DT(
         env="CartPole-v1",
@@ -51,12 +44,6 @@ RECIPES: dict[str, Any] = {
 }
 
 
-def packed(run, folder):
-    files, steps = pack(run, folder.name)
-    write_agent(folder, files, steps)
-    return folder
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("runs") / "run")
@@ -65,20 +52,6 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def agent(run, tmp_path_factory):
     return packed(run, tmp_path_factory.mktemp("agents") / "cart.pole-2")
-
-
-@pytest.mark.parametrize("kind", RECIPES)
-def test_an_agent_plays_as_its_run_did(kind, tmp_path):
-    run = make_run(tmp_path / "run", RECIPES[kind])
-    loaded = load_agent(packed(run, tmp_path / "agent"))
-    evaluation = json.loads((run / "evaluation.json").read_text())
-    assert loaded.evaluate().tolist() == evaluation["returns"]
-
-    saved = load_file(tmp_path / "agent" / WEIGHTS)
-    _, algorithm, _ = load_trained(Run.open(run))
-    everything = {tuple(x.flatten().tolist()) for x in algorithm.model.state_dict().values()}
-    assert all(tuple(weight.flatten().tolist()) in everything for weight in saved.values())
-    assert len(saved) == len(algorithm.policy.state_dict())
 
 
 def test_a_run_is_an_agent_too(run):
