@@ -255,7 +255,7 @@ class Search:
         return replace(recipe, name=f"{recipe.name}/trial-{number}") if recipe.name else recipe
 
     def _write_trials(self) -> None:
-        rows = [["trial", "state", "value", "step", *self.space]]
+        rows: list[list[Any]] = [["trial", "state", "value", "step", *self.space]]
         for trial in self.study.get_trials(deepcopy=False):
             value = trial.value
             if value is None and trial.intermediate_values:  # it was pruned: its last return

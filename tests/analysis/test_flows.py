@@ -94,13 +94,14 @@ class Own(HistoryEncoder):
 
     def __init__(self, settings: OwnHistory, shape: HistoryShape) -> None:
         super().__init__(shape, out_features=shape.width)
+        self.where = settings.where
         layers = nn.ModuleList(SelfAttention(shape.width, 1) for _ in range(2))
-        setattr(self, settings.where, layers)
+        self.add_module(self.where, layers)
 
     def forward(self, tokens: Tensor) -> Tensor:
         leading = tokens.shape[:-3]
         x = tokens.reshape(-1, self.shape.num_frames, self.shape.width)
-        for layer in getattr(self, "blocks", None) or self.attention:
+        for layer in getattr(self, self.where):
             x = layer(x)
         return x[:, -1].reshape(*leading, self.out_features)
 

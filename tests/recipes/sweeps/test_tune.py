@@ -7,6 +7,7 @@ import signal
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,7 +36,7 @@ RECIPE = PPO(
     evaluation_episodes=2,
     checkpoint_interval=64,
 )
-SPACE = {
+SPACE: dict[str, Any] = {
     "learning_rate": {"type": "float", "low": 1e-4, "high": 1e-2, "log": True},
     "epochs": {"type": "int", "low": 1, "high": 2},
     "backbone.history.activation": {"type": "categorical", "choices": ["tanh", "relu"]},
@@ -275,7 +276,12 @@ def test_no_more_trials_than_workers_go_on(tmp_path, naps, monkeypatch):
         for _ in range(3):  # at work when the search was killed
             search.study.ask(search.space)
         search._write_trials()
-    monkeypatch.setattr(tune, "start", lambda job: begun.append(job.folder.name) or Process(2))
+
+    def start(job):
+        begun.append(job.folder.name)
+        return Process(2)
+
+    monkeypatch.setattr(tune, "start", start)
     with Search(tmp_path, SETTINGS) as search:
         assert search.run(2, workers=1) == [0, 1]
     assert len(begun) == 2
