@@ -9,7 +9,7 @@ import math
 import signal
 import subprocess
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -111,7 +111,7 @@ class Search:
     def _load(self) -> None:
         settings = self.settings
         self._write_or_compare("settings.json", _to_json(settings))
-        self._write_or_compare("space.json", json.dumps(settings.space))
+        self._write_or_compare("space.json", json.dumps(settings.space), _read_space)
         trials = self._read_trials()
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.study = optuna.create_study(
@@ -169,7 +169,9 @@ class Search:
             intermediate_values={int(row["step"]): value} if row["step"] else {},
         )
 
-    def _write_or_compare(self, name: str, text: str) -> None:
+    def _write_or_compare(
+        self, name: str, text: str, read: Callable[[str], Any] = json.loads
+    ) -> None:
         path, advice = self.folder / name, "name another folder with --out, or move it away"
         if not path.exists():
             if (self.folder / "trials.csv").exists():
@@ -180,10 +182,10 @@ class Search:
             write_text_atomic(path, text)
             return
         try:
-            before = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+            before = read(path.read_text(encoding="utf-8"))
+        except (AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{path} cannot be read ({error}): {advice}") from error
-        if before != json.loads(text):
+        if before != read(text):
             raise ValueError(f"{self.folder} holds a search with other settings: {advice}")
 
     def run(self, trials: int, workers: int) -> list[int]:
@@ -368,6 +370,10 @@ def importances(study: optuna.Study) -> dict[str, float]:
     if len(complete) < _FEWEST or len({trial.value for trial in complete}) < 2:
         return {}
     return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
+
+
+def _read_space(text: str) -> dict[str, BaseDistribution]:
+    return make_distributions(json.loads(text))
 
 
 def _cell(value: Any) -> str:

@@ -248,7 +248,7 @@ def _inner_blocks(inner: InnerTransformer) -> list[list[nn.Module]]:
         def read_first(first: Tensor, rest: Tensor) -> Tensor:
             return block(torch.cat([first.expand(len(rest), -1, -1), rest], 1), read="first")
 
-        block.read_first = read_first  # type: ignore[assignment]
+        vars(block).update(read_first=read_first)
     return [[inner.blocks[index % len(inner.blocks)]] for index in range(inner.num_blocks)]
 
 

@@ -162,6 +162,9 @@ def test_trials_are_recorded_and_their_study_is_made_again(searched, disable, mo
     third = read(folder / "trials.csv")[2]
     assert (third["state"], third["value"]) == ("fail", "")
     assert third["learning_rate"] not in [row["learning_rate"] for row in rows]
+    # As the version before wrote it: with what is left out in ours.
+    spelled = SPACE | {"epochs": SPACE["epochs"] | {"step": 1, "log": False}}
+    (folder / "space.json").write_text(json.dumps(spelled))
     with Search(folder, SETTINGS) as search:  # complete: nothing is run again
         assert search.run(3, workers=1) == [2]
     assert not (folder / "importance.csv").exists(), "two complete trials say nothing"
@@ -323,6 +326,9 @@ def test_a_trial_is_not_credited_with_the_run_of_another(searched):
     for old, new in (("trial-0", "other"), ("trial-1", "trial-0"), ("other", "trial-1")):
         (folder / old).rename(folder / new)
     with pytest.raises(ValueError, match=r"trial-0/seed-0 holds a run of .* with other settings"):
+        Search(folder, SETTINGS).__enter__()
+    (folder / "space.json").write_text('{"epochs": [1, 2]}')
+    with pytest.raises(ValueError, match=r"space\.json cannot be read"):
         Search(folder, SETTINGS).__enter__()
     (folder / "settings.json").unlink()
     with pytest.raises(ValueError, match=r"settings\.json is missing"):
