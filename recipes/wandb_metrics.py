@@ -7,8 +7,8 @@ import json
 import math
 import secrets
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
+import msgspec
 from torchrl.record.loggers.wandb import WandbLogger
 
 from torchrl_tit.extras import install
@@ -103,27 +103,29 @@ def check_wandb(project: str) -> None:
         )
 
 
+class _Name(msgspec.Struct):
+    """What ``wandb.json`` holds."""
+
+    project: str
+    id: str
+
+
 def _name_of(run: Run, project: str) -> tuple[str, bool]:
     """Returns the run's name on W&B, which is new if it had none, and whether it had one."""
     path = run.folder / _FILE
-    if path.exists():
-        found = _read(path)
-        if found["project"] != project:
-            raise ValueError(
-                f"{run.folder} is in the project {found['project']!r} already: go on there, or "
-                f"delete {path} to begin a run in {project!r}"
-            )
-        return found["id"], True
-    name = secrets.token_hex(4)
-    write_text_atomic(path, json.dumps({"project": project, "id": name}) + "\n")
-    return name, False
-
-
-def _read(path: Path) -> dict[str, str]:
+    if not path.exists():
+        name = _Name(project, secrets.token_hex(4))
+        write_text_atomic(path, msgspec.json.encode(name).decode() + "\n")
+        return name.id, False
     try:
-        found = json.loads(path.read_bytes())
-        return {"project": str(found["project"]), "id": str(found["id"])}
-    except (ValueError, LookupError, TypeError) as error:
+        found = msgspec.json.decode(path.read_bytes(), type=_Name)
+    except msgspec.MsgspecError as error:
         raise ValueError(
             f"{path} is damaged: delete it to begin a new run on Weights & Biases"
         ) from error
+    if found.project != project:
+        raise ValueError(
+            f"{run.folder} is in the project {found.project!r} already: go on there, or delete "
+            f"{path} to begin a run in {project!r}"
+        )
+    return found.id, True
