@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import pytest
@@ -14,7 +13,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.networks.reference import randomize
 from tests.numerics import assert_near
-from tests.transforms.streams import StreamEnv
 from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.modules import (
@@ -159,31 +157,6 @@ def test_acting_keeps_tokens_and_changes_nothing(network_class):
     assert resets > 6
 
 
-def test_what_is_kept_is_no_part_of_states_and_copies():
-    network, head = make_network()
-    actor = make_dt_actor(network, head)
-    batch, encoded = make_batch(steps=7), []
-    windows = [batch.apply(lambda x, k=k: x[:, k : k + 5]) for k in range(3)]
-    network.frames[0].register_forward_pre_hook(
-        lambda module, inputs: encoded.append(inputs[0].shape[:-1].numel())
-    )
-
-    def frames_encoded(policy, window):
-        encoded.clear()
-        policy(TensorDict({"sequence": window}, [4]))
-        return sum(encoded)
-
-    with torch.no_grad(), acting(actor):
-        assert frames_encoded(actor, windows[0]) == 4 * 5
-        assert frames_encoded(actor, windows[1]) == 4
-        assert not any("cache" in name for name in actor.state_dict())
-        assert frames_encoded(actor, windows[2]) == 4 * 5
-        copied = copy.deepcopy(actor)
-        assert frames_encoded(copied, windows[2]) == 4 * 5
-    actions = [one(TensorDict({"sequence": windows[0]}, [4]))["action"] for one in (copied, actor)]
-    torch.testing.assert_close(*actions, rtol=1e-4, atol=1e-5)
-
-
 @pytest.mark.parametrize("task", ["Hopper-v5", "CartPole-v1"])
 def test_works_in_a_collector(task):
     shape, actions = ((11,), 3) if task == "Hopper-v5" else ((4,), 2)
@@ -216,12 +189,6 @@ def test_one_hot_environment_without_a_batch():
     actor = make_dt_actor(*make_network((4,), 2, space="discrete"), one_hot=True)
     steps = env.rollout(10, actor)
     assert (steps["action"].sum(-1) == 1).all()
-
-
-def test_images_and_integers_of_a_stream():
-    env = StreamEnv([3], shape=(8, 8), dtype=torch.uint8)
-    env = TransformedEnv(env, Compose(TargetReturn(5.0), SequenceHistory(5)))
-    assert env.reset()["sequence", "observation"].dtype == torch.uint8
 
 
 def test_evaluation_side_by_side_equals_one_after_another():
@@ -283,13 +250,9 @@ def test_the_features_of_every_frame_are_not_kept():
         features = backbone(batch)["features"]
     assert features.shape == (4, 5, 16)
     assert not backbone.keeps_frames
-    assert torch.equal(features, network.every_frame(*(batch[name] for name in NAMES)))
-
-
-def test_features_of_every_frame_are_asked_of_those_that_have_them():
-    network = EnhancedTIT(observation_shape=(4,), num_frames=8)
     with pytest.raises(ValueError, match="PairedOuterTransformer encodes the newest frame only"):
-        Backbone(network, every_frame=True)
+        Backbone(EnhancedTIT(observation_shape=(4,)), every_frame=True)
+    assert torch.equal(features, network.every_frame(*(batch[name] for name in NAMES)))
 
 
 def test_autocast_of_every_frame():

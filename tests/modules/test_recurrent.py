@@ -217,17 +217,6 @@ def test_with_several_frames_it_reads_these_and_carries_no_state():
                 assert_near(seen, single(td)["features"][:, -1])
 
 
-@torch.no_grad()
-def test_an_lstm_alone_is_a_network():
-    head = settings.Head(features_dim=None)
-    backbone = Backbone(
-        HistoryNetwork(
-            settings.Flat(), settings.LSTM(), observation_shape=(2,), num_frames=3, head=head
-        )
-    )
-    assert backbone(TensorDict({"history": torch.randn(5, 3, 2)}, [5]))["features"].shape == (5, 64)
-
-
 @pytest.mark.parametrize("trunks", TRUNKS)
 def test_a_missing_entry_says_what_to_add(trunks):
     backbone = make_backbone(trunks)
