@@ -31,10 +31,6 @@ def test_tasks(name, observation, action):
     env.close()
 
 
-def test_one_copy_has_a_batch_dimension():
-    assert make_env("CartPole-v1").reset()["observation"].shape == (1, 4)
-
-
 def lean(root):
     """Pushes the cart to the side that the pole leans to; the same rule for every copy."""
     return root.set("action", (root["observation"][:, 2] > 0).long())
@@ -81,11 +77,6 @@ def test_a_seeded_reset_is_gymnasiums():
 def test_unknown_names(name, words):
     with pytest.raises(ValueError, match=words):
         make_env(name)
-
-
-def test_no_copies():
-    with pytest.raises(ValueError, match="num_envs must be at least 1, not 0"):
-        make_env("CartPole-v1", 0)
 
 
 @pytest.mark.filterwarnings("ignore:The observation 'speech'")

@@ -142,21 +142,6 @@ def test_histories_leave_steps_that_were_taken():
     assert set(root["history"].keys()) == set(root["observation"].keys())
 
 
-@pytest.mark.filterwarnings("ignore:The observation 'speech'")
-def test_general_way_of_stepping_writes_the_same():
-    short, general = (make_env(ROBOT, 2, seed=0, num_frames=2) for _ in range(2))
-    general.base_env.set_seed(0)
-    root, other = short.reset(seed=3), general.reset(seed=3)
-    for _ in range(12):
-        action = short.action_spec.rand()
-        step, root = short.step_and_maybe_reset(root.set("action", action))
-        following, other = super(type(general), general).step_and_maybe_reset(
-            other.set("action", action)
-        )
-        assert (step == following).all()
-        assert (root == other).all()
-
-
 @pytest.mark.parametrize(
     ("actions", "spec", "shape"),
     [
@@ -230,12 +215,6 @@ def test_an_action_that_is_not_a_number_is_refused(dtype, clip):
     root = env.reset().set("action", torch.tensor([[1.0, 2.0], [3.0, torch.nan]]))
     with pytest.raises(ValueError, match=r"^the action \[3.0, nan\] is not a number: [^\n]*$"):
         env.step(root)
-
-
-def test_actions_without_bounds_are_unbounded():
-    env = echo(Box(-np.inf, np.inf, (2,)), clip_actions=False)
-    check_env_specs(env)
-    assert isinstance(env.action_spec, Unbounded)
 
 
 def test_masks_in_info():

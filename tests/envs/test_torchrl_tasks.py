@@ -14,14 +14,12 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import EnvBase, GymEnv
-from torchrl.envs.utils import check_env_specs
 
 from tests.envs.tasks import Corridor
 from tests.envs.test_spaces import kinds
 from tests.transforms.streams import assert_histories
 from torchrl_tit.envs import make_env
 from torchrl_tit.envs.torchrl_specs import TensorReader, action_spec
-from torchrl_tit.envs.torchrl_tasks import TorchRLTask
 
 CORRIDOR = "tests.envs.tasks:Corridor"
 
@@ -266,7 +264,3 @@ def test_one_line_says_what_is_wrong(name, settings, kind, words):
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match=r"UnboundedDiscrete .* are not supported, only floats"):
         action_spec(Unbounded((2,), dtype=torch.int64), clip=True)
-
-
-def test_one_task_alone():
-    check_env_specs(TorchRLTask(Corridor()))

@@ -1,7 +1,6 @@
 """History writes the last K observations of each environment, and nothing else."""
 
 import warnings
-from inspect import signature
 from typing import Any
 
 import pytest
@@ -11,7 +10,6 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
 from torchrl.envs import (
     CatFrames,
     Compose,
-    GymEnv,
     RewardSum,
     SerialEnv,
     TransformedEnv,
@@ -20,7 +18,6 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from tests.transforms.streams import StreamEnv, assert_histories
-from torchrl_tit.envs import make_env
 from torchrl_tit.transforms import History, frames_before
 
 
@@ -76,20 +73,6 @@ def test_several_observations():
     assert torch.equal(rollout["b"][..., -1, :], rollout["episode_reward"])
 
 
-@pytest.mark.parametrize("num_frames", [1, 4])
-def test_specs_tell_the_truth(num_frames):
-    env = TransformedEnv(GymEnv("CartPole-v1"), History(num_frames))
-    check_env_specs(env)
-    assert env.observation_spec["observation"].shape == (4,)
-    assert env.observation_spec["history"].shape == (num_frames, 4)
-
-
-def test_one_frame_is_stored_nowhere():
-    env = TransformedEnv(StreamEnv([2]), History(1))
-    env.rollout(3)
-    assert not env.state_dict()
-
-
 def test_is_torchrls_cat_frames_in_one_step():
     """The same as CatFrames after UnsqueezeTransform, entry by entry and buffer by buffer."""
     ours = TransformedEnv(StreamEnv([3]), History(4))
@@ -119,16 +102,6 @@ def test_a_new_environment_takes_the_state():
     assert torch.equal(*[each.state_dict()["_cat_buffers_observation"] for each in (env, other)])
 
 
-def test_what_was_written_is_never_written_again():
-    env = TransformedEnv(StreamEnv([2]), History(3))
-    root, kept = env.reset(), []
-    for _ in range(30):
-        step, root = env.step_and_maybe_reset(env.rand_action(root))
-        kept.append((step, step.clone()))
-    for written, copy in kept:
-        assert_close(written, copy, rtol=0, atol=0)
-
-
 def test_moves_to_an_environment_of_another_size():
     history = History(3)
     TransformedEnv(StreamEnv([2]), history).rollout(4)
@@ -143,13 +116,6 @@ def test_transforms_can_be_added_in_the_middle_of_an_episode():
     env.append_transform(RewardSum())
     step = env.step(env.rand_action(root.set("episode_reward", torch.zeros(2, 1))))["next"]
     assert torch.equal(step["history"], torch.stack([first, first, step["observation"]], 1))
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_moves_to_a_gpu():
-    env = TransformedEnv(make_env("CartPole-v1", 2, device="cuda").base_env, History(3))
-    assert env.reset()["history"].is_cuda
-    assert_histories(env, 3, "same")
 
 
 @pytest.mark.parametrize("padding", ["same", "constant"])
@@ -271,11 +237,6 @@ def test_steps_that_are_no_slices_are_refused():
         History(3)(flat[0])
 
 
-def test_takes_one_key_as_a_name():
-    env = TransformedEnv(StreamEnv([2]), History(2, "observation", "past"))
-    assert env.reset()["past"].shape == (2, 2, 3)
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "words"),
     [
@@ -302,16 +263,6 @@ def test_takes_one_key_as_a_name():
 def test_wrong_arguments(arguments, error, words):
     with pytest.raises(error, match=words):
         History(**arguments)
-
-
-OPTIONS = set(signature(CatFrames.__init__).parameters) - set(signature(History).parameters)
-
-
-@pytest.mark.parametrize("option", sorted(OPTIONS - {"self"}))
-def test_other_options_of_cat_frames_are_refused_by_name(option):
-    options: dict[str, Any] = {option: None}
-    with pytest.raises(TypeError, match=f"unexpected keyword argument '{option}'"):
-        History(2, **options)
 
 
 @pytest.mark.parametrize("wrap", [lambda history: history, lambda history: Compose(history)])

@@ -262,7 +262,7 @@ class History(CatFrames):
                 f"slices of {self.N} steps must be whole, so strict_length=False cannot be: use an "
                 "OnlineHistoryStorage, which pads the histories of an episode's first steps"
             )
-        cat_frames = CatFrames(self.N, self.dim, self.in_keys, self.out_keys)
+        cat_frames = CatFrames(self.N, self.dim, self.in_keys, self.out_keys, reset_key="_reset")
         _, sampler = cat_frames.make_rb_transform_and_sampler(batch_size, **sampler_kwargs)
         history = History(
             self.N,
