@@ -292,7 +292,7 @@ MIXED = Dict({"pose": Box(-1, 1, (2,)), "speech": Text(3)})
     [
         (BIG, {}, ValueError, r"\[9, 8, 7\].*`--image-layout HWC` or `--image-layout CHW`"),
         (Box(0, 1, (2, 9, 4)), {}, ValueError, "not clear whether its channels"),
-        (Box(0, 1, (2, 9, 4)), {"image_layout": "WHC"}, ValueError, "'HWC'.* not 'WHC'"),
+        (Box(0, 1, (2, 9, 4)), {"image_layout": "WHC"}, ValueError, "'WHC', not one of .*'HWC'"),
         (Box(0, 1, (2, 3, 4, 5)), {}, ValueError, "at most 3 dimensions.*FlattenObservation"),
         (Text(5), {}, ValueError, r"not supported: 'observation' \(Text\(.*Supported are Box"),
         (Sequence(Discrete(2)), {}, ValueError, "not supported: 'observation'.*Sequence"),

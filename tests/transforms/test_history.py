@@ -241,9 +241,9 @@ def test_steps_that_are_no_slices_are_refused():
     ("arguments", "error", "words"),
     [
         ({"num_frames": 0}, ValueError, "num_frames must be at least 1, not 0"),
-        ({"num_frames": 2.0}, TypeError, "num_frames must be an integer, not 2.0"),
+        ({"num_frames": 2.0}, ValueError, "'num_frames' is 2.0: Expected `int`"),
         ({"num_frames": 2, "observation_ndim": -1}, ValueError, "observation_ndim .* -1"),
-        ({"num_frames": 2, "padding": "zeros"}, ValueError, "'same', 'constant', not 'zeros'"),
+        ({"num_frames": 2, "padding": "zeros"}, ValueError, "'padding' is 'zeros', not one of"),
         ({"num_frames": 2, "in_keys": ["a", "b"]}, ValueError, r"in_keys=\['a', 'b'\]"),
         ({"num_frames": 2, "in_keys": [], "out_keys": []}, ValueError, "at least one"),
         ({"num_frames": 2, "out_keys": ["observation"]}, ValueError, "needs a key of its own"),

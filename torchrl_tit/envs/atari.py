@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,6 +15,8 @@ from torch import Tensor
 from torchrl.data import Categorical, Unbounded
 
 from torchrl_tit.envs.vector import GymVectorEnv
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Copies, Steps, StepsOrNone
 
 _NOOP, _FIRE = 0, 1
 _HEIGHT, _WIDTH = 210, 160  # of the screen
@@ -121,28 +123,20 @@ class AtariGames(VectorEnv):
         "render_fps": 60 // FRAME_SKIP,
     }
 
+    @checked_arguments
     def __init__(
         self,
         game: str,
-        num_envs: int = 1,
+        num_envs: Copies = 1,
         *,
-        noop_max: int = 30,
-        max_num_frames_per_episode: int = MAX_NUM_FRAMES,
-        render_mode: str | None = None,
+        noop_max: StepsOrNone = 30,
+        max_num_frames_per_episode: Steps = MAX_NUM_FRAMES,
+        render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
         from ale_py import roms  # an optional extra
 
         if game not in roms.get_all_rom_ids():
             raise ValueError(f"Unknown game {game!r}: ale-py has {roms.get_all_rom_ids()}.")
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode must be None or 'rgb_array', not {render_mode!r}")
-        for name, given, least in (
-            ("num_envs", num_envs, 1),
-            ("noop_max", noop_max, 0),
-            ("max_num_frames_per_episode", max_num_frames_per_episode, 1),
-        ):
-            if given < least:
-                raise ValueError(f"{name} must be at least {least}, not {given}")
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._noop_max = noop_max

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from torchrl.data import (
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.settings.arguments import checked_arguments
 
 ImageLayout = Literal["auto", "HWC", "CHW"]
 
@@ -84,6 +85,7 @@ class ObservationReader:
         {'camera': (3, 84, 84), 'gear': (1,)}
     """
 
+    @checked_arguments
     def __init__(
         self,
         space: Space,
@@ -92,7 +94,6 @@ class ObservationReader:
         image_layout: ImageLayout = "auto",
         mask_actions: bool = False,
     ) -> None:
-        check_layout(image_layout)
         found = dict(_leaf_spaces(space))
         masks = [name for name in found if mask_actions and _belongs(name, MASK)]
         self._mask_paths = [found.pop(name)[0] for name in masks]
@@ -255,13 +256,6 @@ def choose(
 def leaf_name(keys: Iterable[str]) -> str:
     """The name of a nested observation, without dots, which names of modules cannot have."""
     return "/".join(keys).replace(".", "_")
-
-
-def check_layout(layout: str) -> None:
-    """Raises ValueError if an image layout is unknown."""
-    if layout not in get_args(ImageLayout):
-        known = ", ".join(map(repr, get_args(ImageLayout)))
-        raise ValueError(f"image_layout must be one of {known}, not {layout!r}")
 
 
 def _leaf_spaces(

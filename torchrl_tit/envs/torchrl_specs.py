@@ -27,11 +27,11 @@ from torchrl_tit.envs.spaces import (
     ImageLayout,
     array_spec,
     categories_spec,
-    check_layout,
     choose,
     group,
     leaf_name,
 )
+from torchrl_tit.settings.arguments import checked_arguments
 
 Convert = Callable[[Tensor], Tensor]
 
@@ -60,6 +60,7 @@ class TensorReader:
         torch.Size([1])
     """
 
+    @checked_arguments
     def __init__(
         self,
         specs: Composite,
@@ -68,7 +69,6 @@ class TensorReader:
         image_layout: ImageLayout = "auto",
         mask_actions: bool = False,
     ) -> None:
-        check_layout(image_layout)
         found = {_name(key): (key, specs[key]) for key in specs.keys(True, True)}
         self.mask_key: NestedKey | None = None
         """Key of the action mask, if it is read."""

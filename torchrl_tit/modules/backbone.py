@@ -31,6 +31,7 @@ from torchrl_tit.modules.frame_cache import ActingNetwork
 from torchrl_tit.modules.sequences import SequenceKeys, default_observation_keys
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import HistoryNetwork, TwoTrunks
+from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.windows import Padding, Windows
 
 
@@ -126,6 +127,7 @@ class Backbone(TensorModule):
         torch.Size([5, 32])
     """
 
+    @checked_arguments
     def __init__(
         self,
         network: nn.Module,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -29,7 +28,7 @@ class SequenceKeys:
     """The keys that a backbone reads from sequences.
 
     Raises:
-        ValueError: if the numbers of observations and histories differ, or the padding is unknown.
+        ValueError: if the numbers of observations and histories differ.
     """
 
     histories: list[NestedKey]
@@ -47,9 +46,6 @@ class SequenceKeys:
                 f"there are histories under {self.histories}, but observation_keys is "
                 f"{self.observations}: name one for each"
             )
-        if self.padding not in (None, *get_args(Padding)):
-            known = ", ".join(map(repr, get_args(Padding)))
-            raise ValueError(f"padding must be one of {known} or None, not {self.padding!r}")
 
     def in_sequence(self, tensordict: TensorDictBase) -> bool:
         """Whether the last batch dimension of a tensordict is time."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any, get_args
+from typing import Annotated, Any
 
 import torch
+from msgspec import Meta
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.utils import expand_right
 from torch import Tensor
@@ -13,6 +14,8 @@ from torchrl.data import Composite, SliceSampler, TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import CatFrames, Compose, ExcludeTransform, Transform
 
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Size
 from torchrl_tit.windows import Padding, Windows, find_windows
 
 
@@ -44,11 +47,10 @@ class History(CatFrames):
             observation, ``"constant"`` writes zeros.
 
     Raises:
-        TypeError: If ``num_frames`` or ``observation_ndim`` is not an integer, or ``in_keys`` or
-            ``out_keys`` are no keys.
-        ValueError: If one of them is too small, the padding is unknown, the keys do not pair up, a
-            key under "next" is not that of an observation in ``in_keys``, or, when the transform is
-            added to an environment, its observation does not have ``observation_ndim`` dimensions.
+        TypeError: If ``in_keys`` or ``out_keys`` are no keys.
+        ValueError: If a number or the padding is invalid, the keys do not pair up, a key under
+            "next" is not that of an observation in ``in_keys``, or, when the transform is added to
+            an environment, its observation does not have ``observation_ndim`` dimensions.
         KeyError: If the environment has no such observation.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
@@ -61,20 +63,16 @@ class History(CatFrames):
         torch.Size([2, 4, 4])
     """
 
+    @checked_arguments
     def __init__(
         self,
-        num_frames: int,
+        num_frames: Size,
         in_keys: Sequence[NestedKey] | str = ("observation",),
         out_keys: Sequence[NestedKey] | str = ("history",),
         *,
-        observation_ndim: int = 1,
+        observation_ndim: Annotated[int, Meta(ge=0)] = 1,
         padding: Padding = "same",
     ) -> None:
-        _check_integer("num_frames", num_frames, minimum=1)
-        _check_integer("observation_ndim", observation_ndim, minimum=0)
-        if padding not in get_args(Padding):
-            known = ", ".join(map(repr, get_args(Padding)))
-            raise ValueError(f"padding must be one of {known}, not {padding!r}")
         observations, histories = _key_list("in_keys", in_keys), _key_list("out_keys", out_keys)
         _check_keys(observations, histories)
         observations, histories = _without_next(observations, histories)
@@ -326,13 +324,6 @@ def frames_before(env: EnvBase) -> dict[NestedKey, Tensor]:
 def _buffer_name(key: NestedKey) -> str:
     """The name that `CatFrames` gives the buffer of a key."""
     return f"_cat_buffers_{key}"
-
-
-def _check_integer(name: str, value: int, minimum: int) -> None:
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError(f"{name} must be an integer, not {value!r}")
-    if value < minimum:
-        raise ValueError(f"{name} must be at least {minimum}, not {value}")
 
 
 def _key_list(name: str, keys: Sequence[NestedKey] | str) -> list[NestedKey]:

@@ -8,6 +8,9 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
+from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.numbers import Positive, Size
+
 
 class SequenceHistory(Transform):
     """Writes the last K steps of the episode as Decision Transformer reads them.
@@ -53,20 +56,17 @@ class SequenceHistory(Transform):
         tensor([False,  True,  True])
     """
 
+    @checked_arguments
     def __init__(
         self,
-        num_frames: int = 20,
+        num_frames: Size = 20,
         *,
-        return_scale: float = 1000.0,
+        return_scale: Positive = 1000.0,
         observation_key: NestedKey = "observation",
         action_key: NestedKey = "action",
         target_return_key: NestedKey = "target_return",
         out_key: NestedKey = "sequence",
     ) -> None:
-        if num_frames < 1:
-            raise ValueError(f"num_frames must be at least 1, not {num_frames}")
-        if not return_scale > 0:
-            raise ValueError(f"return_scale must be positive, not {return_scale}")
         super().__init__(in_keys=[observation_key, target_return_key], out_keys=[out_key])
         self.num_frames = num_frames
         self.return_scale = return_scale
