@@ -22,6 +22,7 @@ from torchrl_tit.envs import observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.modules import Backbone
+from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
@@ -29,7 +30,6 @@ from .algorithm import Algorithm, Stateful, check_finite, numbers
 from .dataset_recipe import DatasetRecipe
 from .evaluation import Outcome
 from .networks import make_backbone, make_critic
-from .recipe import Padding
 from .task import make_task
 
 

@@ -20,13 +20,14 @@ from torchrl.envs import EnvBase
 
 from torchrl_tit.evaluation import evaluate, finished_returns
 from torchrl_tit.modules import ActingCollector
+from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps
 
 from .algorithm import Algorithm
 from .evaluation import Outcome
 from .ray_cluster import check_address
 from .ray_collector import ClusterCollector, check_cluster
-from .recipe import Padding, Recipe
+from .recipe import Recipe
 from .task import make_task, seed_copies
 
 

@@ -34,6 +34,7 @@ from torchrl_tit.networks import build_network, masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
 from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings import CoBERL
+from torchrl_tit.settings.choices import VectorizationMode
 from torchrl_tit.settings.numbers import (
     Batch,
     Fraction,
@@ -88,7 +89,7 @@ class PPO(OnlineRecipe, algorithm="ppo"):
 
     mask_actions: bool = False
     """Whether the policy chooses only actions that the task's action_mask allows."""
-    vectorization_mode: Literal["sync", "async"] = "sync"
+    vectorization_mode: VectorizationMode = "sync"
     """Whether environments run in this process ("sync") or in one process each ("async", for slow
     tasks)."""
     minibatch_size: Batch = 64

@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.checks import check_fields
+from torchrl_tit.settings.choices import ImageLayout
 from torchrl_tit.settings.literals import parse_assignments, parse_call
 from torchrl_tit.settings.numbers import Episodes, Seed, Steps, Threads
 from torchrl_tit.settings.parts import Names
@@ -21,8 +22,6 @@ except ModuleNotFoundError:  # an extra: only the command line reads this mark
 
 Compile = Literal["auto", "on", "off"]
 Precision = Literal["auto", "float32", "bfloat16"]
-Padding = Literal["same", "constant"]
-ImageLayout = Literal["auto", "HWC", "CHW"]
 
 
 @dataclass(frozen=True, kw_only=True)

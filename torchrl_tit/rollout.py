@@ -11,8 +11,9 @@ from torch.nn.functional import pad
 
 from torchrl_tit.modules import ActingCollector
 from torchrl_tit.modules.frame_tables import table_of_first
+from torchrl_tit.settings.choices import Padding
 from torchrl_tit.transforms import frames_before
-from torchrl_tit.windows import Padding, Windows, find_windows
+from torchrl_tit.windows import Windows, find_windows
 
 
 class FrameCollector(ActingCollector):

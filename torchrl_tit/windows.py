@@ -8,13 +8,12 @@ sets and environments.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-Padding = Literal["same", "constant"]
-"""Padding before an episode's first step: its first observation ("same") or zeros ("constant")."""
+from torchrl_tit.settings.choices import Padding
 
 
 class Windows(NamedTuple):

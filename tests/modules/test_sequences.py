@@ -24,7 +24,7 @@ from torchrl_tit import Backbone, EnhancedTIT, settings
 from torchrl_tit.envs import make_env
 from torchrl_tit.modules import make_value
 from torchrl_tit.networks import HistoryNetwork, TwoTrunks
-from torchrl_tit.windows import Padding
+from torchrl_tit.settings.choices import Padding
 
 pytestmark = pytest.mark.numerics
 

@@ -3,26 +3,33 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
+from torchrl.data import Bounded, MultiCategorical
 
-from recipes.algorithm import make_algorithm
-from recipes.registry import get_recipe
+from torchrl_tit import Backbone
+from torchrl_tit.modules import make_actor, make_squashed_actor, make_value
 from torchrl_tit.modules.tensor_module import TensorModule
+from torchrl_tit.networks import build_network
+from torchrl_tit.settings import NETWORKS
 
 
-@pytest.mark.parametrize(
-    "name", ["ppo/cartpole/enhanced-tit", "ppo/hopper/mlp", "sac/hopper/mlp", "dqn/cartpole/mlp"]
-)
-def test_policies_write_without_a_search(name, monkeypatch):
-    algorithm = make_algorithm(get_recipe(name))
-    td = algorithm.make_env(2, 0).reset()
+@pytest.mark.parametrize("trunks", ["shared", "separate"])
+def test_policies_write_without_a_search(trunks, monkeypatch):
+    keys = ["policy", "value"] if trunks == "separate" else ["policy"]
+    backbone = Backbone(build_network(NETWORKS["mlp"](2), (4,), trunks=trunks), out_keys=keys)
+    heads = [
+        make_actor(64, MultiCategorical([2, 3]), in_key="policy"),
+        make_squashed_actor(64, Bounded(-1, 1, (3,)), in_key="policy", action_key="squashed"),
+        make_value(64, in_key=keys[-1]),
+    ]
 
     def search(*args: object, **kwargs: object) -> None:
         raise AssertionError("TensorDict looks for data frames")
 
     monkeypatch.setattr(TensorDict, "from_any", search)
-    assert algorithm.policy(td)["action"].shape[0] == 2
+    td = TensorDictSequential(backbone, *heads)(TensorDict({"history": torch.randn(5, 2, 4)}, [5]))
+    assert td["squashed"].shape == (5, 3)
 
 
 @pytest.mark.parametrize("out_keys", [["y"], ["y", "z"], ["_", "z"], [("deep", "y"), "z"]])

@@ -22,8 +22,9 @@ from torchrl_tit.datasets.storages import (
     take,
 )
 from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Frames
-from torchrl_tit.windows import Padding, Windows, find_windows
+from torchrl_tit.windows import Windows, find_windows
 
 _STORED = [
     "observation",

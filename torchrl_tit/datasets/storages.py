@@ -17,8 +17,9 @@ from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 from torchrl_tit.datasets.checks import DatasetError
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Frames, Positive, Real
-from torchrl_tit.windows import Padding, find_windows
+from torchrl_tit.windows import find_windows
 
 Entries = dict[NestedKey, Tensor]
 TimeLimits = Literal["keep", "drop"]

@@ -10,8 +10,7 @@ from torchrl_tit.envs.factory import (
     make_games,
     time_limit,
 )
-from torchrl_tit.envs.gymnasium_tasks import VectorizationMode
-from torchrl_tit.envs.spaces import ImageLayout, observation_keys, observation_specs
+from torchrl_tit.envs.spaces import observation_keys, observation_specs
 from torchrl_tit.envs.torchrl_tasks import TorchRLTask
 from torchrl_tit.envs.vector import GymVectorEnv
 
@@ -19,10 +18,8 @@ __all__ = [
     "AtariEnv",
     "AtariGames",
     "GymVectorEnv",
-    "ImageLayout",
     "TorchRLTask",
     "TransformedVectorEnv",
-    "VectorizationMode",
     "is_atari",
     "make_env",
     "make_games",

@@ -12,18 +12,17 @@ from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.atari import FRAME_SKIP, MAX_NUM_FRAMES, AtariEnv, AtariGames
-from torchrl_tit.envs.gymnasium_tasks import VectorizationMode, make_gymnasium_tasks
+from torchrl_tit.envs.gymnasium_tasks import make_gymnasium_tasks
 from torchrl_tit.envs.names import find_task, load_wrappers, task_spec, unknown
-from torchrl_tit.envs.spaces import ImageLayout
 from torchrl_tit.envs.spaces import observation_keys as keys_of
 from torchrl_tit.envs.torchrl_tasks import make_torchrl_tasks
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.extras import install
 from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.choices import ImageLayout, Padding, VectorizationMode
 from torchrl_tit.settings.numbers import Copies, Seed
 from torchrl_tit.transforms.hide_velocities import HideVelocities
 from torchrl_tit.transforms.history import History
-from torchrl_tit.windows import Padding
 
 
 @checked_arguments

@@ -9,15 +9,14 @@ import sys
 import warnings
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from torchrl_tit.envs.names import Wrap, task_spec
 from torchrl_tit.settings.imports import load_plugins
-
-VectorizationMode = Literal["sync", "async"]
+from torchrl_tit.settings.choices import VectorizationMode
 
 _shown: set[str] = set()  # MuJoCo's warnings
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,8 +22,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.settings.arguments import checked_arguments
-
-ImageLayout = Literal["auto", "HWC", "CHW"]
+from torchrl_tit.settings.choices import ImageLayout
 
 _MAX_CHANNELS = 4
 _MAX_ORDER = 3  # of an observation: channels, height, width

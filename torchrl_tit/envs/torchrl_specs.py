@@ -24,7 +24,6 @@ from torchrl.data import (
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.actions import box_action_spec, refuse_nan
 from torchrl_tit.envs.spaces import (
-    ImageLayout,
     array_spec,
     categories_spec,
     choose,
@@ -32,6 +31,7 @@ from torchrl_tit.envs.spaces import (
     leaf_name,
 )
 from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.choices import ImageLayout
 
 Convert = Callable[[Tensor], Tensor]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.names import load_wrappers
 from torchrl_tit.envs.torchrl_specs import TensorReader, action_spec
+from torchrl_tit.settings.choices import ImageLayout, VectorizationMode
 
 
 class TorchRLTask(EnvBase):
@@ -51,7 +52,7 @@ class TorchRLTask(EnvBase):
         *,
         clip_actions: bool = True,
         observation_keys: Sequence[str] = (),
-        image_layout: Literal["auto", "HWC", "CHW"] = "auto",
+        image_layout: ImageLayout = "auto",
         mask_actions: bool = False,
     ) -> None:
         _check(env)
@@ -191,7 +192,7 @@ def make_torchrl_tasks(
     *,
     name: str,
     wrappers: Sequence[str] = (),
-    vectorization_mode: Literal["sync", "async"] = "sync",
+    vectorization_mode: VectorizationMode = "sync",
     device: torch.device | str | None = None,
     task_settings: dict[str, Any],
     **reading: Any,

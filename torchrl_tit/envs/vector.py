@@ -16,7 +16,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK, ActionMasks
 from torchrl_tit.envs.actions import ActionWriter
-from torchrl_tit.envs.spaces import ImageLayout, ObservationReader
+from torchrl_tit.envs.spaces import ObservationReader
+from torchrl_tit.settings.choices import ImageLayout
 
 
 class GymVectorEnv(EnvBase):

@@ -25,9 +25,9 @@ from torchrl_tit.export.task_action import TaskAction
 from torchrl_tit.modules.backbone import Backbone, trunks_of
 from torchrl_tit.modules.distributions import IndependentBernoulli
 from torchrl_tit.networks import HistoryNetwork
+from torchrl_tit.settings.choices import Padding
 from torchrl_tit.transforms import History, SequenceHistory
 from torchrl_tit.transforms.hide_velocities import HideEntries
-from torchrl_tit.windows import Padding
 
 
 @dataclass(frozen=True)

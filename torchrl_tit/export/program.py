@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from torchrl_tit.export.parts import Entry, Parts
 from torchrl_tit.histories.encoder import RecurrentEncoder
-from torchrl_tit.windows import Padding
+from torchrl_tit.settings.choices import Padding
 
 FIRST = "is_init"
 """Name of the input that marks the beginning of an episode, bool [N]."""

@@ -32,7 +32,8 @@ from torchrl_tit.modules.sequences import SequenceKeys, default_observation_keys
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import HistoryNetwork, TwoTrunks
 from torchrl_tit.settings.arguments import checked_arguments
-from torchrl_tit.windows import Padding, Windows
+from torchrl_tit.settings.choices import Padding
+from torchrl_tit.windows import Windows
 
 
 class Backbone(TensorModule):

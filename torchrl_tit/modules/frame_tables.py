@@ -8,7 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchrl_tit.windows import Padding, Windows, find_windows
+from torchrl_tit.settings.choices import Padding
+from torchrl_tit.windows import Windows, find_windows
 
 
 class FrameTable(NamedTuple):

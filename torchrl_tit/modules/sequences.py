@@ -20,7 +20,7 @@ from torchrl_tit.modules.frame_tables import (
 )
 from torchrl_tit.modules.torch_internals import is_transformed
 from torchrl_tit.networks import HistoryNetwork
-from torchrl_tit.windows import Padding
+from torchrl_tit.settings.choices import Padding
 
 
 @dataclass(frozen=True)

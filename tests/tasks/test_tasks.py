@@ -1,11 +1,15 @@
-"""The passive T-Maze: what decides its return."""
+"""The passive T-Maze, and tasks with fewer actions."""
+
+from collections.abc import Callable
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import Discrete
 from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common import env_checker
 
-from torchrl_tit.tasks import TMaze
+from torchrl_tit.tasks import FirstActions, TMaze
 
 RIGHT, UP, LEFT, DOWN = range(4)
 
@@ -94,3 +98,47 @@ def test_bad_lengths(length):
 def test_a_word_is_no_yes():
     with pytest.raises(ValueError, match="end_when_behind must be True or False, not 'no'"):
         gymnasium.make("TMaze-v0", end_when_behind="no")
+
+
+def test_other_actions_are_gone():
+    env = FirstActions(gymnasium.make("Taxi-v4"), 4)
+    assert env.action_space == Discrete(4)
+    env.reset(seed=0)
+    expected = gymnasium.make("Taxi-v4")
+    expected.reset(seed=0)
+    for action in (0, 3, 2, 1):
+        assert env.step(action)[0] == expected.step(action)[0]
+
+
+@pytest.mark.parametrize("count", [0, 7])
+def test_wrong_numbers_of_actions(count):
+    with pytest.raises(ValueError, match=f"from 1 to 6, the task's actions, not {count}"):
+        FirstActions(gymnasium.make("Taxi-v4"), count)
+
+
+def test_other_kinds_of_actions():
+    with pytest.raises(ValueError, match="needs Discrete actions, not Box"):
+        FirstActions(gymnasium.make("Pendulum-v1"), 1)
+
+
+def test_a_spec_recreates_the_wrapper():
+    env = FirstActions(gymnasium.make("Taxi-v4"), 4)
+    assert env.spec is not None
+    again = gymnasium.make(env.spec)
+    assert again.action_space == Discrete(4)
+    assert again.spec == env.spec
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: TMaze(3),
+        lambda: TMaze(3, render_mode="rgb_array", end_when_behind=True),
+        lambda: gymnasium.make("TMaze-v0", corridor_length=1),
+        lambda: FirstActions(gymnasium.make("FrozenLake-v1"), count=3),
+    ],
+    ids=["t-maze", "t-maze-that-ends", "registered", "first-actions"],
+)
+def test_checker_of_stable_baselines3(make: Callable[[], gymnasium.Env]) -> None:
+    env_checker.check_env(make())
