@@ -40,27 +40,27 @@ def evaluate(
     NumPy and Python.
 
     Args:
-        env: An environment of any batch size whose `reset` takes a seed, as those of
+        env: an environment of any batch size whose `reset` takes a seed, as those of
             :func:`~torchrl_tit.envs.make_env` and TorchRL's `GymWrapper` do, and whose rewards are
             the task's own, not clipped. It is reset, which ends its current episodes. Or a function
             that makes an environment with a given number of copies; it is called with ``episodes``,
             and the environment is closed at the end.
-        policy: Writes the action into the tensordict. It acts in evaluation mode.
-        episodes: Number of episodes.
-        seed: Seed of the first episode.
-        reward_key: Key of the reward in "next".
-        shrink: Whether the policy is called only for environments whose first episode is still
+        policy: writes the action into the tensordict. It acts in evaluation mode.
+        episodes: number of episodes.
+        seed: seed of the first episode.
+        reward_key: key of the reward in "next".
+        shrink: whether the policy is called only for environments whose first episode is still
             running, which saves time if episodes differ in length. The policy must accept batches
             of any size and keep no state from step to step.
-        deterministic: Whether to take the distribution's deterministic action (its mode or mean)
+        deterministic: whether to take the distribution's deterministic action (its mode or mean)
             instead of a sample.
 
     Returns:
         The undiscounted return of each episode; float64 [episodes], on the environment's device.
 
     Raises:
-        ValueError: If ``episodes`` is less than 1.
-        FloatingPointError: If a reward in one of these episodes is NaN or infinite.
+        ValueError: if ``episodes`` is less than 1.
+        FloatingPointError: if a reward in one of these episodes is NaN or infinite.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
     2212.14538), section 4: the final model over 100 episodes.
@@ -90,7 +90,7 @@ def watching_episodes(ended: Callable[[int], Any]) -> Iterator[None]:
     """Calls a function with the number of episodes that have just ended, to show progress.
 
     Args:
-        ended: The function.
+        ended: the function.
 
     Example:
         >>> from torchrl.data import Categorical
@@ -173,14 +173,14 @@ def finished_returns(batch: TensorDictBase) -> Tensor:
     """Returns the returns of the episodes, or of the whole Atari games, that ended in a batch.
 
     Args:
-        batch: Steps of environments of :func:`~torchrl_tit.envs.make_env`, as a collector returns
+        batch: steps of environments of :func:`~torchrl_tit.envs.make_env`, as a collector returns
             them; any shape.
 
     Returns:
         The undiscounted return of each episode, in the task's own rewards; [episodes].
 
     Raises:
-        FloatingPointError: If a reward in the batch is NaN or infinite.
+        FloatingPointError: if a reward in the batch is NaN or infinite.
 
     Example:
         >>> from torchrl_tit.envs import make_env
@@ -200,10 +200,10 @@ def check_rewards(rewards: Tensor) -> None:
     """Checks that rewards are finite.
 
     Args:
-        rewards: Rewards of N copies of a task, [N] or [N, time].
+        rewards: rewards of N copies of a task, [N] or [N, time].
 
     Raises:
-        FloatingPointError: If one is NaN or infinite.
+        FloatingPointError: if one is NaN or infinite.
 
     Example:
         >>> check_rewards(torch.tensor([0.5, torch.inf]))

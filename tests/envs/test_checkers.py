@@ -71,8 +71,10 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 
 
 @pytest.mark.filterwarnings("ignore:The observation '(mission|speech)'")
-@pytest.mark.parametrize(("num_envs", "num_frames"), [(1, 1), (2, 3)])
-@pytest.mark.parametrize("kind", TASKS)
+@pytest.mark.parametrize(
+    ("kind", "num_envs", "num_frames"),
+    [*((kind, 2, 3) for kind in TASKS), ("MuJoCo", 1, 1), ("a dictionary and masks", 1, 1)],
+)
 def test_specs_tell_the_truth(kind: str, num_envs: int, num_frames: int) -> None:
     name, settings = TASKS[kind]
     env = make_env(name, num_envs, seed=0, num_frames=num_frames, **settings)

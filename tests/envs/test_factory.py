@@ -10,27 +10,6 @@ from torchrl_tit.envs import gymnasium_tasks, make_env
 from torchrl_tit.settings.imports import import_allowed
 
 
-@pytest.mark.parametrize(
-    ("name", "observation", "action"),
-    [
-        ("CartPole-v1", (4,), ()),
-        ("Acrobot-v1", (6,), ()),
-        ("MountainCar-v0", (2,), ()),
-        ("HalfCheetah-v5", (17,), (6,)),
-        ("Ant-v5", (105,), (8,)),
-    ],
-)
-def test_tasks(name, observation, action):
-    env = make_env(name, 2, num_frames=3)
-    rollout = env.rollout(4)
-    assert env.batch_size == (2,)
-    assert rollout["observation"].shape == (2, 4, *observation)
-    assert rollout["history"].shape == (2, 4, 3, *observation)
-    assert rollout["history"].dtype is torch.float32
-    assert rollout["action"].shape == (2, 4, *action)
-    env.close()
-
-
 def lean(root):
     """Pushes the cart to the side that the pole leans to; the same rule for every copy."""
     return root.set("action", (root["observation"][:, 2] > 0).long())

@@ -82,15 +82,6 @@ def test_features_are_those_of_the_full_pass_whatever_comes(name, padding):
             assert_exact(backbone, streams.step(torch.rand(5) < 0.2))
 
 
-def test_a_wrong_token_would_show():
-    backbone, network, shape = make()
-    stream = torch.randn(5, 6, *shape)
-    with backbone.acting():
-        history = fill(backbone, stream)
-        cache_of(backbone).tokens.entries[0, 1] *= -1
-        assert not torch.allclose(features(backbone, history), network(history), rtol=0, atol=1e-6)
-
-
 @pytest.mark.parametrize("name", ["enhanced", "images"])
 def test_only_new_frames_are_encoded(name):
     backbone, network, shape = make(name, steps=6)

@@ -1,7 +1,5 @@
 """A backbone that carries a recurrent state, step by step and over whole sequences."""
 
-import copy
-
 import pytest
 import torch
 from tensordict import TensorDict
@@ -180,16 +178,6 @@ def test_a_collector_registers_what_the_policy_needs(name, trunks, num_frames):
     for key in backbone.features_keys:
         assert_near(again[key], batch[key])
     collector.shutdown()
-
-
-def test_copies_and_acting_mode_change_nothing():
-    backbone = make_backbone()
-    td = sequences(backbone)[:, 0]
-    assert not backbone.keeps_frames
-    expected = backbone(td.clone())
-    with acting(backbone), torch.no_grad():
-        assert_near(backbone(td.clone())["features"], expected["features"])
-        assert_near(copy.deepcopy(backbone)(td.clone())["features"], expected["features"])
 
 
 @pytest.mark.usefixtures("float64")

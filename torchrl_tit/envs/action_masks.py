@@ -17,10 +17,10 @@ class ActionMasks:
 
     Args:
         num_envs: N.
-        space: The action space of one task.
+        space: the action space of one task.
 
     Raises:
-        ValueError: If actions of that kind cannot be masked.
+        ValueError: if actions of that kind cannot be masked.
 
     Example:
         >>> masks = ActionMasks(2, Discrete(3))

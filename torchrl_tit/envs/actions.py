@@ -18,12 +18,12 @@ class ActionWriter:
     """Converts actions from tensordicts for a vector of Gymnasium tasks.
 
     Args:
-        space: The action space of one task.
-        clip: Whether continuous actions are clipped to their bounds, so that their spec is
+        space: the action space of one task.
+        clip: whether continuous actions are clipped to their bounds, so that their spec is
             unbounded. Actions of a Box of integers are rounded and clipped in either case.
 
     Raises:
-        ValueError: If actions of that kind are not supported.
+        ValueError: if actions of that kind are not supported.
 
     Example:
         >>> write = ActionWriter(Discrete(3, start=-1), clip=True)
@@ -71,7 +71,7 @@ class ActionWriter:
         """Converts actions [N, *spec] to the tasks' actions, [N, *space].
 
         Raises:
-            ValueError: If an action is NaN.
+            ValueError: if an action is NaN.
         """
         if actions.dtype.kind == "f":
             refuse_nan(actions)

@@ -46,8 +46,8 @@ class AtariEnv(GymVectorEnv):
     entry starts new games in all copies.
 
     Args:
-        games: The games.
-        device: Device of the tensors; by default they stay on the CPU and the device is None.
+        games: the games.
+        device: device of the tensors; by default they stay on the CPU and the device is None.
 
     Example:
         >>> env = AtariEnv(AtariGames("pong", num_envs=2))
@@ -87,21 +87,21 @@ class AtariGames(VectorEnv):
     ale-py's `AtariVectorEnv` emulates and scales in its own threads. There is one instance per
     game, since an instance cannot step only some of its games (those that lost a life), and its own
     options for lost lives either end the game or never press fire. The conversion from scaled
-    colours to grey is done here, since the grey of the maximum of colours is not the maximum of the
+    colors to grey is done here, since the grey of the maximum of colors is not the maximum of the
     greys. `AtariWrapper` converts before it scales; the difference is one grey level of rounding.
 
     Games that are reset with the same seed and given the same actions repeat exactly.
 
     Args:
-        game: The name of ale-py's ROM file, such as "ms_pacman".
+        game: the name of ale-py's ROM file, such as "ms_pacman".
         num_envs: N, the number of games.
-        noop_max: Maximum number of no-op frames at the start of a game; 0 for none.
-        max_num_frames_per_episode: Number of frames (4 for each action) after which a game is
+        noop_max: maximum number of no-op frames at the start of a game; 0 for none.
+        max_num_frames_per_episode: number of frames (4 for each action) after which a game is
             truncated, not counting the no-op frames at its start.
         render_mode: ``"rgb_array"`` emulates each game a second time, for images in full size.
 
     Raises:
-        ValueError: If the game or the render mode is unknown, or a number of games or frames is
+        ValueError: if the game or the render mode is unknown, or a number of games or frames is
             too small.
 
     Source: "Human-level control through deep reinforcement learning" (Mnih et al., 2015), methods.
@@ -175,7 +175,7 @@ class AtariGames(VectorEnv):
         """Starts episodes, each with a new game or with the next life.
 
         Args:
-            seed: Copy i gets ``seed + i``, or entry i of a sequence.
+            seed: copy i gets ``seed + i``, or entry i of a sequence.
             options: ``"reset_mask"``, bool [N], selects the copies to reset; those that lost a life
                 continue their game. Without a mask, or with a seed, all copies start new games.
 
@@ -225,7 +225,7 @@ class AtariGames(VectorEnv):
         """Returns the screen of each game, uint8 [210, 160, 3].
 
         Raises:
-            ValueError: If the games were made without ``render_mode="rgb_array"``.
+            ValueError: if the games were made without ``render_mode="rgb_array"``.
         """
         if self.render_mode is None:
             raise ValueError('Games are rendered only with render_mode="rgb_array".')

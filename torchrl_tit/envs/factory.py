@@ -68,37 +68,37 @@ def make_env(
     ======================  ==================  ===================================================
 
     Args:
-        name: A name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". In
+        name: a name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". In
             "module:Name-v0", the module registers the name. In "module:Name", the name is that of a
             class or function in the module that makes a TorchRL `EnvBase`: see
             :class:`~torchrl_tit.envs.torchrl_tasks.TorchRLTask`. The module is imported, so pass no
             names from strangers. Names that begin with "ALE/", such as "ALE/Pong-v5", are Atari
             games with the preprocessing of :class:`~torchrl_tit.envs.AtariGames`.
         num_envs: N, the number of copies; the batch size is [N], also for N = 1.
-        seed: Copy i is seeded with ``seed + i``; without a seed, all differ from run to run.
+        seed: copy i is seeded with ``seed + i``; without a seed, all differ from run to run.
         num_frames: K, the number of observations in a history.
-        padding: How a history is padded before an episode's first step: see
+        padding: how a history is padded before an episode's first step: see
             :class:`~torchrl_tit.transforms.History`.
-        keep_histories: Whether a step keeps its histories after it is taken. If not,
+        keep_histories: whether a step keeps its histories after it is taken. If not,
             ``step_and_maybe_reset`` removes them, also from "next", and a collector stores
             observations only; the tensordict on which the policy acts has its histories in either
             case.
-        hide_velocities: Whether observations and histories lack the velocities: see
+        hide_velocities: whether observations and histories lack the velocities: see
             :class:`~torchrl_tit.transforms.HideVelocities`.
-        clip_actions: Whether continuous actions are clipped before they are passed to the task: see
+        clip_actions: whether continuous actions are clipped before they are passed to the task: see
             :class:`~torchrl_tit.envs.GymVectorEnv`.
-        observation_keys: Names of the observations to keep, for a task with several; by default,
+        observation_keys: names of the observations to keep, for a task with several; by default,
             all. See :class:`~torchrl_tit.envs.GymVectorEnv`.
-        image_layout: Where the task's images have their channels: ``"HWC"``, ``"CHW"``, or
+        image_layout: where the task's images have their channels: ``"HWC"``, ``"CHW"``, or
             ``"auto"``, which infers it from their shape.
-        mask_actions: Whether to write which actions the task allows.
+        mask_actions: whether to write which actions the task allows.
         wrappers: Gymnasium wrappers and TorchRL transforms around each copy, the innermost first,
             as "module:Class" or "module:Class(argument=literal)".
         vectorization_mode: ``"sync"`` steps the copies one after the other in this process,
             ``"async"`` in parallel, in one process each, with the same results, which pays off for
             slow tasks. Atari games always run in parallel, in threads.
-        device: Device of the tensors; by default they stay on the CPU and the device is None.
-        **kwargs: Passed to `gymnasium.make`, such as ``max_episode_steps=200``, to the class or
+        device: device of the tensors; by default they stay on the CPU and the device is None.
+        **kwargs: passed to `gymnasium.make`, such as ``max_episode_steps=200``, to the class or
             function of the TorchRL environment, or to :class:`~torchrl_tit.envs.AtariGames`.
 
     Returns:
@@ -106,7 +106,7 @@ def make_env(
         :class:`~torchrl_tit.envs.AtariEnv`.
 
     Raises:
-        ValueError: If the name or the mode is unknown, a wrapper or a setting of the task is
+        ValueError: if the name or the mode is unknown, a wrapper or a setting of the task is
             wrong, a package that the task needs is missing, ``num_envs``, ``num_frames`` or the
             padding is invalid, observations or actions are of an unsupported kind, ``"async"`` is
             given for Atari games, or it is not known which observations are velocities.
@@ -258,7 +258,7 @@ def is_atari(name: str) -> bool:
     """Returns whether a name is that of an Atari game, which begins with "ALE/".
 
     Args:
-        name: A name that Gymnasium may have registered.
+        name: a name that Gymnasium may have registered.
 
     Returns:
         Whether it is an Atari game.
@@ -274,7 +274,7 @@ def time_limit(name: str) -> int | None:
     """Returns the number of steps after which the episodes of a task are truncated.
 
     Args:
-        name: A name that :func:`make_env` accepts.
+        name: a name that :func:`make_env` accepts.
 
     Returns:
         The number of steps, or None for a task without a time limit.
@@ -293,15 +293,15 @@ def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
     """Makes copies of an Atari game by Gymnasium's name, as :func:`make_env` does.
 
     Args:
-        name: A name such as "ALE/Pong-v5".
-        num_envs: The number of copies.
-        **kwargs: Passed to :class:`~torchrl_tit.envs.AtariGames`.
+        name: a name such as "ALE/Pong-v5".
+        num_envs: the number of copies.
+        **kwargs: passed to :class:`~torchrl_tit.envs.AtariGames`.
 
     Returns:
         The games.
 
     Raises:
-        ValueError: If the name is unknown, or ale-py is missing.
+        ValueError: if the name is unknown, or ale-py is missing.
 
     Example:
         >>> make_games("ALE/Pong-v5").single_observation_space

@@ -31,7 +31,7 @@ def find_task(name: str) -> str | Callable[..., EnvBase]:
     """Resolves a task's name, and registers it with Gymnasium if necessary.
 
     Args:
-        name: A name that Gymnasium has registered; one from a package that this library knows, such
+        name: a name that Gymnasium has registered; one from a package that this library knows, such
             as "MiniGrid-Empty-5x5-v0"; "module:Name-v0", where the module registers the name; or
             "module:Name", a class or function in the module that makes a TorchRL environment.
 
@@ -39,7 +39,7 @@ def find_task(name: str) -> str | Callable[..., EnvBase]:
         The name for `gymnasium.make`, or the class or function.
 
     Raises:
-        ValueError: If there is no such name, module or class, the module cannot be imported, or it
+        ValueError: if there is no such name, module or class, the module cannot be imported, or it
             is neither a registered name nor something that makes a TorchRL environment.
 
     Example:
@@ -133,7 +133,7 @@ def load_wrappers(names: Sequence[str]) -> tuple[list[Wrap], list[Transform]]:
         Functions that apply the Gymnasium wrappers to a task, and the transforms.
 
     Raises:
-        ValueError: If there is no such class, it is of another kind, its arguments are invalid, or
+        ValueError: if there is no such class, it is of another kind, its arguments are invalid, or
             a wrapper comes after a transform.
 
     Example:

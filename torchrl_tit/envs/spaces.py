@@ -33,10 +33,10 @@ class Leaf:
     """One observation of a task.
 
     Args:
-        path: Keys and indices that lead to it in the task's return value.
-        spec: One of the kinds that :func:`observation_specs` lists, without batch dimensions.
-        channels_last: Whether the task's images are (height, width, channels).
-        start: The integer from which the task's categories are counted, for each or one for all.
+        path: keys and indices that lead to it in the task's return value.
+        spec: one of the kinds that :func:`observation_specs` lists, without batch dimensions.
+        channels_last: whether the task's images are (height, width, channels).
+        start: the integer from which the task's categories are counted, for each or one for all.
     """
 
     path: tuple[str | int, ...]
@@ -48,7 +48,7 @@ class Leaf:
         """Converts the task's values to the spec's shape and dtype.
 
         Args:
-            values: Observations of N copies, [N, *space]; they are copied.
+            values: observations of N copies, [N, *space]; they are copied.
 
         Returns:
             The observations, [N, *spec].
@@ -67,14 +67,14 @@ class ObservationReader:
     """Reads the observations that a vector of Gymnasium tasks returns.
 
     Args:
-        space: The observation space of one task.
-        keys: Names of the observations to keep, or of groups of them; if empty, all.
-        image_layout: Order of the dimensions of the task's images: ``"HWC"`` (height, width,
+        space: the observation space of one task.
+        keys: names of the observations to keep, or of groups of them; if empty, all.
+        image_layout: order of the dimensions of the task's images: ``"HWC"`` (height, width,
             channels), ``"CHW"``, or ``"auto"``, which infers it from the shape.
-        mask_actions: Whether "action_mask" is the mask of the actions instead of an observation.
+        mask_actions: whether "action_mask" is the mask of the actions instead of an observation.
 
     Raises:
-        ValueError: If no observation is of a supported kind, or one of ``keys`` is not; if a key is
+        ValueError: if no observation is of a supported kind, or one of ``keys`` is not; if a key is
             unknown; or if the layout of an image cannot be inferred.
 
     Example:
@@ -112,7 +112,7 @@ class ObservationReader:
         """Reads the observations.
 
         Args:
-            values: The observations that the vector of N tasks returned.
+            values: the observations that the vector of N tasks returned.
 
         Returns:
             The only observation [N, *obs], or each by its name; none shares memory with ``values``.
@@ -138,7 +138,7 @@ def observation_specs(env: EnvBase) -> TensorSpec | dict[str, TensorSpec]:
     ===========  ==================================================================================
 
     Args:
-        env: An environment of :func:`~torchrl_tit.envs.make_env`, or any whose observations are
+        env: an environment of :func:`~torchrl_tit.envs.make_env`, or any whose observations are
             under "observation".
 
     Returns:
@@ -189,7 +189,7 @@ def array_spec(
     """The spec of an array or an image, and whether the task's channels come last.
 
     Raises:
-        ValueError: If it has more than three dimensions, or the channel dimension of an image
+        ValueError: if it has more than three dimensions, or the channel dimension of an image
             cannot be inferred.
     """
     if len(shape) > _MAX_ORDER:
@@ -213,16 +213,16 @@ def choose(
     """Chooses the observations to read.
 
     Args:
-        found: The task's observations by name: the path, and the space or spec.
-        keys: Names, or prefixes of names before "/"; if empty, all.
-        supported: Returns whether a value of ``found`` is of a supported kind.
+        found: the task's observations by name: the path, and the space or spec.
+        keys: names, or prefixes of names before "/"; if empty, all.
+        supported: returns whether a value of ``found`` is of a supported kind.
 
     Returns:
         The chosen observations, in the task's order. If there are no keys, unsupported ones are
         left out with a warning.
 
     Raises:
-        ValueError: If a key is unknown or of an unsupported kind, or nothing is left.
+        ValueError: if a key is unknown or of an unsupported kind, or nothing is left.
     """
     for key in keys:
         if not any(_belongs(name, key) for name in found):

@@ -43,14 +43,14 @@ class TensorReader:
     """Reads the observations of a TorchRL environment without batch dimensions.
 
     Args:
-        specs: The specs of its observations.
-        keys: Names of the observations to keep, or of groups of them; by default, all except the
+        specs: the specs of its observations.
+        keys: names of the observations to keep, or of groups of them; by default, all except the
             counters of TorchRL's transforms.
-        image_layout: See :class:`~torchrl_tit.envs.spaces.ObservationReader`.
-        mask_actions: Whether "action_mask" is the mask of the actions instead of an observation.
+        image_layout: see :class:`~torchrl_tit.envs.spaces.ObservationReader`.
+        mask_actions: whether "action_mask" is the mask of the actions instead of an observation.
 
     Raises:
-        ValueError: If no observation is of a supported kind, or one of ``keys`` is not; if a key is
+        ValueError: if no observation is of a supported kind, or one of ``keys`` is not; if a key is
             unknown; if there is no mask; or if the layout of an image cannot be inferred.
 
     Example:
@@ -99,15 +99,15 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
     """Converts the spec of a TorchRL environment's action.
 
     Args:
-        found: Its spec, without batch dimensions.
-        clip: Whether continuous actions are clipped to their bounds, so that their spec is
+        found: its spec, without batch dimensions.
+        clip: whether continuous actions are clipped to their bounds, so that their spec is
             unbounded.
 
     Returns:
         The spec of our action, and the function that converts it to the environment's.
 
     Raises:
-        ValueError: If the action is of an unsupported kind.
+        ValueError: if the action is of an unsupported kind.
 
     Example:
         >>> spec, convert = action_spec(OneHot(3), clip=True)

@@ -28,14 +28,14 @@ class TorchRLTask(EnvBase):
     environment itself reads from step to step are kept internally.
 
     Args:
-        env: The environment, without batch dimensions.
-        clip_actions: See :class:`~torchrl_tit.envs.GymVectorEnv`, also for the next three.
-        observation_keys: Names of the observations to keep; all by default.
-        image_layout: Where images have their channels.
-        mask_actions: Whether an observation "action_mask" marks the allowed actions.
+        env: the environment, without batch dimensions.
+        clip_actions: see :class:`~torchrl_tit.envs.GymVectorEnv`, also for the next three.
+        observation_keys: names of the observations to keep; all by default.
+        image_layout: where images have their channels.
+        mask_actions: whether an observation "action_mask" marks the allowed actions.
 
     Raises:
-        ValueError: If its observations or actions are of an unsupported kind, or it has a batch
+        ValueError: if its observations or actions are of an unsupported kind, or it has a batch
             size, several actions, several rewards, or separate done flags for parts of it. See also
             :class:`~torchrl_tit.envs.torchrl_specs.TensorReader`.
 
@@ -118,7 +118,7 @@ class TorchRLTask(EnvBase):
             uint8 [height, width, 3].
 
         Raises:
-            ValueError: If it has neither.
+            ValueError: if it has neither.
         """
         own = getattr(self._env, "render", None)
         picture = own() if callable(own) else None
@@ -177,7 +177,7 @@ class SerialTasks(_SeededCopies, SerialEnv):
         """Renders the copies; uint8 [N, height, width, 3].
 
         Raises:
-            ValueError: If they cannot be rendered.
+            ValueError: if they cannot be rendered.
         """
         return np.stack([copy.render() for copy in self._envs])
 
@@ -200,23 +200,23 @@ def make_torchrl_tasks(
     """Makes copies of a TorchRL environment, as an environment of batch size [N].
 
     Args:
-        make: A class or function that makes an environment without batch dimensions.
+        make: a class or function that makes an environment without batch dimensions.
         num_envs: N.
-        name: The task's name, for error messages.
+        name: the task's name, for error messages.
         wrappers: TorchRL transforms around each copy, in the format of
             :func:`~torchrl_tit.envs.wrappers.load_wrappers`.
         vectorization_mode: ``"sync"`` steps the copies in this process (`SerialEnv`), ``"async"``
             in one process each (`ParallelEnv`).
-        device: Device of the tensors.
-        task_settings: Passed to ``make``. If ``make`` has no ``max_episode_steps``, TorchRL's
+        device: device of the tensors.
+        task_settings: passed to ``make``. If ``make`` has no ``max_episode_steps``, TorchRL's
             `StepCounter` truncates the episodes.
-        **reading: See :class:`TorchRLTask`.
+        **reading: see :class:`TorchRLTask`.
 
     Returns:
         The environment.
 
     Raises:
-        ValueError: See :class:`TorchRLTask`; or if a setting or a wrapper is invalid.
+        ValueError: see :class:`TorchRLTask`; or if a setting or a wrapper is invalid.
 
     Example:
         >>> from torchrl.envs import PendulumEnv

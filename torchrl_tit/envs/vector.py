@@ -52,22 +52,22 @@ class GymVectorEnv(EnvBase):
     ValueError if an action is NaN.
 
     Args:
-        env: The vector environment, made with ``autoreset_mode=AutoresetMode.DISABLED``. Its
+        env: the vector environment, made with ``autoreset_mode=AutoresetMode.DISABLED``. Its
             observations can be Box, Discrete, MultiDiscrete and MultiBinary, and Dict and Tuple of
             these, its actions Box, Discrete, MultiDiscrete and MultiBinary.
-        clip_actions: Whether continuous actions are clipped and their spec is unbounded. Otherwise
+        clip_actions: whether continuous actions are clipped and their spec is unbounded. Otherwise
             they are passed on unchanged, and the spec has the task's bounds, as the nearest float32
             within them. Integers (a Box of them) are rounded and clipped in either case.
-        observation_keys: Names of the observations to keep; all by default.
-        image_layout: Where images have their channels: ``"HWC"``, ``"CHW"``, or ``"auto"``, which
+        observation_keys: names of the observations to keep; all by default.
+        image_layout: where images have their channels: ``"HWC"``, ``"CHW"``, or ``"auto"``, which
             infers it from their shape.
-        mask_actions: Whether to write which actions are allowed: the task's observation
+        mask_actions: whether to write which actions are allowed: the task's observation
             "action_mask" (then not written as an observation), or the entry of that name in its
             ``info``.
-        device: Device of the tensors; by default they stay on the CPU and the device is None.
+        device: device of the tensors; by default they stay on the CPU and the device is None.
 
     Raises:
-        ValueError: If the vector environment resets itself, observations or actions are of another
+        ValueError: if the vector environment resets itself, observations or actions are of another
             kind, there is no observation of that name, the layout of an image cannot be inferred,
             or the task has no action mask.
 
@@ -217,7 +217,7 @@ class GymVectorEnv(EnvBase):
             One image per task; uint8 [N, height, width, 3].
 
         Raises:
-            ValueError: If the tasks cannot be rendered.
+            ValueError: if the tasks cannot be rendered.
         """
         pictures = self._env.render() or (None,)
         if pictures[0] is None:
@@ -254,7 +254,7 @@ class GymVectorEnv(EnvBase):
         """Closes the tasks.
 
         Args:
-            raise_if_closed: As in TorchRL, but closing twice is allowed.
+            raise_if_closed: as in TorchRL, but closing twice is allowed.
         """
         self._env.close()
         super().close(raise_if_closed=raise_if_closed)

@@ -273,11 +273,11 @@ class _Linear(nn.Linear):
     """A linear layer whose weights start orthogonal and whose bias starts at 0."""
 
     def __init__(self, in_features: int, out_features: int, gain: float) -> None:
-        self.gain = gain  # first, because nn.Linear initialises itself
+        self.gain = gain  # first, because nn.Linear initializes itself
         super().__init__(in_features, out_features)
 
     def reset_parameters(self) -> None:
-        """Initialises the weights and the bias."""
+        """Initializes the weights and the bias."""
         super().reset_parameters()
         init_orthogonal_(self, gain=self.gain)
 
@@ -286,7 +286,7 @@ class _Scale(AddStateIndependentNormalScale):
     """TensorDict's scale of a Gaussian, whose logarithm can be set back to 0."""
 
     def reset_parameters(self) -> None:
-        """Initialises the logarithm of the scale."""
+        """Initializes the logarithm of the scale."""
         nn.init.zeros_(self.state_independent_scale)
 
 

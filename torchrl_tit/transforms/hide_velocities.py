@@ -28,12 +28,12 @@ class HideEntries(ObservationTransform):
     for both keys.
 
     Args:
-        hidden: Indices of the entries to remove.
-        in_keys: Keys of the observations, which may be nested. One of shape [..., D] becomes
+        hidden: indices of the entries to remove.
+        in_keys: keys of the observations, which may be nested. One of shape [..., D] becomes
             [..., D - len(hidden)].
 
     Raises:
-        ValueError: If ``hidden`` names an entry twice; or, when the specs of an environment with
+        ValueError: if ``hidden`` names an entry twice; or, when the specs of an environment with
             the transform are read, if it names an entry that does not exist, or all entries.
 
     Example:
@@ -64,13 +64,13 @@ class HideEntries(ObservationTransform):
         """Removes the entries from the specs.
 
         Args:
-            observation_spec: The specs before this transform.
+            observation_spec: the specs before this transform.
 
         Returns:
             The same specs, with fewer entries under ``in_keys``.
 
         Raises:
-            ValueError: If an entry to hide does not exist, or none would be left.
+            ValueError: if an entry to hide does not exist, or none would be left.
         """
         for key in self.in_keys:
             observation_spec[key] = self._spec(observation_spec[key])
@@ -100,11 +100,11 @@ class HideVelocities(HideEntries):
     The velocities can be inferred from several observations, so a history makes up for them.
 
     Args:
-        task: Name of the task, with or without its version, such as "CartPole-v1" or "Hopper".
-        in_keys: See :class:`HideEntries`.
+        task: name of the task, with or without its version, such as "CartPole-v1" or "Hopper".
+        in_keys: see :class:`HideEntries`.
 
     Raises:
-        ValueError: If the velocities of this task are unknown, or if, when the specs of an
+        ValueError: if the velocities of this task are unknown, or if, when the specs of an
             environment with the transform are read, a setting of the task has added entries; use
             :class:`HideEntries` instead.
 

@@ -38,21 +38,21 @@ class History(CatFrames):
 
     Args:
         num_frames: K, the number of observations in a history, at least 1.
-        in_keys: Keys of the observations: a list, whose entries may be nested, or one name. On
+        in_keys: keys of the observations: a list, whose entries may be nested, or one name. On
             stored data, the histories of the next observations are made in any case; they can be
             named as `CatFrames` requires, ``["observation", ("next", "observation")]``.
-        out_keys: Keys of the histories, one for each of ``in_keys`` and different from all of them.
-        observation_ndim: Number of dimensions of one observation: 1 for arrays [D], 2 for grey
+        out_keys: keys of the histories, one for each of ``in_keys`` and different from all of them.
+        observation_ndim: number of dimensions of one observation: 1 for arrays [D], 2 for grey
             images [H, W], 3 for images [C, H, W].
-        padding: How to pad before an episode's first step: ``"same"`` repeats the first
+        padding: how to pad before an episode's first step: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
 
     Raises:
-        TypeError: If ``in_keys`` or ``out_keys`` are no keys.
-        ValueError: If a number or the padding is invalid, the keys do not pair up, a key under
+        TypeError: if ``in_keys`` or ``out_keys`` are no keys.
+        ValueError: if a number or the padding is invalid, the keys do not pair up, a key under
             "next" is not that of an observation in ``in_keys``, or, when the transform is added to
             an environment, its observation does not have ``observation_ndim`` dimensions.
-        KeyError: If the environment has no such observation.
+        KeyError: if the environment has no such observation.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
     2212.14538), section 3: the outer transformer reads the observations of the last K steps.
@@ -92,11 +92,11 @@ class History(CatFrames):
         """Joins an environment or a composition of transforms, and makes the buffers.
 
         Args:
-            container: The environment or composition that the transform joins.
+            container: the environment or composition that the transform joins.
 
         Raises:
-            KeyError: If the environment has no such observation.
-            ValueError: If an observation does not have ``observation_ndim`` dimensions.
+            KeyError: if the environment has no such observation.
+            ValueError: if an observation does not have ``observation_ndim`` dimensions.
         """
         super().set_container(container)
         if self.parent is None:  # a composition without an environment yet
@@ -131,9 +131,9 @@ class History(CatFrames):
         """Adds the newest observation to the last histories.
 
         Args:
-            buffer: The last histories, [..., K, *obs].
+            buffer: the last histories, [..., K, *obs].
             newest: [..., 1, *obs].
-            reset: True where an episode begins, bool [...]; the other histories stay unchanged.
+            reset: true where an episode begins, bool [...]; the other histories stay unchanged.
                 None in a step.
 
         Returns:
@@ -173,7 +173,7 @@ class History(CatFrames):
         """Adds the specs of the histories.
 
         Args:
-            observation_spec: The specs before this transform.
+            observation_spec: the specs before this transform.
 
         Returns:
             The same specs with those of the histories.
@@ -202,7 +202,7 @@ class History(CatFrames):
             The same tensordict with the histories [..., T, K, *obs].
 
         Raises:
-            ValueError: If the steps are not slices, or the starts of slices cannot be found.
+            ValueError: if the steps are not slices, or the starts of slices cannot be found.
         """
         time = tensordict.ndim - 1
         named = [axis for axis, name in enumerate(tensordict.names) if name == "time"]
@@ -232,14 +232,14 @@ class History(CatFrames):
         :class:`~torchrl_tit.datasets.OnlineHistoryStorage` draws every step and reads less.
 
         Args:
-            batch_size: Ignored; the buffer's batch size is used.
-            **sampler_kwargs: Passed to `SliceSampler`, which finds the episodes.
+            batch_size: ignored; the buffer's batch size is used.
+            **sampler_kwargs: passed to `SliceSampler`, which finds the episodes.
 
         Returns:
             The transform and the sampler.
 
         Raises:
-            ValueError: If slices may be shorter than K steps.
+            ValueError: if slices may be shorter than K steps.
 
         Example:
             >>> from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -375,15 +375,15 @@ def find_histories(
 
     Args:
         steps: [*B, T], where the last dimension is time; flat batches [slices * steps] also work.
-        keys: Keys of the observations.
-        num_frames: Number K of frames in a window.
-        padding: What replaces frames before a window's first valid one.
+        keys: keys of the observations.
+        num_frames: number K of frames in a window.
+        padding: what replaces frames before a window's first valid one.
 
     Returns:
         Windows [*B, T, K] on the steps in order.
 
     Raises:
-        ValueError: If the steps are single ones, or the starts cannot be found.
+        ValueError: if the steps are single ones, or the starts cannot be found.
 
     Example:
         >>> from tensordict import TensorDict

@@ -28,17 +28,17 @@ class SequenceHistory(Transform):
     of a step with the observation that follows it.
 
     Args:
-        num_frames: Number K of steps, at least 1.
-        return_scale: Divisor of the returns-to-go.
-        observation_key: Key of the observation [..., *obs].
-        action_key: Key under which the policy writes the action [..., *action].
-        target_return_key: Key of the return that is still to be reached [..., 1].
-        out_key: Key of the sequence.
+        num_frames: number K of steps, at least 1.
+        return_scale: divisor of the returns-to-go.
+        observation_key: key of the observation [..., *obs].
+        action_key: key under which the policy writes the action [..., *action].
+        target_return_key: key of the return that is still to be reached [..., 1].
+        out_key: key of the sequence.
 
     Raises:
-        ValueError: If ``num_frames`` is less than 1, ``return_scale`` is not positive, or the
+        ValueError: if ``num_frames`` is less than 1, ``return_scale`` is not positive, or the
             policy writes an action whose shape is not the environment's.
-        KeyError: If the environment lacks one of the entries.
+        KeyError: if the environment lacks one of the entries.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3.
 
