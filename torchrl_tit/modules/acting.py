@@ -1,27 +1,139 @@
-"""Acting mode of whole policies, and a collector that uses it."""
+"""Acting mode, in which only the newest frames are encoded, and a collector that uses it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any, TypeVar
 
+import torch
 from tensordict import TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.collectors import Collector
+
+from torchrl_tit.modules.frame_cache import ActingNetwork
+from torchrl_tit.modules.tensor_module import TensorModule
+from torchrl_tit.networks import HistoryNetwork, TwoTrunks
 
 T = TypeVar("T")
 
 
-@runtime_checkable
-class HasActingMode(Protocol):
-    """A module that can reuse what it computed a step ago, such as a backbone."""
+class ActingModule(TensorModule):
+    """A network as a TensorDictModule that keeps, while it acts, the tokens of the last frames.
 
-    def acting(self) -> AbstractContextManager[None]:
-        """Returns the context in which it does so."""
+    :class:`Backbone` adds to it how tensordicts are read.
+    """
+
+    _acting: list[ActingNetwork] | None = None  # one per trunk, in acting mode
+    _compiled: list[ActingNetwork] | None = None  # what acting mode runs, if compiled
+
+    @property
+    def keeps_frames(self) -> bool:
+        """Whether acting mode saves work: frames are encoded, and histories have several."""
+        return any(trunk.keeps_frames for trunk in trunks_of(self.module).values())
+
+    @contextmanager
+    def acting(self) -> Iterator[None]:
+        """Keeps the tokens of the last frames, so that only the newest is encoded at each step.
+
+        For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses. Any
+        histories are allowed: after a reset, or with another batch, all new frames are encoded (see
+        :class:`~torchrl_tit.modules.FrameCache`). Has no effect while gradients are enabled, or on
+        networks that encode no frames or read a single one.
+
+        **Weights that change within the context** are noticed if PyTorch counts the write: when a
+        state dict is loaded into any module, within ``to_module``, and after most optimizers' step.
+        Nothing shows that a fused optimizer stepped, or that weights were written through ``.data``
+        or shared memory: call :meth:`clear_cache` afterwards; otherwise, for the next K - 1 steps,
+        frames seen before the change keep the tokens of the old weights. There is no need for it
+        between two collections, each of which enters a new context, as with
+        :func:`~torchrl_tit.modules.while_acting` and :class:`~torchrl_tit.modules.ActingCollector`.
+
+        The cache (copies of one batch of histories and of its tokens) starts empty. It is discarded
+        at the end, when weights change, and whenever the backbone or a module that contains it is
+        moved or cast, or its state dict is taken. So a run continues exactly like one that is
+        resumed from its state dict. Copies and pickles are not in acting mode.
+
+        Example:
+            >>> from tensordict import TensorDict
+            >>> from torchrl_tit import Backbone, EnhancedTIT
+            >>> backbone = Backbone(EnhancedTIT(observation_shape=(4,), num_frames=8))
+            >>> frames = torch.randn(5, 20, 4)
+            >>> with backbone.acting(), torch.no_grad():
+            ...     for step in range(12):
+            ...         td = backbone(TensorDict({"history": frames[:, step : step + 8]}, [5]))
+        """
+        outer, self._acting = self._acting, self._make_acting()
+        self.clear_cache()
+        try:
+            yield
+        finally:
+            self.clear_cache()
+            self._acting = outer
+
+    def compile_parts(self, **options: Any) -> None:
+        """Compiles what acting mode runs: the encoding of the newest frames, and all later layers.
+
+        Between the two, plain Python decides which tokens can be reused. Do not compile the whole
+        policy instead: a compiled backbone keeps no tokens. Copies of the backbone are not
+        compiled.
+
+        Args:
+            **options: passed to ``torch.compile``.
+        """
+        if self.keeps_frames:
+            self._compiled = list(map(ActingNetwork, trunks_of(self.module).values()))
+            for network in self._compiled:
+                network.compile(**options)
 
     def clear_cache(self) -> None:
-        """Discards what it has kept."""
+        """Discards the tokens that acting mode keeps."""
+        for network in self._acting or ():
+            network.clear()
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """Returns the network's state dict, and discards the tokens that acting mode keeps."""
+        self.clear_cache()
+        return super().state_dict(*args, **kwargs)
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Any:
+        self.clear_cache()  # moved or cast
+        return super()._apply(*args, **kwargs)
+
+    def _make_acting(self) -> list[ActingNetwork] | None:
+        if not self.keeps_frames:
+            return None
+        # A compiled network clears its cache when it enters `acting`.
+        return self._compiled or list(map(ActingNetwork, trunks_of(self.module).values()))
+
+    def _call_network(self, inputs: Sequence[Tensor]) -> Any:
+        """Calls the network; in acting mode, it encodes the newest frames only."""
+        if torch.compiler.is_compiling() or self._acting is None:
+            return self.module(*inputs)
+        return self._call_trunks(inputs, self._acting)
+
+    def _call_trunks(self, inputs: Sequence[Tensor], compute: Sequence[Callable[..., Any]]) -> Any:
+        """Calls the network, each of whose trunks computes its output in another way."""
+        if len(compute) == 1:
+            return self.module(*inputs, compute=compute[0])
+        return self.module(*inputs, compute=compute)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Compiled code cannot be copied, and nothing would clear a copy's cache.
+        return {**super().__getstate__(), "_compiled": None, "_acting": None}
+
+
+def trunks_of(network: nn.Module) -> dict[str, HistoryNetwork]:
+    """Returns the trunks of a network by the key prefix of their state; empty for other modules.
+
+    Example:
+        >>> from torchrl_tit.networks import MLP
+        >>> list(trunks_of(MLP((4,))))
+        ['policy_', 'value_']
+    """
+    if isinstance(network, TwoTrunks):
+        return {"policy_": network.policy, "value_": network.value}
+    return {"": network} if isinstance(network, HistoryNetwork) else {}
 
 
 @contextmanager
@@ -29,9 +141,8 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
     """Puts every backbone of a policy into acting mode: only the newest frames are encoded.
 
     Args:
-        policy: a module that contains any number of backbones, or of other modules with a method
-            ``acting`` (see :meth:`Backbone.acting`, also for weights that change within the
-            context). Other functions are left unchanged.
+        policy: a module that contains any number of backbones (see :meth:`Backbone.acting`, also
+            for weights that change within the context). Other functions are left unchanged.
 
     Example:
         >>> from tensordict.nn import TensorDictSequential
@@ -60,9 +171,9 @@ def clear_caches(policy: Callable[..., Any]) -> None:
         module.clear_cache()
 
 
-def _within(policy: Callable[..., Any]) -> list[HasActingMode]:
+def _within(policy: Callable[..., Any]) -> list[ActingModule]:
     modules = policy.modules() if isinstance(policy, nn.Module) else ()
-    return [module for module in modules if isinstance(module, HasActingMode)]
+    return [module for module in modules if isinstance(module, ActingModule)]
 
 
 def while_acting(policy: Callable[..., Any], batches: Iterable[T]) -> Iterator[T]:

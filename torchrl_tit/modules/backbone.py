@@ -6,7 +6,7 @@ Which call encodes what::
       encode_steps(td)               steps [*B]: the K frames of each history; with a recurrent
                                      network, the newest frame and the state
         within acting()              ... the newest frame only: the tokens of the others are kept
-                                     (frame_cache.py)
+                                     (acting.py, frame_cache.py)
       encode_sequences(td)           sequences [*B, T]: each frame once; makes a table of their
                                      frames (sequences.py, frame_tables.py), and calls
         encode_windows(frames, windows)    each frame of a table once; also for batches that are
@@ -15,8 +15,8 @@ Which call encodes what::
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -27,16 +27,15 @@ from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, Transform
 
 from torchrl_tit.histories.encoder import RecurrentEncoder
-from torchrl_tit.modules.frame_cache import ActingNetwork
+from torchrl_tit.modules.acting import ActingModule, trunks_of
 from torchrl_tit.modules.sequences import SequenceKeys, default_observation_keys
-from torchrl_tit.modules.tensor_module import TensorModule
-from torchrl_tit.networks import HistoryNetwork, TwoTrunks
+from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.arguments import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.windows import Windows
 
 
-class Backbone(TensorModule):
+class Backbone(ActingModule):
     """Reads histories and writes features, for any TorchRL head, loss or collector.
 
     Put one backbone in front of all heads. They read its features, so the network runs once per
@@ -172,8 +171,6 @@ class Backbone(TensorModule):
         """Shape of each entry of the recurrent state without batch dimensions, by key."""
         self.autocast = autocast
         self.every_frame = every_frame
-        self._acting: list[ActingNetwork] | None = None  # one per trunk, in acting mode
-        self._compiled: list[ActingNetwork] | None = None  # what acting mode runs, if compiled
 
     @dispatch(auto_batch_size=False)
     def forward(
@@ -311,9 +308,7 @@ class Backbone(TensorModule):
     @property
     def keeps_frames(self) -> bool:
         """Whether acting mode saves work: frames are encoded, and histories have several."""
-        if self.every_frame:
-            return False
-        return any(trunk.keeps_frames for trunk in trunks_of(self.module).values())
+        return not self.every_frame and super().keeps_frames
 
     def make_transforms(self) -> Compose:
         """Builds the transforms that carry the recurrent state through an environment.
@@ -341,85 +336,11 @@ class Backbone(TensorModule):
         specs = {key: Unbounded(shape=shape) for key, shape in self.state_shapes.items()}
         return TensorDictPrimer(specs, expand_specs=True)
 
-    @contextmanager
-    def acting(self) -> Iterator[None]:
-        """Keeps the tokens of the last frames, so that only the newest is encoded at each step.
-
-        For collection and evaluation (see :func:`~torchrl_tit.modules.acting`), not for losses. Any
-        histories are allowed: after a reset, or with another batch, all new frames are encoded (see
-        :class:`~torchrl_tit.modules.FrameCache`). Has no effect while gradients are enabled, or on
-        networks that encode no frames or read a single one.
-
-        **Weights that change within the context** are noticed if PyTorch counts the write: when a
-        state dict is loaded into any module, within ``to_module``, and after most optimizers' step.
-        Nothing shows that a fused optimizer stepped, or that weights were written through ``.data``
-        or shared memory: call :meth:`clear_cache` afterwards; otherwise, for the next K - 1 steps,
-        frames seen before the change keep the tokens of the old weights. There is no need for it
-        between two collections, each of which enters a new context, as with
-        :func:`~torchrl_tit.modules.while_acting` and :class:`~torchrl_tit.modules.ActingCollector`.
-
-        The cache (copies of one batch of histories and of its tokens) starts empty. It is discarded
-        at the end, when weights change, and whenever the backbone or a module that contains it is
-        moved or cast, or its state dict is taken. So a run continues exactly like one that is
-        resumed from its state dict. Copies and pickles are not in acting mode.
-
-        Example:
-            >>> from tensordict import TensorDict
-            >>> from torchrl_tit import EnhancedTIT
-            >>> backbone = Backbone(EnhancedTIT(observation_shape=(4,), num_frames=8))
-            >>> frames = torch.randn(5, 20, 4)
-            >>> with backbone.acting(), torch.no_grad():
-            ...     for step in range(12):
-            ...         td = backbone(TensorDict({"history": frames[:, step : step + 8]}, [5]))
-        """
-        outer, self._acting = self._acting, self._make_acting()
-        self.clear_cache()
-        try:
-            yield
-        finally:
-            self.clear_cache()
-            self._acting = outer
-
-    def compile_parts(self, **options: Any) -> None:
-        """Compiles what acting mode runs: the encoding of the newest frames, and all later layers.
-
-        Between the two, plain Python decides which tokens can be reused. Do not compile the whole
-        policy instead: a compiled backbone keeps no tokens. Copies of the backbone are not
-        compiled.
-
-        Args:
-            **options: passed to ``torch.compile``.
-        """
-        if self.keeps_frames:
-            self._compiled = list(map(ActingNetwork, trunks_of(self.module).values()))
-            for network in self._compiled:
-                network.compile(**options)
-
-    def clear_cache(self) -> None:
-        """Discards the tokens that acting mode keeps."""
-        for network in self._acting or ():
-            network.clear()
-
-    def state_dict(self, *args: Any, **kwargs: Any) -> Any:
-        """Returns the network's state dict, and discards the tokens that acting mode keeps."""
-        self.clear_cache()
-        return super().state_dict(*args, **kwargs)
-
-    def _apply(self, *args: Any, **kwargs: Any) -> Any:
-        self.clear_cache()  # moved or cast
-        return super()._apply(*args, **kwargs)
-
     def computing(self, device: torch.device) -> AbstractContextManager[object]:
         """Returns the context in which matrix products have the dtype ``autocast``."""
         if self.autocast is None:
             return nullcontext()
         return torch.autocast(device.type, self.autocast)
-
-    def _make_acting(self) -> list[ActingNetwork] | None:
-        if not self.keeps_frames:
-            return None
-        # A compiled network clears its cache when it enters `acting`.
-        return self._compiled or list(map(ActingNetwork, trunks_of(self.module).values()))
 
     def _in_full(self, outputs: Tensor | Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Returns the outputs in the full precision that heads and losses need."""
@@ -431,15 +352,7 @@ class Backbone(TensorModule):
             return self.module.every_frame(*tensors)
         if self.is_recurrent:
             return self._step(tensors)
-        if torch.compiler.is_compiling() or self._acting is None:
-            return self.module(*tensors)
-        return self._call_trunks(tensors, self._acting)
-
-    def _call_trunks(self, inputs: Sequence[Tensor], compute: Sequence[Callable[..., Any]]) -> Any:
-        """Calls the network, each of whose trunks computes its output in another way."""
-        if len(compute) == 1:
-            return self.module(*inputs, compute=compute[0])
-        return self.module(*inputs, compute=compute)
+        return self._call_network(tensors)
 
     def _step(self, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Histories, state and is_init -> features and the next state."""
@@ -479,23 +392,6 @@ class Backbone(TensorModule):
             f"there is no {kind} under {key!r}, only {sorted(map(str, tensordict.keys(True)))}: "
             f"{hint}"
         )
-
-    def __getstate__(self) -> dict[str, Any]:
-        # Compiled code cannot be copied, and nothing would clear a copy's cache.
-        return {**super().__getstate__(), "_compiled": None, "_acting": None}
-
-
-def trunks_of(network: nn.Module) -> dict[str, HistoryNetwork]:
-    """Returns the trunks of a network by the key prefix of their state; empty for other modules.
-
-    Example:
-        >>> from torchrl_tit.networks import MLP
-        >>> list(trunks_of(MLP((4,))))
-        ['policy_', 'value_']
-    """
-    if isinstance(network, TwoTrunks):
-        return {"policy_": network.policy, "value_": network.value}
-    return {"": network} if isinstance(network, HistoryNetwork) else {}
 
 
 def history_keys(observation: object) -> list[NestedKey]:
