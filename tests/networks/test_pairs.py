@@ -32,7 +32,8 @@ from torchrl_tit.networks import (
     masked_predictions,
 )
 from torchrl_tit.settings import FrameSettings, HistorySettings
-from torchrl_tit.windows import Padding, find_windows
+from torchrl_tit.settings.choices import Padding
+from torchrl_tit.windows import find_windows
 
 NUM_FRAMES, WIDTH, ACTIONS = 3, 8, 2
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.data import Categorical, Unbounded
 
 from torchrl_tit.envs.vector import GymVectorEnv
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Copies, Steps, StepsOrNone
 
 _NOOP, _FIRE = 0, 1

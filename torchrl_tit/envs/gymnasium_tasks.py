@@ -15,8 +15,8 @@ import gymnasium
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 from torchrl_tit.envs.names import Wrap, task_spec
-from torchrl_tit.settings.imports import load_plugins
 from torchrl_tit.settings.choices import VectorizationMode
+from torchrl_tit.settings.imports import load_plugins
 
 _shown: set[str] = set()  # MuJoCo's warnings
 

@@ -21,7 +21,7 @@ from torchrl.data import (
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
 
 _MAX_CHANNELS = 4

@@ -30,7 +30,7 @@ from torchrl_tit.envs.spaces import (
     group,
     leaf_name,
 )
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
 
 Convert = Callable[[Tensor], Tensor]

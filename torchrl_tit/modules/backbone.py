@@ -30,7 +30,7 @@ from torchrl_tit.histories.encoder import RecurrentEncoder
 from torchrl_tit.modules.acting import ActingModule, trunks_of
 from torchrl_tit.modules.sequences import SequenceKeys, default_observation_keys
 from torchrl_tit.networks import HistoryNetwork
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.windows import Windows
 

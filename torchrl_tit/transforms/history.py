@@ -14,7 +14,7 @@ from torchrl.data import Composite, SliceSampler, TensorSpec
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import CatFrames, Compose, ExcludeTransform, Transform
 
-from torchrl_tit.settings.arguments import checked_arguments
+from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Size
 from torchrl_tit.windows import Windows, find_windows
