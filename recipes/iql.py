@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor, nn
@@ -82,17 +81,17 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         size, values = (0, spec.space.n) if discrete else (spec.shape[0], 1)
         critics = [self.make_critic(env, size, values=values) for _ in range(2)]
         value = self.make_critic(env, 0, out_key="state_value")
-        settings: dict[str, Any] = {
-            "loss_function": "l2",
-            "temperature": recipe.temperature,
-            "expectile": recipe.expectile,
-        }
-        if discrete:
-            settings["action_space"] = "categorical"
-        else:  # two matrix products are faster than a batched one on a CPU
-            settings["deactivate_vmap"] = self.device.type == "cpu"
+        discrete_only = {"action_space": "categorical"} if discrete else {}
         make_loss = DiscreteIQLLoss if discrete else IQLLoss
-        loss = make_loss(self._policy, critics, value, **settings)
+        loss = make_loss(
+            self._policy,
+            critics,
+            value,
+            loss_function="l2",
+            temperature=recipe.temperature,
+            expectile=recipe.expectile,
+            **discrete_only,
+        )
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss
 

@@ -78,9 +78,7 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
             alpha=recipe.alpha,
             policy_noise=recipe.policy_noise * half_range,
             noise_clip=recipe.noise_clip * half_range,
-            # On a CPU, two matrix products are faster than one batched product; slices cannot be
-            # batched.
-            deactivate_vmap=self.device.type == "cpu" or recipe.slice_length > 1,
+            deactivate_vmap=recipe.slice_length > 1,  # which it cannot map over
         )
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss

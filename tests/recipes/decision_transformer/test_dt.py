@@ -16,7 +16,7 @@ from recipes import runner
 from recipes.cli import main
 from recipes.decision_transformer import DT, check_data
 from recipes.metrics import read_metrics
-from recipes.recipe_json import recipe_from_json, recipe_to_json
+from recipes.recipe_json import recipe_to_json
 from recipes.registry import get_recipe
 from recipes.run import Run
 from tests.datasets.rollouts import roll, write
@@ -32,28 +32,6 @@ from torchrl_tit.datasets import (
 from torchrl_tit.settings.networks import decision_transformer, dt_tit, mlp
 
 pytestmark = pytest.mark.filterwarnings("ignore:target_returns")
-
-
-def test_named_recipes_have_the_protocols_settings():
-    networks = {"dt": decision_transformer(), "dt-tit": dt_tit()}
-    for task, targets in {
-        "halfcheetah": (12000, 6000),
-        "hopper": (3600, 1800),
-        "walker2d": (5000, 2500),
-    }.items():
-        for dataset in (f"{task}-medium-v2", f"{task}-medium-replay-v2"):
-            for network, backbone in networks.items():
-                recipe = get_recipe(f"dt/{dataset}/{network}")
-                assert isinstance(recipe, DT)
-                assert recipe.dataset == dataset
-                assert list(recipe.target_returns) == list(targets)
-                assert recipe.backbone == backbone
-                assert recipe.backbone.num_frames == 20
-                assert recipe.final_step == 100_000
-                assert (recipe.batch_size, recipe.learning_rate) == (64, 1e-4)
-                assert (recipe.weight_decay, recipe.max_grad_norm) == (1e-4, 0.25)
-                assert (recipe.evaluation_episodes, recipe.return_scale) == (100, 1000)
-                assert recipe_from_json(recipe_to_json(recipe), "it") == recipe
 
 
 def test_warm_up_is_linear():
@@ -232,16 +210,10 @@ def test_a_target_that_the_data_never_reach_is_warned_of(tmp_path):
     ("settings", "message"),
     [
         ({"target_returns": ()}, r"target_returns must be at least one finite number, not \(\)"),
-        ({"target_returns": (float("nan"),)}, "target_returns must be at least one finite"),
-        ({"return_scale": 0.0}, "return_scale must be positive, not 0"),
-        ({"iterations": 0}, "iterations must be at least 1"),
-        ({"acting_num_frames": 0}, "acting_num_frames must be at least 1"),
         ({"acting_num_frames": 7}, "acting_num_frames must be at most 6, not 7"),
-        ({"target_returns": (10.0, 5.0, 10.0)}, "must differ within six digits, unlike"),
         ({"target_returns": (1234567.0, 1234568.0)}, "must differ within six digits, unlike"),
         ({"backbone": mlp()}, "backbone.history is mlp, but this recipe trains a decision-tran"),
         ({"action_space": "gaussian"}, "'gaussian', which this loss cannot train"),
-        ({"action_space": "box"}, "'action_space' is 'box', not one of"),
     ],
 )
 def test_wrong_settings(tmp_path, settings, message):
@@ -300,13 +272,3 @@ def test_other_algorithms_refuse_the_network():
             ValueError, match=r"reads actions and returns .* use a dt or odt recipe"
         ):
             replace(get_recipe(name), backbone=decision_transformer())
-
-
-def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
-    recipe = make_dt(tmp_path, max_grad_norm=0.25)
-    with Run.create(tmp_path / "run", recipe) as run:
-        runner.train(replace(recipe, iterations=1), run)
-        poisoned = replace(recipe, return_scale=1e-38)
-        with pytest.raises((FloatingPointError, ValueError)):
-            runner.train(poisoned, run)
-    assert load_checkpoint(run.checkpoints)[0] == 9

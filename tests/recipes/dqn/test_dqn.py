@@ -17,7 +17,6 @@ from recipes.algorithm import make_algorithm
 from recipes.callback import Callback
 from recipes.dqn import DQN, DQNAlgorithm
 from recipes.metrics import read_metrics
-from recipes.registry import RECIPES, get_recipe
 from recipes.run import Run
 from recipes.runner import train
 from tests.recipes.cql.cql_runs import tit
@@ -227,13 +226,7 @@ def test_clipped_rewards(tmp_path: Path) -> None:
             r"dqn needs a few discrete .* \(MultiCategorical, shape \[2\]\): use a ppo",
         ),
         ({"backbone": lstm()}, "dqn draws single transitions, so its network cannot carry a state"),
-        ({"final_epsilon": 1.5}, "final_epsilon must be at most 1"),
-        ({"exploration_fraction": -0.1}, "exploration_fraction must be at least 0"),
-        ({"target_interval": 0}, "target_interval must be at least 1, not 0"),
-        ({"tau": 2.0}, "tau must be at most 1"),
         ({"buffer_size": 5}, "buffer_size 5 has no room for a batch of 10 steps"),
-        ({"random_steps": 25}, "steps_per_batch 10 does not divide random_steps 25"),
-        ({"loss_function": "l1"}, r"field 'loss_function' is 'l1', not one of \('l2', 'smooth_l1'"),
     ],
 )
 def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
@@ -241,17 +234,3 @@ def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> 
         gymnasium.register(SEVERAL, entry_point=lambda **_: SeveralActions())
     with pytest.raises(ValueError, match=message):
         make(replace(SMALL, **changes))
-
-
-def test_named_recipes() -> None:
-    names = {f"dqn/{t}/{n}" for t, n in (("cartpole", "mlp"), ("pong", "nature-cnn"))}
-    names |= {"dqn/cartpole/enhanced-tit", "dqn/pong/enhanced-tit"}
-    assert {name for name in RECIPES if name.startswith("dqn/")} == names
-    pong = get_recipe("dqn/pong/enhanced-tit")
-    assert isinstance(pong, DQN)
-    # CleanRL's dqn_atari.py; its target network is copied every 1000 steps.
-    assert (pong.batch_size, pong.learning_rate, pong.gamma) == (32, 1e-4, 0.99)
-    assert (pong.buffer_size, pong.random_steps) == (1_000_000, 80_000)
-    assert pong.target_interval / pong.updates_per_step == 1000
-    assert (pong.final_epsilon, pong.exploration_fraction, pong.double) == (0.01, 0.1, True)
-    assert (pong.clip_rewards, pong.backbone.num_frames) == (True, 4)

@@ -8,9 +8,12 @@ import pytest
 import torch
 from tensordict.nn import set_skip_existing
 from torch.nn import functional as F
+from torchrl.modules import MLP
 from torchrl.objectives import BCLoss
 
-from tests.recipes.offline.offline_runs import BC, IQL, TD3BC, double, make
+from recipes.cql import CQL
+from recipes.sac import SAC
+from tests.recipes.offline.offline_runs import BC, IQL, SMALL, TD3BC, double, make, make_algorithm
 
 
 def value(loss, network, td, params=None):
@@ -197,10 +200,41 @@ def test_td3bc(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "term"), [(BC, "loss_bc"), (IQL, "loss_qvalue"), (TD3BC, "loss_qvalue")]
+    ("kind", "term"),
+    [(BC, "loss_bc"), (IQL, "loss_qvalue"), (TD3BC, "loss_qvalue"), (CQL, "loss_qvalue")],
 )
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path, kind, term):
     algorithm, batch = double(make(kind, tmp_path), tmp_path)
     batch["action" if kind is BC else ("next", "reward")][0] = torch.nan
     with pytest.raises(FloatingPointError, match=f"{term} became nan"):
         algorithm.update(batch, 0)
+
+
+@pytest.mark.parametrize("kind", [SAC, CQL, IQL, TD3BC])
+def test_critics_start_as_they_were_built(tmp_path, kind, monkeypatch):
+    """Of a single one, TorchRL's loss makes a copy whose weights it draws anew."""
+    built = []
+
+    def make_mlp(*sizes, **layers):
+        network = MLP(*sizes, **layers)
+        built.append({name: weight.clone() for name, weight in network.state_dict().items()})
+        return network
+
+    monkeypatch.setattr("recipes.networks.MLP", make_mlp)
+    settings = {"env": "Pendulum-v1", "backbone": SMALL, "critic_hidden": (16,)}
+    recipe = SAC(**settings) if kind is SAC else make(kind, tmp_path, **settings)
+    loss = make_algorithm(recipe).model
+    stacked = loss.qvalue_network_params.flatten_keys(".")
+    for key, weights in stacked.items():
+        if key.endswith(("weight", "bias")):
+            name = ".".join(key.split(".")[-2:])
+            assert torch.equal(weights, torch.stack([critic[name] for critic in built[:2]]))
+            assert not torch.equal(*weights)
+
+
+def test_noise_of_td3bc_follows_the_range_of_actions(tmp_path):
+    """Pendulum's reach from -2 to 2."""
+    recipe = make(TD3BC, tmp_path, env="Pendulum-v1", policy_noise=0.3, noise_clip=0.4)
+    loss = make_algorithm(recipe).model
+    torch.testing.assert_close(loss.policy_noise, torch.tensor([0.6]))
+    torch.testing.assert_close(loss.noise_clip, torch.tensor([0.8]))
