@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
 import torch
 from tensordict import TensorDictBase
@@ -18,6 +18,8 @@ from .evaluation import Outcome
 from .recipe import Recipe
 
 RecipeT = TypeVar("RecipeT", bound=Recipe)
+Terms: TypeAlias = TensorDictBase | Mapping[str, Tensor]
+"""Terms of a loss by name, float [] each."""
 
 
 class Stateful(Protocol):
@@ -202,18 +204,16 @@ def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
     networks.load_state_dict(dict(weights))
 
 
-def total_loss(terms: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
+def total_loss(terms: Terms) -> Tensor:
     """Adds up the terms of a loss, those whose names begin with "loss_"; float []."""
     return torch.stack([term for name, term in terms.items() if name.startswith("loss_")]).sum()
 
 
-def descend(
-    terms: TensorDictBase | Mapping[str, Tensor], optimizer: torch.optim.Optimizer
-) -> Tensor:
+def descend(terms: Terms, optimizer: torch.optim.Optimizer) -> Tensor:
     """Takes a gradient step on the sum of the terms whose names begin with "loss_".
 
     Args:
-        terms: the terms of a loss, float [] each, and other numbers.
+        terms: the terms of a loss, and other numbers.
         optimizer: of all weights; it leaves those alone on which the sum does not depend.
 
     Returns:
@@ -226,7 +226,7 @@ def descend(
     return total.detach()
 
 
-def numbers(columns: Sequence[str], terms: TensorDictBase | Mapping[str, Tensor]) -> Tensor:
+def numbers(columns: Sequence[str], terms: Terms) -> Tensor:
     """Selects the numbers that an update returns from the terms of its losses; float [columns]."""
     return torch.stack([terms[name].detach() for name in columns])
 

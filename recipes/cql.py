@@ -22,7 +22,7 @@ from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
 from torchrl_tit.settings.numbers import Count, Fraction, Rate, Weight, Widths
 
-from .algorithm import descend
+from .algorithm import Terms, descend
 from .compilation import check_compiler, compile_and_time, should_compile
 from .networks import describe, is_discrete, make_value_policy
 from .offline import TransitionAlgorithm, TransitionRecipe
@@ -61,7 +61,6 @@ class ConservativeRecipe(TransitionRecipe):
 
 
 RecipeT = TypeVar("RecipeT", bound=ConservativeRecipe)
-Terms = TensorDictBase | dict[str, Tensor]
 
 
 class ConservativeAlgorithm(TransitionAlgorithm[RecipeT]):
@@ -176,8 +175,12 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
             samples: transitions [B] or slices [N, T], with the actions that the policy drew: see
                 :meth:`~torchrl_tit.objectives.ContinuousCQLLoss.sample_policy`.
         """
-        terms = self.model.critic_loss(samples).exclude("td_error")
-        return terms.set("loss_alpha", self.model.alpha_loss(samples)[0])
+        terms = self.model.critic_loss(samples)
+        return {
+            "loss_alpha": self.model.alpha_loss(samples)[0],
+            "loss_qvalue": terms["loss_qvalue"],
+            "loss_cql": terms["loss_cql"],
+        }
 
     def actor_loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the actor, once the others have taken a step on theirs.
@@ -206,7 +209,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         actor_terms = self._actor_loss(samples)
         descend(actor_terms, self.optimizer)
         self.target.step()
-        return self.numbers({**dict(terms.items()), **dict(actor_terms.items())})
+        return self.numbers({**terms, **actor_terms})
 
 
 @dataclass(frozen=True, kw_only=True)

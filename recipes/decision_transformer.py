@@ -45,7 +45,7 @@ from torchrl_tit.settings.numbers import (
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 from torchrl_tit.transforms import SequenceHistory
 
-from .algorithm import Stateful, check_finite, total_loss
+from .algorithm import Stateful, Terms, check_finite, total_loss
 from .dataset_recipe import DatasetRecipe
 from .evaluation import Outcome
 from .networks import normalize_frames
@@ -183,7 +183,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         return Agent(network, DTHead(network.features_dim, self.action_dim, recipe.action_space))
 
     @abstractmethod
-    def loss(self, samples: TensorDictBase) -> TensorDictBase | dict[str, Tensor]:
+    def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the loss, float [] each.
 
         Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
@@ -343,7 +343,7 @@ class DTAlgorithm(SequenceAlgorithm[DT]):
         """Optimizer, and the sampling state of the replay buffer."""
         return {"optimizer": self.optimizer, "buffer": self.buffer}
 
-    def loss(self, samples: TensorDictBase) -> TensorDictBase | dict[str, Tensor]:
+    def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the loss; see :meth:`SequenceAlgorithm.loss`."""
         return {"loss_action": self.dt_loss(samples)["loss"]}
 

@@ -23,7 +23,7 @@ from torchrl_tit.envs import observation_specs
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.settings.numbers import Batch, Fraction, Rate, Steps, Weight
 
-from .algorithm import Stateful, descend
+from .algorithm import Stateful, Terms, descend
 from .networks import describe, is_discrete, make_backbone, make_value_policy
 from .replay import ReplayAlgorithm, ReplayRecipe
 
@@ -168,11 +168,11 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
             return batch
         return batch.copy().set(("next", "reward"), batch["next", "reward"].sign())
 
-    def loss(self, samples: TensorDictBase) -> TensorDictBase | dict[str, Tensor]:
+    def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the loss; see :meth:`ReplayAlgorithm.loss`."""
         return {"loss_value": self.model(samples)["loss"]}
 
-    def learn(self, samples: TensorDictBase, number: int) -> Mapping[str, Tensor]:
+    def learn(self, samples: TensorDictBase, number: int) -> Terms:
         """Takes a gradient step on the values, and every so many copies them to the target."""
         terms = self.loss(samples)
         total = descend(terms, self.optimizer)

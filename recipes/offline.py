@@ -26,7 +26,7 @@ from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
-from .algorithm import Algorithm, Stateful, check_finite, numbers
+from .algorithm import Algorithm, Stateful, Terms, check_finite, numbers
 from .dataset_recipe import DatasetRecipe
 from .evaluation import Outcome
 from .networks import make_backbone, make_critic
@@ -183,7 +183,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
         """
 
     @abstractmethod
-    def loss(self, samples: TensorDictBase) -> TensorDictBase | dict[str, Tensor]:
+    def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the loss, float [] each.
 
         Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
@@ -287,7 +287,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
         length = recipe.slice_length
         return make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed, slice_length=length)
 
-    def numbers(self, terms: TensorDictBase | Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def numbers(self, terms: Terms) -> Mapping[str, Tensor]:
         """Selects and checks the numbers that an update returns.
 
         On a GPU, checking would have to wait for it, so the runner checks there instead, less

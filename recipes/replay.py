@@ -20,7 +20,7 @@ from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_chec
 from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
 from torchrl_tit.settings.numbers import Batch, Steps, Weight
 
-from .algorithm import Stateful, check_finite, numbers
+from .algorithm import Stateful, Terms, check_finite, numbers
 from .online import OnlineAlgorithm, OnlineRecipe
 from .task import make_task
 
@@ -114,7 +114,7 @@ class ReplayAlgorithm(OnlineAlgorithm[RecipeT]):
         """
 
     @abstractmethod
-    def loss(self, samples: TensorDictBase) -> TensorDictBase | dict[str, Tensor]:
+    def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the loss, float [] each.
 
         Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
@@ -188,7 +188,7 @@ class ReplayAlgorithm(OnlineAlgorithm[RecipeT]):
         return dict(zip(self.columns, values, strict=True))
 
     @abstractmethod
-    def learn(self, samples: TensorDictBase, number: int) -> Mapping[str, Tensor]:
+    def learn(self, samples: TensorDictBase, number: int) -> Terms:
         """Takes a gradient step on :meth:`loss`, and updates the targets.
 
         Args:

@@ -6,7 +6,6 @@ Settings first, then the algorithm. To change it, subclass both and override one
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,7 +13,7 @@ from typing import Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictSequential
-from torch import Tensor, nn
+from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
@@ -25,7 +24,7 @@ from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.numbers import Fraction, Rate, Widths
 
-from .algorithm import descend
+from .algorithm import Terms, descend
 from .networks import describe, make_backbone, make_critic
 from .replay import ReplayAlgorithm, ReplayRecipe
 
@@ -70,6 +69,7 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
 
     columns = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy")
     optional_columns = columns  # nothing is learned during the random steps
+    model: SACLoss
 
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with policy, critics, their targets and the temperature."""
@@ -110,7 +110,7 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
         """Returns the terms of the loss; see :meth:`ReplayAlgorithm.loss`."""
         return self.model(samples)
 
-    def learn(self, samples: TensorDictBase, number: int) -> Mapping[str, Tensor]:
+    def learn(self, samples: TensorDictBase, number: int) -> Terms:
         """Takes a gradient step on all networks, and moves the targets."""
         terms = self.loss(samples)
         descend(terms, self.optimizer)

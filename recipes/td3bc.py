@@ -15,7 +15,7 @@ from torchrl.objectives import SoftUpdate, TD3BCLoss
 from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.settings.numbers import Rate, Steps, Weight
 
-from .algorithm import Stateful, descend
+from .algorithm import Stateful, Terms, descend
 from .networks import describe, make_deterministic_policy
 from .offline import ActorCriticRecipe, TransitionAlgorithm
 
@@ -57,6 +57,7 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
     """
 
     columns = ("loss_qvalue", "loss_actor", "loss_bc")
+    model: TD3BCLoss
 
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with policy, critics and their targets."""
@@ -98,11 +99,11 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
         """Optimizer, the sampling state of the replay buffer, and the actor's last terms."""
         return {**super().state(), "actor_terms": self.actor_terms}
 
-    def loss(self, samples: TensorDictBase) -> TensorDictBase | dict[str, Tensor]:
+    def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the critics; see :meth:`TransitionAlgorithm.loss`."""
         return {"loss_qvalue": self.model.qvalue_loss(samples)[0]}
 
-    def actor_loss(self, samples: TensorDictBase) -> dict[str, Tensor]:
+    def actor_loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the actor, once the critics have taken a step on theirs."""
         loss_actor, others = self.model.actor_loss(samples)
         return {"loss_actor": loss_actor, "bc_loss": others["bc_loss"]}

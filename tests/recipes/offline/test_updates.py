@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -221,7 +222,7 @@ def test_critics_start_as_they_were_built(tmp_path, kind, monkeypatch):
         return network
 
     monkeypatch.setattr("recipes.networks.MLP", make_mlp)
-    settings = {"env": "Pendulum-v1", "backbone": SMALL, "critic_hidden": (16,)}
+    settings: dict[str, Any] = {"env": "Pendulum-v1", "backbone": SMALL, "critic_hidden": (16,)}
     recipe = SAC(**settings) if kind is SAC else make(kind, tmp_path, **settings)
     loss = make_algorithm(recipe).model
     stacked = loss.qvalue_network_params.flatten_keys(".")
