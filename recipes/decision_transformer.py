@@ -229,7 +229,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         return env.append_transform(Compose(TargetReturn(target_return), history))
 
     def load_data(self) -> Episodes:
-        """Loads the data set, by whose statistics the network then normalises observations.
+        """Loads the data set, by whose statistics the network then normalizes observations.
 
         Raises:
             ValueError: if its actions are of another kind, no episode is finished, or one is longer

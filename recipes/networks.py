@@ -45,7 +45,7 @@ def make_backbone(
         out_key: key of the features.
         slices: whether it reads slices of consecutive steps [..., T] in TorchRL's recurrent mode;
             it then also reads the observations and "is_init".
-        eps: if given, it normalises observations by the statistics of a data set; see
+        eps: if given, it normalizes observations by the statistics of a data set; see
             :class:`~torchrl_tit.frames.NormalizedFrames`.
     """
     histories = history_keys(observation)

