@@ -76,7 +76,7 @@ versions/%: $(VENV)/installed-versions
 	  $(RESOLUTION_$(word 2,$(subst -, ,$*))) -e '.[test]'
 	$(PYTEST) $(ARGS)
 
-# The runs are left in RUNS; the same folder goes on where `make kill` was stopped.
+# The runs are left in RUNS, which must be new to `make kill` and `make soak`.
 RUNS ?= runs/reliability
 MINUTES ?= 120
 

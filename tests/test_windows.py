@@ -1,5 +1,6 @@
 """Windows hold the frames that a plain walk backwards finds."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -30,13 +31,11 @@ def test_windows_of_rows(num_frames, padding, stride, dtype):
     newest = oldest + stride * torch.randint(0, 30 // stride, (4, 6))
     windows = find_windows(newest, oldest, num_frames, padding, stride)
     gathered = windows.gather(frames)
-    assert gathered.shape == (4, 6, num_frames, 2, 3)
-    assert gathered.dtype == dtype
-    for i in range(4):
-        for j in range(6):
-            step = newest[i, j].item(), oldest[i, j].item()
-            expected = by_walking(frames, *step, num_frames, padding, stride)
-            assert torch.equal(gathered[i, j], expected)
+    assert (gathered.shape, gathered.dtype) == ((4, 6, num_frames, 2, 3), dtype)
+    for step in np.ndindex(4, 6):
+        rows = newest[step].item(), oldest[step].item()
+        expected = by_walking(frames, *rows, num_frames, padding, stride)
+        assert torch.equal(gathered[step], expected)
 
 
 @pytest.mark.parametrize("padding", ["same", "constant"])
