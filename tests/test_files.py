@@ -21,7 +21,12 @@ def test_file_is_forced_to_disk_before_it_gets_its_name(tmp_path: Path, monkeypa
 
     def noted(name: str) -> None:
         call = getattr(os, name)
-        monkeypatch.setattr(os, name, lambda *own: (calls.append(name), call(*own))[1])
+
+        def note(*own: object) -> None:
+            calls.append(name)
+            call(*own)
+
+        monkeypatch.setattr(os, name, note)
 
     noted("fsync")
     noted("replace")

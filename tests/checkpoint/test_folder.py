@@ -81,7 +81,7 @@ def test_what_cannot_be_saved_touches_nothing(tmp_path: Path) -> None:
         (ValueError, "keep", (1, {}, 0)),
     ):
         with pytest.raises(error, match=message):
-            save_checkpoint(tmp_path / "new", *arguments)  # type: ignore[arg-type]
+            save_checkpoint(tmp_path / "new", *arguments)
     assert not (tmp_path / "new").exists()
 
 

@@ -291,7 +291,12 @@ def test_rows_are_on_the_disk_before_a_checkpoint_and_memory_is_returned_after(
 
     def noted(owner: Any, name: str) -> None:
         call = getattr(owner, name)
-        monkeypatch.setattr(owner, name, lambda *own: (done.append(name), call(*own)))
+
+        def note(*own: Any) -> None:
+            done.append(name)
+            call(*own)
+
+        monkeypatch.setattr(owner, name, note)
 
     for owner, name in ((Metrics, "sync"), (Run, "save"), (runner, "return_free_memory")):
         noted(owner, name)

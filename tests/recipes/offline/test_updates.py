@@ -200,6 +200,11 @@ def test_td3bc(tmp_path):
     assert again["loss_actor"] == terms["loss_actor"]
 
 
+def test_the_noise_of_td3bcs_target_follows_the_range_of_actions(tmp_path):
+    loss = make_algorithm(make(TD3BC, tmp_path, env="Pendulum-v1")).model  # from -2 to 2
+    assert (loss.policy_noise.item(), loss.noise_clip.item()) == pytest.approx((0.4, 1.0))
+
+
 @pytest.mark.parametrize(
     ("kind", "term"),
     [(BC, "loss_bc"), (IQL, "loss_qvalue"), (TD3BC, "loss_qvalue"), (CQL, "loss_qvalue")],
