@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from tensordict.nn import (
@@ -23,8 +24,11 @@ from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.modules.sequences import default_observation_keys
 from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
-from torchrl_tit.networks import build_network
+from torchrl_tit.networks import HistoryNetwork, build_network, chosen_by_kind
 from torchrl_tit.settings import Flat, Network
+
+from .algorithm import Algorithm
+from .recipe import Recipe
 
 _MIN_LOG_STD = -5.0
 
@@ -228,3 +232,23 @@ def _array_size(observation: Observations) -> int:
         kind = "images" if first.kind == "image" else first.kind
         raise ValueError(f"an MLP cannot value {kind} {first.shape}: set critic to 'backbone'")
     return first.entries
+
+
+def name_chosen_encoders(recipe: Recipe, algorithm: Algorithm[Any]) -> tuple[Recipe, str]:
+    """Adds to a recipe the frame encoders that were chosen by the kinds of observations.
+
+    The run's recipe.json then records them, and a resumed run keeps them in later versions too.
+
+    Args:
+        recipe: the recipe.
+        algorithm: its algorithm, with the networks.
+
+    Returns:
+        The recipe for the run, and a description of what was chosen, which is empty if nothing was.
+    """
+    modules = algorithm.policy.modules()
+    network = next((module for module in modules if isinstance(module, HistoryNetwork)), None)
+    chosen = {} if network is None else network.frame_settings
+    if not (described := chosen_by_kind(recipe.backbone, chosen)):
+        return recipe, ""
+    return replace(recipe, backbone=replace(recipe.backbone, frames=chosen)), described

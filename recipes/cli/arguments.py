@@ -1,22 +1,36 @@
-"""Parsing of a command's arguments, with one-line error messages."""
+"""What all commands share: their arguments, users' own modules, and messages of one line."""
 
 from __future__ import annotations
 
 import argparse
 import io
+import re
 import sys
-from contextlib import redirect_stderr
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import make_dataclass, replace
 from inspect import getdoc
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
 
+import torchrl_tit
 from torchrl_tit.settings.checks import printable
+from torchrl_tit.settings.imports import allow, import_allowed
 from torchrl_tit.settings.numbers import MAX_SEED
 
 from ..recipe import Recipe
-from .imports import HELP, OPTION
+
+IMPORT = "--import"
+IMPORT_HELP = (
+    "module (or Python file) of your own to import first, for what it registers; can be repeated; "
+    "an option of every command"
+)
+
+_MODULE_AND_NAME = re.compile(r"(?:--[\w.-]+=)?([A-Za-z_][\w.]*):[A-Za-z_][\w/-]*(?:\(.*\))?")
+
+_OURS = (str(Path(torchrl_tit.__file__).parent), str(Path(__file__).parents[1]))
 
 
 class Parser(argparse.ArgumentParser):
@@ -25,11 +39,50 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         # Only for the help text: the option itself is parsed before the command is known.
-        self.add_argument(OPTION, metavar="MODULE", help=HELP)
+        self.add_argument(IMPORT, metavar="MODULE", help=IMPORT_HELP)
 
     def error(self, message: str) -> NoReturn:
         """Exits with a one-line message that says what is wrong with the arguments."""
         fail(f"{message} (see `{self.prog} --help`)")
+
+
+def import_what_is_typed(arguments: list[str]) -> list[str]:
+    """Imports the modules of ``--import``, and allows those that other arguments name.
+
+    Args:
+        arguments: all arguments of the program.
+
+    Returns:
+        The arguments without ``--import``.
+
+    Raises:
+        ImportError: if a module cannot be imported.
+        ValueError: if the option lacks the module.
+    """
+    rest, modules = [], []
+    words = iter(arguments)
+    for word in words:
+        option, equals, module = word.partition("=")
+        if option == IMPORT:
+            modules.append(module if equals else next(words, ""))
+        else:
+            rest.append(word)
+    for module in modules:
+        if not module or module.startswith("-"):
+            raise ValueError(f"{IMPORT} needs the name of a module, such as my_package")
+        import_allowed(module)
+    for module in _named(rest):
+        allow(module)
+    return rest
+
+
+def _named(arguments: list[str]) -> Iterator[str]:
+    """Modules in arguments such as ``module:Task-v0``: users who type one want it imported."""
+    for argument in arguments:
+        found = _MODULE_AND_NAME.fullmatch(argument)
+        # `hf:user/name` is an agent, whose files are not the user's own word.
+        if found and found[1] != "hf" and not found[1].endswith((".", ".py")):
+            yield found[1]
 
 
 def add_machine_options(parser: argparse.ArgumentParser) -> None:
@@ -78,7 +131,7 @@ def parse_fields(fields: list[Any], arguments: list[str], command: str, describe
                 tyro.conf.AvoidSubcommands[settings],  # type: ignore[misc, valid-type]
                 args=arguments,
                 prog=f"{program()} {command}",
-                description=f"{getdoc(described)}\n\n{OPTION} MODULE: {HELP}.",
+                description=f"{getdoc(described)}\n\n{IMPORT} MODULE: {IMPORT_HELP}.",
             )
     except SystemExit as stop:
         if stop.code:
@@ -120,3 +173,31 @@ def fail(message: str) -> NoReturn:
     """Exits with a one-line error message."""
     note(message, "error: ")
     sys.exit(2)
+
+
+@contextmanager
+def one_line_warnings() -> Iterator[None]:
+    """Writes warnings as "warning: TEXT", without the source that Python shows.
+
+    Warnings of other libraries are followed by their location. Python repeats a warning whenever
+    the filters have changed, and TorchRL and Gymnasium change them; here each text is printed once.
+    """
+    shown: set[str] = set()
+
+    def write(
+        message: Warning | str, category: type, filename: str, lineno: int, line: str | None = None
+    ) -> str:
+        text = f"warning: {printable(' '.join(str(message).split()))}"
+        if not filename.startswith(_OURS):
+            text += f" ({filename}:{lineno})"
+        if text in shown:
+            return ""
+        shown.add(text)
+        return f"{text}\n"
+
+    before = warnings.formatwarning
+    warnings.formatwarning = write
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before

@@ -9,9 +9,7 @@ import torchrl_tit
 from torchrl_tit.extras import EXTRAS, missing
 from torchrl_tit.settings import resolve
 
-from .arguments import fail, program
-from .imports import import_what_is_typed
-from .warned import one_line_warnings
+from .arguments import fail, import_what_is_typed, one_line_warnings, program
 
 COMMANDS = {
     "list": "named_recipes:list_recipes",

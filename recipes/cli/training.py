@@ -13,8 +13,8 @@ from torchrl_tit.settings.imports import import_options
 from .. import runner
 from ..algorithm import make_algorithm
 from ..callback import Callback
-from ..chosen_frames import with_chosen_frames
 from ..initial_weights import weights_from
+from ..networks import name_chosen_encoders
 from ..recipe import Recipe
 from ..results.plot import plot_run
 from ..run import Run
@@ -43,7 +43,7 @@ def start(
     if init_from is not None:
         weights, report = weights_from(init_from, algorithm)
         say(report)
-    recipe, chosen = with_chosen_frames(recipe, algorithm)
+    recipe, chosen = name_chosen_encoders(recipe, algorithm)
     if chosen:
         say(f"frames chosen by kind of observation: {chosen}")
     with Run.create(folder or _make_folder(recipe), recipe, weights) as run:

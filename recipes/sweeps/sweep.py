@@ -19,8 +19,8 @@ from torchrl_tit.settings.checks import nearest
 from torchrl_tit.settings.imports import import_options, load_plugins
 
 from ..algorithm import make_algorithm
-from ..chosen_frames import with_chosen_frames
 from ..interrupt import raise_on_signals
+from ..networks import name_chosen_encoders
 from ..recipe import Recipe
 from ..recipe_file import is_recipe_file, recipes_from_file
 from ..registry import RECIPES, find_recipe
@@ -126,7 +126,7 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
         allow_names(recipe)
         algorithm = make_algorithm(recipe)
         algorithm.check()
-        recipe, _ = with_chosen_frames(recipe, algorithm)
+        recipe, _ = name_chosen_encoders(recipe, algorithm)
         for seed in dict.fromkeys(seeds):
             folder = out / recipe.name / f"seed-{seed}"
             job = Job(replace(recipe, seed=seed), folder, source)

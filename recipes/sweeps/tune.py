@@ -26,9 +26,9 @@ from torchrl_tit.agents.folder import read_evaluation
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 
 from ..algorithm import make_algorithm
-from ..chosen_frames import with_chosen_frames
 from ..interrupt import raise_on_signals
 from ..metrics import read_metrics
+from ..networks import name_chosen_encoders
 from ..recipe import Recipe
 from ..recipe_json import recipe_to_json
 from .search_space import SearchSpace, make_distributions, with_values
@@ -287,7 +287,7 @@ class _Trial:
         except ValueError as error:  # values that do not fit together
             self._explain(str(error))
             return
-        chosen, _ = with_chosen_frames(recipe, algorithm)
+        chosen, _ = name_chosen_encoders(recipe, algorithm)
         file = search.folder / f"trial-{trial.number}.json"
         self.jobs = [
             Job(replace(chosen, seed=seed), self.folder / f"seed-{seed}", source=str(file))

@@ -19,7 +19,6 @@ from torchrl_tit.histories.catformer import Catformer
 from torchrl_tit.histories.coberl import CoBERL
 from torchrl_tit.histories.decision_transformer import DecisionTransformer
 from torchrl_tit.histories.encoder import HistoryEncoder, RecurrentEncoder
-from torchrl_tit.layers.blocks import TransformerBlock
 from torchrl_tit.networks import HistoryNetwork, build_network
 
 Kind: TypeAlias = Literal["spatial", "temporal"]
@@ -241,14 +240,6 @@ class _Tape:
 
 
 def _inner_blocks(inner: InnerTransformer) -> list[list[nn.Module]]:
-    if inner.num_blocks == 1:  # a shortcut that hooks do not see
-        (block,) = inner.blocks
-        assert isinstance(block, TransformerBlock)
-
-        def read_first(first: Tensor, rest: Tensor) -> Tensor:
-            return block(torch.cat([first.expand(len(rest), -1, -1), rest], 1), read="first")
-
-        vars(block).update(read_first=read_first)
     return [[inner.blocks[index % len(inner.blocks)]] for index in range(inner.num_blocks)]
 
 

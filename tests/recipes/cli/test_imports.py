@@ -15,9 +15,6 @@ SLOW = ("torch", "torchrl", "tensordict", "gymnasium", "matplotlib", "scipy", "o
     [
         ["--help"],
         ["list"],
-        ["show", "ppo/cartpole/enhanced-tit"],
-        ["train", "ppo/cartpole/enhanced-tit", "--help"],
-        ["train", "sac/hopper/mlp", "--help"],
         ["evaluate", "--help"],
     ],
     ids=" ".join,

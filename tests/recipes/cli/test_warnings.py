@@ -3,7 +3,7 @@
 import warnings
 
 import recipes
-from recipes.cli.warned import one_line_warnings
+from recipes.cli.arguments import one_line_warnings
 from tests.recipes.commands import Command
 
 
