@@ -8,7 +8,6 @@ chosen parts.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from dataclasses import fields, replace
 from itertools import pairwise
@@ -69,13 +68,13 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
     network = recipe.backbone
     if "backbone.network" in names:
         system = NETWORKS[names["backbone.network"]]()
-        network = _replace_unchecked(system, num_frames=network.num_frames)
+        network = _draft(system, num_frames=network.num_frames)
     if "backbone.frame" in names:
         frame = FrameSettings.get(names["backbone.frame"])
-        network = _replace_unchecked(network, frame=_replace_part(network.frame, frame))
+        network = _draft(network, frame=_replace_part(network.frame, frame))
     if "backbone.history" in names:
         history = HistorySettings.get(names["backbone.history"])
-        network = _replace_unchecked(network, history=_replace_part(network.history, history))
+        network = _draft(network, history=_replace_part(network.history, history))
     frames = dict(network.frames)
     for key in _keys_with_fields(arguments):
         frames.setdefault(key, network.frame)
@@ -84,8 +83,8 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
             key = option.removeprefix(_PER_KEY)
             old = frames.get(key, network.frame)
             frames[key] = _with_width_of(old, _replace_part(old, FrameSettings.get(name)))
-    network = _replace_unchecked(network, frames=frames)
-    return _replace_unchecked(recipe, backbone=network)
+    network = _draft(network, frames=frames)
+    return _draft(recipe, backbone=network)
 
 
 def check_recipe(recipe: RecipeT) -> RecipeT:
@@ -190,13 +189,12 @@ def _replace_part(old: Part, new: type[Any]) -> Any:
 def _with_width_of(old: Part, new: Any) -> Any:
     """Returns settings with the old ones' width: tokens of all observations have the same width."""
     if "embed_dim" in field_types(type(old)) and "embed_dim" in field_types(type(new)):
-        return _replace_unchecked(new, embed_dim=getattr(old, "embed_dim"))  # noqa: B009
+        return _draft(new, embed_dim=getattr(old, "embed_dim"))  # noqa: B009
     return new
 
 
-def _replace_unchecked(settings: T, **values: Any) -> T:
-    """Returns a copy of frozen settings with other values, without running ``__post_init__``."""
-    copied = copy.copy(settings)
-    for name, value in values.items():
-        object.__setattr__(copied, name, value)
-    return copied
+def _draft(settings: T, **values: Any) -> T:
+    """Makes settings like these with other values, but runs none of the checks yet."""
+    draft = object.__new__(type(settings))
+    vars(draft).update(vars(settings) | values)
+    return draft

@@ -8,11 +8,18 @@ from dataclasses import fields, replace
 
 import torch
 
-from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.observation import Observation, Observations, read_observations
 from torchrl_tit.networks.building import BrokenEncoderError, build_frame
-from torchrl_tit.settings import FrameSettings
+from torchrl_tit.settings import (
+    Flat,
+    FrameSettings,
+    Inner,
+    Linear,
+    NatureCNNFrames,
+    Network,
+    resolve,
+)
 from torchrl_tit.settings.checks import nearest
 
 _WIDTH = 64
@@ -20,27 +27,25 @@ _MOST_PATCHES = 1024
 _CNN_PIXELS = 36
 
 
-def frames_by_kind(
-    network: settings.Network, observation: Observations
-) -> dict[str, FrameSettings]:
+def frames_by_kind(settings: Network, observation: Observations) -> dict[str, FrameSettings]:
     """Chooses the settings of the frame encoder of each observation.
 
-    ``network.frames`` gives those of some observations. If one other observation is left, it gets
-    ``network.frame``. If several are left, each gets the first of these that can read it, all of
+    ``settings.frames`` gives those of some observations. If one other observation is left, it gets
+    ``settings.frame``. If several are left, each gets the first of these that can read it, all of
     the same width:
 
-    1. ``network.frame``, unless it is flat: flat frames are as wide as their observations, so they
+    1. ``settings.frame``, unless it is flat: flat frames are as wide as their observations, so they
        cannot be concatenated;
     2. the same with the patch size "auto";
     3. for arrays and categories, a linear layer; for images, NatureCNN, or an inner transformer if
        they have fewer than 36 pixels per side.
 
     Args:
-        network: settings of the network.
+        settings: those of the network.
         observation: shape or spec of an observation, or of each by name if there are several.
 
     Raises:
-        ValueError: if ``network.frames`` names an observation that does not exist, or no encoder
+        ValueError: if ``settings.frames`` names an observation that does not exist, or no encoder
             can read an observation; the message names it and its kind.
 
     Example:
@@ -54,32 +59,32 @@ def frames_by_kind(
         'auto'
     """
     observations = read_observations(observation)
-    for name in network.frames:
+    for name in settings.frames:
         if name not in observations:
             raise ValueError(
                 f"frames names the observation {name!r}, which the task does not have: "
                 f"{nearest(name, observations)}"
             )
     if len(observations) == 1:
-        return {name: network.frames.get(name, network.frame) for name in observations}
-    if getattr(settings.resolve(network.history.builds), "reads_frames", False):
+        return {name: settings.frames.get(name, settings.frame) for name in observations}
+    if getattr(resolve(settings.history.builds), "reads_frames", False):
         raise ValueError(
-            f"{network.history.name} stacks the frames of one observation, but the task has "
+            f"{settings.history.name} stacks the frames of one observation, but the task has "
             f"several ({', '.join(observations)}): choose one of them (--observation-keys), or "
             "another history encoder"
         )
-    width = _width(network, observations)
+    width = _width(settings, observations)
     return {
-        name: network.frames.get(name) or _first_that_reads(network.frame, width, seen, name)
+        name: settings.frames.get(name) or _first_that_reads(settings.frame, width, seen, name)
         for name, seen in observations.items()
     }
 
 
-def chosen_by_kind(network: settings.Network, frames: Mapping[str, FrameSettings]) -> str:
+def chosen_by_kind(settings: Network, frames: Mapping[str, FrameSettings]) -> str:
     """Describes the frame encoders that settings do not name, in a few words; "" if there are none.
 
     Args:
-        network: settings of the network.
+        settings: those of the network.
         frames: what :func:`frames_by_kind` returned.
 
     Example:
@@ -89,7 +94,7 @@ def chosen_by_kind(network: settings.Network, frames: Mapping[str, FrameSettings
     """
     described = []
     for name, frame in frames.items():
-        if frame != network.frames.get(name, network.frame):
+        if frame != settings.frames.get(name, settings.frame):
             differing = [
                 f"{field.name} {getattr(frame, field.name)}"
                 for field in fields(frame)
@@ -99,16 +104,18 @@ def chosen_by_kind(network: settings.Network, frames: Mapping[str, FrameSettings
     return "; ".join(described)
 
 
-def _width(network: settings.Network, observations: Mapping[str, Observation]) -> int:
+def _width(settings: Network, observations: Mapping[str, Observation]) -> int:
     """The width of a token, which all frame encoders share: of those named, else of the first."""
-    candidates = [(frame, name) for name, frame in network.frames.items()]
-    if not isinstance(network.frame, settings.Flat):
-        candidates += [(network.frame, name) for name in observations if name not in network.frames]
+    candidates = [(frame, name) for name, frame in settings.frames.items()]
+    if not isinstance(settings.frame, Flat):
+        candidates += [
+            (settings.frame, name) for name in observations if name not in settings.frames
+        ]
     for frame, name in candidates:
         encoder = _try(frame, observations[name])
         if isinstance(encoder, FrameEncoder):
             return encoder.width
-    return int(getattr(network.frame, "embed_dim", _WIDTH))
+    return int(getattr(settings.frame, "embed_dim", _WIDTH))
 
 
 def _first_that_reads(
@@ -132,16 +139,16 @@ def _candidates(
     patch_size = getattr(frame, "patch_size", None)
     pixels = math.prod(observation.shape[-2:]) if observation.kind == "image" else 0
     too_many_patches = isinstance(patch_size, int) and pixels > _MOST_PATCHES * patch_size**2
-    if not isinstance(frame, settings.Flat) and not too_many_patches:
+    if not isinstance(frame, Flat) and not too_many_patches:
         yield frame
     if hasattr(frame, "patch_size"):
         yield replace(frame, patch_size="auto")  # type: ignore[call-arg]
     if observation.kind != "image":
-        yield settings.Linear(embed_dim=width, bias=True)
+        yield Linear(embed_dim=width, bias=True)
         return
     if min(observation.shape[-2:]) >= _CNN_PIXELS:
-        yield settings.NatureCNNFrames(embed_dim=width)
-    yield settings.Inner(embed_dim=width, patch_size="auto", every_block=False)
+        yield NatureCNNFrames(embed_dim=width)
+    yield Inner(embed_dim=width, patch_size="auto", every_block=False)
 
 
 def _try(frame: FrameSettings, observation: Observation) -> FrameEncoder | ValueError:

@@ -351,7 +351,7 @@ class TwoTrunks(nn.Module):
 
 
 def build_network(
-    network: settings.Network,
+    settings: settings.Network,
     observation: Observations,
     *,
     action_dim: int | None = None,
@@ -360,7 +360,7 @@ def build_network(
     """Builds the network that settings describe.
 
     Args:
-        network: the settings.
+        settings: those of the network.
         observation: shape or spec of an observation, or of each by name if there are several.
         action_dim: entries of an action, for history encoders that read actions.
         trunks: "shared" builds one network even if the settings ask for two, for example for an
@@ -375,29 +375,29 @@ def build_network(
         >>> build_network(NETWORKS["enhanced-tit"](4), (4,))(torch.randn(2, 4, 4)).shape
         torch.Size([2, 64])
     """
-    if (trunks or network.trunks) == "separate":
-        policy, value = (build_trunk(network, observation, action_dim) for _ in range(2))
+    if (trunks or settings.trunks) == "separate":
+        policy, value = (build_trunk(settings, observation, action_dim) for _ in range(2))
         return TwoTrunks(policy, value)
-    return build_trunk(network, observation, action_dim)
+    return build_trunk(settings, observation, action_dim)
 
 
 def build_trunk(
-    network: settings.Network, observation: Observations, action_dim: int | None = None
+    settings: settings.Network, observation: Observations, action_dim: int | None = None
 ) -> HistoryNetwork:
     """Builds a single network, whether or not the settings share it between policy and value.
 
     Args:
-        network: the settings.
+        settings: those of the network.
         observation: shape or spec of an observation, or of each by name if there are several.
         action_dim: entries of an action, for history encoders that read actions.
     """
     return HistoryNetwork(
-        frames_by_kind(network, observation),
-        network.history,
+        frames_by_kind(settings, observation),
+        settings.history,
         observation_shape=observation,
-        num_frames=network.num_frames,
-        head=network.head,
-        initialization=network.initialization,
+        num_frames=settings.num_frames,
+        head=settings.head,
+        initialization=settings.initialization,
         action_dim=action_dim,
     )
 

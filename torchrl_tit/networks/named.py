@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-from torchrl_tit import settings
 from torchrl_tit.frames.observation import Observations
 from torchrl_tit.networks.by_kind import frames_by_kind
 from torchrl_tit.networks.history_network import HistoryNetwork, TwoTrunks, build_trunk
-from torchrl_tit.settings import networks
+from torchrl_tit.settings import Network, networks
 
 __all__ = [
     "D2RL",
@@ -32,10 +31,10 @@ __all__ = [
 
 
 class _Named:
-    describe: ClassVar[Callable[..., settings.Network]]
+    describe: ClassVar[Callable[..., Network]]
     """The function that describes the network."""
 
-    def __init_subclass__(cls, *, describe: Callable[..., settings.Network] | None = None) -> None:
+    def __init_subclass__(cls, *, describe: Callable[..., Network] | None = None) -> None:
         super().__init_subclass__()
         if describe is not None:
             cls.describe = staticmethod(describe)
@@ -65,14 +64,14 @@ class NamedNetwork(_Named, HistoryNetwork):
         **hyperparameters: Any,
     ) -> None:
         given = {} if num_frames is None else {"num_frames": num_frames}
-        network = self.describe(**given, **hyperparameters)
+        settings = self.describe(**given, **hyperparameters)
         super().__init__(
-            frames_by_kind(network, observation_shape),
-            network.history,
+            frames_by_kind(settings, observation_shape),
+            settings.history,
             observation_shape=observation_shape,
-            num_frames=network.num_frames,
-            head=network.head,
-            initialization=network.initialization,
+            num_frames=settings.num_frames,
+            head=settings.head,
+            initialization=settings.initialization,
             action_dim=action_dim,
         )
 
@@ -211,8 +210,8 @@ class NamedTrunks(_Named, TwoTrunks):
     def __init__(
         self, observation_shape: Observations, num_frames: int = 1, **hyperparameters: Any
     ) -> None:
-        network = self.describe(num_frames=num_frames, **hyperparameters)
-        super().__init__(*(build_trunk(network, observation_shape) for _ in range(2)))
+        settings = self.describe(num_frames=num_frames, **hyperparameters)
+        super().__init__(*(build_trunk(settings, observation_shape) for _ in range(2)))
 
 
 class MLP(NamedTrunks, describe=networks.mlp):
