@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import msgspec
 import torch
 
-from torchrl_tit.datasets import has_reference, normalized_score, normalized_spread
+from torchrl_tit.scores import has_reference, normalized_score, normalized_spread
 
 from .dataset_recipe import DatasetRecipe
 from .recipe import Recipe

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchrl_tit.datasets import has_reference
+from torchrl_tit.scores import has_reference
 
 from ..dataset_recipe import DatasetRecipe
 from ..recipe import Recipe

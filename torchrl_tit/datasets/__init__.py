@@ -6,16 +6,16 @@ from torchrl_tit.datasets.hdf5 import read_hdf5, write_hdf5
 from torchrl_tit.datasets.minari import read_minari, write_minari
 from torchrl_tit.datasets.online import OnlineHistoryStorage
 from torchrl_tit.datasets.replay_buffer import ConsecutiveSampler, make_replay_buffer, make_sampler
-from torchrl_tit.datasets.scores import (
+from torchrl_tit.datasets.sources import download_d4rl, load_episodes
+from torchrl_tit.datasets.storages import EpisodeStorage, HistoryStorage, SequenceStorage
+from torchrl_tit.datasets.transition_parts import TransitionParts
+from torchrl_tit.datasets.transitions import episodes_from_arrays
+from torchrl_tit.scores import (
     REFERENCE_RETURNS,
     has_reference,
     normalized_score,
     normalized_spread,
 )
-from torchrl_tit.datasets.sources import download_d4rl, load_episodes
-from torchrl_tit.datasets.storages import EpisodeStorage, HistoryStorage, SequenceStorage
-from torchrl_tit.datasets.transition_parts import TransitionParts
-from torchrl_tit.datasets.transitions import episodes_from_arrays
 
 __all__ = [
     "REFERENCE_RETURNS",

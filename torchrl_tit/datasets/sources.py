@@ -20,9 +20,9 @@ from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.hdf5 import read_hdf5
 from torchrl_tit.datasets.hdf5_files import damage_named, h5py
 from torchrl_tit.datasets.minari import is_minari_name, minari, read_minari
-from torchrl_tit.datasets.scores import has_reference
 from torchrl_tit.datasets.transitions import Gaps
 from torchrl_tit.files import whole_or_not_at_all, write_text_atomic
+from torchrl_tit.scores import has_reference
 
 HDF5_SUFFIXES = (".hdf5", ".h5")
 _HOST = "rail.eecs.berkeley.edu"  # hosts all of D4RL's files
