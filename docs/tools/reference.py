@@ -4,6 +4,7 @@
 
 commands.md     what each command's --help prints
 fields.md       the fields of recipes and networks, with their bounds and defaults
+metrics.md      the columns of metrics.csv, but for PPO's
 api.md, api/    every public name, a page for each package; mkdocstrings fills them in
 
 The site needs none of this library's dependencies: they are imported here, in its environment.
@@ -29,6 +30,7 @@ import msgspec
 from recipes.cli.main import COMMANDS, USAGE, main
 from recipes.recipe import Recipe
 from recipes.registry import RECIPES
+from recipes.results.metric_words import to_markdown
 from torchrl_tit.settings import NETWORKS, FrameSettings, Head, HistorySettings, Network
 
 ROOT = Path(__file__).parents[2]
@@ -50,6 +52,7 @@ def pages() -> dict[str, str]:
     return {
         "commands.md": _commands(),
         "fields.md": _fields(),
+        "metrics.md": _metrics(),
         "api.md": f"| package | |\n|---|---|\n{index}\n",
         **api,
     }
@@ -91,14 +94,9 @@ def _help(words: list[str]) -> str:
 
 
 def _fields() -> str:
-    assert RECIPES  # every algorithm is registered
     sections: list[str] = []
     seen: set[type] = {object}
-    algorithms: dict[Any, str] = {
-        kind: f"`{name}`"
-        for name, kind in Recipe.registered.items()
-        if kind.__module__.startswith("recipes.")
-    }
+    algorithms: dict[Any, str] = {kind: f"`{name}`" for name, kind in _algorithms().items()}
     parts: dict[type, str] = {Network: "The network (`backbone`)", Head: "Its head (`head`)"}
     for table, word in ((FrameSettings, "Frame encoder"), (HistorySettings, "History encoder")):
         parts |= {
@@ -116,6 +114,13 @@ def _fields() -> str:
             if section := _section(cls, algorithms.get(cls) or parts.get(cls)):
                 sections.append(section)
     return "\n".join(sections)
+
+
+def _algorithms() -> dict[str, Any]:
+    """The recipes of this package, by the name of their algorithm."""
+    assert RECIPES  # every algorithm is registered
+    registered = Recipe.registered.items()
+    return {name: kind for name, kind in registered if kind.__module__.startswith("recipes.")}
 
 
 def _section(cls: type, title: str | None) -> str:
@@ -196,6 +201,14 @@ def _default(field: dataclasses.Field[Any]) -> str:
     if dataclasses.is_dataclass(value) or isinstance(value, Mapping):
         return str(getattr(value, "name", "")) or "see there"
     return f"`{' '.join(map(str, value)) if isinstance(value, tuple) else value}`"
+
+
+# Metrics
+
+
+def _metrics() -> str:
+    sections = [f"## `{name}`\n\n{to_markdown(name)}" for name in _algorithms() if name != "ppo"]
+    return "\n".join(sections)
 
 
 # Public names

@@ -15,7 +15,8 @@ The first row is the header. ``=`` gives the form of the rows that follow: each 
 after a colon, the cells that are not measured. A line that begins with ``|`` is a row with its own
 form. ``{mean}`` is a measure of :data:`MEASURES`, ``{mean.1}`` the same with one digit, ``{mean @
 hopper/mlp}`` that of the runs of a path below docs/results, ``{median FILE.json / KEY / ...}`` a
-number of a benchmark.
+number of a benchmark. Where a row names ``FILE.json / KEY``, or a key below ``<!-- table:
+FILE.json``, a measure names the rest: ``{median.1 KEY / ...}``.
 
 With ``--check``, pages that differ from their data are named, and nothing is written.
 """
@@ -55,7 +56,7 @@ class Runs:
     Args:
         path: a path in a table of runs below docs/results; with a space between, several; or a CSV
             file and a value of its first column, such as "memory/s7.csv ppo/memory-s7/lstm", or
-            "COLUMN=VALUE".
+            "COLUMN=VALUE", several joined by " & ".
     """
 
     def __init__(self, path: str) -> None:
@@ -65,8 +66,10 @@ class Runs:
         if name.endswith(".csv"):
             with (RESULTS / name).open(newline="", encoding="utf-8") as file:
                 rows = list(csv.DictReader(file))
-            column, _, wanted = value.rpartition("=")
-            self.rows = [row for row in rows if row[column or next(iter(row))] == wanted]
+            for condition in value.split(" & "):
+                column, _, wanted = condition.rpartition("=")
+                rows = [row for row in rows if row[column or next(iter(row))] == wanted]
+            self.rows = rows
         else:
             found = [pair for name in path.split() for pair in _runs_below(name)]
             self.runs = sorted(found, key=lambda pair: int(pair[0].rows[pair[1]]["seed"]))
@@ -296,12 +299,12 @@ def _found(path: str) -> list[float]:
     return [float(one) for one in (value if isinstance(value, list) else [value])]
 
 
-def _of_benchmark(kind: str, words: str, digits: int) -> str:
+def _of_benchmark(kind: str, words: str, below: str, digits: int) -> str:
     if kind == "ratio":  # round by round
-        over, _, under = words.partition(" : ")
-        values = [a / b for a, b in zip(_found(over), _found(under), strict=True)]
+        over, under = (_found(f"{below}{part}") for part in words.split(" : "))
+        values = [a / b for a, b in zip(over, under, strict=True)]
     else:
-        values = _found(words)
+        values = _found(f"{below}{words}")
     text = number(median(values), digits)
     return f"{text} ({_range(values, digits)})" if kind == "spread" else text
 
@@ -316,7 +319,8 @@ def measure(text: str, path: str) -> str:
     name, _, rest = words.partition(" ")
     name, _, digits = name.partition(".")
     if name in ("median", "ratio", "spread"):
-        return _of_benchmark(name, rest, int(digits or 0))
+        below = f"{path} / " if ".json" in path else ""
+        return _of_benchmark(name, rest, below, int(digits or 0))
     if name not in MEASURES:
         raise ValueError(f"unknown measure {name!r}: choose from {', '.join(MEASURES)}")
     return MEASURES[name](_runs(of or path), int(digits or 0), *rest.split())
@@ -343,7 +347,10 @@ def print_table(folder: str, form: str) -> str:
             lines.append(_row(line, "", []))
         else:
             name, _, rest = line.partition(": ")
-            path = " ".join(f"{folder}/{part}" if folder else part for part in name.split(" + "))
+            if folder.endswith(".json"):
+                path = f"{folder} / {name}"
+            else:
+                path = " ".join(f"{folder}/{p}" if folder else p for p in name.split(" + "))
             lines.append(_row(f"| {pattern} |", path, rest.split("|")))
         if len(lines) == 1:
             lines.append("|" + "---|" * (lines[0].count("|") - 1))

@@ -6,7 +6,7 @@ from torchrl_tit.settings.networks import enhanced_tit, mlp
 
 from .preset import SAC, Preset
 
-# The whole observation is one patch, as docs/results/hopper.md found for PPO.
+# The whole observation is one patch, as docs/results/classic_control.md found for PPO.
 SAC_RECIPES: dict[str, Preset] = {
     recipe.name: recipe
     for recipe in (

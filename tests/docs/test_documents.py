@@ -7,6 +7,7 @@ import pytest
 
 from recipes import registry
 from recipes.results.experiments import find_runs
+from torchrl_tit.settings import FrameSettings, HistorySettings
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
@@ -35,6 +36,20 @@ def test_python_runs(document):
     namespace: dict[str, object] = {}
     for block in re.findall(r"```python\n(.*?)```", document.read_text(), flags=re.DOTALL):
         exec(compile(block, name(document), "exec"), namespace)
+
+
+def test_all_pages_together_are_short():
+    pages = [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
+    assert sum(len(page.read_text().split()) for page in pages) <= 45_000
+
+
+def test_the_page_on_recipes_lists_every_encoder():
+    page = (ROOT / "docs" / "recipes.md").read_text()
+    for kind, settings in (("frame", FrameSettings), ("history", HistorySettings)):
+        [row] = re.findall(rf"^\| `--backbone\.{kind}` \|.*", page, flags=re.MULTILINE)
+        classes = settings.registered.items()
+        ours = {name for name, c in classes if c.__module__.startswith("torchrl_tit.")}
+        assert {*re.findall(r"`([\w-]+)`", row)} == ours
 
 
 def test_results_can_be_run_again():

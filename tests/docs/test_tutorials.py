@@ -70,10 +70,3 @@ def test_no_two_pages_write_one_run():
     written = [run for page in PAGES for run in {*runs.findall(page.read_text())}]
     assert len(written) > 10
     assert len(written) == len({*written})
-
-
-def test_what_is_shown_and_not_run_is_a_command():
-    for page in PAGES:
-        for _, language, _, code in BLOCK.findall(page.read_text()):
-            assert language in ("python", "sh", "bash"), page.name
-            assert code.strip(), page.name

@@ -134,7 +134,7 @@ gymnasium.register("Line-v0", entry_point=f"{__name__}:Line", max_episode_steps=
 
 @dataclass(frozen=True, kw_only=True)
 class Reinforce(Recipe, algorithm="reinforce"):
-    """REINFORCE (Williams, 1992), with normalised returns to go."""
+    """REINFORCE (Williams, 1992), with normalized returns to go."""
 
     total_steps: int = 100_000
     """Environment steps of the whole run."""
