@@ -101,6 +101,7 @@ def own_modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
     monkeypatch.setattr(imports, "_failures", None)
+    list(RECIPES.values())  # imports every algorithm, which would be forgotten, too
     tables: list[Names[Any]] = [FrameSettings.registered, HistorySettings.registered]
     tables += [Recipe.registered, RECIPES.names]
     before = [(dict(table), deepcopy(vars(table))) for table in tables]

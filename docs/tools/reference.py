@@ -118,7 +118,7 @@ def _fields() -> str:
 
 def _algorithms() -> dict[str, Any]:
     """The recipes of this package, by the name of their algorithm."""
-    assert RECIPES  # every algorithm is registered
+    list(RECIPES.values())  # building the named recipes registers every algorithm
     registered = Recipe.registered.items()
     return {name: kind for name, kind in registered if kind.__module__.startswith("recipes.")}
 

@@ -1,6 +1,7 @@
 """The documentation site, as far as it can be told without what builds it."""
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -56,8 +57,14 @@ def test_commands(pages):
     assert "--backbone" not in pages["commands.md"]
 
 
+def test_metrics(pages):
+    algorithms = {recipe.algorithm for recipe in RECIPES.values()} - {"ppo"}
+    assert {*re.findall(r"^## `(.*)`$", pages["metrics.md"], flags=re.MULTILINE)} == algorithms
+    assert pages["metrics.md"].count("| `return_mean` |") == len(algorithms)
+
+
 def test_fields(pages):
-    assert RECIPES
+    assert {recipe.algorithm for recipe in RECIPES.values()} <= {*Recipe.registered}
     lines = pages["fields.md"].splitlines()
     tables = [Recipe.registered, FrameSettings.registered, HistorySettings.registered]
     for kind in [kind for table in tables for kind in table.values()]:
