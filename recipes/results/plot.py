@@ -98,7 +98,7 @@ def draw_curves(
         middle, low, high = intervals_of(values)
         label = f"{name} ({len(whole)} runs)" if len(whole) > 1 else name
         marker = "o" if len(steps) == 1 else None  # a line through one point is invisible
-        axes.plot(steps, middle, c=color, ls=line, lw=2, marker=marker, label=_plain(label))
+        axes.plot(steps, middle, c=color, ls=line, lw=2, marker=marker, label=plain(label))
         if len(whole) > 1:
             axes.fill_between(steps, low, high, color=color, alpha=0.2, lw=0)
         bold[name] = Curve(steps, middle)
@@ -160,7 +160,7 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
         tasks.setdefault((cell.recipe.rpartition("/")[0], cell.measure), []).append(cell)
     labels = {
         (task, measure): [
-            fill(_plain(cell.label.removeprefix(f"{task}/")), _WIDEST_LABEL) for cell in group
+            fill(plain(cell.label.removeprefix(f"{task}/")), _WIDEST_LABEL) for cell in group
         ]
         for (task, measure), group in tasks.items()
     }
@@ -189,14 +189,12 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     save_figure(figure, picture)
 
 
-def new_chart(title: str, offline: bool, of_returns: bool = True) -> tuple[Figure, Axes]:
-    """Returns a figure with axes for a metric over the steps."""
+def new_chart(title: str, offline: bool) -> tuple[Figure, Axes]:
+    """Returns a figure with axes for returns over the steps."""
     figure = new_figure((7, 4))
     axes = figure.add_subplot()
     steps, episodes = ("gradient", "evaluation") if offline else ("environment", "training")
-    axes.set(title=_plain(title), xlabel=f"{steps} steps")
-    if of_returns:
-        axes.set_ylabel(f"return of {episodes} episodes")
+    axes.set(title=plain(title), xlabel=f"{steps} steps", ylabel=f"return of {episodes} episodes")
     axes.grid(alpha=0.3)
     return figure, axes
 
@@ -254,6 +252,6 @@ def _smoothed(curve: Curve, window: int) -> Curve:
     return Curve(curve.steps, (sums[ends] - sums[starts]) / (ends - starts))
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
     """A name of others, in which Matplotlib would read "$" as the beginning of a formula."""
     return text.replace("$", r"\$")

@@ -47,7 +47,17 @@ from .experiments import (
 from .explanation import ExplainedStep, Explainer, explain_episode
 from .film import film_policy, make_rendered
 from .metric_words import MetricWords, known_columns, limit, words_of
-from .plot import NEARLY, WINDOW, Curve, add_legend, curve_of, draw_curves, new_chart, to_bytes
+from .plot import (
+    NEARLY,
+    WINDOW,
+    Curve,
+    add_legend,
+    curve_of,
+    draw_curves,
+    new_chart,
+    plain,
+    to_bytes,
+)
 from .table import HEADER, Cell, make_table, to_columns
 
 _OFTEN = 0.25  # minimum share of batches outside a limit for a metric to be pointed out
@@ -375,8 +385,8 @@ def _episode_chart(groups: Sequence[Group]) -> Chart | None:
         return None
     figure, axes = new_chart("", groups[0].recipe.offline)
     axes.boxplot([*boxes.values()], showmeans=True, meanline=True)
-    labels = [name.replace("$", r"\$") for name in boxes]
-    axes.set_xticks(range(1, len(boxes) + 1), labels, rotation=20, ha="right")
+    places = range(1, len(boxes) + 1)
+    axes.set_xticks(places, [*map(plain, boxes)], rotation=20, ha="right")
     axes.set(xlabel="", ylabel="return of an episode")
     quarters = {name: np.percentile(returns, [25, 50, 75]) for name, returns in boxes.items()}
     texts = [
