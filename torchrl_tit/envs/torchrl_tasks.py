@@ -129,6 +129,8 @@ class TorchRLTask(EnvBase):
         picture = np.asarray(picture)
         return np.moveaxis(picture, 0, -1) if picture.shape[0] in (1, 3) else picture
 
+    picture = render  # TorchRL's batches of environments ask their copies for what they lack
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes the task."""
         if not self._env.is_closed:
@@ -179,7 +181,7 @@ class SerialTasks(_SeededCopies, SerialEnv):
         Raises:
             ValueError: if they cannot be rendered.
         """
-        return np.stack([copy.render() for copy in self._envs])
+        return np.stack(self.picture())  # of each copy
 
 
 class ParallelTasks(_SeededCopies, ParallelEnv):
