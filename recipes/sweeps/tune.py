@@ -283,7 +283,8 @@ class _Trial:
         try:
             recipe = search.recipe(trial.number, trial.params)
             algorithm = make_algorithm(recipe)
-            algorithm.check()
+            if not self.folder.exists():  # otherwise it was checked before its runs began
+                algorithm.check()
         except ValueError as error:  # values that do not fit together
             self._explain(str(error))
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -103,14 +104,14 @@ def test_catformer(shape: tuple[int, int, int], features: int, settings: dict[st
 KINDS: dict[str, tuple[Callable[[], nn.Module], dict[str, Any], dict[str, Any], str, str]] = {
     # What makes the reference, its config, entries that do not fit, a parameter and our name of it.
     "resnet": (
-        lambda: ReferenceResNet(IMAGE, 8),
+        partial(ReferenceResNet, IMAGE, 8),
         {"observation_shape": list(IMAGE)},
         {"features_dim": 9, "observation_shape": [4, 28, 28]},
         "resnet.2.cnn.0.bias",
         "layers.2.conv.bias",
     ),
     "catformer": (
-        lambda: ReferenceCatformer(IMAGE, 8),
+        partial(ReferenceCatformer, IMAGE, 8),
         {"observation_shape": list(IMAGE)},
         {"features_dim": 9, "observation_shape": [4, 28, 28]},
         "resnet.2.cnn.0.bias",
@@ -118,7 +119,7 @@ KINDS: dict[str, tuple[Callable[[], nn.Module], dict[str, Any], dict[str, Any], 
     ),
     **{
         kind: (
-            lambda kind=kind: ReferenceTrunks(kind, 11, 64),
+            partial(ReferenceTrunks, kind, 11, 64),
             {"observation_shape": [11]},
             {"hidden_dim": 32, "observation_shape": [12]},
             "linear2_value.0.bias",
