@@ -139,9 +139,10 @@ def _runs_something(metadata: dict[str, Any]) -> dict[str, Any]:
     return metadata | {"env_spec": json.dumps(spec)}
 
 
-def _endless_space(metadata: dict[str, Any]) -> dict[str, Any]:
-    space = {"type": "Box", "dtype": "float64", "shape": [10**10], "low": 0.0, "high": 1.0}
-    return metadata | {"observation_space": json.dumps(space)}
+def _endless_space(metadata: dict[str, Any], dimensions: int = 1) -> dict[str, Any]:
+    shape = [10**10] * dimensions
+    space = {"type": "Box", "dtype": "uint8", "shape": shape, "low": 0, "high": 255}
+    return metadata | {"observation_space": json.dumps(space), "jpeg_encoding": True}
 
 
 def _episode_elsewhere(file: h5py.File, folder: Path) -> None:
@@ -230,6 +231,7 @@ _METADATA: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
         "claim 1000000000 episodes, but there are 2",
     ),
     "spaces in spaces": (_nested, "is not a whole Minari data set"),
+    "images of 1e20 bytes": (partial(_endless_space, dimensions=2), "declares .* bytes of data"),
     "metadata of a list": (lambda m: [m], "Expected `object`, got `array`"),
     "metadata of other kinds": (
         lambda m: m | {"author": 5},

@@ -12,6 +12,7 @@ import json
 import os
 from collections.abc import Iterator
 from functools import partial
+from math import prod
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -163,9 +164,7 @@ def read_minari(name: str | os.PathLike[str], **settings: Any) -> Episodes:
         image = tuple(space.shape) if metadata.jpeg_encoding and len(space.shape) > 1 else None
         fields, lengths, noted = _joined(source, file, metadata.total_episodes, image)
         left_out |= noted
-        declared = sum(
-            field.dtype.itemsize * int(np.prod(field.shape)) for field in fields.values()
-        )
+        declared = sum(field.dtype.itemsize * prod(field.shape) for field in fields.values())
         check_size(source, declared, file.id.get_filesize())
         return episodes_from_transitions(
             {**fields, **dict.fromkeys(left_out)},
