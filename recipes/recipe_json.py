@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from torchrl_tit.settings import FrameSettings, HistorySettings, Network, Part
+from torchrl_tit.settings import FrameSettings, HistorySettings, Part
 from torchrl_tit.settings.checks import checked, field_types, nearest
 
 from .recipe import Recipe, get_recipe_class
@@ -55,12 +55,6 @@ def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
         if not isinstance(fields, dict):
             raise ValueError("expected an object with the recipe's fields")
         kind = get_recipe_class(fields.pop("algorithm", None))
-        for name, value in kind.removed.items():
-            if fields.pop(name, value) != value:
-                raise ValueError(
-                    f"field {name!r} no longer exists, and only {value!r} can be read, which did "
-                    "nothing: leave it out"
-                )
         recipe = _convert(kind, fields)
     except (RecursionError, ValueError) as error:  # json.JSONDecodeError is one
         raise ValueError(f"{source} cannot be read as a recipe: {error}") from error
@@ -72,9 +66,16 @@ def _convert(kind: type[T], fields: Any, prefix: str = "") -> T:
     """Builds settings from a dictionary; each value must have exactly its field's type."""
     if not isinstance(fields, dict):
         raise ValueError(f"field {prefix[:-1]!r}: expected an object, not {fields!r}")
-    types = field_types(kind)
+    types, removed = field_types(kind), getattr(kind, "removed", {})
     values = {}
     for name, value in fields.items():
+        if name in removed:
+            if value != removed[name]:
+                raise ValueError(
+                    f"field {prefix + name!r} no longer exists, and only {removed[name]!r} can be "
+                    "read, which did nothing: leave it out"
+                )
+            continue
         if name not in types:
             raise ValueError(f"unknown field {prefix + name!r}: {nearest(name, types)}")
         values[name] = _READERS.get(types[name], _convert_value)(types[name], value, prefix + name)
@@ -108,18 +109,8 @@ def _convert_parts(kind: Any, value: Any, name: str) -> dict[str, Part]:
     return {key: _convert_part(FrameSettings, part, f"{name}.{key}") for key, part in value.items()}
 
 
-def _convert_network(kind: type[Network], value: Any, name: str) -> Network:
-    if isinstance(value, dict) and "network" in value:
-        raise ValueError(
-            f"field {name + '.network'!r} is from an older version of torchrl-tit: name a frame "
-            f"encoder in {name + '.frame'!r} and a history encoder in {name + '.history'!r}"
-        )
-    return _convert(kind, value, f"{name}.")
-
-
 _READERS: dict[Any, Callable[[Any, Any, str], Any]] = {
     FrameSettings: _convert_part,
     Mapping[str, FrameSettings]: _convert_parts,
     HistorySettings: _convert_part,
-    Network: _convert_network,
 }

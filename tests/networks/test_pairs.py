@@ -570,7 +570,7 @@ WRONG: dict[str, tuple[Any, Any, Any, str]] = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_parts_that_do_not_fit_each_other_or_the_observation(case: Pair) -> None:
+def test_parts_that_do_not_fit_each_other_or_the_observation(case: str) -> None:
     frame, history, shape, message = WRONG[case]
     with pytest.raises(ValueError, match=message) as error:
         HistoryNetwork(frame, history, observation_shape=shape, num_frames=NUM_FRAMES)

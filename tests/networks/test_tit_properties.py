@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from tests.networks.reference import randomize
 from tests.numerics import assert_near
-from torchrl_tit import settings
 from torchrl_tit.histories.outer import StackedOuterTransformer
 from torchrl_tit.layers import TransformerBlock
 from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, VanillaTIT
@@ -120,15 +119,3 @@ def test_each_dropout_sits_where_its_name_says(setting: str) -> None:
     layer = {"attention": "attention.dropout", "ffn": "ffn.3"}[kind]
     active = {n for n, m in network.named_modules() if isinstance(m, nn.Dropout) and m.p}
     assert active == {f"{side}.blocks.{index}.{layer}" for index in range(2)}
-
-
-def test_features_need_not_be_normalized() -> None:
-    head = settings.Head(features_dim=8, final_norm=False)
-    network = HistoryNetwork(
-        settings.Inner(embed_dim=8), settings.PairedOuter(), observation_shape=(4,), head=head
-    )
-    assert [type(layer).__name__ for layer in network.head.children()] == [
-        "LayerNorm",
-        "Linear",
-        "Tanh",
-    ]

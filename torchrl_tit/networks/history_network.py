@@ -507,7 +507,5 @@ def _make_head(in_features: int, head: settings.Head) -> tuple[nn.Module, int]:
         return nn.Identity(), in_features
     layers = [nn.Linear(in_features, head.features_dim), make_activation(head.activation)]
     if head.norm:
-        layers = [nn.LayerNorm(in_features), *layers]
-        if head.final_norm:
-            layers.append(nn.LayerNorm(head.features_dim))
+        layers = [nn.LayerNorm(in_features), *layers, nn.LayerNorm(head.features_dim)]
     return nn.Sequential(*layers), head.features_dim

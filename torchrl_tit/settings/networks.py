@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from torchrl_tit.settings.checks import check_fields
 from torchrl_tit.settings.encoders import (
@@ -43,8 +43,9 @@ class Head:
     """Activation after the linear layer."""
     norm: bool = True
     """Whether to add a LayerNorm before the linear layer and another one after the activation."""
-    final_norm: bool = True
-    """Whether to add that second LayerNorm."""
+
+    removed: ClassVar[dict[str, Any]] = {"final_norm": True}
+    """Fields of older versions that no longer exist, with the values at which they did nothing."""
 
     def __post_init__(self) -> None:
         check_fields(self)
