@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
+from torchrl_tit.settings.choices import Gaps
 from torchrl_tit.settings.numbers import Batch, Steps
 
 from .recipe import Recipe
-
-Gaps = Literal["error", "cut"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,9 +27,9 @@ from torchrl_tit.datasets.checks import (
 from torchrl_tit.datasets.episodes import Episodes, memory_mapped_rows, rows_per_chunk
 from torchrl_tit.datasets.hdf5_files import damage_named
 from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.choices import Gaps
 from torchrl_tit.settings.numbers import Steps
 
-Gaps = Literal["error", "cut"]
 FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
 _REQUIRED = FIELDS[:4]
 _NUMBERS = (*FLAGS, "rewards")  # fields with one number a row

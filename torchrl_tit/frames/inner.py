@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
-from torchrl_tit.frames.observation import Kind, check_observation_shape
+from torchrl_tit.frames.observation import Kind
 from torchrl_tit.layers.blocks import TransformerBlock
 from torchrl_tit.layers.patches import find_patch_size, make_patch_embedding
 
@@ -52,9 +52,8 @@ class InnerTransformer(FrameEncoder):
         num_frames: int | None = None,
         categories: Sequence[int] | None = None,
     ) -> None:
-        shape = check_observation_shape(observation_shape)
         super().__init__(
-            shape,
+            observation_shape,
             num_tokens=settings.num_blocks if settings.every_block else 1,
             width=settings.embed_dim,
         )
@@ -62,8 +61,10 @@ class InnerTransformer(FrameEncoder):
         self.num_blocks = settings.num_blocks
         self.every_block = settings.every_block
         self.patch_embedding = make_patch_embedding(
-            shape,
-            find_patch_size(shape, settings.patch_size, categories=categories is not None),
+            self.observation_shape,
+            find_patch_size(
+                self.observation_shape, settings.patch_size, categories=categories is not None
+            ),
             settings.embed_dim,
             num_frames=num_frames or 1,
             categories=categories,

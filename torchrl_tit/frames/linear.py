@@ -11,7 +11,7 @@ from torch.nn import functional as F
 
 from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
-from torchrl_tit.frames.observation import Kind, check_observation_shape
+from torchrl_tit.frames.observation import Kind
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.categories import CategoryIndex
 from torchrl_tit.layers.patches import embed
@@ -44,10 +44,9 @@ class LinearFrameEncoder(FrameEncoder):
         *,
         categories: Sequence[int] | None = None,
     ) -> None:
-        shape = check_observation_shape(observation_shape)
-        super().__init__(shape, num_tokens=1, width=settings.embed_dim)
+        super().__init__(observation_shape, num_tokens=1, width=settings.embed_dim)
         self.index = None if categories is None else CategoryIndex(categories)
-        entries = math.prod(shape) if categories is None else sum(categories)
+        entries = math.prod(observation_shape) if categories is None else sum(categories)
         self.linear = nn.Linear(entries, settings.embed_dim, bias=settings.bias)
         self.activation: nn.Module = nn.Identity()
         if settings.activation != "none":

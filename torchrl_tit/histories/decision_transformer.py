@@ -112,31 +112,20 @@ class DecisionTransformer(HistoryEncoder):
         Returns:
             float [..., D].
         """
-        return self._encode(
-            tokens, action, return_to_go, timestep, mask, read=slice(-1, None)
-        ).squeeze(-2)
+        newest = self._encode(slice(-1, None), tokens, action, return_to_go, timestep, mask)
+        return newest.squeeze(-2)
 
-    def every_frame(  # type: ignore[override]
-        self,
-        tokens: Tensor,
-        action: Tensor,
-        return_to_go: Tensor,
-        timestep: Tensor,
-        mask: Tensor | None = None,
-    ) -> Tensor:
+    def every_frame(self, tokens: Tensor, *context: Tensor) -> Tensor:
         """Encodes every step of a window from the steps up to it, for training.
 
         Args:
             tokens: as in ``forward``.
-            action: as in ``forward``.
-            return_to_go: as in ``forward``.
-            timestep: as in ``forward``.
-            mask: as in ``forward``.
+            *context: the other inputs, as in ``forward``.
 
         Returns:
             float [..., K, D]; finite but meaningless at padding.
         """
-        return self._encode(tokens, action, return_to_go, timestep, mask, read=_STATES)
+        return self._encode(_STATES, tokens, *context)
 
     def attention_maps(self, tokens: Tensor, *context: Tensor) -> list[Tensor]:
         """Returns how much each step's state attends to each step, float [..., heads, K, K].
@@ -153,12 +142,12 @@ class DecisionTransformer(HistoryEncoder):
 
     def _encode(
         self,
+        read: slice,
         tokens: Tensor,
         action: Tensor,
         return_to_go: Tensor,
         timestep: Tensor,
-        mask: Tensor | None,
-        read: slice,
+        mask: Tensor | None = None,
     ) -> Tensor:
         """Features of the positions ``read`` of the sequence, float [..., positions, D]."""
         state = self.one_token(tokens)  # [..., K, D]

@@ -89,11 +89,12 @@ class HistoryEncoder(nn.Module):
         """
         raise NotImplementedError("there is no forward, which maps [..., K, L, D] to [..., E]")
 
-    def every_frame(self, tokens: Tensor) -> Tensor:
+    def every_frame(self, tokens: Tensor, *context: Tensor) -> Tensor:
         """Encodes every frame from itself and the frames before it, for losses on whole windows.
 
         Args:
             tokens: as in ``forward``.
+            *context: its other inputs, as in ``forward``.
 
         Returns:
             float [..., K, E].

@@ -12,3 +12,5 @@ ImageLayout = Literal["auto", "HWC", "CHW"]
 
 VectorizationMode = Literal["sync", "async"]
 """Whether copies of a task are stepped one after the other, or in parallel in processes."""
+Gaps = Literal["error", "cut"]
+"""Where a next observation is not that of the next row: an error, or the episode ends."""
