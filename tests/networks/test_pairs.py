@@ -466,112 +466,47 @@ def test_a_carried_state_reads_a_sequence_as_single_steps(case: Pair) -> None:
 
 
 PIXELS_AND_STATE = {"pixels": (36, 36), "state": (6,)}
-WRONG: dict[str, tuple[Any, Any, Any, str]] = {
-    **{
-        f"{frame}+{history}": (
-            FRAMES[frame],
-            HISTORIES[history],
-            (36, 36),
-            "stacks the frames themselves, not tokens: choose flat frames of one observation",
-        )
-        for frame, history in REFUSED
-    },
-    "several observations, stacked": (
-        settings.Flat(),
-        settings.StackedCNN(),
-        {"left": (36, 36), "right": (36, 36)},
-        "StackedCNN stacks the frames themselves, not tokens",
-    ),
-    "widths differ": (
-        {"pixels": settings.ResNetFrames(embed_dim=8), "state": settings.Linear(embed_dim=16)},
-        settings.Outer(),
-        PIXELS_AND_STATE,
-        r"tokens of the widths 8 \(pixels\) and 16 \(state\) cannot stand side by side: give both",
-    ),
-    "an encoder is missing": (
-        {"pixels": settings.ResNetFrames()},
-        settings.Outer(),
-        PIXELS_AND_STATE,
-        "there are frame encoders for pixels, but observations pixels, state: name one for each",
-    ),
-    "heads do not divide the width of tokens": (
-        settings.Linear(embed_dim=10),
-        settings.Outer(num_heads=4),
-        (6,),
-        "the width 10 cannot be split over 4 attention heads",
-    ),
-    "heads do not divide the width of flat frames": (
-        settings.Flat(),
-        settings.Catformer(num_heads=5),
-        (6,),
-        "the width 6 cannot be split over 5 attention heads",
-    ),
-    "heads do not divide the width of gated blocks": (
-        settings.Linear(embed_dim=12),
-        settings.CoBERL(num_heads=8),
-        (6,),
-        "the width 12 cannot be split over 8 attention heads",
-    ),
-    "stacked images are too small": (
-        settings.Flat(),
-        settings.StackedCNN(),
-        (36, 35),
-        "images of 36 x 35 pixels are too small .* must have at least 36",
-    ),
-    "images are too small": (
-        settings.NatureCNNFrames(),
-        settings.Outer(),
-        (3, 35, 84),
-        "images of 35 x 84 pixels are too small .* must have at least 36",
-    ),
-    "images are too small for the residual network": (
-        settings.ResNetFrames(),
-        settings.Outer(),
-        (7, 84),
-        "images of 7 x 84 pixels are too small .* must have at least 8",
-    ),
-    "convolutions on arrays": (
-        settings.ResNetFrames(),
-        settings.Outer(),
-        (6,),
-        r"resnet frames do not read an array of shape \(6,\): take inner, linear or flat frames",
-    ),
-    "stacked convolutions on arrays": (
-        settings.Flat(),
-        settings.StackedCNN(),
-        (6,),
-        r"observation_shape \(6,\) is that of an array, but this encoder reads images",
-    ),
-    "the patch does not divide the image": (
-        settings.Inner(patch_size=10),
-        settings.Outer(),
-        (36, 36),
-        "patch_size 10 does not divide the image of 36 x 36 pixels: choose one of",
-    ),
-    "the patch does not divide the stacked images": (
-        settings.Flat(),
-        settings.StackedInner(patch_size=10),
-        (36, 36),
-        "patch_size 10 does not divide the image of 36 x 36 pixels: choose one of",
-    ),
-    "no actions": (
-        settings.Linear(embed_dim=8),
-        settings.DecisionTransformer(),
-        (6,),
-        "Decision Transformer reads actions and returns .*: give action_dim",
-    ),
-    "a module in the place of settings": (
-        torch.nn.Linear(6, 8),
-        settings.Outer(),
-        (6,),
-        "a network is built from settings, such as .*, but Linear.* is no FrameSettings",
-    ),
-}
+STACKS = "stacks the frames themselves, not tokens: choose flat frames of one observation"
+PATCH = "patch_size 10 does not divide the image of 36 x 36 pixels: choose one of"
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_parts_that_do_not_fit_each_other_or_the_observation(case: str) -> None:
-    frame, history, shape, message = WRONG[case]
+@pytest.mark.parametrize(
+    ("frame", "history", "shape", "message"),
+    [
+        *((FRAMES[frame], HISTORIES[history], (36, 36), STACKS) for frame, history in REFUSED),
+        (settings.Flat(), settings.StackedCNN(), {"left": (36, 36), "right": (36, 36)}, STACKS),
+        ({"pixels": settings.ResNetFrames(embed_dim=8), "state": settings.Linear(embed_dim=16)},
+         settings.Outer(), PIXELS_AND_STATE, r"tokens of the widths 8 \(pixels\) and 16 \(state\) "
+         "cannot stand side by side: give both"),
+        ({"pixels": settings.ResNetFrames()}, settings.Outer(), PIXELS_AND_STATE,
+         "there are frame encoders for pixels, but observations pixels, state: name one for each"),
+        (settings.Linear(embed_dim=10), settings.Outer(num_heads=4), (6,),
+         "the width 10 cannot be split over 4 attention heads"),
+        (settings.Flat(), settings.Catformer(num_heads=5), (6,),
+         "the width 6 cannot be split over 5 attention heads"),
+        (settings.Linear(embed_dim=12), settings.CoBERL(num_heads=8), (6,),
+         "the width 12 cannot be split over 8 attention heads"),
+        (settings.Flat(), settings.StackedCNN(), (36, 35),
+         "images of 36 x 35 pixels are too small .* must have at least 36"),
+        (settings.NatureCNNFrames(), settings.Outer(), (3, 35, 84),
+         "images of 35 x 84 pixels are too small .* must have at least 36"),
+        (settings.ResNetFrames(), settings.Outer(), (7, 84),
+         "images of 7 x 84 pixels are too small .* must have at least 8"),
+        (settings.ResNetFrames(), settings.Outer(), (6,),
+         r"resnet frames do not read an array of shape \(6,\): take inner, linear or flat frames"),
+        (settings.Flat(), settings.StackedCNN(), (6,),
+         r"observation_shape \(6,\) is that of an array, but this encoder reads images"),
+        (settings.Inner(patch_size=10), settings.Outer(), (36, 36), PATCH),
+        (settings.Flat(), settings.StackedInner(patch_size=10), (36, 36), PATCH),
+        (settings.Linear(embed_dim=8), settings.DecisionTransformer(), (6,),
+         "Decision Transformer reads actions and returns .*: give action_dim"),
+        (torch.nn.Linear(6, 8), settings.Outer(), (6,),
+         "a network is built from settings, such as .*, but Linear.* is no FrameSettings"),
+    ],
+)  # fmt: skip
+def test_parts_that_do_not_fit_each_other_or_the_observation(
+    frame: Any, history: Any, shape: Any, message: str
+) -> None:
     with pytest.raises(ValueError, match=message) as error:
         HistoryNetwork(frame, history, observation_shape=shape, num_frames=NUM_FRAMES)
     assert "\n" not in str(error.value)
