@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 
 def bytes_to_floats(x: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -20,7 +21,7 @@ def bytes_to_floats(x: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
 
 
 class ImageConv2d(nn.Conv2d):
-    """2-d convolution that reads floats unchanged and divides bytes (uint8) by 255.
+    """2-d convolution without padding that reads floats, or bytes (uint8), which it divides by 255.
 
     The division is applied to the weights, which are fewer.
 
@@ -33,7 +34,8 @@ class ImageConv2d(nn.Conv2d):
     def forward(self, input: Tensor) -> Tensor:
         """[N, C, H, W], float or uint8 -> float [N, out_channels, H', W']."""
         if input.dtype == torch.uint8:
-            return self._conv_forward(input.to(self.weight.dtype), self.weight / 255, self.bias)
+            weight = self.weight / 255
+            return F.conv2d(input.to(weight.dtype), weight, self.bias, self.stride)
         return super().forward(input)
 
 
