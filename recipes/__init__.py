@@ -18,7 +18,7 @@ _HOMES = {
     "DatasetAlgorithm": "offline",
     "DatasetRecipe": "dataset_recipe",
     "NotFiniteError": "algorithm",
-    "Outcome": "outcomes",
+    "Outcome": "evaluation",
     "Recipe": "recipe",
     "Run": "run",
     "check_finite": "algorithm",
