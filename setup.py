@@ -15,6 +15,11 @@ setup(
     package_data={
         "torchrl_tit": ["py.typed"],
         "torchrl_tit.agents": ["*/*.json", "*/*.md", "*/*.safetensors"],
-        "torchrl_tit.recipes": ["*/*.csv", "*/*.html", "*/*.json", "*/*.md"],
+        "torchrl_tit.recipes": [
+            "tools/*/*.csv",
+            "tools/*/*.html",
+            "tools/*/*.json",
+            "tools/*/*.md",
+        ],
     },
 )

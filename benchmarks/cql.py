@@ -27,9 +27,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
+from recipes.core.recipe import Compile
+from recipes.core.registry import RECIPES
 from recipes.cql import CQL, CQLAlgorithm
-from recipes.recipe import Compile
-from recipes.registry import RECIPES
 from torchrl_tit.networks import build_network
 
 from .measuring import publish, ratios, spread, table, take_turns

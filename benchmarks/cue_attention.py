@@ -20,9 +20,9 @@ from matplotlib.figure import Figure
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, TransformedEnv
 
-from recipes.results.plot import new_figure, save_figure
-from recipes.run import Run
-from recipes.runner import load_trained
+from recipes.core.run import Run
+from recipes.core.runner import load_trained
+from recipes.tools.results.plot import new_figure, save_figure
 from torchrl_tit.analysis import outer_attention
 from torchrl_tit.analysis.targets import find_network, histories_of
 

@@ -17,10 +17,10 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from recipes.results.experiments import group_runs
-from recipes.results.interval import interval_of
-from recipes.run import Run
-from recipes.runner import load_trained
+from recipes.core.run import Run
+from recipes.core.runner import load_trained
+from recipes.tools.results.experiments import group_runs
+from recipes.tools.results.interval import interval_of
 from torchrl_tit.analysis import (
     Target,
     find_objects,

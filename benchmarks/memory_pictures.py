@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from recipes.metrics import parse_metrics
-from recipes.results.experiments import find_runs
-from recipes.results.interval import intervals_of
-from recipes.results.plot import new_figure, save_figure
+from recipes.core.metrics import parse_metrics
+from recipes.tools.results.experiments import find_runs
+from recipes.tools.results.interval import intervals_of
+from recipes.tools.results.plot import new_figure, save_figure
 
 from .measuring import read_rows
 from .memory_tasks import shares

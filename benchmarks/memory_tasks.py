@@ -25,12 +25,12 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from recipes import runner
-from recipes.callback import Callback
-from recipes.recipe import Recipe
-from recipes.registry import find_recipe
-from recipes.results.interval import interval_of
-from recipes.run import Run
+from recipes.core import runner
+from recipes.core.callback import Callback
+from recipes.core.recipe import Recipe
+from recipes.core.registry import find_recipe
+from recipes.core.run import Run
+from recipes.tools.results.interval import interval_of
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.evaluation import finished_returns
 from torchrl_tit.files import write_text_atomic

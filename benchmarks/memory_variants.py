@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from recipes.core.registry import get_recipe
 from recipes.ppo import PPO
 from recipes.presets.ppo_memory import VIEW
-from recipes.registry import get_recipe
 from torchrl_tit.settings import GRU, Inner, Network, Outer
 from torchrl_tit.settings.encoders import ChainedOuter, PairedOuter
 

@@ -25,12 +25,13 @@ from stable_baselines3.common.vec_env import VecFrameStack
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from recipes import ppo, runner
-from recipes.callback import Callback
-from recipes.metrics import read_metrics
-from recipes.recipe import Compile
-from recipes.registry import get_recipe
-from recipes.run import Run
+from recipes import ppo
+from recipes.core import runner
+from recipes.core.callback import Callback
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe import Compile
+from recipes.core.registry import get_recipe
+from recipes.core.run import Run
 
 from .measuring import empty_compile_cache, publish, ratios, spread, table
 from .straightforward import StraightforwardTIT

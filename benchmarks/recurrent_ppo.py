@@ -29,8 +29,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from torch import Tensor, nn
 
+from recipes.core.registry import get_recipe
 from recipes.ppo import PPO
-from recipes.registry import get_recipe
 from torchrl_tit.tasks import FirstActions
 
 from .measuring import add_missing_rows

@@ -8,32 +8,32 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from .one_name import share_modules
+from .core.package_alias import share_modules
 
 share_modules(__name__)
 
 _HOMES = {
-    "Algorithm": "algorithm",
-    "Callback": "callback",
+    "Algorithm": "core.algorithm",
+    "Callback": "core.callback",
     "DatasetAlgorithm": "offline",
-    "DatasetRecipe": "dataset_recipe",
-    "NotFiniteError": "algorithm",
-    "Outcome": "evaluation",
-    "Recipe": "recipe",
-    "Run": "run",
-    "check_finite": "algorithm",
-    "evaluate": "runner",
-    "find_recipe": "registry",
-    "get_recipe": "registry",
-    "load_trained": "runner",
-    "make_algorithm": "algorithm",
-    "make_task": "task",
-    "recipe_from_json": "recipe_json",
-    "recipe_to_json": "recipe_json",
-    "register_recipes": "registry",
-    "seed_copies": "task",
-    "train": "runner",
-    "weights_from": "initial_weights",
+    "DatasetRecipe": "core.dataset_recipe",
+    "NotFiniteError": "core.algorithm",
+    "Outcome": "core.evaluation",
+    "Recipe": "core.recipe",
+    "Run": "core.run",
+    "check_finite": "core.algorithm",
+    "evaluate": "core.runner",
+    "find_recipe": "core.registry",
+    "get_recipe": "core.registry",
+    "load_trained": "core.runner",
+    "make_algorithm": "core.algorithm",
+    "make_task": "core.task",
+    "recipe_from_json": "core.recipe_json",
+    "recipe_to_json": "core.recipe_json",
+    "register_recipes": "core.registry",
+    "seed_copies": "core.task",
+    "train": "core.runner",
+    "weights_from": "core.initial_weights",
 }
 """The modules of the public names; PyTorch is loaded with the first name that needs it."""
 

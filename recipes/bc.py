@@ -14,8 +14,8 @@ from torchrl.envs import EnvBase
 from torchrl_tit.objectives import LikelihoodBCLoss
 from torchrl_tit.settings.numbers import Rate, Steps
 
-from .algorithm import descend
-from .networks import make_cloning_policy
+from .core.algorithm import descend
+from .core.networks import make_cloning_policy
 from .offline import TransitionAlgorithm, TransitionRecipe
 
 

@@ -22,11 +22,11 @@ from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
 from torchrl_tit.settings.numbers import Count, Fraction, Rate, Weight, Widths
 
-from .algorithm import Terms, descend
-from .compilation import check_compiler, compile_and_time, should_compile
-from .networks import describe, is_discrete, make_value_policy
+from .core.algorithm import Terms, descend
+from .core.compilation import check_compiler, compile_and_time, should_compile
+from .core.networks import describe, is_discrete, make_value_policy
+from .core.recipe import Compile
 from .offline import TransitionAlgorithm, TransitionRecipe
-from .recipe import Compile
 
 
 @dataclass(frozen=True, kw_only=True)

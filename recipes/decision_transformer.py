@@ -45,12 +45,12 @@ from torchrl_tit.settings.numbers import (
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 from torchrl_tit.transforms import SequenceHistory
 
-from .algorithm import Stateful, Terms, check_finite, total_loss
-from .dataset_recipe import DatasetRecipe
-from .evaluation import Outcome
-from .networks import normalize_frames
+from .core.algorithm import Stateful, Terms, check_finite, total_loss
+from .core.dataset_recipe import DatasetRecipe
+from .core.evaluation import Outcome
+from .core.networks import normalize_frames
+from .core.task import make_task, task_limit
 from .offline import DatasetAlgorithm
-from .task import make_task, task_limit
 
 ActionSpace = Literal["continuous", "gaussian", "discrete"]
 

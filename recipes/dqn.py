@@ -23,8 +23,8 @@ from torchrl_tit.envs import observation_specs
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.settings.numbers import Batch, Fraction, Rate, Steps, Weight
 
-from .algorithm import Stateful, Terms, descend
-from .networks import describe, is_discrete, make_backbone, make_value_policy
+from .core.algorithm import Stateful, Terms, descend
+from .core.networks import describe, is_discrete, make_backbone, make_value_policy
 from .replay import ReplayAlgorithm, ReplayRecipe
 
 

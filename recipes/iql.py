@@ -15,8 +15,8 @@ from torchrl.objectives import DiscreteIQLLoss, IQLLoss, SoftUpdate
 from torchrl_tit.datasets import DatasetError, Episodes
 from torchrl_tit.settings.numbers import Inside, Rate, Weight
 
-from .algorithm import descend
-from .networks import describe, is_continuous, is_discrete, make_cloning_policy
+from .core.algorithm import descend
+from .core.networks import describe, is_continuous, is_discrete, make_cloning_policy
 from .offline import ActorCriticRecipe, TransitionAlgorithm
 
 _RETURN_RANGE = 1000.0

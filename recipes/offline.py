@@ -26,11 +26,11 @@ from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
-from .algorithm import Algorithm, Stateful, Terms, check_finite, numbers
-from .dataset_recipe import DatasetRecipe
-from .evaluation import Outcome
-from .networks import make_backbone, make_critic
-from .task import make_task
+from .core.algorithm import Algorithm, Stateful, Terms, check_finite, numbers
+from .core.dataset_recipe import DatasetRecipe
+from .core.evaluation import Outcome
+from .core.networks import make_backbone, make_critic
+from .core.task import make_task
 
 
 class Buffer(Stateful, Protocol):
@@ -208,7 +208,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
 
         Args:
             env: the task.
-            slices: as in :func:`~recipes.networks.make_backbone`; always on if the recipe draws
+            slices: as in :func:`~recipes.core.networks.make_backbone`; always on if the recipe draws
                 slices.
         """
         recipe, slices = self.recipe, slices or self.recipe.slice_length > 1
@@ -216,7 +216,7 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
         return make_backbone(recipe.backbone, observation, slices=slices, eps=self._eps)
 
     def make_critic(self, env: EnvBase, action_dim: int, **settings: Any) -> TensorDictModuleBase:
-        """Builds a value network; see :func:`~recipes.networks.make_critic`."""
+        """Builds a value network; see :func:`~recipes.core.networks.make_critic`."""
         recipe: Any = self.recipe
         return make_critic(
             observation_specs(env),

@@ -23,12 +23,12 @@ from torchrl_tit.modules import ActingCollector
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps
 
-from .algorithm import Algorithm
-from .evaluation import Outcome
-from .ray_cluster import check_address
-from .ray_collector import ClusterCollector, check_cluster
-from .recipe import Recipe
-from .task import make_task, seed_copies
+from .core.algorithm import Algorithm
+from .core.evaluation import Outcome
+from .core.ray_cluster import check_address
+from .core.ray_collector import ClusterCollector, check_cluster
+from .core.recipe import Recipe
+from .core.task import make_task, seed_copies
 
 
 @dataclass(frozen=True, kw_only=True)

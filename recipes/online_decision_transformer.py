@@ -46,9 +46,9 @@ from torchrl_tit.settings.numbers import (
 )
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
-from .algorithm import Stateful, check_finite, total_loss
+from .core.algorithm import Stateful, check_finite, total_loss
+from .core.task import seed_copies
 from .decision_transformer import ActionSpace, SequenceAlgorithm, SequenceRecipe
-from .task import seed_copies
 
 try:
     import pytorch_optimizer

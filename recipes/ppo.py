@@ -47,20 +47,20 @@ from torchrl_tit.settings.numbers import (
 )
 from torchrl_tit.windows import Windows
 
-from .adaptive import AdvantageScale, KLAdaptiveRate, ReturnScale, normalize_advantages
-from .algorithm import Stateful, check_finite
-from .compilation import (
+from .core.adaptive import AdvantageScale, KLAdaptiveRate, ReturnScale, normalize_advantages
+from .core.algorithm import Stateful, check_finite
+from .core.compilation import (
     STATIC_SHAPES,
     autocast_type,
     check_compiler,
     compile_and_time,
     should_compile,
 )
-from .flat_parameters import FlatParameters
-from .networks import normalize_frames
+from .core.flat_parameters import FlatParameters
+from .core.networks import normalize_frames
+from .core.recipe import Compile, Precision
+from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
-from .recipe import Compile, Precision
-from .task import make_task
 
 # Longer sequences are faster, but their steps are more correlated.
 _LONGEST = 16

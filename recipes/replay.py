@@ -20,9 +20,9 @@ from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_chec
 from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
 from torchrl_tit.settings.numbers import Batch, Steps, Weight
 
-from .algorithm import Stateful, Terms, check_finite, numbers
+from .core.algorithm import Stateful, Terms, check_finite, numbers
+from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
-from .task import make_task
 
 _STORED = [
     "observation",

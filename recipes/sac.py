@@ -24,8 +24,8 @@ from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.numbers import Fraction, Rate, Widths
 
-from .algorithm import Terms, descend
-from .networks import describe, make_backbone, make_critic
+from .core.algorithm import Terms, descend
+from .core.networks import describe, make_backbone, make_critic
 from .replay import ReplayAlgorithm, ReplayRecipe
 
 

@@ -15,8 +15,8 @@ from torchrl.objectives import SoftUpdate, TD3BCLoss
 from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.settings.numbers import Rate, Steps, Weight
 
-from .algorithm import Stateful, Terms, descend
-from .networks import describe, make_deterministic_policy
+from .core.algorithm import Stateful, Terms, descend
+from .core.networks import describe, make_deterministic_policy
 from .offline import ActorCriticRecipe, TransitionAlgorithm
 
 

@@ -19,8 +19,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from recipes.recipe import Recipe
-from recipes.registry import RECIPES
+from recipes.core.recipe import Recipe
+from recipes.core.registry import RECIPES
 from tests import processes
 from torchrl_tit.settings import FrameSettings, HistorySettings, imports
 from torchrl_tit.settings.parts import Names

@@ -23,8 +23,8 @@ PRELOADED = [
     "pytest",
     "recipes.cli.main",
     "recipes.ppo",
-    "recipes.results.plot",
-    "recipes.runner",
+    "recipes.tools.results.plot",
+    "recipes.core.runner",
     "torch.utils.tensorboard",
 ]
 _describe, _prepare, _ensure_running = (

@@ -22,7 +22,7 @@ main(["play", "cartpole", "--episodes", "1"])
 import torchrl_tit.datasets
 import recipes.online_decision_transformer  # and with it, all that plays its agents
 from recipes import Run, get_recipe
-from recipes.metrics import Metrics
+from recipes.core.metrics import Metrics
 from pathlib import Path
 
 def create():

@@ -28,9 +28,9 @@ import docstring_parser
 import msgspec
 
 from recipes.cli.main import COMMANDS, USAGE, main
-from recipes.recipe import Recipe
-from recipes.registry import RECIPES
-from recipes.results.metric_words import to_markdown
+from recipes.core.recipe import Recipe
+from recipes.core.registry import RECIPES
+from recipes.tools.results.metric_words import to_markdown
 from torchrl_tit.settings import NETWORKS, FrameSettings, Head, HistorySettings, Network
 
 ROOT = Path(__file__).parents[2]

@@ -37,9 +37,9 @@ from typing import Any
 
 import numpy as np
 
-from recipes.records import Records
-from recipes.results.interval import interval_of
-from recipes.results.table import paper_results, plain_name
+from recipes.core.records import Records
+from recipes.tools.results.interval import interval_of
+from recipes.tools.results.table import paper_results, plain_name
 from torchrl_tit.files import write_text_atomic
 
 ROOT = Path(__file__).parents[2]

@@ -43,7 +43,7 @@ def play(arguments: list[str]) -> None:
 
     from torchrl_tit import load_agent
 
-    from ..results.film import check_film, film_policy
+    from ..tools.results.film import check_film, film_policy
 
     if options.out is not None:
         check_film(options.out)
@@ -99,7 +99,7 @@ def share(arguments: list[str]) -> None:
             fail(f"{options.run} is an agent already: share it as REPO, without other options")
         _upload(found, repository, options.private)
         return
-    from ..agents import pack
+    from ..tools.agents import pack
 
     source = f"{PREFIX}{repository}" if repository is not None else options.out.name
     name = options.name or source.rpartition("/")[2]

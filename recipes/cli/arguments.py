@@ -20,7 +20,7 @@ from torchrl_tit.settings.checks import printable
 from torchrl_tit.settings.imports import allow, import_allowed
 from torchrl_tit.settings.numbers import MAX_SEED
 
-from ..recipe import Recipe
+from ..core.recipe import Recipe
 
 IMPORT = "--import"
 IMPORT_HELP = (

@@ -19,7 +19,7 @@ from torchrl_tit.settings import NETWORKS, FrameSettings, HistorySettings, Part
 from torchrl_tit.settings.checks import field_types, nearest
 from torchrl_tit.settings.imports import load_plugins
 
-from ..recipe import Recipe
+from ..core.recipe import Recipe
 
 RecipeT = TypeVar("RecipeT", bound=Recipe)
 T = TypeVar("T")
@@ -56,7 +56,7 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
         ValueError: if a name is missing or unknown; the message suggests the nearest ones.
 
     Example:
-        >>> from recipes.registry import get_recipe
+        >>> from recipes.core.registry import get_recipe
         >>> arguments = ["--backbone.frame", "resnet", "--backbone.history", "outer"]
         >>> recipe = choose_network(get_recipe("ppo/pong/enhanced-tit"), arguments)
         >>> recipe.backbone.frame

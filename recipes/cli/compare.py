@@ -6,9 +6,9 @@ from pathlib import Path
 
 from torchrl_tit.files import write_text_atomic
 
-from ..results.experiments import check_together, find_runs, group_runs
-from ..results.plot import plot_comparison, plot_table
-from ..results.table import make_table, to_csv, to_markdown
+from ..tools.results.experiments import check_together, find_runs, group_runs
+from ..tools.results.plot import plot_comparison, plot_table
+from ..tools.results.table import make_table, to_csv, to_markdown
 from .arguments import Parser, fail, note, program, say
 
 

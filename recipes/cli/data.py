@@ -22,9 +22,9 @@ from torchrl_tit.datasets.sources import HDF5_SUFFIXES
 from torchrl_tit.settings.checks import printable
 from torchrl_tit.settings.imports import import_options
 
-from ..collect import Collection
-from ..collect.collect import collect
-from ..trust import may_name_task
+from ..core.trust import may_name_task
+from ..tools.collect import Collection
+from ..tools.collect.collect import collect
 from .arguments import Parser, note, parse_fields, program, say
 
 

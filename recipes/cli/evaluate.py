@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
-from ..recipe import Recipe
+from ..core.recipe import Recipe
 from .arguments import Parser, add_machine_options, fail, override, program, say
 
 
@@ -31,7 +31,7 @@ def evaluate(arguments: list[str]) -> None:
     add_machine_options(parser)
     options = parser.parse_args(arguments)
     from .. import runner  # not at the top: help needs no PyTorch
-    from ..run import Run
+    from ..core.run import Run
 
     run = Run.open(options.run)
     recipe = override(
@@ -83,8 +83,8 @@ def render(arguments: list[str]) -> None:
         "--seed", type=int, help="seed of the first episode; default: the evaluation's"
     )
     options = parser.parse_args(arguments)
-    from ..results.film import film  # not at the top: help needs no PyTorch
-    from ..run import Run
+    from ..core.run import Run
+    from ..tools.results.film import film  # not at the top: help needs no PyTorch
 
     run = Run.open(options.run)
     recipe = override(run.recipe, evaluation_seed=options.seed)

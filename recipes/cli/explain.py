@@ -43,7 +43,7 @@ def explain(arguments: list[str]) -> None:
 
     from torchrl_tit import load_agent
 
-    from ..results.explanation import check_explanation, explain_policy
+    from ..tools.results.explanation import check_explanation, explain_policy
 
     check_explanation(options.out, options.step, options.max_steps)
     agent = load_agent(options.agent)

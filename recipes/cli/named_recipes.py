@@ -6,8 +6,8 @@ from fnmatch import fnmatchcase
 
 from torchrl_tit.settings.imports import load_plugins
 
-from ..recipe_json import recipe_to_json
-from ..registry import RECIPES, find_recipe
+from ..core.recipe_json import recipe_to_json
+from ..core.registry import RECIPES, find_recipe
 from .arguments import Parser, fail, note, program, say
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..results.recording import record_runs
+from ..tools.results.recording import record_runs
 from .arguments import Parser, program, say
 
 

@@ -31,7 +31,7 @@ def report(arguments: list[str]) -> None:
     )
     options = parser.parse_args(arguments)
     # Not at the top: it needs an extra, and help needs no PyTorch.
-    from ..results.report import report as write
+    from ..tools.results.report import report as write
 
     write(
         options.runs,

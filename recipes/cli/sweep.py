@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from ..algorithm import make_algorithm
-from ..registry import find_recipe
-from ..sweeps.sweep import make_jobs, run_jobs
-from ..trust import allow_names
-from ..wandb_metrics import check_wandb
+from ..core.algorithm import make_algorithm
+from ..core.registry import find_recipe
+from ..core.trust import allow_names
+from ..tools.sweeps.sweep import make_jobs, run_jobs
+from ..tools.wandb_metrics import check_wandb
 from .arguments import Parser, fail, note, program, say
 
 
@@ -49,8 +49,8 @@ def sweep(arguments: list[str]) -> None:
             failed = run_jobs(jobs, options.workers or 1)
         else:
             # Not at the top: Ray is an extra.
-            from ..ray_cluster import connect
-            from ..sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
+            from ..core.ray_cluster import connect
+            from ..tools.sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
 
             connect(options.ray)
             for line in find_unmet_needs(jobs):
@@ -83,8 +83,8 @@ def tune(arguments: list[str]) -> None:
         if getattr(options, name) < 1:
             fail(f"--{name.replace('_', '-')} must be at least 1, not {getattr(options, name)}")
     # Not at the top: Optuna is an extra.
-    from ..sweeps.search_space import load_space
-    from ..sweeps.tune import Search, Settings, importances
+    from ..tools.sweeps.search_space import load_space
+    from ..tools.sweeps.tune import Search, Settings, importances
 
     recipe = find_recipe(options.name)
     allow_names(recipe)

@@ -15,9 +15,9 @@ from torchrl_tit.settings import resolve
 from torchrl_tit.settings.checks import field_types
 from torchrl_tit.settings.imports import load_plugins
 
-from ..recipe import Recipe
-from ..registry import find_recipe
-from ..trust import allow_names
+from ..core.recipe import Recipe
+from ..core.registry import find_recipe
+from ..core.trust import allow_names
 from .arguments import Parser, add_machine_options, fail, option, parse_fields, program
 from .backbone_options import check_recipe, choose_network, option_fields
 

@@ -10,15 +10,15 @@ from pathlib import Path
 
 from torchrl_tit.settings.imports import import_options
 
-from .. import runner
-from ..algorithm import make_algorithm
-from ..callback import Callback
-from ..initial_weights import weights_from
-from ..networks import name_chosen_encoders
-from ..recipe import Recipe
-from ..results.plot import plot_run
-from ..run import Run
-from ..wandb_metrics import WandbMetrics, check_wandb
+from ..core import runner
+from ..core.algorithm import make_algorithm
+from ..core.callback import Callback
+from ..core.initial_weights import weights_from
+from ..core.networks import name_chosen_encoders
+from ..core.recipe import Recipe
+from ..core.run import Run
+from ..tools.results.plot import plot_run
+from ..tools.wandb_metrics import WandbMetrics, check_wandb
 from .arguments import note, option, override, program, say
 from .evaluate import one_line
 from .unused_frames import UnusedFrames

@@ -6,8 +6,8 @@ import warnings
 from collections import defaultdict
 from typing import Any
 
-from ..callback import Callback
-from ..recipe import Recipe
+from ..core.callback import Callback
+from ..core.recipe import Recipe
 
 _SHARE = 5
 """A run is checked after one part in this many, because the first episodes are often short."""

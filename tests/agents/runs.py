@@ -4,12 +4,12 @@ from pathlib import Path
 
 import torch
 
-from recipes import runner
-from recipes.agents import pack
-from recipes.algorithm import make_algorithm
+from recipes.core import runner
+from recipes.core.algorithm import make_algorithm
+from recipes.core.recipe import Recipe
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.recipe import Recipe
-from recipes.run import Run
+from recipes.tools.agents import pack
 from torchrl_tit.agents.folder import write_agent
 from torchrl_tit.settings.networks import enhanced_tit
 

@@ -15,8 +15,8 @@ from benchmarks.cue_attention import (
     plot_decisions,
     to_markdown,
 )
+from recipes.core.registry import get_recipe
 from recipes.ppo import PPO
-from recipes.registry import get_recipe
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 

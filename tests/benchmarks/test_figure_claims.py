@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from benchmarks.figure_claims import FigureClaims, main, measure_figure_claims, to_markdown
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.results.interval import interval_of
-from recipes.run import Run
+from recipes.tools.results.interval import interval_of
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp, resnet
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.memory_pictures import main, plot_curves, plot_lengths
-from recipes.recipe_json import recipe_to_json
-from recipes.registry import get_recipe
+from recipes.core.recipe_json import recipe_to_json
+from recipes.core.registry import get_recipe
 
 SHORT, LONG = [(100, 50), (200, 100)], [(100, 50), (200, 100), (400, 0)]
 """Step and successes of 100 episodes each."""

@@ -8,9 +8,9 @@ import pytest
 from benchmarks import memory_tasks
 from benchmarks.measuring import read_rows
 from benchmarks.memory_tasks import EPISODES, Successes
-from recipes import runner
-from recipes.registry import find_recipe
-from recipes.run import Run
+from recipes.core import runner
+from recipes.core.registry import find_recipe
+from recipes.core.run import Run
 
 NAME = "ppo/tmaze-10/frames-4"
 SHORT: dict[str, Any] = {

@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("minigrid")
 
 from benchmarks import memory_variants
-from recipes.algorithm import make_algorithm
-from recipes.registry import find_recipe, get_recipe
+from recipes.core.algorithm import make_algorithm
+from recipes.core.registry import find_recipe, get_recipe
 
 LARGER = ("frames-32", "tiles-of-28-pixels")
 FIELDS = {

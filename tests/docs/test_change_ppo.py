@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from recipes.cli import main
-from recipes.metrics import read_metrics
+from recipes.core.metrics import read_metrics
 from recipes.ppo import PPO, PPOAlgorithm
 from tests.numerics import assert_near
 from tests.recipes.ppo import tasks

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import torch
 
-from recipes.metrics import read_metrics
-from recipes.run import Run
-from recipes.runner import evaluate, load_trained, train
+from recipes.core.metrics import read_metrics
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, load_trained, train
 from tests.docs.test_tutorials import BLOCK
 from tests.recipes.cql.cql_runs import SETTINGS, make_data
 from torchrl_tit.settings.networks import mlp

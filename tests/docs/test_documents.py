@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from recipes import registry
-from recipes.results.experiments import find_runs
+from recipes.core import registry
+from recipes.tools.results.experiments import find_runs
 from torchrl_tit.settings import FrameSettings, HistorySettings
 
 ROOT = Path(__file__).parents[2]

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from recipes.cli import main
-from recipes.metrics import read_metrics
-from recipes.recipe_json import recipe_from_json
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe_json import recipe_from_json
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "docs" / "examples" / "own_package"

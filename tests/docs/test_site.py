@@ -10,8 +10,8 @@ import yaml
 
 from docs.tools import reference
 from recipes.cli.main import COMMANDS
-from recipes.recipe import Recipe
-from recipes.registry import RECIPES
+from recipes.core.recipe import Recipe
+from recipes.core.registry import RECIPES
 from torchrl_tit.settings import FrameSettings, HistorySettings
 from torchrl_tit.settings.numbers import Batch, Positive, Real, Width
 

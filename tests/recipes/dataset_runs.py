@@ -7,10 +7,10 @@ from pathlib import Path
 
 import torch
 
-from recipes import runner
-from recipes.metrics import read_metrics
-from recipes.recipe import Recipe
-from recipes.run import Run
+from recipes.core import runner
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe import Recipe
+from recipes.core.run import Run
 from tests.datasets.rollouts import roll, write
 from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from recipes.recipe import Recipe
+from recipes.core.recipe import Recipe
 
 TIMES = ("time", "steps_per_second")
 """Columns of metrics that differ from run to run."""

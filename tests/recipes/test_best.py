@@ -5,11 +5,11 @@ import json
 import pytest
 from torch import nn
 
-from recipes.best import EPISODES, Best
 from recipes.cli import main
+from recipes.core.best import EPISODES, Best
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, load_trained, train
 from recipes.ppo import PPO
-from recipes.run import Run
-from recipes.runner import evaluate, load_trained, train
 from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import mlp

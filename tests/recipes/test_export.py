@@ -13,10 +13,10 @@ from safetensors.torch import load_file
 from tensordict.nn import set_interaction_type
 from tensordict.nn.probabilistic import InteractionType
 
-from recipes import runner
+from recipes.core import runner
+from recipes.core.run import Run
 from recipes.dqn import DQN
 from recipes.ppo import PPO
-from recipes.run import Run
 from recipes.sac import SAC
 from tests.agents.runs import packed
 from tests.recipes.cql.cql_runs import make_cartpole_data, make_cql, make_discrete_cql, tit

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 import torch
 
-from recipes import runner
 from recipes.cli import main
-from recipes.initial_weights import weights_from
+from recipes.core import runner
+from recipes.core.initial_weights import weights_from
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.run import Run
 from torchrl_tit.checkpoint import CheckpointError, load_checkpoint
 from torchrl_tit.settings.networks import mlp
 

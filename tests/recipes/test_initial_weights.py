@@ -8,14 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from recipes import runner
-from recipes.algorithm import make_algorithm
 from recipes.cli import main, training
-from recipes.initial_weights import weights_from
-from recipes.run import Run
+from recipes.core import runner
+from recipes.core.algorithm import make_algorithm
+from recipes.core.initial_weights import weights_from
+from recipes.core.run import Run
 from recipes.sac import SAC
 from tests.recipes.cli.test_cli import fails
-from tests.recipes.sweeps.sweep_runs import TINY
+from tests.recipes.tools.sweeps.sweep_runs import TINY
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import mlp

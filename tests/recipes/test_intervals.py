@@ -16,18 +16,18 @@ import numpy as np
 import pytest
 import torch
 
-from recipes.algorithm import NotFiniteError, make_algorithm
-from recipes.callback import Callback
 from recipes.cli import main
+from recipes.core.algorithm import NotFiniteError, make_algorithm
+from recipes.core.callback import Callback
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe import Recipe
+from recipes.core.recipe_json import recipe_to_json
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
+from recipes.core.task import make_task, seed_copies
 from recipes.dqn import DQN
-from recipes.metrics import read_metrics
 from recipes.ppo import PPO
-from recipes.recipe import Recipe
-from recipes.recipe_json import recipe_to_json
-from recipes.run import Run
-from recipes.runner import evaluate, train
 from recipes.sac import SAC
-from recipes.task import make_task, seed_copies
 from tests.envs import tasks
 from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import load_checkpoint

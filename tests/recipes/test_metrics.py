@@ -5,7 +5,7 @@ import math
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from recipes.metrics import Metrics, read_metrics
+from recipes.core.metrics import Metrics, read_metrics
 
 
 def scalars(folder, name):

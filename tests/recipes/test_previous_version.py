@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from recipes.cli import main
-from recipes.metrics import read_metrics
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.registry import RECIPES, get_recipe
-from recipes.run import Run
-from recipes.runner import evaluate
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.registry import RECIPES, get_recipe
+from recipes.core.run import Run
+from recipes.core.runner import evaluate
 from torchrl_tit import load_agent
 
 DATA = Path(__file__).parents[1] / "data" / "previous_version"

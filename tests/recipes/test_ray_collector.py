@@ -12,14 +12,14 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from recipes.algorithm import make_algorithm
-from recipes.callback import Callback
+from recipes.core.algorithm import make_algorithm
+from recipes.core.callback import Callback
+from recipes.core.ray_collector import _check_own_name
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
+from recipes.core.task import seed_copies
 from recipes.ppo import PPO
-from recipes.ray_collector import _check_own_name
-from recipes.run import Run
-from recipes.runner import evaluate, train
 from recipes.sac import SAC, SACAlgorithm
-from recipes.task import seed_copies
 from tests.numerics import assert_near
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.rollout import FrameCollector, Rollout

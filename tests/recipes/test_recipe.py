@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from recipes.core.recipe import Recipe
+from recipes.core.registry import get_recipe
 from recipes.ppo import PPO
-from recipes.recipe import Recipe
-from recipes.registry import get_recipe
 from torchrl_tit.networks import MLP
 from torchrl_tit.settings import FrameSettings, Head, HistorySettings, Inner, Network, Outer
 from torchrl_tit.settings.checks import checked, field_types

@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
-from recipes import run as run_module
-from recipes import runner
-from recipes.algorithm import make_algorithm
 from recipes.cli import main
-from recipes.dataset_recipe import DatasetRecipe
-from recipes.metrics import read_metrics
+from recipes.core import run as run_module
+from recipes.core import runner
+from recipes.core.algorithm import make_algorithm
+from recipes.core.dataset_recipe import DatasetRecipe
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe_json import recipe_to_json, settings_to_dict
+from recipes.core.registry import RECIPES
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.recipe_json import recipe_to_json, settings_to_dict
-from recipes.registry import RECIPES
-from recipes.results.plot import plot_run
-from recipes.run import Run
+from recipes.tools.results.plot import plot_run
 from tests.recipes.commands import Command
 from tests.recipes.dataset_runs import assert_same_run
 from tests.recipes.states import unchecked
@@ -80,7 +80,7 @@ def test_a_folder_that_a_killed_process_had_only_begun_becomes_a_run(tmp_path, m
         path.write_text(text)
 
     with monkeypatch.context() as patch:
-        patch.setattr("recipes.run.write_text_atomic", killed)
+        patch.setattr("recipes.core.run.write_text_atomic", killed)
         with pytest.raises(SystemExit):
             Run.create(tmp_path / "run", SMALL)
     (tmp_path / "run" / ".recipe.json.0a1b2c3d.tmp").touch()
@@ -370,7 +370,7 @@ def test_a_run_in_use_is_evaluated_into_another_file_only(tmp_path, capsys):
 
 def test_a_run_of_any_algorithm_is_opened_by_a_script_of_its_own():
     script = (
-        "from recipes.records import Records; from recipes.run import RecordedRun; "
+        "from recipes.core.records import Records; from recipes.core.run import RecordedRun; "
         "print(RecordedRun(Records('docs/results/cartpole'), 'mlp/seed-0').recipe.env)"
     )
     done = subprocess.run(

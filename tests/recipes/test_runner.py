@@ -18,14 +18,14 @@ import pytest
 import torch
 from torch import nn
 
-from recipes import runner
-from recipes.algorithm import Algorithm, NotFiniteError, check_finite
-from recipes.callback import Callback
-from recipes.evaluation import Outcome
-from recipes.metrics import Metrics, read_metrics
-from recipes.recipe import Recipe
-from recipes.run import Run
-from recipes.runner import evaluate, load_trained, train
+from recipes.core import runner
+from recipes.core.algorithm import Algorithm, NotFiniteError, check_finite
+from recipes.core.callback import Callback
+from recipes.core.evaluation import Outcome
+from recipes.core.metrics import Metrics, read_metrics
+from recipes.core.recipe import Recipe
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, load_trained, train
 from tests.recipes.dataset_runs import assert_same_run
 from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import CheckpointError, checkpoint_steps, load_checkpoint

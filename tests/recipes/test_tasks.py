@@ -9,12 +9,12 @@ import pytest
 import torch
 
 from recipes.cli import main
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.run import Run
+from recipes.core.task import make_task, task_limit
 from recipes.cql import DiscreteCQL
 from recipes.ppo import PPO
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.run import Run
 from recipes.sac import SAC
-from recipes.task import make_task, task_limit
 from torchrl_tit.settings.networks import mlp
 
 BATCH = 32

@@ -12,9 +12,9 @@ import gymnasium
 import pytest
 
 from recipes.cli import main
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.registry import RECIPES, get_recipe
-from recipes.trust import WRAPPERS, allow_names, check_names, may_name_task
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.registry import RECIPES, get_recipe
+from recipes.core.trust import WRAPPERS, allow_names, check_names, may_name_task
 from torchrl_tit.agents.folder import CONTENTS, RECIPE, read_agent, write_agent
 from torchrl_tit.agents.loading import find_agent
 from torchrl_tit.settings.imports import allow, allowed_modules, import_named

@@ -10,11 +10,11 @@ from importlib import import_module
 import pytest
 
 from recipes.cli import main
-from recipes.metrics import read_metrics
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe_json import recipe_to_json
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.recipe_json import recipe_to_json
-from recipes.run import Run
-from recipes.wandb_metrics import WandbMetrics
+from recipes.tools.wandb_metrics import WandbMetrics
 from torchrl_tit.settings.networks import mlp
 
 RECIPE = PPO(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recipes.algorithm import make_algorithm
-from recipes.recipe import Recipe
-from recipes.run import Run
+from recipes.core.algorithm import make_algorithm
+from recipes.core.recipe import Recipe
+from recipes.core.run import Run
 
 
 def untrained(folder: Path, recipe: Recipe) -> Run:

@@ -31,8 +31,8 @@ from hypothesis import strategies as st
 from recipes.cli import main as command_line
 from recipes.cli import training
 from recipes.cli.main import COMMANDS
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.registry import RECIPES
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.registry import RECIPES
 from tests.datasets.hostile import good_arrays
 from torchrl_tit.datasets import Episodes, episodes_from_arrays, load_episodes, write_minari
 from torchrl_tit.networks import build_network

@@ -30,12 +30,12 @@ import h5py
 import numpy as np
 
 from recipes.cli import main as command_line
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe import Recipe
+from recipes.core.recipe_json import recipe_to_json
 from recipes.cql import CQL
 from recipes.decision_transformer import DT
-from recipes.metrics import read_metrics
 from recipes.ppo import PPO
-from recipes.recipe import Recipe
-from recipes.recipe_json import recipe_to_json
 from recipes.sac import SAC
 from tests import processes
 from tests.recipes.states import TIMES, assert_same

@@ -43,7 +43,7 @@ def test_a_plugin_is_imported_when_a_name_is_unknown_without_it(install):
     assert (part().width, part.builds) == (3, "wave_a:Encoder")
 
 
-def test_two_plugins_with_one_name_are_named_where_it_is_used(install):
+def test_two_plugins_with_package_alias_are_named_where_it_is_used(install):
     install("wave_a", PART.format(name="wave"))
     install("wave_b", PART.format(name="wave"))
     install("other_a", PART.format(name="other"))

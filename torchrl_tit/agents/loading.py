@@ -196,4 +196,4 @@ def _recipes(name: str) -> Any:
     """
     if importlib.util.find_spec("torchrl_tit.recipes") is None:  # a clone that is not installed
         importlib.import_module("recipes")  # available under both names once imported
-    return resolve(f"torchrl_tit.recipes.agents:{name}")
+    return resolve(f"torchrl_tit.recipes.tools.agents:{name}")

@@ -1,6 +1,6 @@
 """Imports by name: the modules that users named in their own words, and installed plugins.
 
-What a file may name beside them is said in :mod:`recipes.trust`.
+What a file may name beside them is said in :mod:`recipes.core.trust`.
 """
 
 from __future__ import annotations

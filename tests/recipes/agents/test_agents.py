@@ -9,11 +9,11 @@ import torch
 from safetensors.torch import load_file, save
 from torchrl.envs import GymEnv, TransformedEnv
 
-from recipes.agents import pack
 from recipes.bc import BC
 from recipes.decision_transformer import DT
 from recipes.ppo import PPO
 from recipes.sac import SAC
+from recipes.tools.agents import pack
 from tests.agents.runs import make_run, packed
 from torchrl_tit import load_agent
 from torchrl_tit.agents import AgentError, TrainedAgent

@@ -6,7 +6,7 @@ import imageio.v3 as imageio
 import pytest
 
 from recipes.cli import main
-from recipes.run import Run
+from recipes.core.run import Run
 from tests.agents.runs import make_run
 from torchrl_tit.agents import agent_names, load_agent
 from torchrl_tit.agents.folder import CARD, WEIGHTS

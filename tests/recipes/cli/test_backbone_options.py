@@ -7,7 +7,7 @@ import pytest
 
 from recipes.cli import main
 from recipes.cli.backbone_options import choose_network
-from recipes.registry import get_recipe
+from recipes.core.registry import get_recipe
 from tests.recipes.cli.test_cli import SHORT, fails
 from torchrl_tit.settings import (
     NETWORKS,

@@ -11,8 +11,8 @@ import pytest
 
 import torchrl_tit
 from recipes.cli import main
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.registry import RECIPES, get_recipe
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.registry import RECIPES, get_recipe
 from tests.recipes.commands import Command
 
 SHORT = [

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from recipes.cli import main
-from recipes.registry import get_recipe
-from recipes.run import Run
+from recipes.core.registry import get_recipe
+from recipes.core.run import Run
 
 NAME = "ppo/cartpole/mlp"
 
@@ -57,7 +57,7 @@ def test_the_logs_of_a_sweep_are_passed_over(begun, drawn, capsys):
     assert "seed-0.log is not a run folder, but a log" in capsys.readouterr().err
 
 
-def test_other_settings_under_one_name_are_another_curve(begun, drawn):
+def test_other_settings_under_package_alias_are_another_curve(begun, drawn):
     begun("a"), begun("b", learning_rate=1e-3), begun("c", seed=2)
     assert drawn("a", "b", "c") == {NAME: ["a", "c"], f"{NAME} (learning_rate 0.001)": ["b"]}
 

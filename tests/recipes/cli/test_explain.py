@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from recipes.cli import main
+from recipes.core.run import Run
+from recipes.core.runner import load_trained
 from recipes.ppo import PPO
-from recipes.run import Run
-from recipes.runner import load_trained
 from tests.recipes.cql.cql_runs import make_discrete_cql
 from tests.recipes.decision_transformer.sequence_runs import SMALL as SMALL_DT
 from tests.recipes.decision_transformer.sequence_runs import make_dt
@@ -73,7 +73,7 @@ def test_a_whole_episode_and_a_picture_of_a_step_of_it(cartpole, tmp_path, capsy
             drawn.append((number, len(pictures), len(values), step.attention.shape))
             return np.full((2, 2, 3), number, np.uint8)
 
-    monkeypatch.setattr("recipes.results.explanation.Page", Small)
+    monkeypatch.setattr("recipes.tools.results.explanation.Page", Small)
     _, algorithm, _ = load_trained(cartpole)
     (length,) = evaluate(algorithm.make_env, algorithm.policy, 1, seed=7).int().tolist()
     explain(cartpole.folder, "--out", tmp_path / "film.gif", "--seed", 7)

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from recipes.cli import main
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.run import Run
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import mlp
 

@@ -6,11 +6,11 @@ import sys
 import pytest
 
 from recipes.cli import main
-from recipes.registry import get_recipe
-from recipes.run import Run
-from recipes.sweeps import sweep
+from recipes.core.registry import get_recipe
+from recipes.core.run import Run
+from recipes.tools.sweeps import sweep
 from tests.recipes.cli.test_cli import SHORT, fails
-from tests.recipes.sweeps.sweep_runs import TINY
+from tests.recipes.tools.sweeps.sweep_runs import TINY
 
 OWN = """
 from dataclasses import dataclass, replace

@@ -7,10 +7,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from recipes.collect import Collection
-from recipes.collect.settings import KINDS
 from recipes.ppo import PPO
 from recipes.sac import SAC
+from recipes.tools.collect import Collection
+from recipes.tools.collect.settings import KINDS
 from torchrl_tit.datasets import load_episodes
 from torchrl_tit.settings.networks import mlp
 

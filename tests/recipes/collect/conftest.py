@@ -5,10 +5,15 @@ from pathlib import Path
 
 import pytest
 
-from recipes.collect import Collection
-from recipes.collect.collect import collect
-from recipes.recipe_json import recipe_to_json
-from tests.recipes.collect.collected import CARTPOLE, CARTPOLE_RECIPE, PENDULUM, PENDULUM_RECIPE
+from recipes.core.recipe_json import recipe_to_json
+from recipes.tools.collect import Collection
+from recipes.tools.collect.collect import collect
+from tests.recipes.tools.collect.collected import (
+    CARTPOLE,
+    CARTPOLE_RECIPE,
+    PENDULUM,
+    PENDULUM_RECIPE,
+)
 
 
 @pytest.fixture(scope="session")

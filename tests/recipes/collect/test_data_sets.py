@@ -15,16 +15,16 @@ from gymnasium.envs.classic_control import CartPoleEnv
 from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict
 
-from recipes.algorithm import NotFiniteError, make_algorithm
-from recipes.callback import Callback
-from recipes.collect import Collection
-from recipes.collect.collect import collect
-from recipes.collect.settings import KINDS
+from recipes.core.algorithm import NotFiniteError, make_algorithm
+from recipes.core.callback import Callback
+from recipes.core.recipe_json import recipe_to_json
+from recipes.core.run import Run
+from recipes.core.runner import train
 from recipes.ppo import PPO
-from recipes.recipe_json import recipe_to_json
-from recipes.run import Run
-from recipes.runner import train
-from tests.recipes.collect.collected import (
+from recipes.tools.collect import Collection
+from recipes.tools.collect.collect import collect
+from recipes.tools.collect.settings import KINDS
+from tests.recipes.tools.collect.collected import (
     CARTPOLE_RECIPE,
     FIELDS,
     PENDULUM,
@@ -214,7 +214,7 @@ def test_both_formats_hold_the_same_and_where_it_came_from(
 
 def test_images_are_stored_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Instead of a whole game, which takes half a minute.
-    monkeypatch.setattr("recipes.collect.agents.evaluate", lambda *_, **__: torch.zeros(1))
+    monkeypatch.setattr("recipes.tools.collect.agents.evaluate", lambda *_, **__: torch.zeros(1))
     recipe = PPO(
         env="ALE/Pong-v5",
         backbone=nature_cnn(num_frames=4, features_dim=8),

@@ -9,12 +9,12 @@ import pytest
 from gymnasium.spaces import Box, Discrete, MultiDiscrete, Space
 
 from recipes.cli import main
-from recipes.collect import Collection
-from recipes.collect.agents import AgentInTraining, find_agent
-from recipes.collect.collect import collect
-from recipes.recipe_json import recipe_to_json
+from recipes.core.recipe_json import recipe_to_json
 from recipes.sac import SAC
-from tests.recipes.collect.collected import (
+from recipes.tools.collect import Collection
+from recipes.tools.collect.agents import AgentInTraining, find_agent
+from recipes.tools.collect.collect import collect
+from tests.recipes.tools.collect.collected import (
     CARTPOLE,
     CARTPOLE_RECIPE,
     PENDULUM,
@@ -96,7 +96,7 @@ def test_what_is_recorded_as_the_task_has_it(
     observation: Space[Any], action: Space[Any], supported: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     spaces = TaskSpaces(observation, action, "Some-v0")
-    monkeypatch.setattr("recipes.collect.collect.task_spaces", lambda name: spaces)
+    monkeypatch.setattr("recipes.tools.collect.collect.task_spaces", lambda name: spaces)
     words = "unknown recipe" if supported else "data can be collected of one array or image"
     with pytest.raises(ValueError, match=words):
         collect(replace(PENDULUM, agent="absent"), Path("absent"))

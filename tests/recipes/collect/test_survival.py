@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recipes import runner
-from recipes.collect import Collection, agents
-from recipes.collect import collect as collecting
-from recipes.collect.agents import AgentInTraining
-from recipes.collect.collect import collect
-from recipes.collect.settings import KINDS
-from tests.recipes.collect.collected import assert_same, attributes, check_episodes, read
+from recipes.core import runner
+from recipes.tools.collect import Collection, agents
+from recipes.tools.collect import collect as collecting
+from recipes.tools.collect.agents import AgentInTraining
+from recipes.tools.collect.collect import collect
+from recipes.tools.collect.settings import KINDS
 from tests.recipes.commands import Command
+from tests.recipes.tools.collect.collected import assert_same, attributes, check_episodes, read
 from torchrl_tit.checkpoint import checkpoint_steps
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from recipes import algorithm
+from recipes.core import algorithm
+from recipes.core.recipe import Recipe
 from recipes.cql import CQL, DiscreteCQL
-from recipes.recipe import Recipe
 from tests.datasets.rollouts import NAMES, Transitions, roll, write
 from tests.recipes.dataset_runs import make_data
 from torchrl_tit.envs import make_env

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from recipes.core.metrics import read_metrics
+from recipes.core.runner import evaluate
 from recipes.cql import DiscreteCQL
-from recipes.metrics import read_metrics
-from recipes.runner import evaluate
 from tests.datasets.rollouts import write
 from tests.recipes.cql.cql_runs import make_algorithm, make_cql, make_discrete_cql, roll_pong, tit
 from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from recipes import runner
+from recipes.core import runner
+from recipes.core.metrics import read_metrics
+from recipes.core.registry import get_recipe
+from recipes.core.run import Run
 from recipes.decision_transformer import check_data
-from recipes.metrics import read_metrics
-from recipes.registry import get_recipe
-from recipes.run import Run
 from tests.datasets.rollouts import roll, write
 from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train
 from tests.recipes.decision_transformer.sequence_runs import SMALL, make_algorithm, make_dt

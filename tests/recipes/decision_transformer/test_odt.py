@@ -12,8 +12,8 @@ import torch
 from torch import nn
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
-from recipes import runner
-from recipes.metrics import read_metrics
+from recipes.core import runner
+from recipes.core.metrics import read_metrics
 from recipes.online_decision_transformer import OnlineData, make_lamb
 from tests.datasets.rollouts import roll
 from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train

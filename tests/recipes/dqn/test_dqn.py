@@ -13,12 +13,12 @@ import torch
 from gymnasium.spaces import Box, MultiDiscrete
 from tensordict import TensorDict, TensorDictBase
 
-from recipes.algorithm import make_algorithm
-from recipes.callback import Callback
+from recipes.core.algorithm import make_algorithm
+from recipes.core.callback import Callback
+from recipes.core.metrics import read_metrics
+from recipes.core.run import Run
+from recipes.core.runner import train
 from recipes.dqn import DQN, DQNAlgorithm
-from recipes.metrics import read_metrics
-from recipes.run import Run
-from recipes.runner import train
 from tests.recipes.cql.cql_runs import tit
 from torchrl_tit.settings.networks import lstm, mlp
 

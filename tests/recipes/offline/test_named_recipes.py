@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from recipes.algorithm import make_algorithm
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.registry import RECIPES, get_recipe
+from recipes.core.algorithm import make_algorithm
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.registry import RECIPES, get_recipe
 from torchrl_tit.settings.networks import decision_transformer, dt_tit, mlp
 
 TASKS = ("halfcheetah", "hopper", "walker2d")

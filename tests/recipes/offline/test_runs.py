@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recipes.metrics import read_metrics
+from recipes.core.metrics import read_metrics
 from tests.datasets.rollouts import roll, write
 from tests.recipes.cql.cql_runs import tit
 from tests.recipes.dataset_runs import assert_resumes_bit_for_bit

@@ -228,7 +228,7 @@ def test_critics_start_as_they_were_built(tmp_path, kind, monkeypatch):
         built.append({name: weight.clone() for name, weight in network.state_dict().items()})
         return network
 
-    monkeypatch.setattr("recipes.networks.MLP", make_mlp)
+    monkeypatch.setattr("recipes.core.networks.MLP", make_mlp)
     settings: dict[str, Any] = {"env": "Pendulum-v1", "backbone": SMALL, "critic_hidden": (16,)}
     recipe = SAC(**settings) if kind is SAC else make(kind, tmp_path, **settings)
     loss = make_algorithm(recipe).model

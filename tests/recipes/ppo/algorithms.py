@@ -4,8 +4,8 @@ from pathlib import Path
 
 import torch
 
+from recipes.core.registry import get_recipe
 from recipes.ppo import PPO, PPOAlgorithm
-from recipes.registry import get_recipe
 
 
 def named(name: str) -> PPO:

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
 from recipes.ppo import PPO, ActorCritic
-from recipes.run import Run
-from recipes.runner import evaluate, train
 from tests.modules.frames import CountedFrames
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from recipes.algorithm import make_algorithm
 from recipes.cli import main, training
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.registry import get_recipe
-from recipes.run import Run
+from recipes.core.algorithm import make_algorithm
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.registry import get_recipe
+from recipes.core.run import Run
 from tests.recipes.ppo import tasks
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings import Inner, Linear

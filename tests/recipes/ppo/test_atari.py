@@ -8,12 +8,12 @@ import torch
 
 pytest.importorskip("ale_py")
 
-from recipes.algorithm import make_algorithm
-from recipes.metrics import read_metrics
+from recipes.core.algorithm import make_algorithm
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
 from recipes.ppo import PPO, PPOAlgorithm
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.run import Run
-from recipes.runner import evaluate, train
 from tests.recipes.ppo.algorithms import named
 from torchrl_tit.settings.networks import enhanced_tit, mlp, vanilla_tit
 

@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import multiprocessing
 
-from recipes.metrics import Metrics
+from recipes.core.metrics import Metrics
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
+from recipes.core.task import seed_copies
 from recipes.ppo import PPO, PPOAlgorithm
-from recipes.run import Run
-from recipes.runner import evaluate, train
-from recipes.task import seed_copies
 from tests.numerics import assert_near
 from tests.recipes.ppo import tasks
 from torchrl_tit.checkpoint import checkpoint_steps

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from recipes.flat_parameters import FlatParameters
+from recipes.core.flat_parameters import FlatParameters
 from tests.numerics import assert_near
 
 

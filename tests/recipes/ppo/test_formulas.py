@@ -11,11 +11,11 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from recipes.compilation import should_compile
+from recipes.core.compilation import should_compile
+from recipes.core.registry import get_recipe
+from recipes.core.run import Run
+from recipes.core.runner import train
 from recipes.ppo import PPO, ActorCritic, PPOAlgorithm
-from recipes.registry import get_recipe
-from recipes.run import Run
-from recipes.runner import train
 from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import prepared
 from torchrl_tit.rollout import Rollout
@@ -47,7 +47,7 @@ def test_the_loss_is_compiled_if_the_recipe_says_so(setting, tmp_path, monkeypat
 )
 def test_compiling_pays_in_long_runs(setting, steps, compiler, expected, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: name if compiler else None)
-    monkeypatch.setattr("recipes.compilation._works", lambda: True)
+    monkeypatch.setattr("recipes.core.compilation._works", lambda: True)
     assert should_compile(setting, steps) is expected
 
 

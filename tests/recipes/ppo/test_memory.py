@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("minigrid")
 pytest.importorskip("popgym")
 
-from recipes.algorithm import make_algorithm
+from recipes.core.algorithm import make_algorithm
 from recipes.presets import ppo_memory
 from tests.recipes.ppo.algorithms import named
 from torchrl_tit.settings import Inner

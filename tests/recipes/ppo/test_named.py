@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from recipes.algorithm import make_algorithm
+from recipes.core.algorithm import make_algorithm
+from recipes.core.registry import RECIPES
 from recipes.ppo import PPO
 from recipes.presets.ppo_memory import MEMORY_RECIPES, MEMORY_SETTINGS
 from recipes.presets.ppo_settings import PPO_SETTINGS
-from recipes.registry import RECIPES
 from torchrl_tit.settings.networks import d2rl, enhanced_tit, mlp, ofenet, vanilla_tit
 
 TASKS = {

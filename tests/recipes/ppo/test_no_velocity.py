@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 from gymnasium.vector import AsyncVectorEnv
 
-from recipes.algorithm import make_algorithm
-from recipes.registry import RECIPES
-from recipes.run import Run
-from recipes.runner import evaluate, train
+from recipes.core.algorithm import make_algorithm
+from recipes.core.registry import RECIPES
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
 from tests.recipes.ppo.algorithms import named
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings import StackedInner

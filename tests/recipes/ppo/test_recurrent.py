@@ -6,10 +6,10 @@ import pytest
 import torch
 from torchrl.objectives.value import GAE
 
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
 from recipes.ppo import PPO, PPOAlgorithm
-from recipes.results.film import film
-from recipes.run import Run
-from recipes.runner import evaluate, train
+from recipes.tools.results.film import film
 from tests.numerics import assert_near
 from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings.networks import lstm, mlp

@@ -13,7 +13,7 @@ from torch.utils._pytree import tree_leaves
 from torchrl.modules import RandomPolicy
 from torchrl.objectives.value import GAE
 
-from recipes.compilation import compile_and_time
+from recipes.core.compilation import compile_and_time
 from recipes.ppo import PPO, PPOAlgorithm
 from tests.modules.frames import CountedFrames
 from tests.numerics import assert_near

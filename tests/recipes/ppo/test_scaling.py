@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from recipes import ppo
-from recipes.adaptive import KLAdaptiveRate, ReturnScale, normalize_advantages
-from recipes.algorithm import make_algorithm
-from recipes.metrics import read_metrics
+from recipes.core.adaptive import KLAdaptiveRate, ReturnScale, normalize_advantages
+from recipes.core.algorithm import make_algorithm
+from recipes.core.metrics import read_metrics
+from recipes.core.run import Run
+from recipes.core.runner import load_trained, train
 from recipes.ppo import PPO, PPOAlgorithm
-from recipes.run import Run
-from recipes.runner import load_trained, train
 from tests.recipes.ppo import tasks
 from tests.recipes.ppo.algorithms import trained
 from tests.recipes.states import assert_same

@@ -6,11 +6,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from recipes.algorithm import make_algorithm
-from recipes.metrics import read_metrics
+from recipes.core.algorithm import make_algorithm
+from recipes.core.metrics import read_metrics
+from recipes.core.run import Run
+from recipes.core.runner import train
 from recipes.ppo import PPO, Minibatch
-from recipes.run import Run
-from recipes.runner import train
 from tests.recipes.ppo.algorithms import named, prepared
 from torchrl_tit.networks import masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss

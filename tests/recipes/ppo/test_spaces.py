@@ -8,9 +8,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from recipes.core.run import Run
+from recipes.core.runner import train
 from recipes.ppo import PPO, PPOAlgorithm
-from recipes.run import Run
-from recipes.runner import train
 from tests.numerics import assert_near
 from tests.recipes.ppo import tasks
 from tests.recipes.ppo.algorithms import perturb

@@ -9,10 +9,10 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 
-from recipes.metrics import read_metrics
+from recipes.core.metrics import read_metrics
+from recipes.core.run import Run
+from recipes.core.runner import train
 from recipes.ppo import PPO, PPOAlgorithm
-from recipes.run import Run
-from recipes.runner import train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from recipes.recipe_json import recipe_to_json
-from recipes.registry import get_recipe
+from recipes.core.recipe_json import recipe_to_json
+from recipes.core.registry import get_recipe
 
 
 def metrics_of(seed, rows=60, steps=1024):

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from recipes.core.registry import get_recipe
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.registry import get_recipe
-from recipes.results.experiments import group_runs
-from recipes.run import Run
+from recipes.tools.results.experiments import group_runs
 from torchrl_tit.settings.networks import mlp, nature_cnn
 
 RECIPE = PPO(name="a", env="CartPole-v1", backbone=mlp())

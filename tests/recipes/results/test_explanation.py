@@ -7,8 +7,15 @@ from tensordict import TensorDict
 from torch.distributions import Categorical
 from torchrl.modules import IndependentNormal, MaskedCategorical, OneHotCategorical, TanhNormal
 
-from recipes.results.explained_page import Choice, ExplainedStep, Page, Seen, as_picture, lay_over
-from recipes.results.explanation import describe_choice
+from recipes.tools.results.explained_page import (
+    Choice,
+    ExplainedStep,
+    Page,
+    Seen,
+    as_picture,
+    lay_over,
+)
+from recipes.tools.results.explanation import describe_choice
 from torchrl_tit.modules.distributions import (
     IndependentBernoulli,
     IndependentCategorical,

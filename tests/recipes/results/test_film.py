@@ -6,13 +6,13 @@ import imageio.v3 as imageio
 import pytest
 from PIL import Image, ImageSequence
 
-from recipes import runner
-from recipes.algorithm import make_algorithm
 from recipes.cli import main
+from recipes.core import runner
+from recipes.core.algorithm import make_algorithm
+from recipes.core.run import Run
+from recipes.core.runner import load_trained
 from recipes.ppo import PPO
-from recipes.results.film import film_policy
-from recipes.run import Run
-from recipes.runner import load_trained
+from recipes.tools.results.film import film_policy
 from tests.recipes.cql.cql_runs import make_cartpole_data
 from tests.recipes.dataset_runs import train
 from tests.recipes.decision_transformer.sequence_runs import SMALL as SMALL_DT

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from recipes import registry
-from recipes.algorithm import make_algorithm
-from recipes.recipe import Recipe
-from recipes.registry import get_recipe
-from recipes.results.metric_words import known_columns, limit, to_markdown, words_of
+from recipes.core import registry
+from recipes.core.algorithm import make_algorithm
+from recipes.core.recipe import Recipe
+from recipes.core.registry import get_recipe
+from recipes.tools.results.metric_words import known_columns, limit, to_markdown, words_of
 
 ROOT = Path(__file__).parents[3]
 assert registry.RECIPES  # every algorithm is registered

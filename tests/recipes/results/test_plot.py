@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from recipes.results import plot
-from recipes.results.experiments import Experiment
-from recipes.results.plot import Curve, curve_of, draw_curves, new_chart, plot_comparison, plot_run
-from recipes.results.table import Cell
-from recipes.run import Run
-from tests.recipes.results.report_runs import write_run
+from recipes.core.run import Run
+from recipes.tools.results import plot
+from recipes.tools.results.experiments import Experiment
+from recipes.tools.results.plot import (
+    Curve,
+    curve_of,
+    draw_curves,
+    new_chart,
+    plot_comparison,
+    plot_run,
+)
+from recipes.tools.results.table import Cell
+from tests.recipes.tools.results.report_runs import write_run
 
 TWO = {"step": [1, 2], "time": [0, 1], "return_mean": [1.0, 3.0]}
 

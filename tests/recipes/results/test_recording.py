@@ -6,15 +6,15 @@ import lzma
 
 import pytest
 
-from recipes import records
 from recipes.cli import main
-from recipes.metrics import parse_metrics
-from recipes.records import Records
-from recipes.registry import find_recipe
-from recipes.results.experiments import find_runs, read_metrics
-from recipes.results.recording import record_runs
-from recipes.results.table import make_table
-from tests.recipes.results.report_runs import metrics_of, write_run
+from recipes.core import records
+from recipes.core.metrics import parse_metrics
+from recipes.core.records import Records
+from recipes.core.registry import find_recipe
+from recipes.tools.results.experiments import find_runs, read_metrics
+from recipes.tools.results.recording import record_runs
+from recipes.tools.results.table import make_table
+from tests.recipes.tools.results.report_runs import metrics_of, write_run
 
 MLP = "ppo/cartpole/mlp"
 

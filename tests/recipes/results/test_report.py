@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from recipes.cli import main
-from recipes.recipe_json import recipe_from_json
-from recipes.results import report as reports
-from recipes.results.interval import interval_of
-from tests.recipes.results.report_runs import metrics_of, write_run
+from recipes.core.recipe_json import recipe_from_json
+from recipes.tools.results import report as reports
+from recipes.tools.results.interval import interval_of
+from tests.recipes.tools.results.report_runs import metrics_of, write_run
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
@@ -210,7 +210,7 @@ def test_a_task_that_cannot_be_rendered(acting, tmp_path, monkeypatch):
     def fail(make_env, name):
         raise ValueError("it has no pictures")
 
-    monkeypatch.setattr("recipes.results.film.make_rendered", fail)
+    monkeypatch.setattr("recipes.tools.results.film.make_rendered", fail)
     report(acting, "--out", tmp_path / "a.html")
     text = Page(tmp_path / "a.html").text
     assert "is shown: it has no pictures" in text

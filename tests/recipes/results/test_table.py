@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 
 from recipes.cli import main
-from recipes.registry import RECIPES
-from recipes.results import plot
-from recipes.results.table import (
+from recipes.core.registry import RECIPES
+from recipes.core.run import Run
+from recipes.tools.results import plot
+from recipes.tools.results.table import (
     make_table,
     paper_results,
     published_results,
     to_csv,
     to_markdown,
 )
-from recipes.run import Run
-from tests.recipes.results.report_runs import write_run
+from tests.recipes.tools.results.report_runs import write_run
 from torchrl_tit.settings import Linear
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 

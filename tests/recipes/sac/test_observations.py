@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Dict
 
-from recipes.algorithm import make_algorithm
-from recipes.metrics import read_metrics
-from recipes.run import Run
-from recipes.runner import evaluate, train
+from recipes.core.algorithm import make_algorithm
+from recipes.core.metrics import read_metrics
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
 from recipes.sac import SAC
 from torchrl_tit.settings.networks import enhanced_tit
 

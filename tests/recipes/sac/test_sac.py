@@ -12,13 +12,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.modules import TanhNormal
 
-from recipes.algorithm import make_algorithm
-from recipes.callback import Callback
+from recipes.core.algorithm import make_algorithm
+from recipes.core.callback import Callback
+from recipes.core.metrics import read_metrics
+from recipes.core.recipe import Recipe
+from recipes.core.run import Run
+from recipes.core.runner import evaluate, train
 from recipes.cql import CQL
-from recipes.metrics import read_metrics
-from recipes.recipe import Recipe
-from recipes.run import Run
-from recipes.runner import evaluate, train
 from recipes.sac import SAC, SACAlgorithm
 from recipes.td3bc import TD3BC
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from recipes.core.recipe import Recipe
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.recipe import Recipe
-from recipes.run import Run
-from recipes.sweeps.sweep import Job
+from recipes.tools.sweeps.sweep import Job
 from tests.recipes.commands import Command
 from torchrl_tit.settings.networks import mlp
 

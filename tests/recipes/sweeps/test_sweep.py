@@ -11,15 +11,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from recipes import runner
 from recipes.cli import main, training
-from recipes.recipe_json import recipe_to_json
-from recipes.registry import RECIPES
-from recipes.results.plot import plot_run
-from recipes.run import Run
-from recipes.sweeps import sweep
+from recipes.core import runner
+from recipes.core.recipe_json import recipe_to_json
+from recipes.core.registry import RECIPES
+from recipes.core.run import Run
+from recipes.tools.results.plot import plot_run
+from recipes.tools.sweeps import sweep
 from tests.recipes.commands import Command
-from tests.recipes.sweeps.sweep_runs import TINY, begin, fork_worker
+from tests.recipes.tools.sweeps.sweep_runs import TINY, begin, fork_worker
 
 
 def long_run(folder):

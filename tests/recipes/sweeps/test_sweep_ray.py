@@ -12,14 +12,14 @@ from threading import Thread
 
 import pytest
 
-from recipes import ray_cluster
 from recipes.cli import main
-from recipes.metrics import read_metrics
-from recipes.ray_cluster import ask_for_machines
-from recipes.sweeps import sweep_ray
-from recipes.sweeps.sweep import Job, run_jobs
-from recipes.sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
-from tests.recipes.sweeps.sweep_runs import TINY, begin
+from recipes.core import ray_cluster
+from recipes.core.metrics import read_metrics
+from recipes.core.ray_cluster import ask_for_machines
+from recipes.tools.sweeps import sweep_ray
+from recipes.tools.sweeps.sweep import Job, run_jobs
+from recipes.tools.sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
+from tests.recipes.tools.sweeps.sweep_runs import TINY, begin
 from torchrl_tit.checkpoint import checkpoint_steps
 
 ROOT = Path(__file__).parents[3]
@@ -29,10 +29,10 @@ LONG = replace(TINY, total_steps=1_000_000, compile="off")
 DRIVER = """
 import sys
 from pathlib import Path
-from recipes.run import Run
-from recipes.sweeps.sweep import Job, run_jobs
-from recipes.ray_cluster import connect
-from recipes.sweeps.sweep_ray import RayWorker
+from recipes.core.run import Run
+from recipes.tools.sweeps.sweep import Job, run_jobs
+from recipes.core.ray_cluster import connect
+from recipes.tools.sweeps.sweep_ray import RayWorker
 
 connect(sys.argv[1])
 run_jobs([Job(Run.open(Path(f)).recipe, Path(f)) for f in sys.argv[2:]], 9, RayWorker)
@@ -203,4 +203,4 @@ def test_who_has_no_token_is_told_where_it_comes_from(monkeypatch, tmp_path):
 def test_a_machine_that_does_not_see_the_folder_says_so(tmp_path):
     actor = sweep_ray._actor_class()
     with pytest.raises(FileNotFoundError, match="must share a file system"):
-        actor("recipes.sweeps.sweep_ray", [], tmp_path, tmp_path / "missing.log")
+        actor("recipes.tools.sweeps.sweep_ray", [], tmp_path, tmp_path / "missing.log")

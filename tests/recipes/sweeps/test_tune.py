@@ -12,19 +12,19 @@ from typing import Any
 import pytest
 
 from recipes.cli import main
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.registry import get_recipe
+from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.recipe_json import recipe_from_json, recipe_to_json
-from recipes.registry import get_recipe
-from recipes.run import Run
 from tests.recipes.commands import Command
-from tests.recipes.sweeps.sweep_runs import fork_worker
+from tests.recipes.tools.sweeps.sweep_runs import fork_worker
 from torchrl_tit.settings.networks import mlp
 
 optuna = pytest.importorskip("optuna")
 
-from recipes.sweeps import tune  # noqa: E402
-from recipes.sweeps.search_space import load_space, with_values  # noqa: E402
-from recipes.sweeps.tune import Search, Settings, importances  # noqa: E402
+from recipes.tools.sweeps import tune  # noqa: E402
+from recipes.tools.sweeps.search_space import load_space, with_values  # noqa: E402
+from recipes.tools.sweeps.tune import Search, Settings, importances  # noqa: E402
 
 RECIPE = PPO(
     name="ppo/cartpole/mine",

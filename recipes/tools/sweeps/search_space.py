@@ -19,8 +19,8 @@ from torchrl_tit.settings import Inner
 from torchrl_tit.settings.checks import nearest
 from torchrl_tit.settings.encoders import OuterSettings
 
-from ..recipe import Recipe
-from ..recipe_json import recipe_from_json, recipe_to_json
+from ...core.recipe import Recipe
+from ...core.recipe_json import recipe_from_json, recipe_to_json
 
 SearchSpace: TypeAlias = dict[str, dict[str, Any]]
 """Ranges by the full name of a field, such as "backbone.frame.patch_size": the "type" of an Optuna
@@ -94,7 +94,7 @@ def with_values(recipe: Recipe, values: Mapping[str, Any], source: Path) -> Reci
         ValueError: if there is no such field, or the recipe rejects a value.
 
     Example:
-        >>> from recipes.registry import get_recipe
+        >>> from recipes.core.registry import get_recipe
         >>> recipe = get_recipe("ppo/cartpole/enhanced-tit")
         >>> with_values(recipe, {"backbone.frame.embed_dim": 64}, Path("here")).backbone.frame
         Inner(num_heads=1, ...embed_dim=64...)

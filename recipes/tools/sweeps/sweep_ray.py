@@ -18,7 +18,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from ..interrupt import raise_on_signals
+from ...core.interrupt import raise_on_signals
 from .sweep import PROGRAM, Job
 
 

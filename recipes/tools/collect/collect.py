@@ -37,10 +37,10 @@ from torchrl_tit.evaluation import check_rewards
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.modules import acting
 
-from ..algorithm import naming
-from ..recipe import Recipe
-from ..recipe_json import recipe_to_json
-from ..run import package_versions
+from ...core.algorithm import naming
+from ...core.recipe import Recipe
+from ...core.recipe_json import recipe_to_json
+from ...core.run import package_versions
 from .agents import Agent, AgentInTraining, as_fields, find_agent
 from .settings import KINDS, Collection, Kind
 

@@ -15,12 +15,12 @@ from torchrl_tit.agents import AgentError, TrainedAgent
 from torchrl_tit.agents.folder import RECIPE, AgentFiles, read_evaluation
 from torchrl_tit.checkpoint import latest_step
 
-from ..algorithm import Algorithm, load_weights, make_algorithm
-from ..decision_transformer import SequenceRecipe
-from ..recipe import Recipe
-from ..recipe_json import recipe_from_json, recipe_to_json
-from ..run import Run
-from ..runner import load_trained
+from ...core.algorithm import Algorithm, load_weights, make_algorithm
+from ...core.recipe import Recipe
+from ...core.recipe_json import recipe_from_json, recipe_to_json
+from ...core.run import Run
+from ...core.runner import load_trained
+from ...decision_transformer import SequenceRecipe
 
 Device = Literal["cpu", "cuda", "auto"]
 

@@ -4,7 +4,7 @@ A recipe in JSON can come from a stranger, alone or in the folder of a run or an
 names is made and run, so it may name only tasks, wrappers and transforms of this list, with
 numbers and plain words as their settings: they compute, and import, start, write and download
 nothing. Whatever else it names, users allow in their own words: by ``--import MODULE``, by
-installing a plugin, or by typing it. :func:`~recipes.recipe_json.recipe_from_json`, through which
+installing a plugin, or by typing it. :func:`~recipes.core.recipe_json.recipe_from_json`, through which
 every such recipe comes, asks.
 
 Encoders and algorithms need no list: their names are those of registered classes. A data set is
@@ -86,7 +86,7 @@ def check_names(recipe: Recipe, source: object) -> None:
 
     Example:
         >>> from dataclasses import replace
-        >>> from recipes.registry import get_recipe
+        >>> from recipes.core.registry import get_recipe
         >>> recipe = get_recipe("ppo/cartpole/mlp")
         >>> check_names(recipe, "recipe.json")
         >>> check_names(replace(recipe, env="tasks:Mine-v0"), "recipe.json")

@@ -18,9 +18,9 @@ from torchrl_tit.evaluation import evaluate
 from torchrl_tit.extras import install
 from torchrl_tit.files import whole_or_not_at_all
 
-from ..recipe import Recipe
-from ..run import Run
-from ..runner import load_trained
+from ...core.recipe import Recipe
+from ...core.run import Run
+from ...core.runner import load_trained
 
 FILMS = (".gif", ".mp4")
 

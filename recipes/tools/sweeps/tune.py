@@ -25,12 +25,12 @@ from tqdm import tqdm
 from torchrl_tit.agents.folder import read_evaluation
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 
-from ..algorithm import make_algorithm
-from ..interrupt import raise_on_signals
-from ..metrics import read_metrics
-from ..networks import name_chosen_encoders
-from ..recipe import Recipe
-from ..recipe_json import recipe_to_json
+from ...core.algorithm import make_algorithm
+from ...core.interrupt import raise_on_signals
+from ...core.metrics import read_metrics
+from ...core.networks import name_chosen_encoders
+from ...core.recipe import Recipe
+from ...core.recipe_json import recipe_to_json
 from .search_space import SearchSpace, make_distributions, with_values
 from .sweep import Job, start
 

@@ -14,10 +14,10 @@ import numpy as np
 
 from torchrl_tit.scores import has_reference
 
-from ..dataset_recipe import DatasetRecipe
-from ..recipe import Recipe
-from ..registry import RECIPES
-from ..run import Run
+from ...core.dataset_recipe import DatasetRecipe
+from ...core.recipe import Recipe
+from ...core.registry import RECIPES
+from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import interval_of
 

@@ -11,9 +11,9 @@ from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ..records import COLUMNS, LEFT_OUT, OF_EVALUATION, Record, Records, to_csv
-from ..registry import RECIPES
-from ..run import Run
+from ...core.records import COLUMNS, LEFT_OUT, OF_EVALUATION, Record, Records, to_csv
+from ...core.registry import RECIPES
+from ...core.run import Run
 from .experiments import changes_of, find_runs, read_metrics
 
 

@@ -17,11 +17,11 @@ from torchrl_tit.agents import AgentError
 from torchrl_tit.agents.folder import CARD, EVALUATION, RECIPE, VERSIONS, WEIGHTS
 from torchrl_tit.agents.hub import import_hub
 
-from ..dataset_recipe import DatasetRecipe
-from ..recipe import Recipe
-from ..recipe_json import recipe_to_json
-from ..run import Run
-from ..runner import load_trained
+from ...core.dataset_recipe import DatasetRecipe
+from ...core.recipe import Recipe
+from ...core.recipe_json import recipe_to_json
+from ...core.run import Run
+from ...core.runner import load_trained
 from .building import evaluation_of, read_json
 
 
@@ -92,7 +92,7 @@ def without_places(recipe: Recipe) -> Recipe:
     If the data set is a file, the file's name is kept.
 
     Example:
-        >>> from recipes.registry import get_recipe
+        >>> from recipes.core.registry import get_recipe
         >>> recipe = replace(get_recipe("bc/hopper-medium-v2/mlp"), dataset="/data/hopper.hdf5")
         >>> without_places(recipe).dataset
         'hopper.hdf5'

@@ -8,17 +8,17 @@ from pathlib import Path
 
 from torchrl_tit.settings.parts import Names
 
-from .presets.cql import CQL_RECIPES
-from .presets.decision_transformer import DT_RECIPES
-from .presets.dqn import DQN_RECIPES
-from .presets.offline import OFFLINE_RECIPES
-from .presets.ppo_any_task import ANY_TASK_RECIPES
-from .presets.ppo_arrays import ARRAY_RECIPES
-from .presets.ppo_atari import ATARI_RECIPES
-from .presets.ppo_memory import MEMORY_RECIPES
-from .presets.ppo_no_velocity import NO_VELOCITY_RECIPES
-from .presets.preset import Preset
-from .presets.sac import SAC_RECIPES
+from ..presets.cql import CQL_RECIPES
+from ..presets.decision_transformer import DT_RECIPES
+from ..presets.dqn import DQN_RECIPES
+from ..presets.offline import OFFLINE_RECIPES
+from ..presets.ppo_any_task import ANY_TASK_RECIPES
+from ..presets.ppo_arrays import ARRAY_RECIPES
+from ..presets.ppo_atari import ATARI_RECIPES
+from ..presets.ppo_memory import MEMORY_RECIPES
+from ..presets.ppo_no_velocity import NO_VELOCITY_RECIPES
+from ..presets.preset import Preset
+from ..presets.sac import SAC_RECIPES
 from .recipe import Recipe, get_recipe_class
 from .recipe_file import is_recipe_file, recipe_from_file
 from .recipe_json import recipe_from_json

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
-from ..recipe import Recipe
+from ...core.recipe import Recipe
 
 _TARGET = re.compile(r"return_-?[\d.]+(e[+-]?\d+)?")
 _TIMES = " * "
@@ -78,7 +78,7 @@ def limit(formula: str, recipe: Recipe) -> float | None:
         The limit; None if there is none here.
 
     Example:
-        >>> from recipes.registry import get_recipe
+        >>> from recipes.core.registry import get_recipe
         >>> limit("10 * max_grad_norm", get_recipe("ppo/cartpole/mlp"))
         5.0
     """

@@ -82,7 +82,7 @@ class Recipe:
             cls.algorithm = algorithm
 
     def build(self) -> Any:
-        """Builds the :class:`~recipes.algorithm.Algorithm` with these settings.
+        """Builds the :class:`~recipes.core.algorithm.Algorithm` with these settings.
 
         Raises:
             ValueError: if its networks cannot be built with them.
@@ -209,5 +209,5 @@ def get_recipe_class(algorithm: str) -> type[Recipe]:
         ValueError: if there is no such algorithm, or more than one.
     """
     if str(algorithm) in _MODULES:
-        importlib.import_module(f".{_MODULES[algorithm]}", __package__)
+        importlib.import_module(f"..{_MODULES[algorithm]}", __package__)
     return Recipe.registered.find(algorithm)

@@ -12,12 +12,12 @@ from typing import Any
 
 from torchrl_tit.settings.checks import printable
 
-from ..metrics import parse_metrics
-from ..recipe import Recipe, experiment_of
-from ..recipe_json import recipe_to_json
-from ..records import TABLE, Records, find_records
-from ..registry import RECIPES
-from ..run import RecordedRun, Run
+from ...core.metrics import parse_metrics
+from ...core.recipe import Recipe, experiment_of
+from ...core.recipe_json import recipe_to_json
+from ...core.records import TABLE, Records, find_records
+from ...core.registry import RECIPES
+from ...core.run import RecordedRun, Run
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def changed_fields(before: Recipe, after: Recipe) -> str:
     """Names the fields in which settings differ, ignoring seed and machine.
 
     Example:
-        >>> from recipes.registry import get_recipe
+        >>> from recipes.core.registry import get_recipe
         >>> from dataclasses import replace
         >>> recipe = get_recipe("ppo/cartpole/mlp")
         >>> changed_fields(recipe, replace(recipe, num_envs=4, seed=7))
@@ -182,7 +182,7 @@ def changes_of(before: Recipe, after: Recipe) -> dict[str, Any]:
     """Returns the fields in which settings differ, ignoring seed and machine, with the new values.
 
     Example:
-        >>> from recipes.registry import get_recipe
+        >>> from recipes.core.registry import get_recipe
         >>> from dataclasses import replace
         >>> recipe = get_recipe("ppo/cartpole/mlp")
         >>> changes_of(recipe, replace(recipe, num_envs=4, seed=7))
@@ -200,7 +200,7 @@ def fields_of(recipe: Recipe) -> dict[str, Any]:
     """Returns all settings as in JSON, with nested ones by their full names.
 
     Example:
-        >>> from recipes.registry import get_recipe
+        >>> from recipes.core.registry import get_recipe
         >>> fields_of(get_recipe("ppo/cartpole/mlp"))["backbone.num_frames"]
         1
     """

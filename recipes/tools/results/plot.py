@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from torchrl_tit.files import write_bytes_atomic
 
-from ..run import Run
+from ...core.run import Run
 from .experiments import Experiment, common_part, read_metrics
 from .interval import intervals_of
 from .table import Cell
@@ -152,7 +152,7 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     """Draws cells next to the paper's values, one panel for each task and measure.
 
     Args:
-        cells: what :func:`~recipes.results.table.make_table` returns.
+        cells: what :func:`~recipes.tools.results.table.make_table` returns.
         picture: the PNG file to write.
     """
     tasks: dict[tuple[str, str], list[Cell]] = {}  # of one measure: scores are not returns

@@ -18,16 +18,16 @@ from tqdm import tqdm
 from torchrl_tit.settings.checks import nearest
 from torchrl_tit.settings.imports import import_options, load_plugins
 
-from ..algorithm import make_algorithm
-from ..interrupt import raise_on_signals
-from ..networks import name_chosen_encoders
-from ..recipe import Recipe
-from ..recipe_file import is_recipe_file, recipes_from_file
-from ..registry import RECIPES, find_recipe
-from ..run import Run
-from ..trust import allow_names
+from ...core.algorithm import make_algorithm
+from ...core.interrupt import raise_on_signals
+from ...core.networks import name_chosen_encoders
+from ...core.recipe import Recipe
+from ...core.recipe_file import is_recipe_file, recipes_from_file
+from ...core.registry import RECIPES, find_recipe
+from ...core.run import Run
+from ...core.trust import allow_names
 
-PROGRAM = str(__package__).rpartition(".")[0]
+PROGRAM = str(__package__).removesuffix(".tools.sweeps")
 """The module that ``python -m`` runs: ``recipes``, or ``torchrl_tit.recipes`` if it is
 installed."""
 

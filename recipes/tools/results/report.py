@@ -30,10 +30,10 @@ from torchrl_tit.agents import TrainedAgent
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.files import write_text_atomic
 
-from ..recipe import Recipe
-from ..recipe_json import recipe_to_json
-from ..registry import RECIPES
-from ..run import Run, package_versions
+from ...core.recipe import Recipe
+from ...core.recipe_json import recipe_to_json
+from ...core.registry import RECIPES
+from ...core.run import Run, package_versions
 from .experiments import (
     Experiment,
     changes_of,

@@ -14,11 +14,11 @@ from torchrl.record.loggers.wandb import WandbLogger
 from torchrl_tit.extras import install
 from torchrl_tit.files import write_text_atomic
 
-from .callback import Callback
-from .evaluation import Outcome
-from .metrics import read_metrics
-from .recipe_json import recipe_to_json
-from .run import Run
+from ..core.callback import Callback
+from ..core.evaluation import Outcome
+from ..core.metrics import read_metrics
+from ..core.recipe_json import recipe_to_json
+from ..core.run import Run
 
 _FILE = "wandb.json"
 _NOT_DRAWN = ("step", "time")

@@ -48,7 +48,7 @@ def recipe_from_json(text: str | bytes, source: str | Path) -> Recipe:
 
     Raises:
         ValueError: if it is not JSON, a field is unknown or has the wrong type or value, or it
-            names what a file may not name (:mod:`recipes.trust`).
+            names what a file may not name (:mod:`recipes.core.trust`).
     """
     try:
         fields = json.loads(text)

@@ -40,7 +40,7 @@ class Algorithm(ABC, Generic[RecipeT]):
     """Networks, data and update of an experiment.
 
     The constructor builds only the networks, which is enough for evaluation. :meth:`prepare` builds
-    the rest. The runner (:mod:`recipes.runner`) has the only loop: it takes a batch, calls
+    the rest. The runner (:mod:`recipes.core.runner`) has the only loop: it takes a batch, calls
     :meth:`update`, and handles what all experiments share (progress, metrics, checkpoints, resume,
     interrupts, evaluation).
 
@@ -256,7 +256,7 @@ def naming(where: str) -> Iterator[None]:
         ...     raise FloatingPointError("the reward of copy 0 is nan")
         Traceback (most recent call last):
             ...
-        recipes.algorithm.NotFiniteError: the reward of copy 0 is nan in CartPole-v1
+        recipes.core.algorithm.NotFiniteError: the reward of copy 0 is nan in CartPole-v1
     """
     try:
         yield

@@ -273,7 +273,7 @@ def load_trained(
         run: a run folder with a checkpoint.
         recipe: the run's recipe, if some of its settings are overridden.
         best: whether to load the weights with the highest return so far (see
-            :class:`~recipes.best.Best`) instead of the last ones.
+            :class:`~recipes.core.best.Best`) instead of the last ones.
 
     Returns:
         The steps that it was trained for, the algorithm with its weights, and the whole checkpoint.
@@ -328,7 +328,7 @@ def evaluate(
         best: whether to evaluate the best weights of the checkpoint instead of the last ones.
 
     Returns:
-        The entries of :func:`~recipes.evaluation.summarize`, the "seed" of the first episode, and
+        The entries of :func:`~recipes.core.evaluation.summarize`, the "seed" of the first episode, and
         which "weights" were evaluated: "last" or "best".
 
     Raises:

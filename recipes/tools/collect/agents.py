@@ -21,14 +21,14 @@ from torchrl_tit.evaluation import evaluate
 from torchrl_tit.files import write_text_atomic
 from torchrl_tit.settings.networks import mlp
 
-from ..algorithm import Algorithm, make_algorithm, naming
-from ..callback import Callback
-from ..recipe import Recipe
-from ..recipe_json import recipe_to_json
-from ..registry import find_recipe
-from ..run import Run
-from ..runner import load_trained, train
-from ..sac import SAC
+from ...core.algorithm import Algorithm, make_algorithm, naming
+from ...core.callback import Callback
+from ...core.recipe import Recipe
+from ...core.recipe_json import recipe_to_json
+from ...core.registry import find_recipe
+from ...core.run import Run
+from ...core.runner import load_trained, train
+from ...sac import SAC
 from .settings import Collection
 
 # Far from the seeds of training and of the episodes that are collected.

@@ -85,7 +85,7 @@ class Run:
             folder: the folder.
             recipe: the settings.
             initial_weights: weights to start from, by their names in the algorithm's networks;
-                see :func:`~recipes.initial_weights.weights_from`.
+                see :func:`~recipes.core.initial_weights.weights_from`.
 
         Raises:
             FileExistsError: if the folder exists already and is not empty.

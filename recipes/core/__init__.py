@@ -1,0 +1,1 @@
+"""What all experiments share: recipes, run folders, the loop, checkpoints, metrics."""
