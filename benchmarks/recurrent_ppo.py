@@ -92,8 +92,13 @@ class Tiles(BaseFeaturesExtractor):
         return self.layers(observations)
 
 
-_RECIPE = get_recipe("ppo/memory-s7/lstm")
-assert isinstance(_RECIPE, PPO)
+def _settings_of(name: str) -> PPO:
+    recipe = get_recipe(name)
+    assert isinstance(recipe, PPO)
+    return recipe
+
+
+_RECIPE = _settings_of("ppo/memory-s7/lstm")
 SETTINGS: dict[str, dict[str, Any]] = {
     "default": {"n_epochs": 4},  # instead of 10
     "recipe": {

@@ -208,8 +208,8 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
 
         Args:
             env: the task.
-            slices: as in :func:`~recipes.core.networks.make_backbone`; always on if the recipe draws
-                slices.
+            slices: as in :func:`~recipes.core.networks.make_backbone`; always on if the recipe
+                draws slices.
         """
         recipe, slices = self.recipe, slices or self.recipe.slice_length > 1
         observation = observation_specs(env)

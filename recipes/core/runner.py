@@ -328,8 +328,8 @@ def evaluate(
         best: whether to evaluate the best weights of the checkpoint instead of the last ones.
 
     Returns:
-        The entries of :func:`~recipes.core.evaluation.summarize`, the "seed" of the first episode, and
-        which "weights" were evaluated: "last" or "best".
+        The entries of :func:`~recipes.core.evaluation.summarize`, the "seed" of the first episode,
+        and which "weights" were evaluated: "last" or "best".
 
     Raises:
         FileNotFoundError: if there is no checkpoint.

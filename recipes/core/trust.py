@@ -4,8 +4,8 @@ A recipe in JSON can come from a stranger, alone or in the folder of a run or an
 names is made and run, so it may name only tasks, wrappers and transforms of this list, with
 numbers and plain words as their settings: they compute, and import, start, write and download
 nothing. Whatever else it names, users allow in their own words: by ``--import MODULE``, by
-installing a plugin, or by typing it. :func:`~recipes.core.recipe_json.recipe_from_json`, through which
-every such recipe comes, asks.
+installing a plugin, or by typing it. :func:`~recipes.core.recipe_json.recipe_from_json`, through
+which every such recipe comes, asks.
 
 Encoders and algorithms need no list: their names are those of registered classes. A data set is
 read and never run (:mod:`torchrl_tit.datasets`).

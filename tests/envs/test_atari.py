@@ -251,7 +251,7 @@ def test_bad_input():
     with pytest.raises(ValueError, match="Unknown game 'ping'"):
         AtariGames("ping")
     with pytest.raises(ValueError, match="'render_mode' is 'human'"):
-        AtariGames("pong", render_mode="human")
+        AtariGames("pong", **{"render_mode": "human"})
     for name, value in {"num_envs": 0, "noop_max": -1, "max_num_frames_per_episode": 0}.items():
         with pytest.raises(ValueError, match=f"{name} must be at least .*, not {value}"):
             AtariGames("pong", **{name: value})  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 from recipes.tools.sweeps import sweep
 from tests.recipes.cli.test_cli import SHORT, fails
-from tests.recipes.tools.sweeps.sweep_runs import TINY
+from tests.recipes.sweeps.sweep_runs import TINY
 
 OWN = """
 from dataclasses import dataclass, replace

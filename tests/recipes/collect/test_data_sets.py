@@ -24,7 +24,7 @@ from recipes.ppo import PPO
 from recipes.tools.collect import Collection
 from recipes.tools.collect.collect import collect
 from recipes.tools.collect.settings import KINDS
-from tests.recipes.tools.collect.collected import (
+from tests.recipes.collect.collected import (
     CARTPOLE_RECIPE,
     FIELDS,
     PENDULUM,

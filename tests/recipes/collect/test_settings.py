@@ -14,7 +14,7 @@ from recipes.sac import SAC
 from recipes.tools.collect import Collection
 from recipes.tools.collect.agents import AgentInTraining, find_agent
 from recipes.tools.collect.collect import collect
-from tests.recipes.tools.collect.collected import (
+from tests.recipes.collect.collected import (
     CARTPOLE,
     CARTPOLE_RECIPE,
     PENDULUM,

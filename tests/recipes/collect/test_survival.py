@@ -17,7 +17,7 @@ from recipes.tools.collect.agents import AgentInTraining
 from recipes.tools.collect.collect import collect
 from recipes.tools.collect.settings import KINDS
 from tests.recipes.commands import Command
-from tests.recipes.tools.collect.collected import assert_same, attributes, check_episodes, read
+from tests.recipes.collect.collected import assert_same, attributes, check_episodes, read
 from torchrl_tit.checkpoint import checkpoint_steps
 
 

@@ -18,7 +18,7 @@ from recipes.tools.results.plot import (
     plot_run,
 )
 from recipes.tools.results.table import Cell
-from tests.recipes.tools.results.report_runs import write_run
+from tests.recipes.results.report_runs import write_run
 
 TWO = {"step": [1, 2], "time": [0, 1], "return_mean": [1.0, 3.0]}
 

@@ -14,7 +14,7 @@ from recipes.core.registry import find_recipe
 from recipes.tools.results.experiments import find_runs, read_metrics
 from recipes.tools.results.recording import record_runs
 from recipes.tools.results.table import make_table
-from tests.recipes.tools.results.report_runs import metrics_of, write_run
+from tests.recipes.results.report_runs import metrics_of, write_run
 
 MLP = "ppo/cartpole/mlp"
 

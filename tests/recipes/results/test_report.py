@@ -13,7 +13,7 @@ from recipes.cli import main
 from recipes.core.recipe_json import recipe_from_json
 from recipes.tools.results import report as reports
 from recipes.tools.results.interval import interval_of
-from tests.recipes.tools.results.report_runs import metrics_of, write_run
+from tests.recipes.results.report_runs import metrics_of, write_run
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 

@@ -19,7 +19,7 @@ from recipes.tools.results.table import (
     to_csv,
     to_markdown,
 )
-from tests.recipes.tools.results.report_runs import write_run
+from tests.recipes.results.report_runs import write_run
 from torchrl_tit.settings import Linear
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 

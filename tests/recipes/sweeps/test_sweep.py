@@ -19,7 +19,7 @@ from recipes.core.run import Run
 from recipes.tools.results.plot import plot_run
 from recipes.tools.sweeps import sweep
 from tests.recipes.commands import Command
-from tests.recipes.tools.sweeps.sweep_runs import TINY, begin, fork_worker
+from tests.recipes.sweeps.sweep_runs import TINY, begin, fork_worker
 
 
 def long_run(folder):

@@ -19,7 +19,7 @@ from recipes.core.ray_cluster import ask_for_machines
 from recipes.tools.sweeps import sweep_ray
 from recipes.tools.sweeps.sweep import Job, run_jobs
 from recipes.tools.sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
-from tests.recipes.tools.sweeps.sweep_runs import TINY, begin
+from tests.recipes.sweeps.sweep_runs import TINY, begin
 from torchrl_tit.checkpoint import checkpoint_steps
 
 ROOT = Path(__file__).parents[3]

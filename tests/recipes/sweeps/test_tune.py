@@ -17,7 +17,7 @@ from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 from recipes.ppo import PPO
 from tests.recipes.commands import Command
-from tests.recipes.tools.sweeps.sweep_runs import fork_worker
+from tests.recipes.sweeps.sweep_runs import fork_worker
 from torchrl_tit.settings.networks import mlp
 
 optuna = pytest.importorskip("optuna")
