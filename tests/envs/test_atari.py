@@ -1,5 +1,7 @@
 """Atari games are what Stable-Baselines3's AtariWrapper makes of them, and keep our contract."""
 
+from typing import Any
+
 import gymnasium
 import numpy as np
 import pytest
@@ -250,8 +252,9 @@ def test_bad_input():
         make_env("ALE/Pog-v5")
     with pytest.raises(ValueError, match="Unknown game 'ping'"):
         AtariGames("ping")
+    mode: Any = "human"
     with pytest.raises(ValueError, match="'render_mode' is 'human'"):
-        AtariGames("pong", **{"render_mode": "human"})
+        AtariGames("pong", render_mode=mode)
     for name, value in {"num_envs": 0, "noop_max": -1, "max_num_frames_per_episode": 0}.items():
         with pytest.raises(ValueError, match=f"{name} must be at least .*, not {value}"):
             AtariGames("pong", **{name: value})  # type: ignore[arg-type]

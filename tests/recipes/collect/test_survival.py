@@ -16,8 +16,8 @@ from recipes.tools.collect import collect as collecting
 from recipes.tools.collect.agents import AgentInTraining
 from recipes.tools.collect.collect import collect
 from recipes.tools.collect.settings import KINDS
-from tests.recipes.commands import Command
 from tests.recipes.collect.collected import assert_same, attributes, check_episodes, read
+from tests.recipes.commands import Command
 from torchrl_tit.checkpoint import checkpoint_steps
 
 
