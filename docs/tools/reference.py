@@ -234,7 +234,8 @@ def _target(package: str, name: str) -> str:
         hidden = (Path(str(module.__file__)).parent / f"{name}.py").exists()  # by a module
         return f"{package}.{name}.{name}" if hidden else f"{package}.{name}"
     home = importlib.import_module(
-        homes[name] if "." in homes[name] else f".{homes[name]}", module.__name__
+        homes[name] if homes[name].startswith("torchrl_tit.") else f".{homes[name]}",
+        module.__name__,
     )
     return f"{home.__name__}.{name}"
 

@@ -30,7 +30,7 @@ def evaluate(arguments: list[str]) -> None:
     )
     add_machine_options(parser)
     options = parser.parse_args(arguments)
-    from .. import runner  # not at the top: help needs no PyTorch
+    from ..core import runner  # not at the top: help needs no PyTorch
     from ..core.run import Run
 
     run = Run.open(options.run)

@@ -208,7 +208,7 @@ def test_an_edited_recipe_that_no_longer_fits_changes_nothing(fields, tmp_path, 
     ("text", "reason"),
     [
         *((text, "") for text in (b"\xff\xfe{", b"[" * 100_000, b"{}", b"null")),
-        (b'{"algorithm": "ppo", "backbone": {"network": "enhanced-tit"}}', "an older version"),
+        (b'{"algorithm": "ppo", "backbone": {"network": "enhanced-tit"}}', "unknown field"),
     ],
 )
 def test_a_damaged_or_older_recipe_is_named(text, reason, tmp_path, capsys):

@@ -117,8 +117,8 @@ PONG = named("ppo/pong/nature-cnn")
     ("recipe", "network", "message"),
     [
         (SMALL, nature_cnn(), "image"),
-        (SMALL, catformer(4), "image"),
-        (SMALL, coberl(4), "image"),
+        (SMALL, catformer(4), "do not read an array"),
+        (SMALL, coberl(4), "do not read an array"),
         (SMALL, enhanced_tit(num_heads_outer=5), "heads"),
         (PONG, replace(nature_cnn(4), frame=enhanced_tit(patch_size=12).frame), "flat"),
     ],
