@@ -198,7 +198,8 @@ class HistoryNetwork(nn.Module):
             windows = windows._replace(rows=rows, missing=None)
         tokens = [encoder(x) for encoder, x in zip(self.frames, frames, strict=True)]
         table = self.join_tokens(tokens)
-        if not every_frame and self.history_encoder.reads_tables(windows):
+        shares = windows.rows.shape[-1] > 1  # else a frame is in one window only
+        if shares and not every_frame and self.history_encoder.reads_tables(windows):
             return self.head(self.history_encoder.read_table(self.as_floats(table), windows))
         gathered = windows.gather(table)
         if every_frame:
