@@ -28,8 +28,7 @@ import docstring_parser
 import msgspec
 
 from recipes.cli.main import COMMANDS, USAGE, main
-from recipes.core.recipe import Recipe
-from recipes.core.registry import RECIPES
+from recipes.core.recipe import recipe_classes
 from recipes.tools.results.metric_words import to_markdown
 from torchrl_tit.settings import NETWORKS, FrameSettings, Head, HistorySettings, Network
 
@@ -118,8 +117,7 @@ def _fields() -> str:
 
 def _algorithms() -> dict[str, Any]:
     """The recipes of this package, by the name of their algorithm."""
-    list(RECIPES.values())  # building the named recipes registers every algorithm
-    registered = Recipe.registered.items()
+    registered = recipe_classes().items()
     return {name: kind for name, kind in registered if kind.__module__.startswith("recipes.")}
 
 

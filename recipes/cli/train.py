@@ -15,7 +15,7 @@ from torchrl_tit.settings import resolve
 from torchrl_tit.settings.checks import field_types
 from torchrl_tit.settings.imports import load_plugins
 
-from ..core.recipe import Recipe
+from ..core.recipe import Recipe, recipe_classes
 from ..core.registry import find_recipe
 from ..core.trust import allow_names
 from .arguments import Parser, add_machine_options, fail, option, parse_fields, program
@@ -105,6 +105,6 @@ def _parse_resume(arguments: list[str]) -> argparse.Namespace:
 def _lengths() -> dict[str, list[str]]:
     """Returns the fields that set the length of a run, each with its algorithms."""
     lengths: dict[str, list[str]] = {}
-    for algorithm, kind in Recipe.registered.items():
+    for algorithm, kind in recipe_classes().items():
         lengths.setdefault(kind.length, []).append(algorithm)
     return lengths

@@ -202,6 +202,18 @@ _MODULES = {
 """The modules of this package's algorithms, which are imported when one of them is looked up."""
 
 
+def recipe_classes() -> dict[str, type[Recipe]]:
+    """Imports all algorithms, and returns their recipe classes by name.
+
+    Example:
+        >>> recipe_classes()["sac"].length
+        'total_steps'
+    """
+    for module in sorted({*_MODULES.values()}):
+        importlib.import_module(f"..{module}", __package__)
+    return dict(Recipe.registered)
+
+
 def get_recipe_class(algorithm: str) -> type[Recipe]:
     """Looks up the recipe class of an algorithm, including those of installed plugins.
 
@@ -210,4 +222,6 @@ def get_recipe_class(algorithm: str) -> type[Recipe]:
     """
     if str(algorithm) in _MODULES:
         importlib.import_module(f"..{_MODULES[algorithm]}", __package__)
+    else:  # of a plugin, or misspelled: similar names are suggested
+        recipe_classes()
     return Recipe.registered.find(algorithm)

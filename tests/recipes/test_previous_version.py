@@ -1,6 +1,8 @@
 """What earlier versions wrote can be used: recipes of 0.1.0, and a run and an agent of 8688efa."""
 
 import json
+import subprocess
+import sys
 import re
 import shutil
 from pathlib import Path
@@ -15,6 +17,7 @@ from recipes.core.run import Run
 from recipes.core.runner import evaluate
 from torchrl_tit import load_agent
 
+ROOT = Path(__file__).parents[2]
 DATA = Path(__file__).parents[1] / "data" / "previous_version"
 RETURNS = json.loads((DATA / "run" / "evaluation.json").read_text())["returns"]
 WRITTEN = {
@@ -64,7 +67,9 @@ def test_a_run_is_evaluated_and_trained_further(run):
     before = read_metrics(run / "metrics.csv")
     assert evaluate(Run.open(run))["returns"] == RETURNS
     assert evaluate(Run.open(run), best=True)["steps"] == 512
-    main(["train", "--resume", str(run), "--total-steps", "640"])
+    # In a new process, which has imported no algorithm before it reads the run's recipe.
+    words = ["train", "--resume", str(run), "--total-steps", "640"]
+    subprocess.run([sys.executable, "-m", "recipes", *words], cwd=ROOT, check=True)
     after = read_metrics(run / "metrics.csv")
     assert [str(row) for row in after[: len(before)]] == [str(row) for row in before]
     assert after[-1]["step"] == json.loads((run / "evaluation.json").read_text())["steps"] == 640
