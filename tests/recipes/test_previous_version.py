@@ -1,10 +1,10 @@
 """What earlier versions wrote can be used: recipes of 0.1.0, and a run and an agent of 8688efa."""
 
 import json
-import subprocess
-import sys
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
