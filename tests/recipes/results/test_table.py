@@ -280,3 +280,11 @@ def test_folders_without_results(tmp_path, runs):
         make_table([tmp_path / "empty"])
     with pytest.raises(ValueError, match=r"no evaluated run in .*has no evaluation yet"):
         make_table([runs / "ppo/cartpole/vanilla-tit-protocol/1"])
+
+
+def test_a_run_evaluated_before_its_end_is_left_out(tmp_path):
+    write_run(tmp_path / "whole", MLP, 0, [400.0])
+    early = write_run(tmp_path / "early", MLP, 1, [100.0], evaluation={"steps": 10})
+    (cell,), notes = make_table([tmp_path])
+    assert (cell.runs, cell.mean) == (1, 400)
+    assert notes == [f"{early} is left out: evaluated after 10 of {cell.steps} steps"]
