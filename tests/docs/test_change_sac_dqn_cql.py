@@ -12,7 +12,7 @@ from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
 from recipes.core.runner import evaluate, load_trained, train
 from tests.docs.test_tutorials import BLOCK
-from tests.recipes.cql.cql_runs import SETTINGS, make_data
+from tests.recipes.small import SETTINGS, make_data
 from torchrl_tit.settings.networks import mlp
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "change-sac-dqn-cql.md"

@@ -28,7 +28,7 @@ from recipes.core.run import Run
 from recipes.ppo import PPO
 from recipes.tools.results.plot import plot_run
 from tests.recipes.commands import Command
-from tests.recipes.dataset_runs import assert_same_run
+from tests.recipes.small import assert_same_run
 from tests.recipes.states import unchecked
 from tests.recipes.untrained import untrained
 from torchrl_tit.checkpoint import latest_step
@@ -383,11 +383,8 @@ def test_a_run_of_any_algorithm_is_opened_by_a_script_of_its_own():
 def test_every_named_recipe_builds_its_agent():
     built = set()
     for name, recipe in RECIPES.items():
-        # Recipes of Atari games differ in the game alone (tests/recipes/ppo/test_atari.py); those
-        # without velocities are built in tests/recipes/ppo/test_no_velocity.py.
+        # Recipes of Atari games differ in the game alone (tests/recipes/test_named_recipes.py).
         if recipe.env.startswith("ALE/") and "pong" not in name and "nature-cnn" not in name:
-            continue
-        if "-no-velocity/" in name:
             continue
         if isinstance(recipe, DatasetRecipe) and recipe.dataset in D4RL_DATASETS:  # not read here
             alike = replace(recipe, name="", dataset="hopper-medium-v2")

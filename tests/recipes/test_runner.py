@@ -26,7 +26,7 @@ from recipes.core.metrics import Metrics, read_metrics
 from recipes.core.recipe import Recipe
 from recipes.core.run import Run
 from recipes.core.runner import evaluate, load_trained, train
-from tests.recipes.dataset_runs import assert_same_run
+from tests.recipes.small import assert_same_run
 from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import CheckpointError, checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import mlp

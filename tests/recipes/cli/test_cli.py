@@ -5,14 +5,13 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
 
 import pytest
 
 import torchrl_tit
 from recipes.cli import main
 from recipes.core.recipe_json import recipe_from_json, recipe_to_json
-from recipes.core.registry import RECIPES, get_recipe
+from recipes.core.registry import get_recipe
 from tests.recipes.commands import Command
 
 SHORT = [
@@ -176,12 +175,6 @@ def test_wrong_types_and_unknown_options(option, capsys, tmp_path, monkeypatch):
     captured = capsys.readouterr()
     assert option[0] in captured.err + captured.out
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", RECIPES)
-def test_recipes_come_back_from_json(name):
-    recipe = replace(get_recipe(name), seed=5)
-    assert recipe_from_json(recipe_to_json(recipe), "recipe.json") == recipe
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,7 @@ from recipes.cli import main
 from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
-from tests.recipes.cql.cql_runs import make_discrete_cql
-from tests.recipes.decision_transformer.sequence_runs import SMALL as SMALL_DT
-from tests.recipes.decision_transformer.sequence_runs import make_dt
+from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt
 from tests.recipes.untrained import untrained
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, lstm, mlp

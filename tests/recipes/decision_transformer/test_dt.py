@@ -13,12 +13,10 @@ import torch
 
 from recipes.core import runner
 from recipes.core.metrics import read_metrics
-from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 from recipes.decision_transformer import check_data
 from tests.datasets.rollouts import roll, write
-from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train
-from tests.recipes.decision_transformer.sequence_runs import SMALL, make_algorithm, make_dt
+from tests.recipes.small import SMALL_DT, make_algorithm, make_dt, train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import (
     SequenceStorage,
@@ -26,19 +24,15 @@ from torchrl_tit.datasets import (
     normalized_score,
     normalized_spread,
 )
-from torchrl_tit.settings.networks import decision_transformer, dt_tit, mlp
+from torchrl_tit.settings.networks import decision_transformer, dt_tit
 
 pytestmark = pytest.mark.filterwarnings("ignore:target_returns")
-
-
-def test_resumes_bit_for_bit(tmp_path):
-    assert_resumes_bit_for_bit(make_dt(tmp_path), tmp_path)
 
 
 @pytest.mark.numerics
 def test_a_step_is_the_protocols(tmp_path):
     """Weights after two steps are those of AdamW on the masked error, with clipped gradients."""
-    backbone = dt_tit(**SMALL, dropout=0.0)
+    backbone = dt_tit(**SMALL_DT, dropout=0.0)
     settings: dict[str, Any] = {"iterations": 1, "updates_per_iteration": 2}
     recipe = make_dt(tmp_path, backbone=backbone, return_scale=50.0, weight_decay=10.0, **settings)
     _, state = load_checkpoint(train(recipe, tmp_path / "run").checkpoints)
@@ -153,7 +147,7 @@ def test_discrete_actions_are_learnt(tmp_path):
         tmp_path,
         dataset=str(write(tmp_path / "cartpole.hdf5", arrays)),
         env="CartPole-v1",
-        backbone=dt_tit(**SMALL, dropout=0.0),
+        backbone=dt_tit(**SMALL_DT, dropout=0.0),
         action_space="discrete",
         learning_rate=1e-2,
         target_returns=(20.0,),
@@ -175,46 +169,6 @@ def test_a_target_that_the_data_never_reach_is_warned_of(tmp_path):
         train(recipe, tmp_path / "run")
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"target_returns": ()}, r"target_returns must be at least one finite number, not \(\)"),
-        ({"acting_num_frames": 7}, "acting_num_frames must be at most 6, not 7"),
-        ({"target_returns": (1234567.0, 1234568.0)}, "must differ within six digits, unlike"),
-        ({"backbone": mlp()}, "backbone.history is mlp, but this recipe trains a decision-tran"),
-        ({"action_space": "gaussian"}, "'gaussian', which this loss cannot train"),
-    ],
-)
-def test_wrong_settings(tmp_path, settings, message):
-    with pytest.raises(ValueError, match=message):
-        make_dt(tmp_path, **settings)
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        (
-            {"backbone": decision_transformer(max_ep_len=999)},
-            "episodes of Hopper-v5 have up to 1000 steps, but max_ep_len is 999",
-        ),
-        (
-            {"action_space": "discrete"},
-            "Hopper-v5 has continuous actions, but the head's are discrete",
-        ),
-        (
-            {"env": "CartPole-v1"},
-            "CartPole-v1 has discrete actions, but the head's are continuous",
-        ),
-        ({"env": "Pendulum-v1"}, "actions of Pendulum-v1 range from -2 to 2, but the head's"),
-        ({"env": "Walker2d-v5"}, r"observations"),
-        ({"dataset": "hopper"}, "'hopper' is not a data set"),
-    ],
-)
-def test_tasks_and_data_that_do_not_fit(tmp_path, settings, message):
-    with pytest.raises(ValueError, match=message):
-        make_algorithm(make_dt(tmp_path, **settings)).check()
-
-
 def test_data_that_do_not_fit_the_network(tmp_path):
     arrays = roll()
     arrays["timeouts"][:] = arrays["terminals"][:] = False
@@ -233,11 +187,3 @@ def test_data_that_do_not_fit_the_network(tmp_path):
     message = r"actions in .* are continuous \(torch.float32\), but .* \(discrete actions are int"
     with pytest.raises(ValueError, match=message):
         check_data(make_dt(tmp_path, action_space="discrete"), episodes)
-
-
-def test_other_algorithms_refuse_the_network():
-    for name in ("ppo/cartpole/mlp", "cql/hopper-medium-v0/mlp", "sac/hopper/mlp"):
-        with pytest.raises(
-            ValueError, match=r"reads actions and returns .* use a dt or odt recipe"
-        ):
-            replace(get_recipe(name), backbone=decision_transformer())

@@ -13,8 +13,8 @@ from gymnasium.spaces import Box
 
 from recipes.decision_transformer import check_data
 from tests.datasets.rollouts import roll, write
-from tests.recipes.decision_transformer.sequence_runs import (
-    SMALL,
+from tests.recipes.small import (
+    SMALL_DT,
     make_algorithm,
     make_dt,
     make_odt,
@@ -48,7 +48,7 @@ def test_a_task_without_a_time_limit_is_cut_off_where_time_steps_end(tmp_path):
     recipe = make_dt(
         tmp_path,
         env="tests/Endless-v0",
-        backbone=dt_tit(**SMALL, max_ep_len=12),
+        backbone=dt_tit(**SMALL_DT, max_ep_len=12),
         evaluation_episodes=2,
     )
     assert [outcome.returns for outcome in make_algorithm(recipe).play(0)] == [[12, 12]] * 2
@@ -56,7 +56,7 @@ def test_a_task_without_a_time_limit_is_cut_off_where_time_steps_end(tmp_path):
 
 def test_episodes_that_are_explored_are_as_long_as_those_of_the_evaluation(tmp_path):
     """Without an embedding of time steps nothing ends at max_ep_len but endless tasks."""
-    backbone = dt_tit(**SMALL, max_ep_len=12, timestep_embedding=False)
+    backbone = dt_tit(**SMALL_DT, max_ep_len=12, timestep_embedding=False)
     for env, length in {"tests/Endless-v0": 12, "tests/Long-v0": 30}.items():
         recipe = make_odt(tmp_path, env=env, backbone=backbone, evaluation_episodes=1)
         algorithm = make_algorithm(recipe)
@@ -73,10 +73,10 @@ def test_every_entry_of_an_action_must_reach_as_far_as_the_heads(tmp_path):
 def test_whole_atari_games_need_as_many_time_steps(tmp_path):
     pytest.importorskip("ale_py")
     settings: dict[str, Any] = {"env": "ALE/Pong-v5", "action_space": "discrete"}
-    recipe = make_dt(tmp_path, backbone=dt_tit(**SMALL, patch_size=42), **settings)
+    recipe = make_dt(tmp_path, backbone=dt_tit(**SMALL_DT, patch_size=42), **settings)
     with pytest.raises(ValueError, match="Pong-v5 have up to 27000 steps, but max_ep_len is 1000"):
         make_algorithm(recipe)
-    backbone = dt_tit(**SMALL, patch_size=42, max_ep_len=27_000)
+    backbone = dt_tit(**SMALL_DT, patch_size=42, max_ep_len=27_000)
     algorithm = make_algorithm(make_dt(tmp_path, backbone=backbone, **settings))
     state = algorithm.make_env(2).reset()
     assert algorithm.policy(state)["action"].shape == (2,)

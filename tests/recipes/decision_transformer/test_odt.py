@@ -16,8 +16,12 @@ from recipes.core import runner
 from recipes.core.metrics import read_metrics
 from recipes.online_decision_transformer import OnlineData, make_lamb
 from tests.datasets.rollouts import roll
-from tests.recipes.dataset_runs import assert_resumes_bit_for_bit, train
-from tests.recipes.decision_transformer.sequence_runs import SMALL, make_algorithm, make_odt
+from tests.recipes.small import (
+    SMALL_DT,
+    make_algorithm,
+    make_odt,
+    train,
+)
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import (
     SequenceStorage,
@@ -30,21 +34,12 @@ from torchrl_tit.settings.networks import dt_tit
 pytestmark = pytest.mark.filterwarnings("ignore:target_returns")
 
 
-@pytest.mark.parametrize("rounds", [0, 3])
-def test_resumes_bit_for_bit(tmp_path, rounds):
-    """From within pre-training, and from within a round."""
-    recipe = make_odt(tmp_path, rounds=rounds, log_interval=5)
-    if not rounds:
-        recipe = make_odt(tmp_path, rounds=0, pretraining_updates=10, checkpoint_interval=4)
-    assert_resumes_bit_for_bit(recipe, tmp_path)
-
-
 def test_a_step_is_the_protocols(tmp_path):
     """Weights and temperature after two steps on the likelihood and entropy of unmasked steps.
 
     Gradients are clipped, LAMB warms up, and the temperature follows the entropy.
     """
-    backbone = dt_tit(**SMALL, timestep_embedding=False, dropout=0.0)
+    backbone = dt_tit(**SMALL_DT, timestep_embedding=False, dropout=0.0)
     settings: dict[str, Any] = {"pretraining_updates": 2, "rounds": 0, "evaluation_episodes": 1}
     settings |= {"return_scale": 50.0, "weight_decay": 1.0, "alpha_learning_rate": 0.1}
     recipe = make_odt(tmp_path, backbone=backbone, **settings)
@@ -224,8 +219,3 @@ def test_lamb_is_that_of_the_release():
         optimizer.step()
     for parameter, expected in zip(wide.parameters(), weights, strict=True):
         torch.testing.assert_close(parameter.detach(), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_wrong_settings(tmp_path):
-    with pytest.raises(ValueError, match="action_space is 'continuous', but exploration needs a d"):
-        make_odt(tmp_path, action_space="continuous")

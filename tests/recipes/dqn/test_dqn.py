@@ -6,11 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
-from gymnasium.spaces import Box, MultiDiscrete
 from tensordict import TensorDict, TensorDictBase
 
 from recipes.core.algorithm import make_algorithm
@@ -19,18 +16,8 @@ from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
 from recipes.core.runner import train
 from recipes.dqn import DQN, DQNAlgorithm
-from tests.recipes.cql.cql_runs import tit
-from torchrl_tit.settings.networks import lstm, mlp
-
-SEVERAL = "SeveralActions-v0"
-
-
-class SeveralActions(gymnasium.Env):
-    """Two actions at each step; nothing is ever done."""
-
-    observation_space = Box(-1, 1, (4,), np.float32)
-    action_space = MultiDiscrete([2, 3])
-
+from tests.recipes.small import tit
+from torchrl_tit.settings.networks import mlp
 
 SMALL = DQN(
     name="dqn/cartpole/small",
@@ -202,35 +189,9 @@ def values_of_taxi(algorithm: DQNAlgorithm, states: TensorDictBase) -> torch.Ten
     return algorithm.policy(everything)["action_value"].detach()
 
 
-def test_several_observations(tmp_path: Path) -> None:
-    recipe = replace(SMALL, env="Blackjack-v1", backbone=tit(2), total_steps=40)
-    with Run.create(tmp_path / "run", recipe) as run:
-        train(recipe, run)
-    assert read_metrics(run.folder / "metrics.csv")[-1]["loss"] > 0
-
-
 def test_clipped_rewards(tmp_path: Path) -> None:
     algorithm = make(replace(SMALL, clip_rewards=True))
     reward = torch.tensor([[[-3.0], [0.0], [0.2]]])
     batch = TensorDict({"next": {"reward": reward, "observation": torch.zeros(1, 3, 4)}}, [1, 3])
     assert algorithm.collected(batch)["next", "reward"].flatten().tolist() == [-1, 0, 1]
     assert batch["next", "reward"] is reward  # what callbacks see
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"env": "Pendulum-v1"}, "dqn needs a few discrete actions, but those of Pendulum-v1 are"),
-        (
-            {"env": SEVERAL},
-            r"dqn needs a few discrete .* \(MultiCategorical, shape \[2\]\): use a ppo",
-        ),
-        ({"backbone": lstm()}, "dqn draws single transitions, so its network cannot carry a state"),
-        ({"buffer_size": 5}, "buffer_size 5 has no room for a batch of 10 steps"),
-    ],
-)
-def test_what_does_not_fit_is_refused(changes: dict[str, Any], message: str) -> None:
-    if changes.get("env") == SEVERAL and SEVERAL not in gymnasium.registry:
-        gymnasium.register(SEVERAL, entry_point=lambda **_: SeveralActions())
-    with pytest.raises(ValueError, match=message):
-        make(replace(SMALL, **changes))

@@ -2,44 +2,19 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 
-from recipes.core.metrics import read_metrics
 from tests.datasets.rollouts import roll, write
-from tests.recipes.cql.cql_runs import tit
-from tests.recipes.dataset_runs import assert_resumes_bit_for_bit
-from tests.recipes.offline.offline_runs import BC, IQL, TD3BC, double, make, make_algorithm
-from torchrl_tit.settings.networks import lstm
-
-COLUMNS = {
-    BC: ["loss_bc"],
-    IQL: ["loss_value", "loss_qvalue", "loss_actor", "nll"],
-    TD3BC: ["loss_qvalue", "loss_actor", "loss_bc"],
-}
-
-
-@pytest.mark.parametrize(
-    ("kind", "settings"),
-    [
-        (BC, {"backbone": tit(4), "env": "CartPole-v1"}),
-        (IQL, {"backbone": tit(2), "critic": "backbone", "total_updates": 9}),
-        (IQL, {"backbone": tit(), "env": "CartPole-v1", "normalize_rewards": True}),
-        (TD3BC, {"backbone": tit(2), "critic": "backbone", "total_updates": 9}),
-    ],
-    ids=["bc", "iql", "discrete-iql", "td3bc"],
+from tests.recipes.small import (
+    BC,
+    IQL,
+    TD3BC,
+    double,
+    make,
+    make_algorithm,
+    tit,
 )
-def test_trains_and_resumes_bit_for_bit(tmp_path, kind, settings):
-    recipe = make(kind, tmp_path, **settings)
-    make_algorithm(recipe).check()
-    assert_resumes_bit_for_bit(recipe, tmp_path)
-    rows = read_metrics(tmp_path / "whole" / "metrics.csv")
-    assert list(rows[0]) == ["step", "time", "steps_per_second", "return_mean", *COLUMNS[kind]]
-    for row in rows:  # an evaluation between two rows has one of its own
-        whole = row["step"] % recipe.log_interval == 0
-        assert all(np.isfinite(row[name]) == whole for name in COLUMNS[kind])
-    assert np.isfinite(rows[-1]["return_mean"])
 
 
 @pytest.mark.parametrize("kind", [BC, IQL, TD3BC])
@@ -51,7 +26,7 @@ def test_learns(tmp_path, kind):
     batch = algorithm.buffer.sample()
     seen = batch["observation"][:, :3]
     batch["action"] = 0.8 * ((seen - seen.mean(0)) / seen.std(0)).tanh()
-    seen = [algorithm.update(batch.clone(), 0)[COLUMNS[kind][-1]] for _ in range(40)]
+    seen = [algorithm.update(batch.clone(), 0)[algorithm.columns[-1]] for _ in range(40)]
     assert seen[-1] < 0.7 * seen[0] if kind is TD3BC else seen[-1] < seen[0] - 1
 
 
@@ -107,28 +82,3 @@ def test_slices_have_the_loss_of_their_transitions(tmp_path, kind):
             patch.setattr(torch, "randn_like", lambda x: noise.view(x.shape))  # noqa: B023
             terms.append(algorithm.update(batch, 0))
     torch.testing.assert_close(terms[1], terms[0], rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("kind", "settings", "message"),
-    [
-        (TD3BC, {"env": "CartPole-v1"}, "td3bc needs continuous actions .* CartPole-v1 are discre"),
-        (BC, {"env": "Walker2d-v5"}, r"\[11\], but in Walker2d-v5 it is \[17\]"),
-        (IQL, {"env": "Blackjack-v1"}, "data sets hold one observation, but .* has several"),
-        (BC, {"env": "FrozenLake-v1", "normalize_observations": True}, "int64, not floats: swit"),
-        (BC, {"backbone": lstm()}, "bc draws single transitions, so its network cannot carry"),
-        (IQL, {"expectile": 1.0}, r"expectile must be a probability in \(0, 1\), not 1.0"),
-    ],
-)
-def test_what_does_not_fit_is_refused(tmp_path, kind, settings, message):
-    with pytest.raises(ValueError, match=message):
-        make_algorithm(make(kind, tmp_path, **settings)).check()
-
-
-def test_rewards_that_cannot_be_scaled(tmp_path):
-    rolled = roll()
-    rolled["rewards"][:] = 0
-    data = str(write(tmp_path / "same.hdf5", rolled))
-    recipe = make(IQL, tmp_path, dataset=data, normalize_rewards=True)
-    with pytest.raises(ValueError, match=r"normalize_rewards is on, but no two .*: switch it off"):
-        make_algorithm(recipe).check()

@@ -14,7 +14,7 @@ from torchrl.objectives import BCLoss
 
 from recipes.cql import CQL
 from recipes.sac import SAC
-from tests.recipes.offline.offline_runs import BC, IQL, SMALL, TD3BC, double, make, make_algorithm
+from tests.recipes.small import BC, IQL, SMALL, TD3BC, double, make, make_algorithm
 
 
 def value(loss, network, td, params=None):

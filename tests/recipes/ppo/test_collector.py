@@ -11,7 +11,7 @@ from torch import multiprocessing
 
 from recipes.core.metrics import Metrics
 from recipes.core.run import Run
-from recipes.core.runner import evaluate, train
+from recipes.core.runner import train
 from recipes.core.task import seed_copies
 from recipes.ppo import PPO, PPOAlgorithm
 from tests.numerics import assert_near
@@ -86,26 +86,3 @@ def test_a_terminals_ctrl_c_reaches_every_process_and_saves(fields, tmp_path, mo
     with Run.create(tmp_path / "run", recipe) as run, pytest.raises(KeyboardInterrupt):
         train(recipe, run)
     assert checkpoint_steps(run.checkpoints) == [128]
-
-
-@pytest.mark.slow
-def test_a_run_trains_and_goes_on(tmp_path):
-    with Run.create(tmp_path / "run", replace(RECIPE, total_steps=128)) as run:
-        train(run.recipe, run)
-        assert max(checkpoint_steps(run.checkpoints)) == 128
-    with Run(tmp_path / "run", RECIPE) as run:
-        train(RECIPE, run)
-        assert max(checkpoint_steps(run.checkpoints)) == 192
-        assert evaluate(run)["steps"] == 192
-
-
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        ({"num_envs": 3, "steps_per_batch": 63}, "collectors 2 does not divide num_envs 3"),
-        ({"collectors": 0}, "collectors must be at least 1"),
-    ],
-)
-def test_settings_that_do_not_fit(fields, words):
-    with pytest.raises(ValueError, match=words):
-        replace(RECIPE, **fields)

@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -18,7 +17,6 @@ from recipes.core.runner import train
 from recipes.ppo import PPO, ActorCritic, PPOAlgorithm
 from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import prepared
-from torchrl_tit.rollout import Rollout
 
 RECIPE = get_recipe("ppo/cartpole/enhanced-tit")
 assert isinstance(RECIPE, PPO)
@@ -61,33 +59,6 @@ def test_compiling_without_a_compiler_is_refused(monkeypatch):
 
 def test_whole_rollouts_cover_the_steps():
     assert RECIPE.final_step == 100_352  # 49 batches of 2048 cover 100k
-
-
-def test_minibatches_show_every_step_once_an_epoch():
-    n = 40
-    batch = TensorDict(
-        {
-            "observation": torch.arange(n).view(2, 20, 1),
-            "next": {
-                "observation": torch.arange(1, n + 1).view(2, 20, 1),
-                "done": torch.zeros(2, 20, 1, dtype=torch.bool),
-            },
-            "action": torch.arange(n).view(2, 20),
-            "action_log_prob": torch.zeros(2, 20),
-            "advantage": torch.zeros(2, 20, 1),
-            "value_target": torch.zeros(2, 20, 1),
-        },
-        [2, 20],
-    )
-    algorithm = PPOAlgorithm(replace(SMALL, epochs=3, minibatch_size=16))
-    shown = list(algorithm.minibatches(batch, Rollout(batch, 1, "same")))
-    for steps, [frames], windows in shown:
-        assert torch.equal(windows.gather(frames).flatten(), steps["action"].flatten())
-    parts = [part.steps["action"].flatten().tolist() for part in shown]
-    assert [len(part) for part in parts] == [16, 16, 8] * 3
-    epochs = [[*parts[i], *parts[i + 1], *parts[i + 2]] for i in (0, 3, 6)]
-    assert all(sorted(epoch) == list(range(n)) for epoch in epochs)
-    assert epochs[0] != epochs[1] != epochs[2]
 
 
 @pytest.mark.numerics

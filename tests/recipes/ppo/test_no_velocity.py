@@ -2,32 +2,12 @@
 
 from dataclasses import replace
 
-import pytest
 from gymnasium.vector import AsyncVectorEnv
 
-from recipes.core.algorithm import make_algorithm
-from recipes.core.registry import RECIPES
 from recipes.core.run import Run
 from recipes.core.runner import evaluate, train
 from tests.recipes.ppo.algorithms import named
 from torchrl_tit.checkpoint import load_checkpoint
-from torchrl_tit.settings import StackedInner
-
-
-@pytest.mark.parametrize("name", [name for name in RECIPES if "-no-velocity/" in name])
-def test_recipes_can_be_built_and_hide_the_velocities(name):
-    recipe = named(name)
-    algorithm = make_algorithm(recipe)
-    algorithm.check()
-    network = name.rpartition("/")[2]
-    assert recipe.backbone.num_frames == (8 if "8" in network else 1)
-    backbone = recipe.backbone
-    positions = "learned" if network == "enhanced-tit-k8" else "none"
-    assert getattr(backbone.history, "temporal_positions", "none") == positions
-    assert isinstance(backbone.history, StackedInner) == ("wo-outer" in network)
-    entries = {"CartPole-v1": 2, "Acrobot-v1": 4, "Hopper-v5": 5}[recipe.env]
-    env = algorithm.make_env(2, seed=0)
-    assert env.reset()["history"].shape == (2, backbone.num_frames, entries)
 
 
 def test_a_run_in_processes_is_the_run_in_one(tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ from recipes.ppo import PPO, PPOAlgorithm
 from recipes.tools.results.film import film
 from tests.numerics import assert_near
 from torchrl_tit.rollout import FrameCollector, Rollout
-from torchrl_tit.settings.networks import lstm, mlp
+from torchrl_tit.settings.networks import lstm
 
 RECIPE = PPO(
     env="CartPole-v1",
@@ -97,21 +97,6 @@ def test_a_film_is_evaluated_alike(tmp_path):
         rendered = replace(RECIPE, evaluation_seed=RECIPE.evaluation_seed)
         video = tmp_path / "film.gif"
         assert film(rendered, run, video, episodes=3) == returns
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"sequence_length": 5}, "sequence_length 5 does not divide minibatch_size 32"),
-        ({"sequence_length": 32, "steps_per_batch": 80}, "steps_per_batch / num_envs 40"),
-        ({"sequence_length": 0}, "sequence_length must be at least 1"),
-    ],
-)
-def test_sequences_that_do_not_fit_are_refused(fields, message):
-    with pytest.raises(ValueError, match=message):
-        replace(RECIPE, **fields)
-    if fields["sequence_length"]:
-        replace(RECIPE, **fields, backbone=mlp())  # which has no use for it
 
 
 def test_with_several_frames_it_reads_those_and_carries_no_state():

@@ -13,10 +13,7 @@ from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
 from recipes.tools.results.film import film_policy
-from tests.recipes.cql.cql_runs import make_cartpole_data
-from tests.recipes.dataset_runs import train
-from tests.recipes.decision_transformer.sequence_runs import SMALL as SMALL_DT
-from tests.recipes.decision_transformer.sequence_runs import make_dt
+from tests.recipes.small import SMALL_DT, make_cartpole_data, make_dt, train
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, mlp
 

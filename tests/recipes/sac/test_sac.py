@@ -4,8 +4,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,14 +13,11 @@ from torchrl.modules import TanhNormal
 from recipes.core.algorithm import make_algorithm
 from recipes.core.callback import Callback
 from recipes.core.metrics import read_metrics
-from recipes.core.recipe import Recipe
 from recipes.core.run import Run
 from recipes.core.runner import evaluate, train
-from recipes.cql import CQL
 from recipes.sac import SAC, SACAlgorithm
-from recipes.td3bc import TD3BC
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
-from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
+from torchrl_tit.settings.networks import enhanced_tit, mlp
 
 SMALL = SAC(
     name="sac/pendulum/small",
@@ -284,51 +279,3 @@ def test_evaluation_plays_the_most_likely_actions(tmp_path: Path) -> None:
     assert first == again
     assert first["steps"] == 10
     assert first["episodes"] == 1
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"random_steps": 25}, "steps_per_batch 10 does not divide random_steps 25"),
-        ({"slice_length": 3}, "slice_length 3 does not divide batch_size 8"),
-        ({"slice_length": 8, "random_steps": 10, "num_envs": 2}, "slice_length 8 is longer than"),
-        ({"backbone": lstm()}, "sac draws single transitions.*or use a ppo recipe"),
-    ],
-)
-def test_impossible_settings(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message) as error:
-        replace(SMALL, **fields)
-    assert "\n" not in str(error.value)
-
-
-def test_impossible_tasks() -> None:
-    message = "sac needs continuous actions within bounds, but CartPole-v1 has .*: use a ppo recipe"
-    with pytest.raises(ValueError, match=message) as error:
-        make_algorithm(replace(SMALL, env="CartPole-v1"))
-    assert "\n" not in str(error.value)
-
-
-class Endless(gymnasium.Env):
-    """Actions have no upper bounds, or none at all."""
-
-    observation_space = gymnasium.spaces.Box(-1, 1, (3,))
-
-    def __init__(self, begin: bool) -> None:
-        self.action_space = gymnasium.spaces.Box(0 if begin else -np.inf, np.inf, (2,))
-
-
-gymnasium.register("Endless-v0", f"{__name__}:Endless")
-
-
-@pytest.mark.parametrize("kind", [SAC, CQL, TD3BC])
-@pytest.mark.parametrize("begin", [True, False])
-def test_actions_without_finite_bounds_are_refused(kind: type[Recipe], begin: bool) -> None:
-    fields: dict[str, Any] = {"dataset": "none.hdf5"} if kind.offline else {}
-    fields |= {"env": f"{__name__}:Endless-v0", "env_settings": (f"begin={begin}",)}
-    recipe = kind(backbone=SMALL.backbone, **fields)
-    message = (
-        rf"{recipe.algorithm} needs continuous actions within bounds, but .*\(.*shape \[2\].*\)"
-    )
-    with pytest.raises(ValueError, match=message) as error:
-        make_algorithm(recipe)
-    assert "\n" not in str(error.value)

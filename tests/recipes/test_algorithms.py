@@ -1,6 +1,5 @@
-"""What every algorithm trains is whole: its policy acts on raw observations, wherever it is."""
+"""Every algorithm trains, resumes, and its policy acts on raw observations, wherever it is."""
 
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,86 +13,76 @@ from tensordict.nn import set_interaction_type
 from tensordict.nn.probabilistic import InteractionType
 
 from recipes.core import runner
+from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
-from recipes.dqn import DQN
-from recipes.ppo import PPO
-from recipes.sac import SAC
 from tests.agents.runs import packed
-from tests.recipes.cql.cql_runs import make_cartpole_data, make_cql, make_discrete_cql, tit
-from tests.recipes.dataset_runs import train
-from tests.recipes.decision_transformer.sequence_runs import SMALL, make_dt, make_odt
-from tests.recipes.offline.offline_runs import BC, IQL, TD3BC, make
+from tests.recipes.small import (
+    BC,
+    RECIPES,
+    assert_resumes_bit_for_bit,
+    make,
+    make_algorithm,
+    tit,
+    train,
+)
 from torchrl_tit.agents import load_agent
 from torchrl_tit.agents.folder import WEIGHTS
+from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.export.comparison import COPIES, compare
 from torchrl_tit.export.parts import read_parts
 from torchrl_tit.export.policy import export_policy
 from torchrl_tit.export.program import make_program
 from torchrl_tit.frames import NormalizedFrames
-from torchrl_tit.settings.networks import decision_transformer
 
-ONLINE: dict[str, Any] = {
-    "backbone": tit(3),
-    "name": "small",
-    "evaluation_episodes": 2,
-    "env_settings": ("max_episode_steps=20",),
+NOISE = {
+    "standard_normal": ("ppo, continuous", "sac", "bc", "iql", "cql", "odt", "odt, offline"),
+    "gumbel": ("ppo", "bc, discrete", "iql, discrete", "dt, discrete"),
 }
-STEPS: dict[str, Any] = {"total_steps": 60, "steps_per_batch": 20, "random_steps": 20}
-OFFLINE: dict[str, Any] = {"total_updates": 3, "evaluation_episodes": 2, "backbone": tit(3)}
-NORMALIZED: dict[str, Any] = {**OFFLINE, "normalize_observations": True}
-SEQUENCES: dict[str, Any] = {"target_returns": (20.0,), "evaluation_episodes": 2}
-
-
-def ppo(folder, env):
-    short: dict[str, Any] = {
-        "total_steps": 96,
-        "steps_per_batch": 32,
-        "minibatch_size": 16,
-        "epochs": 2,
-    }
-    return PPO(env=env, **ONLINE, **short, normalize_observations=True)
-
-
-def discrete_dt(folder):
-    return make_dt(
-        folder,
-        dataset=str(make_cartpole_data(folder)),
-        env="CartPole-v1",
-        backbone=decision_transformer(**SMALL),
-        action_space="discrete",
-        iterations=1,
-        updates_per_iteration=3,
-        **SEQUENCES,
-    )
-
-
-# A recipe, and the noise with which its actions are drawn.
-RECIPES: dict[str, Any] = {
-    "ppo": (partial(ppo, env="CartPole-v1"), "gumbel"),
-    "ppo, continuous": (partial(ppo, env="Pendulum-v1"), "standard_normal"),
-    "sac": (lambda folder: SAC(env="Pendulum-v1", **ONLINE, **STEPS), "standard_normal"),
-    "dqn": (lambda folder: DQN(env="CartPole-v1", **ONLINE, **STEPS), None),
-    "bc": (partial(make, BC, **NORMALIZED), "standard_normal"),
-    "bc, discrete": (partial(make, BC, env="CartPole-v1", **NORMALIZED), "gumbel"),
-    "iql": (partial(make, IQL, **NORMALIZED), "standard_normal"),
-    "td3bc": (partial(make, TD3BC, **NORMALIZED), None),
-    "cql": (partial(make_cql, **NORMALIZED), "standard_normal"),
-    "discrete-cql": (partial(make_discrete_cql, **NORMALIZED), None),
-    "dt": (partial(make_dt, iterations=1, updates_per_iteration=3, **SEQUENCES), None),
-    "dt, discrete": (discrete_dt, "gumbel"),
-    "odt": (partial(make_odt, rounds=1, updates_per_round=2, **SEQUENCES), "standard_normal"),
-}
+"""With which the actions of policies are drawn that draw them."""
 
 
 @pytest.fixture(scope="module", params=RECIPES)
 def trained(request, tmp_path_factory):
     """A run, loaded as an agent."""
     folder = tmp_path_factory.mktemp("run")
-    make_recipe, noise = RECIPES[request.param]
-    run = train(make_recipe(folder), folder / "run")
+    recipe = RECIPES[request.param](folder)
+    make_algorithm(recipe).check()
+    run = train(recipe, folder / "run")
     agent = load_agent(run.folder)
     agent.policy.requires_grad_(False)
+    noise = next((noise for noise, names in NOISE.items() if request.param in names), None)
     return SimpleNamespace(name=request.param, run=run, agent=agent, noise=noise)
+
+
+def test_all_networks_are_trained_and_all_terms_are_logged(trained):
+    recipe = trained.run.recipe
+    torch.manual_seed(recipe.seed)
+    algorithm = make_algorithm(recipe)
+    before = algorithm.model.state_dict()
+    _, state = load_checkpoint(trained.run.checkpoints)
+    changed = {network_of(n) for n, w in state["networks"].items() if not torch.equal(w, before[n])}
+    assert changed >= {network_of(name) for name, _ in algorithm.model.named_parameters()}
+    if recipe.algorithm != "dqn":  # whose target is copied after many steps
+        assert changed >= {
+            network_of(n) for n in before if n.startswith("target_") and "_params" in n
+        }
+    rows = read_metrics(trained.run.folder / "metrics.csv")
+    for column in {"return_mean", *algorithm.columns} - set(algorithm.optional_columns):
+        values = np.array([row[column] for row in rows])
+        assert np.isfinite(values).any(), column
+        assert not np.isinf(values).any(), column
+
+
+def network_of(name):
+    """The network that a weight belongs to."""
+    return name.partition("_params")[0].partition(".")[0]
+
+
+def test_a_run_on_data_resumes_bit_for_bit(trained, tmp_path):
+    """That of others is in test_intervals.py: they begin new episodes."""
+    if not trained.run.recipe.offline:
+        pytest.skip("no run on data")
+    assert_resumes_bit_for_bit(trained.run, tmp_path / "cut")
 
 
 def test_the_environment_leaves_observations_as_they_are(trained):
@@ -157,7 +146,8 @@ def test_its_files_act_as_the_agent(trained, format, step_by_step, tmp_path):
 
 def test_a_cloned_policy_acts_on_raw_histories(tmp_path):
     """As the same network without statistics does on observations normalised by hand."""
-    run = train(make(BC, tmp_path, **{**NORMALIZED, "total_updates": 30}), tmp_path / "run")
+    recipe = make(BC, tmp_path, backbone=tit(3), normalize_observations=True, total_updates=30)
+    run = train(recipe, tmp_path / "run")
     policy = load_agent(run.folder).policy
     trained: Any = runner.load_trained(run)[1]
     trained.prepare(30, tmp_path)

@@ -1,0 +1,305 @@
+"""The named recipes have the settings of the papers, or of the results that docs/ shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fnmatch import fnmatch
+from operator import attrgetter
+from typing import Any
+
+import pytest
+
+from recipes.core.algorithm import make_algorithm
+from recipes.core.recipe_json import recipe_from_json, recipe_to_json
+from recipes.core.registry import RECIPES, get_recipe
+from recipes.ppo import PPO
+from recipes.presets.ppo_memory import MEMORY_RECIPES
+from recipes.presets.ppo_settings import PPO_SETTINGS
+from torchrl_tit.settings import Inner
+from torchrl_tit.settings.networks import (
+    catformer,
+    coberl,
+    d2rl,
+    decision_transformer,
+    dt_tit,
+    enhanced_tit,
+    mlp,
+    ofenet,
+    vanilla_tit,
+)
+
+ARRAYS = {
+    "acrobot": ("Acrobot-v1", 100_000), "cartpole": ("CartPole-v1", 100_000),
+    "mountaincar": ("MountainCar-v0", 100_000), "ant": ("Ant-v5", 1_000_000),
+    "halfcheetah": ("HalfCheetah-v5", 1_000_000), "hopper": ("Hopper-v5", 1_000_000),
+    "walker2d": ("Walker2d-v5", 1_000_000),
+}  # fmt: skip
+GAMES = {
+    "breakout": "ALE/Breakout-v5", "mspacman": "ALE/MsPacman-v5", "pong": "ALE/Pong-v5",
+    "spaceinvaders": "ALE/SpaceInvaders-v5",
+}  # fmt: skip
+IMAGE_NETWORKS = [
+    *("nature-cnn", "resnet", "catformer", "coberl", "vanilla-tit", "enhanced-tit"),
+    *("enhanced-tit-wo-dense", "enhanced-tit-wo-inner", "enhanced-tit-wo-outer"),
+]
+TANH_64 = {"hidden_dim": 64, "num_layers": 2, "activation": "tanh"}
+TIT_OF_ARRAYS: dict[str, Any] = {
+    "patch_size": 1, "embed_dim": 32, "num_blocks": 2, "num_heads_outer": 1, "num_heads_inner": 1,
+    "ffn_expansion_outer": 4, "ffn_expansion_inner": 4, "activation_outer": "gelu",
+    "activation_inner": "gelu", "position_encoding": True, "temporal_positions": "none",
+    "share_blocks": False, "features_dim": 64, "activation_head": "tanh",
+    "attention_dropout_inner": 0.0, "attention_dropout_outer": 0.0, "ffn_dropout_inner": 0.0,
+    "ffn_dropout_outer": 0.0,
+}  # fmt: skip
+MOUNTAINCAR: dict[str, Any] = {
+    **TIT_OF_ARRAYS, "num_heads_outer": 8, "num_heads_inner": 4, "features_dim": 128,
+}  # fmt: skip
+TIT_OF_IMAGES: dict[str, Any] = {
+    **TIT_OF_ARRAYS, "patch_size": 12, "embed_dim": 64, "num_heads_outer": 4, "num_heads_inner": 4,
+    "features_dim": 512, "activation_head": "gelu", "attention_dropout_inner": 0.1,
+    "attention_dropout_outer": 0.1, "ffn_dropout_inner": 0.1, "ffn_dropout_outer": 0.1,
+}  # fmt: skip
+del TIT_OF_IMAGES["temporal_positions"]  # learned for several frames
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    # The protocol of arXiv 2212.14538, appendix; MountainCar's TiTs have settings of their own.
+    "ppo/*-protocol": {
+        "learning_rate": 3e-4, "decay_learning_rate": False, "warmup_steps": 0, "adam_eps": 1e-5,
+        "max_grad_norm": 0.5, "num_envs": 1, "steps_per_batch": 2048, "minibatch_size": 64,
+        "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "bootstrap_time_limit": True,
+        "clip_epsilon": 0.2, "decay_clip_epsilon": False, "entropy_coeff": 0.0,
+        "critic_coeff": 0.5, "contrastive_coeff": 0.0, "clip_rewards": False, "reward_scale": 1.0,
+        "hide_velocities": False, "initialization": "orthogonal", "evaluation_episodes": 100,
+        "backbone.num_frames": 1,
+    },
+    **{
+        f"ppo/{task}/*-protocol": {"env": env, "total_steps": steps}
+        for task, (env, steps) in ARRAYS.items()
+    },
+    **{
+        f"ppo/{task}/{network.history.name}*": {
+            "backbone.history": network.history, "backbone.trunks": "separate",
+            "backbone.head.features_dim": None,
+        }
+        for task in ARRAYS
+        for network in (mlp(**TANH_64), ofenet(**TANH_64), d2rl(**TANH_64))
+    },
+    **{
+        f"ppo/{task}/{name}-protocol": {"backbone": network(1, **hyperparameters)}
+        for task in ARRAYS
+        for name, network, hyperparameters in (
+            (
+                "vanilla-tit", vanilla_tit,
+                {**MOUNTAINCAR, "features_dim": 64} if task == "mountaincar" else TIT_OF_ARRAYS,
+            ),
+            (
+                "enhanced-tit", enhanced_tit,
+                {**MOUNTAINCAR, "embed_dim": 16} if task == "mountaincar" else TIT_OF_ARRAYS,
+            ),
+        )
+    },
+    **{
+        f"ppo/{game}/{network}": {
+            "env": env, "padding": "constant", "num_envs": 8, "steps_per_batch": 1024,
+            "minibatch_size": 64 if "tit" in network else 256, "epochs": 4,
+            "learning_rate": 2.5e-4, "decay_learning_rate": True, "clip_epsilon": 0.1,
+            "decay_clip_epsilon": True, "entropy_coeff": 0.01, "critic_coeff": 0.5, "gamma": 0.99,
+            "gae_lambda": 0.95, "clip_rewards": True, "total_steps": 10_000_000,
+            "evaluation_episodes": 100, "initialization": "orthogonal", "contrastive_coeff": 0.0,
+            "warmup_steps": 0, "backbone.num_frames": 4,
+        }
+        for game, env in GAMES.items()
+        for network in IMAGE_NETWORKS
+    },
+    "ppo/pong/enhanced-tit": {"backbone": enhanced_tit(4, **TIT_OF_IMAGES)},
+    "ppo/pong/vanilla-tit": {"backbone": vanilla_tit(4, **TIT_OF_IMAGES)},
+    "ppo/*/catformer-tuned": {
+        "backbone": catformer(4, attention_expansion=2, ffn_expansion=4), "initialization": "own",
+        "warmup_steps": 200_000,
+    },
+    "ppo/*/coberl-tuned": {
+        "backbone": coberl(4, gate_bias=2.0), "initialization": "own", "warmup_steps": 200_000,
+        "contrastive_coeff": 1.0,
+    },
+    "ppo/*-no-velocity/*": {"hide_velocities": True},
+    "ppo/*-no-velocity/*8*": {"backbone.num_frames": 8},
+    "ppo/*-no-velocity/enhanced-tit-k8": {"backbone.history.temporal_positions": "learned"},
+    "ppo/*-no-velocity/*-no-positions": {"backbone.history.temporal_positions": "none"},
+    "ppo/tmaze-*/*": {"env": "TMaze-v0", "entropy_coeff": 0.05},
+    # Sequences as long as the corridor; the floor falls with the price of a step.
+    "ppo/tmaze-250/*": {"advantage_floor": 25 / 250},
+    "ppo/tmaze-500/*": {"advantage_floor": 25 / 500},
+    # arXiv 2212.14538, appendix, with d3rlpy 1.1.1.
+    "cql/*": {
+        "actor_learning_rate": 1e-4, "critic_learning_rate": 3e-4,
+        "temperature_learning_rate": 1e-4, "action_samples": 10, "batch_size": 256, "gamma": 0.99,
+        "tau": 0.005, "critic": "mlp", "critic_hidden": (256, 256, 256), "over_critics": "mean",
+        "time_limits": "drop", "unfinished": "drop", "final_step": 500_000,
+        "evaluation_interval": 1000, "evaluation_episodes": 10,
+    },
+    "cql/*-medium-v0/*": {"conservative_weight": 10.0},
+    "cql/*-replay-v0/*": {"conservative_weight": 5.0},
+    "cql/*/mlp": {"backbone": mlp(hidden_dim=256, num_layers=3, activation="relu")},
+    # docs/results/discrete_cql.md.
+    "discrete-cql/*": {"conservative_weight": 1.0, "gamma": 0.99, "tau": 0.005},
+    "discrete-cql/cartpole-*": {
+        "env": "CartPole-v1", "batch_size": 64, "learning_rate": 3e-4, "final_step": 10_000,
+        "evaluation_interval": 1000, "evaluation_episodes": 20,
+    },
+    "discrete-cql/pong-*": {
+        "env": "ALE/Pong-v5", "batch_size": 32, "learning_rate": 1e-4, "padding": "constant",
+        "final_step": 20_000, "evaluation_interval": 4000, "evaluation_episodes": 5,
+    },
+    # The papers of IQL and TD3+BC, for MuJoCo.
+    "iql/*": {
+        "expectile": 0.7, "temperature": 3.0, "learning_rate": 3e-4, "decay_learning_rate": True,
+        "normalize_rewards": True,
+    },
+    "td3bc/*": {
+        "alpha": 2.5, "policy_delay": 2, "policy_noise": 0.2, "noise_clip": 0.5,
+        "actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4, "normalize_observations": True,
+    },
+    "[it][qd][l3]*": {
+        "tau": 0.005, "gamma": 0.99, "critic_hidden": (256, 256), "batch_size": 256,
+        "final_step": 1_000_000, "evaluation_interval": 5000, "evaluation_episodes": 10,
+    },
+    # arXiv 2106.01345, appendix.
+    "dt/*": {
+        "final_step": 100_000, "batch_size": 64, "learning_rate": 1e-4, "warmup_updates": 10_000,
+        "weight_decay": 1e-4, "max_grad_norm": 0.25, "evaluation_episodes": 100,
+        "return_scale": 1000,
+    },
+    "dt/*/dt": {"backbone": decision_transformer(20)},
+    "dt/*/dt-tit": {"backbone": dt_tit(20)},
+    "dt/halfcheetah-*": {"target_returns": (12000, 6000)},
+    "dt/hopper-*": {"target_returns": (3600, 1800)},
+    "dt/walker2d-*": {"target_returns": (5000, 2500)},
+    # The release of Online Decision Transformer.
+    "odt/*/odt": {
+        "backbone": decision_transformer(
+            20, embed_dim=512, num_blocks=4, num_heads=4, timestep_embedding=False
+        ),
+        "acting_num_frames": 5, "batch_size": 256, "capacity": 1000, "learning_rate": 1e-4,
+        "weight_decay": 5e-4, "warmup_updates": 10_000, "pretraining_updates": 5000,
+        "updates_per_round": 300, "rounds": 1500, "alpha_init": 0.1, "evaluation_interval": 10,
+        "evaluation_episodes": 10, "online_return": 7200, "target_returns": (3600,),
+    },
+    "sac/hopper/*": {"final_step": 1_000_000, "learning_rate": 3e-4, "tau": 0.005},
+    # CleanRL's dqn_atari.py, whose target network is copied every 1000 steps.
+    "dqn/pong/*": {
+        "batch_size": 32, "learning_rate": 1e-4, "gamma": 0.99, "buffer_size": 1_000_000,
+        "random_steps": 80_000, "target_interval": 250, "updates_per_step": 0.25,
+        "final_epsilon": 0.01, "exploration_fraction": 0.1, "double": True, "clip_rewards": True,
+    },
+}  # fmt: skip
+
+
+def test_settings() -> None:
+    for pattern, expected in SETTINGS.items():
+        names = [name for name in RECIPES if fnmatch(name, pattern)]
+        assert names, pattern
+        for name in names:
+            recipe = get_recipe(name)
+            found = {field: attrgetter(field)(recipe) for field in expected}
+            assert found == expected, name
+
+
+def test_recipes_come_back_from_json() -> None:
+    for name in RECIPES:
+        recipe = replace(get_recipe(name), seed=5)
+        assert recipe_from_json(recipe_to_json(recipe), name) == recipe
+
+
+def test_recipes_of_data_sets() -> None:
+    def named(algorithm: str, kinds: str, version: int, networks: str) -> set[str]:
+        tasks = ("halfcheetah", "hopper", "walker2d")
+        sets = [f"{task}-{kind}-v{version}" for task in tasks for kind in kinds.split()]
+        return {f"{algorithm}/{data}/{network}" for data in sets for network in networks.split()}
+
+    both, all_three = "medium medium-replay", "medium medium-replay medium-expert"
+    expected = named("cql", both, 0, "mlp enhanced-tit") | named("dt", both, 2, "dt dt-tit")
+    for algorithm in ("bc", "iql", "td3bc"):
+        expected |= named(algorithm, all_three, 2, "mlp enhanced-tit vanilla-tit")
+    algorithms = ("cql/", "dt/", "bc/", "iql/", "td3bc/")
+    assert {name for name in RECIPES if name.startswith(algorithms)} == expected
+
+
+def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
+    """Only the task, the number of steps and what the network reads differ."""
+    recipes = [
+        recipe
+        for name, recipe in RECIPES.items()
+        if isinstance(recipe, PPO)
+        and not name.endswith("-protocol")
+        and "ALE" not in recipe.env
+        and name not in MEMORY_RECIPES
+    ]
+    assert len({recipe.env for recipe in recipes}) == 7  # the paper's
+    one = PPO(env="one", backbone=mlp(), **PPO_SETTINGS)
+    same: dict[str, Any] = {
+        "env": "one", "backbone": mlp(), "total_steps": one.total_steps, "name": "",
+        "hide_velocities": False,
+    }  # fmt: skip
+    assert {replace(recipe, **same) for recipe in recipes} == {one}
+
+
+def test_all_tit_networks_differ_only_in_frames_and_positions() -> None:
+    no_positions: dict[str, Any] = {"temporal_positions": "none"}
+    networks = {
+        replace(
+            recipe.backbone,
+            num_frames=1,
+            history=replace(recipe.backbone.history, **no_positions),
+        )
+        for name, recipe in RECIPES.items()
+        if isinstance(recipe, PPO)
+        and "enhanced-tit" in name
+        and not name.endswith("-protocol")
+        and "wo-outer" not in name
+        and "ALE" not in recipe.env
+        and "MiniGrid" not in recipe.env  # whose patch is a tile
+    }
+    assert networks == {enhanced_tit(patch_size="auto", patch_weights="own")}
+
+
+TASKS_OF_MEMORY = sorted({name.rpartition("/")[0] for name in MEMORY_RECIPES})
+
+
+@pytest.mark.parametrize("task", TASKS_OF_MEMORY)
+def test_recipes_of_memory_differ_in_the_memory_alone(task: str) -> None:
+    pytest.importorskip("minigrid")
+    pytest.importorskip("popgym")
+    recipes = [get_recipe(name) for name in MEMORY_RECIPES if name.startswith(f"{task}/")]
+    frames = {replace(recipe.backbone.frame, every_block=False) for recipe in recipes}
+    assert len(frames) == 1
+    assert isinstance(frames.pop(), Inner)
+    first, sizes = recipes[0], []
+    for recipe in recipes:
+        assert replace(recipe, name=first.name, backbone=first.backbone) == first
+        algorithm = make_algorithm(recipe)
+        algorithm.check()
+        sizes.append(sum(weights.numel() for weights in algorithm.policy.parameters()))
+        if "tmaze" in task:  # the cue is within reach of those that should solve it
+            length = int(task.rpartition("-")[2])
+            reaches = recipe.backbone.num_frames > length or recipe.backbone.carries_state
+            assert reaches == ("frames" not in recipe.name)
+            assert recipe.steps_per_sequence > length
+    assert max(sizes) < 1.1 * min(sizes), "about the same number of weights"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [f"ppo/{name}/enhanced-tit" for name in ("ant", "cartpole", "memory-s7")]
+    + [f"ppo/pong/{network}" for network in (*IMAGE_NETWORKS, "catformer-tuned", "coberl-tuned")]
+    + ["sac/hopper/mlp", "odt/hopper-medium-replay-v2/odt-small"],
+)
+def test_networks_fit_their_tasks(name: str) -> None:
+    """All of them are built in the slow test in test_run.py."""
+    pytest.importorskip("ale_py")
+    pytest.importorskip("minigrid")
+    algorithm = make_algorithm(get_recipe(name))
+    algorithm.check()
+    if name.startswith("ppo/") and name.count("pong") == 0:
+        (frames,) = algorithm.policy[0].module.frames
+        patches = frames.encoder.patch_embedding.num_patches
+        assert patches == (3 * 3 if "memory" in name else 1)  # a tile; the whole array
