@@ -7,7 +7,20 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import pytest
+
 from recipes.cli import main
+
+
+def fails(capsys: pytest.CaptureFixture[str], *words: object) -> str:
+    """Runs a command that must fail with one line, after at most notes; returns that line."""
+    with pytest.raises(SystemExit) as exit_:
+        main([str(word) for word in words])
+    assert exit_.value.code == 2
+    errors = capsys.readouterr().err
+    assert "Traceback" not in errors
+    [line] = [line for line in errors.splitlines() if line.startswith("error: ")]
+    return line
 
 
 class Command:

@@ -99,10 +99,14 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
         {"backbone": decision_transformer()},
         "reads actions and returns .* use a dt",
     ),
-    (SAC_RECIPE, {"collectors": 2}, "collectors is 2, but sac collects in one process"),
     (
         SAC_RECIPE,
-        {"collectors": 3, "num_envs": 4, "ray": "auto"},
+        {"collectors": 2, "num_envs": 4, "steps_per_batch": 20},
+        "collectors is 2, but sac collects in one process",
+    ),
+    (
+        SAC_RECIPE,
+        {"collectors": 3, "num_envs": 4, "steps_per_batch": 20, "ray": "auto"},
         "collectors 3 does not divide num_envs 4",
     ),
     (SAC_RECIPE, {"random_steps": 25}, "steps_per_batch 10 does not divide random_steps 25"),

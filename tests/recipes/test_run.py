@@ -27,7 +27,7 @@ from recipes.core.registry import RECIPES
 from recipes.core.run import Run
 from recipes.ppo import PPO
 from recipes.tools.results.plot import plot_run
-from tests.recipes.commands import Command
+from tests.recipes.commands import Command, fails
 from tests.recipes.small import assert_same_run
 from tests.recipes.states import unchecked
 from tests.recipes.untrained import untrained
@@ -64,13 +64,6 @@ def trained(folder: Path, recipe: PPO = SMALL) -> Run:
 
 def edit(path: Path, **fields: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
-
-
-def fails(capsys: pytest.CaptureFixture[str], *words: object) -> str:
-    with pytest.raises(SystemExit) as exit_:
-        main(list(map(str, words)))
-    assert exit_.value.code == 2
-    return capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_folder_that_a_killed_process_had_only_begun_becomes_a_run(tmp_path, monkeypatch):
@@ -259,16 +252,6 @@ def test_what_explodes_is_never_saved(poison, message, tmp_path):
         runner.train(unchecked(recipe, **poison), run)
     assert latest_step(run.checkpoints) == 64
     assert len(read_metrics(run.folder / "metrics.csv")) == 1
-
-
-def test_unicode_and_relative_paths(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    words = ["--total-steps", "64", "--steps-per-batch", "64", "--evaluation-episodes", "1"]
-    main(["train", "ppo/cartpole/enhanced-tit", "--out", "läufe/一 号", "--epochs", "1", *words])
-    assert "run folder: läufe/一 号" in capsys.readouterr().out
-    monkeypatch.chdir("läufe")
-    main(["evaluate", "一 号", "--out", "wertung.json"])
-    assert json.loads(Path("wertung.json").read_text())["episodes"] == 1
 
 
 def test_a_disk_that_is_full_stops_the_process_with_one_line(tmp_path):

@@ -15,6 +15,7 @@ from recipes.cli import main
 from recipes.core.recipe_json import recipe_from_json, recipe_to_json
 from recipes.core.registry import RECIPES, get_recipe
 from recipes.core.trust import WRAPPERS, allow_names, check_names, may_name_task
+from tests.recipes.commands import fails
 from torchrl_tit.agents.folder import CONTENTS, RECIPE, read_agent, write_agent
 from torchrl_tit.agents.loading import find_agent
 from torchrl_tit.settings.imports import allow, allowed_modules, import_named
@@ -129,9 +130,9 @@ def test_a_search_space_is_a_file_too(folder, capsys):
     (folder / "space.json").write_text(
         json.dumps({"env": {"type": "categorical", "choices": ["CartPole-v1", "evilmod:Mine-v0"]}})
     )
-    with pytest.raises(SystemExit):
-        main(["tune", NAME, "--space", "space.json", "--out", "new"])
-    assert "space.json names 'evilmod:Mine-v0'" in capsys.readouterr().err
+    assert "space.json names 'evilmod:Mine-v0'" in fails(
+        capsys, "tune", NAME, "--space", "space.json", "--out", "new"
+    )
     assert not (folder / "ran").exists()
 
 

@@ -15,6 +15,7 @@ from recipes.core.recipe_json import recipe_to_json
 from recipes.core.run import Run
 from recipes.ppo import PPO
 from recipes.tools.wandb_metrics import WandbMetrics
+from tests.recipes.commands import fails
 from torchrl_tit.settings.networks import mlp
 
 RECIPE = PPO(
@@ -118,29 +119,22 @@ def test_a_run_that_is_sent_for_the_first_time_sends_its_earlier_rows(tmp_path):
     assert found == [(32, 1.5), (96, 2.5)]
 
 
-def error(capsys, *words):
-    with pytest.raises(SystemExit):
-        main([*map(str, words)])
-    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
-    return line
-
-
 def test_what_cannot_be_sent(tmp_path, capsys, monkeypatch):
     (tmp_path / "recipe.json").write_text(recipe_to_json(RECIPE))
     words = ["train", tmp_path / "recipe.json", "--out", tmp_path / "run", "--wandb"]
-    assert "not 'a/b'" in error(capsys, *words, "a/b")
+    assert "not 'a/b'" in fails(capsys, *words, "a/b")
     with monkeypatch.context() as patch:
         patch.setattr("importlib.util.find_spec", lambda name: None)
-        assert "pip install 'torchrl-tit[wandb]'" in error(capsys, *words, "mine")
+        assert "pip install 'torchrl-tit[wandb]'" in fails(capsys, *words, "mine")
     assert not (tmp_path / "run").exists(), "nothing was begun"
 
     run = Run.create(tmp_path / "run", replace(RECIPE, total_steps=32))
     (run.folder / "wandb.json").write_text('{"project": "other", "id": "abc"}')
-    assert "is in the project 'other' already" in error(
+    assert "is in the project 'other' already" in fails(
         capsys, "train", "--resume", run.folder, "--wandb", "mine"
     )
     (run.folder / "wandb.json").write_text("[]")
-    assert "wandb.json is damaged" in error(
+    assert "wandb.json is damaged" in fails(
         capsys, "train", "--resume", run.folder, "--wandb", "mine"
     )
 
@@ -153,5 +147,5 @@ def test_nobody_is_logged_in(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(wandb, "init", init)
     run = Run.create(tmp_path / "run", RECIPE)
-    line = error(capsys, "train", "--resume", run.folder, "--wandb", "mine")
+    line = fails(capsys, "train", "--resume", run.folder, "--wandb", "mine")
     assert "cannot start: api_key not configured (no-tty). Call wandb.login; log in with" in line

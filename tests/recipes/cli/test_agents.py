@@ -8,6 +8,7 @@ import pytest
 from recipes.cli import main
 from recipes.core.run import Run
 from tests.agents.runs import make_run
+from tests.recipes.commands import fails
 from torchrl_tit.agents import agent_names, load_agent
 from torchrl_tit.agents.folder import CARD, WEIGHTS
 
@@ -15,15 +16,6 @@ from torchrl_tit.agents.folder import CARD, WEIGHTS
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("runs") / "run")
-
-
-def failure(capsys, *words):
-    """What a command that fails prints: one line."""
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    assert stop.value.code == 2
-    [line] = capsys.readouterr().err.splitlines()
-    return line
 
 
 def test_the_list_of_agents(capsys):
@@ -51,7 +43,7 @@ def test_an_agent_plays_and_is_filmed(run, tmp_path, capsys):
     assert f"return {returned:.1f} ± 0.0 over 1 episode of" in capsys.readouterr().out
     shown = [imageio.immeta(film, index=i)["duration"] for i in range(len(imageio.imread(film)))]
     assert sum(shown) == 20 * returned  # a picture a step, at 50 a second
-    assert f"{film} exists already" in failure(capsys, "play", run, "--out", film)
+    assert f"{film} exists already" in fails(capsys, "play", run, "--out", film)
 
 
 def test_the_name_on_the_card(run, tmp_path, capsys):
@@ -86,8 +78,8 @@ def test_what_cannot_be_played_or_shared(run, tmp_path, capsys):
         (["share", run, "--out", tmp_path / "no" / "b"], "cannot be written: there is no folder"),
         (["share", run, "--out", tmp_path / "a b"], "name must be letters"),
     ):
-        assert reason in failure(capsys, *words)
+        assert reason in fails(capsys, *words)
     content = (agent / WEIGHTS).read_bytes()
     (agent / WEIGHTS).write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    assert "model.safetensors was changed after it was written" in failure(capsys, "play", agent)
+    assert "model.safetensors was changed after it was written" in fails(capsys, "play", agent)
     assert sorted(tmp_path.rglob("*")) == before  # nothing was written

@@ -8,7 +8,8 @@ import pytest
 from recipes.cli import main
 from recipes.cli.backbone_options import choose_network
 from recipes.core.registry import get_recipe
-from tests.recipes.cli.test_cli import SHORT, fails
+from tests.recipes.cli.test_cli import SHORT
+from tests.recipes.commands import fails
 from torchrl_tit.settings import (
     NETWORKS,
     Flat,

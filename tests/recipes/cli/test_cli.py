@@ -12,22 +12,12 @@ import torchrl_tit
 from recipes.cli import main
 from recipes.core.recipe_json import recipe_from_json, recipe_to_json
 from recipes.core.registry import get_recipe
-from tests.recipes.commands import Command
+from tests.recipes.commands import Command, fails
 
 SHORT = [
     "--total-steps", "64", "--steps-per-batch", "64", "--minibatch-size", "32", "--epochs", "1",
     "--evaluation-episodes", "2",
 ]  # fmt: skip
-
-
-def fails(capsys, *words: str) -> str:
-    """Runs a command that must fail with one line, and returns that line."""
-    with pytest.raises(SystemExit) as exit_:
-        main(list(words))
-    assert exit_.value.code == 2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
-    assert len(lines) == 1
-    return lines[0]
 
 
 def test_list_and_show(capsys):

@@ -8,6 +8,7 @@ import pytest
 from recipes.cli import main
 from recipes.core.registry import get_recipe
 from recipes.core.run import Run
+from tests.recipes.commands import fails
 
 NAME = "ppo/cartpole/mlp"
 
@@ -52,9 +53,7 @@ def test_the_logs_of_a_sweep_are_passed_over(begun, drawn, capsys):
     begun("seed-0")
     Path("seed-0.log").touch()
     assert drawn("seed-0", "seed-0.log") == {NAME: ["seed-0"]}
-    with pytest.raises(SystemExit):
-        main(["compare", "seed-0.log"])
-    assert "seed-0.log is not a run folder, but a log" in capsys.readouterr().err
+    assert "seed-0.log is not a run folder, but a log" in fails(capsys, "compare", "seed-0.log")
 
 
 def test_other_settings_under_package_alias_are_another_curve(begun, drawn):
@@ -78,23 +77,21 @@ def test_tasks_are_not_compared(begun, capsys):
 
 def test_gradient_steps_and_environment_steps_are_not_compared(begun, capsys):
     begun("a"), begun("b", "discrete-cql/cartpole-mixed/mlp")
-    with pytest.raises(SystemExit):
-        main(["compare", "a", "b"])
-    assert "environment steps and gradient steps do not share an axis" in capsys.readouterr().err
+    assert "environment steps and gradient steps do not share an axis" in fails(
+        capsys, "compare", "a", "b"
+    )
 
 
 def test_runs_in_which_no_episode_has_ended(begun, tmp_path, capsys):
     begun("a")
     (tmp_path / "a" / "metrics.csv").write_text("step,time,return_mean\n1,0,nan\n")
     Run.create(tmp_path / "b", get_recipe("ppo/cartpole/d2rl"))
-    with pytest.raises(SystemExit):
-        main(["compare", "a", "b"])
-    assert "no episode has ended in a, b" in capsys.readouterr().err
+    assert "no episode has ended in a, b" in fails(capsys, "compare", "a", "b")
     assert not (tmp_path / "comparison.png").exists()
 
 
 def test_a_picture_is_called_what_it_is(begun, capsys):
     begun("a")
-    with pytest.raises(SystemExit):
-        main(["compare", "a", "--out", "curves.pdf"])
-    assert "--out curves.pdf must end in .png" in capsys.readouterr().err
+    assert "--out curves.pdf must end in .png" in fails(
+        capsys, "compare", "a", "--out", "curves.pdf"
+    )

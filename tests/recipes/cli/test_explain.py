@@ -12,6 +12,7 @@ from recipes.cli import main
 from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
+from tests.recipes.commands import fails
 from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt
 from tests.recipes.untrained import untrained
 from torchrl_tit.evaluation import evaluate
@@ -33,13 +34,6 @@ def cartpole(tmp_path_factory):
 
 def explain(*words):
     main(["explain", *map(str, words)])
-
-
-def error(capsys, *words):
-    with pytest.raises(SystemExit):
-        explain(*words)
-    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
-    return line
 
 
 def test_a_film_of_an_array_task(cartpole, tmp_path, capsys):
@@ -83,8 +77,16 @@ def test_a_whole_episode_and_a_picture_of_a_step_of_it(cartpole, tmp_path, capsy
     explain(cartpole.folder, "--out", tmp_path / "step.png", "--seed", 7, "--step", length - 1)
     assert drawn[1:] == numbers[-1:], "a picture is that of the film"
     capsys.readouterr()
-    line = error(
-        capsys, cartpole.folder, "--out", tmp_path / "no.png", "--seed", 7, "--step", length
+    line = fails(
+        capsys,
+        "explain",
+        cartpole.folder,
+        "--out",
+        tmp_path / "no.png",
+        "--seed",
+        7,
+        "--step",
+        length,
     )
     assert f"the episode of seed 7 has {length} steps, so there is no step {length}" in line
     assert {path.name for path in tmp_path.iterdir()} == {"film.gif", "step.png"}
@@ -147,23 +149,25 @@ def test_other_policies(make, tmp_path):
 
 def test_files_and_steps_that_cannot_be(cartpole, tmp_path, capsys):
     run, png, gif = cartpole.folder, tmp_path / "a.png", tmp_path / "a.gif"
-    assert "a picture of one step (.png), not 'a.avi'" in error(
-        capsys, run, "--out", tmp_path / "a.avi"
+    assert "a picture of one step (.png), not 'a.avi'" in fails(
+        capsys, "explain", run, "--out", tmp_path / "a.avi"
     )
-    assert "step 3 is one step" in error(capsys, run, "--out", gif, "--step", 3)
-    assert "max_steps 3 is the length of a film" in error(
-        capsys, run, "--out", png, "--max-steps", 3
+    assert "step 3 is one step" in fails(capsys, "explain", run, "--out", gif, "--step", 3)
+    assert "max_steps 3 is the length of a film" in fails(
+        capsys, "explain", run, "--out", png, "--max-steps", 3
     )
-    assert "there is no step -1" in error(capsys, run, "--out", png, "--step", -1)
-    assert "max_steps must be at least 1" in error(capsys, run, "--out", gif, "--max-steps", 0)
-    assert "is neither an agent nor a run" in error(capsys, tmp_path, "--out", png)
-    assert "--seed must be from 0" in error(capsys, run, "--out", png, "--seed", -1)
-    assert "there is no folder" in error(capsys, run, "--out", tmp_path / "no" / "a.png")
+    assert "there is no step -1" in fails(capsys, "explain", run, "--out", png, "--step", -1)
+    assert "max_steps must be at least 1" in fails(
+        capsys, "explain", run, "--out", gif, "--max-steps", 0
+    )
+    assert "is neither an agent nor a run" in fails(capsys, "explain", tmp_path, "--out", png)
+    assert "--seed must be from 0" in fails(capsys, "explain", run, "--out", png, "--seed", -1)
+    assert "there is no folder" in fails(capsys, "explain", run, "--out", tmp_path / "no" / "a.png")
     png.write_bytes(b"mine")
-    assert "exists already" in error(capsys, run, "--out", png)
+    assert "exists already" in fails(capsys, "explain", run, "--out", png)
     assert png.read_bytes() == b"mine"
     empty = Run.create(tmp_path / "run", cartpole.recipe)
-    assert "holds no checkpoint" in error(capsys, empty.folder, "--out", gif)
+    assert "holds no checkpoint" in fails(capsys, "explain", empty.folder, "--out", gif)
     assert not gif.exists()
 
 
@@ -171,19 +175,19 @@ def test_maps_that_a_network_does_not_have(cartpole, tmp_path, capsys, monkeypat
     pytest.importorskip("pygame")
     out = tmp_path / "a.png"
 
-    def fails(run, *words):
-        line = error(capsys, run.folder, "--out", out, *words)
+    def refused(run, *words):
+        line = fails(capsys, "explain", run.folder, "--out", out, *words)
         assert not out.exists()
         return line
 
-    assert "nothing for Grad-CAM to map" in fails(cartpole, "--map", "grad-cam")
-    assert "no layer 'blocks.9' in this network" in fails(cartpole, "--layer", "blocks.9")
-    assert "a layer is for grad-cam, not for attention" in fails(
+    assert "nothing for Grad-CAM to map" in refused(cartpole, "--map", "grad-cam")
+    assert "no layer 'blocks.9' in this network" in refused(cartpole, "--layer", "blocks.9")
+    assert "a layer is for grad-cam, not for attention" in refused(
         cartpole, "--layer", "head.0", "--map", "attention"
     )
     recipe = replace(cartpole.recipe, backbone=mlp())
     run = untrained(tmp_path / "run", recipe)
-    assert "no attention over the parts of an observation" in fails(run, "--map", "attention")
+    assert "no attention over the parts of an observation" in refused(run, "--map", "attention")
     monkeypatch.setitem(sys.modules, "captum.attr", None)
-    assert "need captum: pip install 'torchrl-tit[explain]'" in fails(cartpole)
+    assert "need captum: pip install 'torchrl-tit[explain]'" in refused(cartpole)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]

@@ -9,7 +9,8 @@ from recipes.cli import main
 from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 from recipes.tools.sweeps import sweep
-from tests.recipes.cli.test_cli import SHORT, fails
+from tests.recipes.cli.test_cli import SHORT
+from tests.recipes.commands import fails
 from tests.recipes.sweeps.sweep_runs import TINY
 
 OWN = """

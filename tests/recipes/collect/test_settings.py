@@ -21,6 +21,7 @@ from tests.recipes.collect.collected import (
     attributes,
     read,
 )
+from tests.recipes.commands import fails
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.datasets import TaskSpaces, task_spaces
 from torchrl_tit.settings.networks import mlp
@@ -173,7 +174,6 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     main(["data", "info", str(tmp_path / "c" / "random.hdf5"), "--env", "CartPole-v1"])
     assert "env_id        CartPole-v1" in capsys.readouterr().out
 
-    with pytest.raises(SystemExit) as stop:
-        main([*words, "--out", str(tmp_path / "c"), "--seed", "1"])
-    assert stop.value.code == 2
-    assert "holds data of other settings" in capsys.readouterr().err
+    assert "holds data of other settings" in fails(
+        capsys, *words, "--out", str(tmp_path / "c"), "--seed", "1"
+    )

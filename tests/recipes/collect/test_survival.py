@@ -1,8 +1,6 @@
 """`data collect` that is killed, resumed, and given more sets to make."""
 
 import shutil
-import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,6 @@ from recipes.tools.collect.agents import AgentInTraining
 from recipes.tools.collect.collect import collect
 from recipes.tools.collect.settings import KINDS
 from tests.recipes.collect.collected import assert_same, attributes, check_episodes, read
-from tests.recipes.commands import Command
-from torchrl_tit.checkpoint import checkpoint_steps
 
 
 class Kill(BaseException):
@@ -118,26 +114,6 @@ def test_an_episode_that_a_kill_cut_off_stays_cut_off(
         np.testing.assert_array_equal(array, again[name])
         if name != "timeouts":
             np.testing.assert_array_equal(array[:300], whole[name][:300])
-
-
-@pytest.mark.slow
-def test_killed_and_resumed(pendulum: Path, pendulum_settings: Collection, tmp_path: Path) -> None:
-    """By SIGKILL, from outside, during the training."""
-    options = f"Pendulum-v1 --agent {pendulum_settings.agent} --out {tmp_path / 'killed'} "
-    options += "--transitions 300 --medium-return -2000 --total-steps 400 --num-envs 2 "
-    options += "--evaluation-interval 200 --evaluation-episodes 2 --checkpoint-interval 150 "
-    words = ["data", "collect", *options.split()]
-    checkpoints = tmp_path / "killed" / "training" / "checkpoints"
-
-    for step in (150, 300):
-        process = Command(words, tmp_path / "errors")
-        while process.poll() is None and max(checkpoint_steps(checkpoints), default=0) < step:
-            time.sleep(0.005)
-        process.send_signal(signal.SIGKILL)
-        assert process.wait() == -signal.SIGKILL
-    process = Command(words, tmp_path / "errors")
-    assert process.wait(timeout=300) == 0, process.errors.read_text()
-    check_completed(tmp_path / "killed", pendulum)
 
 
 def test_a_mark_that_is_never_reached_and_a_longer_training(

@@ -132,37 +132,6 @@ def test_evaluation_is_of_both_targets_and_the_best_of_all(tmp_path):
         )
 
 
-def test_discrete_actions_are_learnt(tmp_path):
-    """CartPole from data in which the action follows from the state."""
-    rng = np.random.default_rng(0)
-    states = rng.normal(size=(200, 4)).astype(np.float32)
-    arrays = {
-        "observations": states,
-        "actions": (states[:, 2] > 0).astype(np.int64),
-        "rewards": np.ones(200, np.float32),
-        "terminals": np.arange(200) % 20 == 19,
-        "timeouts": np.zeros(200, bool),
-    }
-    recipe = make_dt(
-        tmp_path,
-        dataset=str(write(tmp_path / "cartpole.hdf5", arrays)),
-        env="CartPole-v1",
-        backbone=dt_tit(**SMALL_DT, dropout=0.0),
-        action_space="discrete",
-        learning_rate=1e-2,
-        target_returns=(20.0,),
-        updates_per_iteration=50,
-        log_interval=10,
-    )
-    make_algorithm(recipe).check()
-    run = train(recipe, tmp_path / "run")
-    losses = [row["loss"] for row in read_metrics(run.folder / "metrics.csv")]
-    assert losses[0] > 0.5
-    assert losses[-1] < 0.35
-    with run:
-        assert "std" in runner.evaluate(run)  # of a task without reference returns
-
-
 def test_a_target_that_the_data_never_reach_is_warned_of(tmp_path):
     recipe = make_dt(tmp_path, target_returns=(5000.0, 10.0), updates_per_iteration=1)
     with pytest.warns(UserWarning, match=r"target_returns 5000: no episode in .*hopper\.hdf5.*ran"):

@@ -13,9 +13,8 @@ from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
 from recipes.tools.results.film import film_policy
-from tests.recipes.small import SMALL_DT, make_cartpole_data, make_dt, train
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, mlp
+from torchrl_tit.settings.networks import enhanced_tit, mlp
 
 SMALL = {"total_steps": 64, "steps_per_batch": 64, "minibatch_size": 32, "epochs": 1}
 
@@ -56,24 +55,6 @@ def test_one_picture_a_step(cartpole, tmp_path, capsys, suffix):
         assert len(pictures) == returns.sum()
     assert (pictures[0] != pictures[-1]).any()
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
-
-
-def test_a_run_on_data(tmp_path, capsys):
-    pytest.importorskip("pygame")
-    recipe = make_dt(
-        tmp_path,
-        dataset=str(make_cartpole_data(tmp_path)),
-        env="CartPole-v1",
-        target_returns=(20.0,),
-        backbone=decision_transformer(**SMALL_DT),
-        action_space="discrete",
-    )
-    run = train(recipe, tmp_path / "run")
-    film = tmp_path / "film.gif"
-    main(["render", str(run.folder), "--out", str(film)])
-    (played, *_) = runner.evaluate(run)["returns"]  # the first episode of the evaluation
-    assert capsys.readouterr().out.splitlines()[0] == f"returns {played:g}"
-    assert sum(durations(film)) == 20 * played
 
 
 def test_atari(tmp_path):

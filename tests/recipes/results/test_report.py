@@ -13,6 +13,7 @@ from recipes.cli import main
 from recipes.core.recipe_json import recipe_from_json
 from recipes.tools.results import report as reports
 from recipes.tools.results.interval import interval_of
+from tests.recipes.commands import fails
 from tests.recipes.results.report_runs import metrics_of, write_run
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp
@@ -47,13 +48,6 @@ class Page(HTMLParser):
 
 def report(*words):
     main(["report", *map(str, words)])
-
-
-def error(capsys, *words):
-    with pytest.raises(SystemExit):
-        report(*words)
-    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
-    return line
 
 
 @pytest.fixture(scope="module")
@@ -219,12 +213,12 @@ def test_a_task_that_cannot_be_rendered(acting, tmp_path, monkeypatch):
 def test_what_does_not_go_together(runs, tmp_path, capsys):
     out = tmp_path / "a.html"
     write_run(tmp_path / "acrobot", "ppo/acrobot/mlp")
-    line = error(capsys, runs / "mlp", tmp_path / "acrobot", "--out", out)
+    line = fails(capsys, "report", runs / "mlp", tmp_path / "acrobot", "--out", out)
     assert "do not go together: their tasks are CartPole-v1 and Acrobot-v1" in line
     write_run(tmp_path / "again", TIT)
-    line = error(capsys, runs / "tit", tmp_path / "again", "--out", out)
+    line = fails(capsys, "report", runs / "tit", tmp_path / "again", "--out", out)
     assert "are the same run" in line
-    assert "no holds no run" in error(capsys, tmp_path / "no", "--out", out)
+    assert "no holds no run" in fails(capsys, "report", tmp_path / "no", "--out", out)
     assert not out.exists()
 
 
@@ -246,7 +240,7 @@ def test_damaged_files_are_named(tmp_path, capsys, name, content, message):
         report(*words)
         assert "all runs not known" in Page(tmp_path / "a.html").text
     else:
-        assert message in error(capsys, *words)
+        assert message in fails(capsys, "report", *words)
 
 
 def test_files_that_cannot_be_written(runs, tmp_path, capsys, monkeypatch):
@@ -256,9 +250,9 @@ def test_files_that_cannot_be_written(runs, tmp_path, capsys, monkeypatch):
         ("b.html", "it is a folder"),
         ("no/a.html", "there is no folder"),
     ]:
-        assert message in error(capsys, runs / "mlp", "--out", tmp_path / out)
+        assert message in fails(capsys, "report", runs / "mlp", "--out", tmp_path / out)
     monkeypatch.setattr("os.access", lambda path, mode: False)
-    line = error(capsys, runs / "mlp", "--out", tmp_path / "a.html")
+    line = fails(capsys, "report", runs / "mlp", "--out", tmp_path / "a.html")
     assert "may not be written to" in line
 
 
@@ -270,7 +264,7 @@ def test_a_full_disk_leaves_the_earlier_report(runs, tmp_path, capsys, monkeypat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    assert "No space left" in error(capsys, runs / "mlp", "--out", out, "--no-pictures")
+    assert "No space left" in fails(capsys, "report", runs / "mlp", "--out", out, "--no-pictures")
     assert out.read_text() == "before"
     assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
 

@@ -8,13 +8,12 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torchrl.modules import TanhNormal
 
 from recipes.core.algorithm import make_algorithm
 from recipes.core.callback import Callback
 from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
-from recipes.core.runner import evaluate, train
+from recipes.core.runner import train
 from recipes.sac import SAC, SACAlgorithm
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit, mlp
@@ -32,9 +31,6 @@ SMALL = SAC(
     log_interval=20,
     checkpoint_interval=30,
     evaluation_episodes=1,
-)
-TIT = enhanced_tit(
-    num_frames=2, patch_size=1, embed_dim=8, num_blocks=1, features_dim=8, ffn_dropout_inner=0.1
 )
 
 NO_DROPOUT = enhanced_tit(num_frames=4, embed_dim=8, num_blocks=2, features_dim=8)
@@ -186,13 +182,6 @@ def test_slices_have_the_gradient_of_their_transitions(
     torch.testing.assert_close(results[1], results[0], rtol=1e-9, atol=1e-9)
 
 
-def test_a_run_that_draws_slices(tmp_path: Path) -> None:
-    recipe = replace(SMALL, backbone=TIT, critic="backbone", slice_length=4, num_envs=2)
-    with Run.create(tmp_path / "run", recipe) as run:
-        train(recipe, run)
-    assert trained(run.folder)[0] == 60
-
-
 def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
     """Critics read the newest observation; targets are the rewards; both errors are squared."""
     algorithm, batch = double(replace(SMALL, backbone=mlp(2, hidden_dim=8)), tmp_path)
@@ -233,17 +222,6 @@ def test_a_gradient_step_moves_weights_and_targets(tmp_path: Path) -> None:
     assert algorithm.model.target_entropy == -1
 
 
-def test_the_policy_is_a_squashed_gaussian_on_the_backbone() -> None:
-    algorithm = make(replace(SMALL, env="Hopper-v5", backbone=TIT)).policy.eval()
-    td = algorithm(TensorDict({"history": torch.randn(5, 2, 11)}, [5]))
-    assert td["features"].shape == (5, 8)
-    assert td["action"].shape == td["loc"].shape == td["scale"].shape == (5, 3)
-    distribution = algorithm.get_dist(td)
-    assert isinstance(distribution, TanhNormal)
-    assert td["action"].abs().max() <= 1
-    assert "action_log_prob" not in td  # at a bound, it would not be that of the sample
-
-
 @pytest.mark.parametrize(
     ("fields", "differ"),
     [
@@ -270,12 +248,3 @@ def test_critics_read_the_history_where_velocities_are_hidden(
     with loss.qvalue_network_params[0].to_module(loss.qvalue_network):
         left, right = loss.qvalue_network(states)["state_action_value"]
     assert (left != right).item() is differ
-
-
-def test_evaluation_plays_the_most_likely_actions(tmp_path: Path) -> None:
-    with Run.create(tmp_path / "run", replace(SMALL, total_steps=10)) as run:
-        train(run.recipe, run)
-        first, again = evaluate(run), evaluate(run)
-    assert first == again
-    assert first["steps"] == 10
-    assert first["episodes"] == 1

@@ -18,7 +18,7 @@ from recipes.core.registry import RECIPES
 from recipes.core.run import Run
 from recipes.tools.results.plot import plot_run
 from recipes.tools.sweeps import sweep
-from tests.recipes.commands import Command
+from tests.recipes.commands import Command, fails
 from tests.recipes.sweeps.sweep_runs import TINY, begin, fork_worker
 
 
@@ -163,10 +163,9 @@ def test_a_run_that_another_sweep_began_first_is_no_failure(completes, tmp_path,
 def test_other_settings_under_the_same_name_are_refused(tmp_path, capsys):
     job = sweep.make_jobs(["ppo/cartpole/mlp"], [0], tmp_path)[0]
     begin(job.folder, TINY)
-    with pytest.raises(SystemExit) as exit_:
-        main(["sweep", "ppo/acrobot/mlp", "ppo/cartpole/mlp", "--out", str(tmp_path)])
-    assert exit_.value.code == 2
-    assert "with other settings" in capsys.readouterr().err
+    assert "with other settings" in fails(
+        capsys, "sweep", "ppo/acrobot/mlp", "ppo/cartpole/mlp", "--out", str(tmp_path)
+    )
     assert not (tmp_path / "ppo/acrobot").exists()
 
 

@@ -16,7 +16,7 @@ from recipes.core.recipe_json import recipe_from_json, recipe_to_json
 from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 from recipes.ppo import PPO
-from tests.recipes.commands import Command
+from tests.recipes.commands import Command, fails
 from tests.recipes.sweeps.sweep_runs import fork_worker
 from torchrl_tit.settings.networks import mlp
 
@@ -135,9 +135,7 @@ def test_a_search_that_was_killed_goes_on(files, capsys, monkeypatch):
 
     main(["table", str(out)])  # where each trial stands under its name
     assert "| ppo/cartpole/mine/trial-1 | 1 |" in capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        main([*words(files, 2), "--seeds", "1"])
-    assert "holds a search with other settings" in capsys.readouterr().err
+    assert "holds a search with other settings" in fails(capsys, *words(files, 2), "--seeds", "1")
 
 
 @pytest.mark.parametrize("disable", [False, True])  # as TQDM_DISABLE=1 does
@@ -234,9 +232,9 @@ def test_bad_spaces_are_refused_before_anything_runs(space, message, files, caps
 
 
 def test_seeds_that_cannot_be_are_refused_before_anything_runs(files, capsys):
-    with pytest.raises(SystemExit):
-        main([*words(files, 1), "--seeds", "0", "-1"])
-    assert "seed must be at least 0, not -1" in capsys.readouterr().err
+    assert "seed must be at least 0, not -1" in fails(
+        capsys, *words(files, 1), "--seeds", "0", "-1"
+    )
     assert not (files / "out").exists()
 
 
