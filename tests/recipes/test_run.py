@@ -62,6 +62,17 @@ def trained(folder: Path, recipe: PPO = SMALL) -> Run:
     return run
 
 
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained(tmp_path_factory.mktemp("runs") / "run").folder
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Run:
+    """A copy of a finished run."""
+    return Run.open(shutil.copytree(finished, tmp_path / "run"))
+
+
 def edit(path: Path, **fields: object) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
 
@@ -115,8 +126,7 @@ def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch,
     assert folders == [name, f"{name}-2", f"{name}-3"]
 
 
-def test_a_run_is_complete_when_trained_evaluated_and_drawn(tmp_path):
-    run = trained(tmp_path / "run")
+def test_a_run_is_complete_when_trained_evaluated_and_drawn(run):
     assert Run.open(run.folder).recipe == SMALL
     versions = json.loads((run.folder / "versions.json").read_text())
     assert versions["torch"] == version("torch")
@@ -186,8 +196,7 @@ def test_a_damaged_list_of_imports_does_not_hide_the_reason(tmp_path):
     ],
     ids=str,
 )
-def test_an_edited_recipe_that_no_longer_fits_changes_nothing(fields, tmp_path, capsys):
-    run = trained(tmp_path / "run")
+def test_an_edited_recipe_that_no_longer_fits_changes_nothing(fields, run, capsys):
     edit(run.folder / "recipe.json", total_steps=192, **fields)
     before = contents(run.folder)
     line = fails(capsys, "train", "--resume", run.folder)
@@ -215,8 +224,7 @@ def test_a_damaged_or_older_recipe_is_named(text, reason, tmp_path, capsys):
     assert contents(run.folder) == before
 
 
-def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(tmp_path):
-    run = trained(tmp_path / "run")
+def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(run):
     recipe = replace(SMALL, total_steps=192, steps_per_batch=96, checkpoint_interval=10**6)
     with run:
         runner.train(recipe, run)
@@ -254,9 +262,8 @@ def test_what_explodes_is_never_saved(poison, message, tmp_path):
     assert len(read_metrics(run.folder / "metrics.csv")) == 1
 
 
-def test_a_disk_that_is_full_stops_the_process_with_one_line(tmp_path):
+def test_a_disk_that_is_full_stops_the_process_with_one_line(run, tmp_path):
     """The limit on a file's size stands for the disk; the metrics still fit, a checkpoint not."""
-    run = trained(tmp_path / "run")
     edit(run.folder / "recipe.json", total_steps=256)
     before = contents(run.checkpoints)
     process = Command(["train", "--resume", run.folder], tmp_path / "errors", file_size=20_000)

@@ -1,18 +1,67 @@
-"""Recipes of conservative Q-learning: dropout and target networks."""
+"""Recipes of conservative Q-learning: their steps, dropout, targets, and how data are read."""
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
 import torch
 
 from recipes.cql import DiscreteCQL
+from tests.datasets.rollouts import roll, write
 from tests.recipes.small import (
+    SMALL,
+    double,
     make_algorithm,
     make_cql,
     make_discrete_cql,
+    tit,
     train,
 )
 from torchrl_tit.networks import HistoryNetwork
+
+RATES = {"temperature": 0.02, "critic": 3e-3, "actor": 1e-3}
+NETWORKS = {"log_alpha": "temperature", "qvalue_network": "critic", "actor_network": "actor"}
+
+
+def test_temperature_and_critics_then_actor_then_targets(tmp_path, monkeypatch):
+    """The formulas of the losses are held against others in tests/objectives/test_cql.py."""
+    rates = {f"{name}_learning_rate": rate for name, rate in RATES.items()}
+    recipe = make_cql(tmp_path, backbone=SMALL, tau=0.1, gamma=0.97, **rates)
+    algorithm, batch = double(recipe, tmp_path)
+    loss, seen = algorithm.model, []
+    compute = algorithm._loss
+
+    def recording(samples):
+        terms = compute(samples)
+        seen.append((samples, {name: term.detach() for name, term in terms.items()}))
+        return terms
+
+    monkeypatch.setattr(algorithm, "_loss", recording)
+    before = {name: weight.clone() for name, weight in loss.state_dict().items()}
+    terms = algorithm.update(batch, 0)
+    after = {name: weight.clone() for name, weight in loss.state_dict().items()}
+
+    for name, weight in after.items():
+        if name.startswith("target_") and "_params" in name:
+            source = after[name.removeprefix("target_")]
+            torch.testing.assert_close(weight, 0.9 * before[name] + 0.1 * source)
+        for network, kind in NETWORKS.items():
+            if name.startswith(network) and not name.endswith(("low", "high")):
+                # Adam's first step is the learning rate, wherever there is a gradient.
+                moved = (weight - before[name]).abs().max().item()
+                assert moved == pytest.approx(RATES[kind], rel=1e-2), name
+
+    # The actor's loss reads the temperature and the critics that were stepped before.
+    [(samples, first)] = seen
+    torch.testing.assert_close(terms["loss_actor"], algorithm.actor_loss(samples)["loss_actor"])
+    loss.load_state_dict(before)
+    unstepped = algorithm.actor_loss(samples)["loss_actor"]
+    assert not torch.isclose(terms["loss_actor"], unstepped, rtol=1e-6)
+    for name in ("loss_alpha", "loss_qvalue"):
+        torch.testing.assert_close(terms[name], first[name])
+    assert loss.value_estimator.gamma.item() == pytest.approx(0.97)
 
 
 @pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
@@ -56,3 +105,23 @@ def test_the_discrete_target_follows_the_trained_network_slowly(tmp_path):
         if weight.is_floating_point():
             torch.testing.assert_close(weight, 0.75 * before[name] + 0.25 * trained[name])
     assert not (trained == before).all()
+
+
+def test_how_the_data_are_read_is_passed_on(tmp_path):
+    """Files without time limits, and with gaps."""
+    rolled = roll()
+    names = ("observations", "actions", "rewards", "terminals")
+    bare = {name: rolled[name] for name in names}
+    bare["terminals"] = np.zeros_like(bare["terminals"])
+    data, steps = str(write(tmp_path / "bare.hdf5", bare)), len(rolled["rewards"])
+    limited = make_cql(tmp_path, dataset=data, max_episode_steps=20, unfinished="keep")
+    dropped = math.ceil(steps / 20)  # the last of each
+    assert len(make_algorithm(limited).make_buffer()) == steps - dropped
+    rolled["next_observations"] = rolled["next_observations"] + np.float32(1)
+    data = str(write(tmp_path / "torn.hdf5", rolled))
+    recipe = make_cql(tmp_path, dataset=data, gaps="cut", time_limits="keep")
+    assert len(make_algorithm(recipe).make_buffer()) == steps
+    for padding, empty in (("same", False), ("constant", True)):
+        padded = make_cql(tmp_path, backbone=tit(3), padding=padding)
+        history = make_algorithm(padded).make_buffer().storage.get(torch.tensor([0]))["history"]
+        assert (not history[:, :-1].any()) == empty
