@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 
@@ -16,8 +14,6 @@ from torchrl_tit.networks import Catformer, CoBERL, GTrXL
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
-SMALL: dict[str, Any] = {"embed_dim": 12, "num_heads": 3, "features_dim": 8}
-
 
 def test_defaults_are_the_protocols() -> None:
     network = Catformer((84, 84), 4)
@@ -29,14 +25,6 @@ def test_defaults_are_the_protocols() -> None:
     assert shapes["history_encoder.ffns.1.1.weight"] == (1020, 765)
     assert shapes["head.1.weight"] == (512, 255)
     assert not any(name.startswith("history_encoder.attentions.0.projection") for name in shapes)
-
-
-def test_expansions_widen_what_they_name() -> None:
-    network = Catformer((20, 20), 4, **SMALL, attention_expansion=2, ffn_expansion=3)
-    shapes = {name: tuple(p.shape) for name, p in network.named_parameters()}
-    assert shapes["history_encoder.attentions.0.projection.weight"] == (24, 12)
-    assert shapes["history_encoder.attentions.1.attention.out_proj.weight"] == (12, 24)
-    assert shapes["history_encoder.ffns.1.1.weight"] == (36, 36)
 
 
 @pytest.mark.parametrize("num_blocks", [1, 2, 3])

@@ -11,7 +11,7 @@ from torchrl.modules import set_recurrent_mode
 
 from tests.networks.reference import randomize
 from torchrl_tit import settings
-from torchrl_tit.histories import HistoryEncoder, HistoryShape, OneToken
+from torchrl_tit.histories import HistoryEncoder, HistoryShape
 from torchrl_tit.settings import HistorySettings
 
 ONE_TOKEN: list[HistorySettings] = [
@@ -40,13 +40,6 @@ def test_several_tokens_become_one_by_a_linear_layer(choices: HistorySettings) -
         several.attention_maps(tokens), one.attention_maps(merged.unsqueeze(-2)), strict=True
     ):
         torch.testing.assert_close(ours, theirs)
-
-
-def test_one_token_stays_as_it_is() -> None:
-    module = OneToken(HistoryShape(num_frames=3, num_tokens=1, width=8))
-    assert not list(module.parameters())
-    tokens = torch.randn(4, 3, 1, 8)
-    assert torch.equal(module(tokens), tokens[:, :, 0])
 
 
 def test_masked_predictions_of_several_tokens_compare_the_one_made_of_them() -> None:
@@ -103,15 +96,13 @@ def test_recurrent_encoders_read_sequences_from_a_given_state(name: str) -> None
     given = tuple(x[:, 0].transpose(0, 1).contiguous() for x in state.values())
     first, _ = reference(tokens[:, :4, 0], given if len(given) > 1 else given[0])
     second, _ = reference(tokens[:, 4:, 0])
-    torch.testing.assert_close(states, torch.cat([first, second], dim=1))
+    expected = torch.cat([first, second], dim=1)
+    torch.testing.assert_close(states, expected)
+    torch.testing.assert_close(
+        torch.autograd.grad(states.square().sum(), list(encoder.parameters()), retain_graph=True),
+        torch.autograd.grad(expected.square().sum(), list(reference.parameters())),
+    )
     torch.testing.assert_close(after["recurrent_state_h"][:, -1, 0], second[:, -1])
-
-
-def test_frames_that_were_encoded_cannot_be_stacked() -> None:
-    tokens = HistoryShape(num_frames=3, num_tokens=1, width=8)
-    for choices in (settings.StackedInner(), settings.StackedCNN()):
-        with pytest.raises(ValueError, match="stacks the frames themselves, not tokens: choose"):
-            choices.build(tokens)
 
 
 def test_an_encoder_without_blocks_has_no_attention_maps() -> None:

@@ -79,12 +79,6 @@ def test_every_system_reads_images_arrays_and_categories_at_once(system):
     assert list(trunk.frame_settings) == ["image", "direction", "state"]
 
 
-def test_choosing_draws_no_random_numbers():
-    state = torch.get_rng_state()
-    frames_by_kind(mlp(), ROBOT)
-    assert torch.equal(torch.get_rng_state(), state)
-
-
 @pytest.mark.parametrize(
     ("frames", "message"),
     [

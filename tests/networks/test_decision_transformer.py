@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from tests.networks.reference import randomize
-from torchrl_tit import settings
 from torchrl_tit.histories.decision_transformer import DecisionTransformer as Encoder
 from torchrl_tit.layers import GPT2Block
 from torchrl_tit.modules import DTHead
@@ -84,27 +83,6 @@ def make_inputs(case: str, *leading: int, steps: int = 5) -> list[Tensor]:
     return [states, actions, returns_to_go, timesteps]
 
 
-def changed(inputs: list[Tensor], entry: int, step: int) -> list[Tensor]:
-    """The inputs with one entry of one step replaced."""
-    inputs = [x.clone() for x in inputs]
-    x = inputs[entry]
-    x[:, step] = x[:, step].roll(1, dims=-1) if x.shape[-1] > 1 else x[:, step] + 1
-    return inputs
-
-
-@every_case
-def test_actions_depend_on_what_precedes_them(case: str) -> None:
-    predictor, inputs = make(case), make_inputs(case, 2)
-    actions = predictor(*inputs)
-    assert actions.shape == (2, 5, 3)
-    for entry in range(3):
-        other = predictor(*changed(inputs, entry, 2))
-        same = (other - actions).abs().amax((0, 2)) < 1e-12
-        # The action of step 2 sees the state and return of its step, but not itself.
-        first = 3 if entry == 1 else 2
-        assert same.tolist() == [step < first for step in range(5)], entry
-
-
 @every_case
 def test_padding_is_not_seen_and_stays_finite(case: str) -> None:
     predictor, inputs = make(case), make_inputs(case, 3)
@@ -147,18 +125,6 @@ def test_only_the_newest_step_of_the_last_block_is_computed() -> None:
     predictor.network(*inputs)
     predictor.network.every_frame(*inputs)
     assert computed == [14, 1, 14, 5]  # return, state and action of five steps, but for the last
-
-
-def test_several_tokens_of_a_state_are_joined() -> None:
-    frame = settings.Inner(num_blocks=2, embed_dim=16)
-    network = HistoryNetwork(
-        frame,
-        settings.DecisionTransformer(num_blocks=1),
-        observation_shape=(11,),
-        head=settings.Head(features_dim=None),
-        action_dim=3,
-    )
-    assert network.every_frame(*make_inputs("dt", 2)).shape == (2, 5, 16)
 
 
 def test_action_heads() -> None:

@@ -1,4 +1,4 @@
-"""NatureCNN and ResNet against the same layers in a row."""
+"""NatureCNN against the same layers in a row; ResNet is in tests/interop."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import torch
 from torch import nn
 
 from tests.numerics import assert_near
-from torchrl_tit.layers.images import ResidualBlock
-from torchrl_tit.networks import NatureCNN, ResNet
+from torchrl_tit.networks import NatureCNN
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -27,30 +26,12 @@ def nature_cnn(channels: int, positions: int) -> nn.Sequential:
     )
 
 
-def resnet(channels: int, positions: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(channels, 64, kernel_size=8, stride=4),
-        nn.ReLU(),
-        ResidualBlock(64),
-        ResidualBlock(64),
-        nn.Flatten(),
-        nn.Linear(64 * positions, 16),
-        nn.ReLU(),
-    )
-
-
 @pytest.mark.parametrize(
     ("shape", "num_frames", "channels", "positions"),
     [((84, 84), 4, 4, 49), ((3, 36, 52), 2, 6, 3), ((36, 36), 1, 1, 1)],
 )
-@pytest.mark.parametrize("kind", [NatureCNN, ResNet])
-def test_equals_the_layers_in_a_row(kind, shape, num_frames, channels, positions):
-    network = kind(shape, num_frames, features_dim=16)
-    if kind is ResNet:
-        height, width = ((side - 8) // 4 + 1 for side in shape[-2:])
-        layers = resnet(channels, height * width)
-    else:
-        layers = nature_cnn(channels, positions)
+def test_equals_the_layers_in_a_row(shape, num_frames, channels, positions):
+    network, layers = NatureCNN(shape, num_frames, features_dim=16), nature_cnn(channels, positions)
     for ours, theirs in zip(network.parameters(), layers.parameters(), strict=True):
         theirs.data.copy_(ours)
     frames = torch.rand(5, num_frames, *shape, requires_grad=True)
@@ -64,15 +45,3 @@ def test_equals_the_layers_in_a_row(kind, shape, num_frames, channels, positions
     features.sum().backward()
     assert frames.grad is not None
     assert frames.grad.flatten(2).abs().sum(2).all()
-
-
-def test_the_residual_block_adds_relu_of_a_convolution_to_its_input():
-    block, x = ResidualBlock(3), torch.randn(2, 3, 5, 4)
-    expected = nn.functional.conv2d(x, block.conv.weight, block.conv.bias, padding=1)
-    assert_near(block(x), x + expected.clamp(min=0))
-
-
-def test_size_for_atari():
-    network = ResNet((84, 84), 4)
-    # 4 x 64 x 8 x 8 + 64, twice 64 x 64 x 3 x 3 + 64, 25,600 x 512 + 512
-    assert sum(p.numel() for p in network.parameters()) == 16_448 + 2 * 36_928 + 13_107_712

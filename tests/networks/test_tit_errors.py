@@ -66,12 +66,6 @@ def test_nothing_left() -> None:
         EnhancedTIT((4,), 2, outer=False, temporal_positions="learned")
 
 
-@BOTH
-def test_unknown_hyperparameter_is_named(kind: type[Any]) -> None:
-    with pytest.raises(TypeError, match=r"got an unexpected keyword argument 'embed_dims'"):
-        kind((4,), embed_dims=64)
-
-
 @pytest.mark.parametrize(
     "shape", [(3, 4), (3, 5), (2, 5, 3), (4,), (), (5, 3), (2, 4, 4), (2, 3, 5)]
 )
@@ -105,18 +99,3 @@ def test_autocast_does_not_convert_these(dtype: torch.dtype) -> None:
     tit = EnhancedTIT((3,), 2)
     with torch.autocast("cpu", torch.bfloat16), pytest.raises(TypeError, match=f"{dtype}"):
         tit(torch.zeros(5, 2, 3, dtype=dtype))
-
-
-def test_float32_into_a_network_of_float64() -> None:
-    with pytest.raises(TypeError, match=r"torch.float32 .* network of torch.float64"):
-        EnhancedTIT((3,), 2).double()(torch.zeros(5, 2, 3))
-
-
-def test_representation_shows_what_the_network_is() -> None:
-    text = repr(EnhancedTIT((8, 8), 4, patch_size=4, num_heads_inner=2, embed_dim=16))
-    assert "ImagePatchEmbedding(16, 1, 4, 4, grid=(2, 2))" in text
-    assert "num_heads=2, causal=False" in text
-    assert "num_heads=1, causal=True" in text
-    assert "ArrayPatchEmbedding(16, 1, 4, padding=1)" in repr(
-        VanillaTIT((11,), 4, patch_size=4, embed_dim=16)
-    )

@@ -12,23 +12,19 @@ from torchrl.envs import EnvBase
 class StreamEnv(EnvBase):
     """Random observations, and episodes of random length in each copy."""
 
-    def __init__(self, batch_size=(), shape=(3,), dtype=torch.float32, group=None, seed=0):
+    def __init__(self, batch_size=(), shape=(3,), dtype=torch.float32, seed=0):
         super().__init__(batch_size=torch.Size(batch_size))
         self.generator = torch.Generator().manual_seed(seed)
-        self.shape_of_one, self.group = (*self.batch_size, *shape), group
+        self.shape_of_one = (*self.batch_size, *shape)
         self.seen = Unbounded(self.shape_of_one, dtype=dtype)
-        specs = Composite(observation=self.seen, shape=self.batch_size)
-        if group is not None:
-            specs = Composite({group: specs}, shape=self.batch_size)
-        self.observation_spec = specs
+        self.observation_spec = Composite(observation=self.seen, shape=self.batch_size)
         self.action_spec = Categorical(2, shape=self.batch_size)
         self.reward_spec = Unbounded((*self.batch_size, 1))
         self.done_spec = Categorical(2, shape=(*self.batch_size, 1), dtype=torch.bool)
 
     def _observe(self) -> TensorDict:
         numbers = torch.randint(0, 256, self.shape_of_one, generator=self.generator)
-        entries = TensorDict({"observation": numbers.to(self.seen.dtype)}, self.batch_size)
-        return entries if self.group is None else TensorDict({self.group: entries}, self.batch_size)
+        return TensorDict({"observation": numbers.to(self.seen.dtype)}, self.batch_size)
 
     def _reset(self, tensordict=None, **kwargs):
         return self._observe()

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, TransformedEnv
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs import GymEnv, TransformedEnv
 
 from torchrl_tit.envs import make_env
-from torchrl_tit.transforms import VELOCITIES, HideEntries, HideVelocities, History
+from torchrl_tit.transforms import VELOCITIES, HideEntries, HideVelocities
 
 TASKS = {"CartPole": "v1", "Acrobot": "v1", "MountainCar": "v0", "Pendulum": "v1"} | dict.fromkeys(
     ["Hopper", "Walker2d", "HalfCheetah"], "v5"
@@ -59,14 +58,6 @@ def test_history_and_observation_are_those_of_the_whole_task_less_the_velocities
             assert torch.equal(step["next", key], expected_step["next", key][..., seen])
             assert torch.equal(root[key], expected[key][..., seen])
         assert torch.equal(step["next", "reward"], expected_step["next", "reward"])
-
-
-def test_below_a_history_of_torchrl():
-    env = TransformedEnv(
-        GymEnv("Acrobot-v1"), Compose(HideVelocities("Acrobot-v1"), History(num_frames=3))
-    )
-    check_env_specs(env)
-    assert env.rollout(5)["history"].shape == (5, 3, 4)
 
 
 def test_nested_keys_and_tensordicts():

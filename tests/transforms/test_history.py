@@ -5,15 +5,13 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase, assert_close
+from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
 from torchrl.envs import (
     CatFrames,
     Compose,
     RewardSum,
-    SerialEnv,
     TransformedEnv,
-    UnsqueezeTransform,
 )
 from torchrl.envs.utils import check_env_specs
 
@@ -29,68 +27,11 @@ def test_equals_the_plain_reference(num_envs, num_frames, padding):
     assert_histories(env, num_frames, padding)
 
 
-@pytest.mark.parametrize("padding", ["same", "constant"])
-def test_images_stay_uint8(padding):
-    stream = StreamEnv([3], shape=(2, 4, 5), dtype=torch.uint8)
-    env = TransformedEnv(stream, History(3, observation_ndim=3, padding=padding))
-    assert_histories(env, 3, padding)
-    assert env.observation_spec["history"].shape == (3, 3, 2, 4, 5)
-    assert env.observation_spec["history"].dtype is torch.uint8
-    assert env.reset()["history"].dtype is torch.uint8
-
-
-@pytest.mark.parametrize("padding", ["same", "constant"])
-def test_nested_keys(padding):
-    history = History(
-        3, in_keys=[("camera", "observation")], out_keys=[("camera", "past")], padding=padding
-    )
-    env = TransformedEnv(StreamEnv([3], group="camera"), history)
-    check_env_specs(env)
-    assert_histories(
-        env, 3, padding, observation=("camera", "observation"), history=("camera", "past")
-    )
-
-
-def test_separate_environments_in_a_batch():
-    env = TransformedEnv(SerialEnv(2, [lambda: StreamEnv(seed=1), lambda: StreamEnv(seed=2)]))
-    env.append_transform(History(3))
-    assert_histories(env, 3, "same")
-
-
 def test_without_a_batch():
     env = TransformedEnv(StreamEnv([], shape=(2,)), History(3))
     check_env_specs(env)
     first = env.reset()
     assert torch.equal(first["history"], first["observation"].expand(3, 2))
-
-
-def test_several_observations():
-    history = History(2, in_keys=["observation", "episode_reward"], out_keys=["a", "b"])
-    env = TransformedEnv(StreamEnv([2]), Compose(RewardSum(), history))
-    rollout = env.rollout(5, break_when_any_done=False)
-    assert rollout["a"].shape == (2, 5, 2, 3)
-    assert rollout["b"].shape == (2, 5, 2, 1)
-    assert torch.equal(rollout["b"][..., -1, :], rollout["episode_reward"])
-
-
-def test_is_torchrls_cat_frames_in_one_step():
-    """The same as CatFrames after UnsqueezeTransform, entry by entry and buffer by buffer."""
-    ours = TransformedEnv(StreamEnv([3]), History(4))
-    theirs = TransformedEnv(
-        StreamEnv([3]),
-        Compose(
-            UnsqueezeTransform(-2, in_keys=["observation"], out_keys=["history"]),
-            CatFrames(4, -2, in_keys=["history"]),
-        ),
-    )
-    assert isinstance(ours.transform, CatFrames)
-    rollouts = []
-    for env in (ours, theirs):
-        torch.manual_seed(0)
-        rollouts.append(env.rollout(40, break_when_any_done=False))
-    assert_close(*rollouts, rtol=0, atol=0)
-    (buffer,), (expected,) = ours.state_dict().values(), theirs.state_dict().values()
-    assert torch.equal(buffer, expected)
 
 
 def test_a_new_environment_takes_the_state():
@@ -116,17 +57,6 @@ def test_transforms_can_be_added_in_the_middle_of_an_episode():
     env.append_transform(RewardSum())
     step = env.step(env.rand_action(root.set("episode_reward", torch.zeros(2, 1))))["next"]
     assert torch.equal(step["history"], torch.stack([first, first, step["observation"]], 1))
-
-
-@pytest.mark.parametrize("padding", ["same", "constant"])
-@pytest.mark.parametrize("num_frames", [1, 3])
-def test_stored_trajectories_get_the_same_histories(num_frames, padding):
-    env = TransformedEnv(StreamEnv([4]), History(num_frames, padding=padding))
-    rollout = env.rollout(30, break_when_any_done=False).refine_names(None, "time")
-    assert rollout["next", "done"].any()
-    stored = rollout.exclude("history")
-    again = History(num_frames, padding=padding)(stored)
-    assert torch.equal(again["history"], rollout["history"])
 
 
 @pytest.mark.parametrize("padding", ["same", "constant"])
