@@ -292,12 +292,3 @@ def test_what_is_refused() -> None:
         other.storage.load_state_dict(storage.state_dict())
     with pytest.raises(ValueError, match="begin at 15, but 27 were written: add all parts"):
         storage.add_part(storage.part(15))
-    wrong: list[tuple[dict[str, Any], str]] = [
-        ({"num_frames": 0}, "num_frames must be at least 1"),
-        ({"ndim": 3}, "ndim must be 1 .*, not 3"),
-        ({"padding": "zeros"}, "field 'padding' is 'zeros', not one of"),
-        ({"max_size": 0}, "max_size must be at least 1, not 0"),
-    ]
-    for settings, message in wrong:
-        with pytest.raises(ValueError, match=message):
-            OnlineHistoryStorage(**{"max_size": 30, **settings})

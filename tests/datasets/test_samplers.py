@@ -22,11 +22,9 @@ from torchrl.data import (
     TensorDictReplayBuffer,
 )
 from torchrl.envs import RenameTransform
-from torchrl.modules import set_recurrent_mode
 
 from tests.datasets.rollouts import Transitions
 from tests.datasets.several import play_several
-from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.datasets import (
     ConsecutiveSampler,
     Episodes,
@@ -117,26 +115,6 @@ def check_slices(batch: TensorDictBase, marked: bool) -> None:
     if marked:
         assert torch.equal(batch["is_init"][1:, 0], ~same)
         assert torch.equal(done[:-1], ~same)
-
-
-@pytest.mark.parametrize("strict_length", [True, False])
-def test_a_backbone_reads_flat_batches_of_slices(make: Make, strict_length: bool) -> None:
-    sampler = SliceSampler(slice_len=4, strict_length=strict_length)
-    buffer = make(TensorDictReplayBuffer, sampler=sampler)
-    torch.manual_seed(0)
-    batch = buffer.sample()
-    if not isinstance(batch["history"], Tensor):  # one of several observations
-        for group in (batch, batch["next"]):
-            group.update({key: group[key, "state"].double() for key in ("history", "observation")})
-    batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
-    shape = batch["observation"].shape[1:]
-    network = EnhancedTIT(shape, num_frames=3, embed_dim=8, num_blocks=1, features_dim=4).double()
-    backbone = Backbone(network)
-    for group in (batch, batch["next"]):
-        expected = backbone(group.select("history"))["features"]
-        with set_recurrent_mode(True):
-            features = backbone(group.copy())["features"]
-        torch.testing.assert_close(features, expected)
 
 
 INDICES: list[Any] = [
@@ -263,8 +241,6 @@ def test_consecutive_steps_are_those_of_an_environment(make: Make) -> None:
 
 def test_slices_that_cannot_be_drawn(make: Make) -> None:
     storage = make().storage
-    with pytest.raises(ValueError, match="slice_length must be at least 1, not 0"):
-        ConsecutiveSampler(0)
     with pytest.raises(ValueError, match="12 steps cannot be divided into slices of 5"):
         ConsecutiveSampler(5).sample(storage, 12)
     with pytest.raises(ValueError, match="consecutive steps, which is less than a slice of 1000"):

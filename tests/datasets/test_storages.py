@@ -200,32 +200,11 @@ def test_the_buffer_cannot_be_written(rolled: Transitions) -> None:
         buffer.empty()
 
 
-@pytest.mark.parametrize(
-    ("kind", "settings", "message"),
-    [
-        (HistoryStorage, {"num_frames": 0}, "num_frames must be at least 1"),
-        (HistoryStorage, {"padding": "zeros"}, "'padding' is 'zeros', not one of"),
-        (HistoryStorage, {"time_limits": "lose"}, "'time_limits' is 'lose', not one of"),
-        (HistoryStorage, {"terminal_observations": "drop"}, "'terminal_observations' is 'drop'"),
-        (HistoryStorage, {"unfinished": True}, "unfinished"),
-        (SequenceStorage, {"num_frames": 0}, "num_frames must be at least 1, not 0"),
-        (SequenceStorage, {"return_scale": 0.0}, "return_scale must be positive"),
-    ],
-)
-def test_wrong_settings(
-    rolled: Transitions, kind: Any, settings: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        kind(episodes_from_arrays(**rolled), **settings)
-
-
 def test_nothing_to_draw(arrays: Transitions) -> None:
     one = {name: array[:1] for name, array in arrays.items()}
     one["timeouts"][:] = True
     with pytest.raises(DatasetError, match="nothing can be drawn from its 1 episodes"):
         HistoryStorage(episodes_from_arrays(**one), time_limits="drop")
-    with pytest.raises(ValueError, match="batch_size must be at least 1, not 0"):
-        make_replay_buffer(HistoryStorage(episodes_from_arrays(**one)), 0)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")

@@ -16,7 +16,6 @@ from torchrl_tit.datasets import (
     TransitionParts,
     episodes_from_arrays,
     load_episodes,
-    task_spaces,
     write_minari,
 )
 
@@ -107,31 +106,6 @@ def test_more_parts_than_files_may_be_open(arrays: Transitions, tmp_path: Path) 
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert (rows == expected).all()
-
-
-def test_images_and_discrete_actions_keep_their_dtypes(tmp_path: Path) -> None:
-    generator = np.random.default_rng(0)
-    frames = generator.integers(0, 256, (1, 7, 84, 84), dtype=np.uint8)
-    ends = np.array([[False, False, True] * 2])
-    parts = TransitionParts(tmp_path)
-    parts.write(
-        1,
-        {
-            "observations": frames[:, :-1],
-            "actions": np.arange(6)[None],
-            "rewards": np.ones((1, 6), np.float32),
-            "terminals": ends,
-            "timeouts": ~ends & ends,
-            "next_observations": frames[:, 1:],
-        },
-    )
-
-    rows = parts.episodes(task=task_spaces("ALE/Pong-v5")).rows
-
-    assert rows["observation"].dtype == torch.uint8
-    assert rows["action"].tolist() == [0, 1, 2, 0, 3, 4, 5, 0]
-    with pytest.raises(DatasetError, match="one row has the shape"):
-        parts.episodes(task=task_spaces("CartPole-v1"))
 
 
 def test_a_game_of_minaris(tmp_path: Path) -> None:

@@ -313,18 +313,6 @@ def test_bounds_are_those_of_the_entry_that_is_wrong() -> None:
         check_actions("a.hdf5", np.array([[2], [3]]), Discrete(3))
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, not 0"),
-        ({"gaps": "cutt"}, "field 'gaps' is 'cutt', not one of"),
-    ],
-)
-def test_wrong_settings(arrays: Transitions, settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        episodes_from_arrays(**arrays, **settings)
-
-
 def test_selected_and_joined_episodes_keep_their_rows(arrays: Transitions) -> None:
     data = episodes_from_arrays(**arrays)
     order = [5, 0, 0, 2]

@@ -3,34 +3,10 @@
 import gymnasium
 import numpy as np
 import pytest
-import torch
 
 from tests.envs.tasks import Robot
 from torchrl_tit.envs import gymnasium_tasks, make_env
 from torchrl_tit.settings.imports import import_allowed
-
-
-def lean(root):
-    """Pushes the cart to the side that the pole leans to; the same rule for every copy."""
-    return root.set("action", (root["observation"][:, 2] > 0).long())
-
-
-def rollout(num_envs, seed):
-    env = make_env("CartPole-v1", num_envs, seed=seed)
-    root, steps = env.reset(), []
-    for _ in range(120):
-        step, root = env.step_and_maybe_reset(lean(root))
-        steps.append(step)
-    return torch.stack(steps, 1)
-
-
-def test_copies_are_seeded_one_after_the_other():
-    together = rollout(3, seed=5)
-    assert together["next", "done"].sum() > 3
-    for i in range(3):
-        alone = rollout(1, seed=5 + i)
-        assert torch.equal(together[i]["observation"], alone[0]["observation"])
-    assert not torch.equal(together[0]["observation"], together[1]["observation"])
 
 
 def test_a_seeded_reset_is_gymnasiums():
@@ -111,13 +87,6 @@ def test_processes_that_fail_print_one_line(own_modules, monkeypatch):
     monkeypatch.setattr(gymnasium_tasks, "AsyncVectorEnv", end)
     with pytest.raises(ValueError, match="'CartPole-v1' cannot be made in processes of its own"):
         make_env("CartPole-v1", vectorization_mode="async")
-
-
-def test_settings_that_are_wrong_or_of_no_use():
-    with pytest.raises(ValueError, match="field 'vectorization_mode' is 'p', not one of"):
-        make_env("CartPole-v1", vectorization_mode="p")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="not known which observations of 'Ant-v5' are velocities"):
-        make_env("Ant-v5", hide_velocities=True)
 
 
 def test_older_versions_by_name(recwarn):

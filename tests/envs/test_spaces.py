@@ -45,23 +45,6 @@ def echo(actions=None, observations=None, copies=2, **settings):
     return GymVectorEnv(SyncVectorEnv(tasks, autoreset_mode=AutoresetMode.DISABLED), **settings)
 
 
-@pytest.mark.filterwarnings("ignore:The observation 'mission'")
-@pytest.mark.parametrize(
-    ("name", "settings", "expected"),
-    [
-        ("FrozenLake-v1", {}, [16]),
-        ("Taxi-v4", {"mask_actions": True}, [500]),
-        ("Blackjack-v1", {}, {"0": [32], "1": [11], "2": [2]}),
-        ("MiniGrid-Empty-5x5-v0", {}, {"direction": [4], "image": ((3, 7, 7), "uint8")}),
-        ("popgym-RepeatPreviousEasy-v0", {}, [4]),
-    ],
-)
-def test_tasks(name, settings, expected):
-    env = make_env(name, 2, seed=0, num_frames=3, **settings)
-    assert kinds(env) == expected
-    check_env_specs(env)
-
-
 @pytest.mark.parametrize(
     ("space", "expected"),
     [
@@ -129,17 +112,6 @@ def test_histories_of_each_observation(padding):
     check_env_specs(env)
     for name in NAMES:
         assert_histories(env, 3, padding, 12, ("observation", name), ("history", name))
-
-
-@pytest.mark.filterwarnings("ignore:The observation 'speech'")
-def test_histories_leave_steps_that_were_taken():
-    env = make_env(ROBOT, 2, seed=0, num_frames=3, keep_histories=False)
-    root = env.rand_action(env.reset())
-    assert root["history", "camera"].shape == (2, 3, 3, 5, 6)
-    step, root = env.step_and_maybe_reset(root)
-    assert "history" not in step
-    assert "history" not in step["next"]
-    assert set(root["history"].keys()) == set(root["observation"].keys())
 
 
 @pytest.mark.parametrize(

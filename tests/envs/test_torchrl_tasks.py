@@ -98,21 +98,6 @@ def test_copies_play_as_one_alone():
     assert not ended.all(1).any()
 
 
-def test_is_the_same_task_as_through_gymnasium():
-    ours = make_env("CartPole-v1", 2, seed=0, num_frames=2, max_episode_steps=9)
-    theirs = make_env(f"{__name__}:cart_pole", 2, num_frames=2, max_episode_steps=9)
-    assert kinds(theirs) == ((4,), "float32")
-    assert type(theirs.action_spec) is Categorical  # of a one-hot vector
-    root = ours.reset()
-    task = theirs.reset()
-    assert torch.equal(task["history"][:, 0], task["history"][:, 1])
-    for action in actions(ours, 30):
-        _, task = theirs.step_and_maybe_reset(task.set("action", action))
-        _, root = ours.step_and_maybe_reset(root.set("action", action))
-    truncated = theirs.rollout(9, lambda td: td.set("action", task["action"] * 0))
-    assert truncated["next", "done"].any()
-
-
 def test_time_limit_is_truncation():
     env = make_env("torchrl.envs:PendulumEnv", 2, seed=0, max_episode_steps=4, clip_actions=False)
     assert "step_count" not in env.observation_spec["observation"]

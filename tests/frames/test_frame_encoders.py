@@ -64,13 +64,6 @@ def test_linear_frames_are_a_linear_layer(
     torch.testing.assert_close(encoder(frames / 255), expected)
 
 
-@pytest.mark.parametrize("shape", [(), (0,), (1, 2, 3, 4), (3, 0), 5])
-@pytest.mark.parametrize("kind", [settings.Flat, settings.Linear])
-def test_neither_array_nor_image(kind: Any, shape: Any) -> None:
-    with pytest.raises(ValueError, match=r"observation_shape .* is not that of an array \(D,\)"):
-        kind().build(shape)
-
-
 def test_an_encoder_without_blocks_has_no_attention_maps() -> None:
     encoder = settings.Linear().build((5,))
     assert isinstance(encoder, FrameEncoder)

@@ -8,7 +8,6 @@ from torchrl.data import (
     Categorical,
     Composite,
     MultiCategorical,
-    OneHot,
     Unbounded,
 )
 
@@ -42,27 +41,3 @@ def test_one_observation_or_several_by_name():
     assert [seen.kind for seen in read_observations(specs).values()] == ["image", "array"]
     nested = Composite(pixels=Unbounded((8, 8)), arm=Composite(left=Unbounded(2)))
     assert set(read_observations(nested)) == {"pixels", "arm/left"}
-
-
-@pytest.mark.parametrize(
-    ("observation", "message"),
-    [
-        (Unbounded(3, dtype=torch.int64), "of torch.int64 are neither floats nor bytes nor categ"),
-        (OneHot(4), "give them a MultiCategorical spec"),
-        (Categorical(4), "are neither floats nor bytes nor categories"),
-        (Unbounded(()), r"observation_shape \(\) is not that of an array"),
-        (Unbounded((2, 3, 4, 5)), "not that of an array"),
-    ],
-)
-def test_what_networks_cannot_read(observation, message):
-    with pytest.raises(ValueError, match=message):
-        read_observation(observation)
-    with pytest.raises(ValueError, match=f"observation 'x': .*{message}"):
-        read_observations({"x": observation})
-
-
-def test_categories_have_a_count_for_each_entry():
-    with pytest.raises(ValueError, match=r"categories \(4, 3\) are an observation of shape \(2,\)"):
-        Observation((3,), categories=(4, 3))
-    with pytest.raises(ValueError, match="there are no observations"):
-        read_observations({})

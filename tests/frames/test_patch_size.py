@@ -5,7 +5,7 @@ import pytest
 from torchrl_tit.frames import Observation
 from torchrl_tit.layers.patches import find_patch_size
 from torchrl_tit.networks.building import build_frame
-from torchrl_tit.settings import Inner, StackedInner
+from torchrl_tit.settings import Inner
 
 
 @pytest.mark.parametrize(
@@ -41,14 +41,3 @@ def test_auto_of_categories(entries, patch_size):
     auto = build_frame(Inner(embed_dim=4, patch_size="auto"), observation)
     named = build_frame(Inner(embed_dim=4, patch_size=patch_size), observation)
     assert str(auto) == str(named)
-
-
-def test_of_images_whose_sides_share_no_divisor():
-    with pytest.raises(ValueError, match=r"97 x 64 .* divisors \[1\]: resize them .* nature-cnn"):
-        find_patch_size((97, 64), "auto")
-
-
-@pytest.mark.parametrize("settings", [Inner, StackedInner])
-def test_another_word(settings):
-    with pytest.raises(ValueError, match="'patch_size' is 'all', not one of"):
-        settings(patch_size="all")

@@ -34,17 +34,3 @@ def test_a_history_is_read_as_one_array(kind: type[Any]) -> None:
     flat.load_state_dict(network.state_dict())
     x = torch.randn(3, 4, 5)
     torch.testing.assert_close(network(x), flat(x.flatten(1).unsqueeze(1)))
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"hidden_dim": 0}, "hidden_dim must be at least 1, not 0"),
-        ({"num_layers": 0}, "num_layers must be at least 1, not 0"),
-        ({"activation": "tan"}, "field 'activation' is 'tan', not one of"),
-    ],
-)
-@pytest.mark.parametrize("kind", [MLP, OFENet, D2RL])
-def test_wrong_settings(kind: type[Any], settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        kind((5,), **settings)

@@ -85,19 +85,6 @@ def test_temporal_positions(kind: str, positions: TemporalPositions) -> None:
     assert encoder(tokens).shape == (6, encoder.out_features)
 
 
-def test_wrong_positions_say_what_to_do() -> None:
-    for kind in KINDS.values():
-        with pytest.raises(ValueError, match="'temporal_positions' is 'rope', not one of"):
-            kind(temporal_positions="rope")
-    with pytest.raises(ValueError, match="'rotary' tells frames apart, but num_frames is 1"):
-        settings.Network(
-            frame=settings.Linear(), history=settings.ChainedOuter(temporal_positions="rotary")
-        )
-    shape = HistoryShape(num_frames=FRAMES, num_tokens=1, width=6)
-    with pytest.raises(ValueError, match="pairs of entries, but a head has 3"):
-        settings.Outer(num_heads=2, temporal_positions="rotary").build(shape)
-
-
 def test_fields_of_an_older_version_are_read() -> None:
     for old, new in ((True, "learned"), (False, "none")):
         fields = {"temporal_position_encoding": old, "num_heads": 2}

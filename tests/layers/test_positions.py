@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.networks.reference import randomize
 from tests.numerics import assert_near
-from torchrl_tit.layers import RelativeBias, Rotary, SelfAttention, TransformerBlock
+from torchrl_tit.layers import SelfAttention, TransformerBlock
 from torchrl_tit.settings import TemporalPositions
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
@@ -105,13 +105,3 @@ def test_only_the_distance_counts(kind: TemporalPositions) -> None:
 def test_only_relative_positions_have_weights(kind: TemporalPositions) -> None:
     block = TransformerBlock(8, 2, causal=True, positions=kind, num_frames=4)
     assert list(block.state_dict()) == list(TransformerBlock(8, 2, causal=True).state_dict())
-
-
-def test_wrong_settings_say_what_to_do() -> None:
-    with pytest.raises(ValueError, match="distances to the past: choose causal=True"):
-        SelfAttention(8, 2, positions="relative", num_frames=4)
-    with pytest.raises(ValueError, match="pairs of entries, but a head has 3: choose a width"):
-        SelfAttention(6, 2, positions="rotary", num_frames=4)
-    for layer in (RelativeBias(2, 4), Rotary(4, 4)):
-        with pytest.raises(ValueError, match="5 steps does not fit positions of 4: give it the l"):
-            layer(5) if isinstance(layer, RelativeBias) else layer(torch.zeros(5, 4), 5)

@@ -7,14 +7,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import set_skip_existing
 from torch import nn
-from torchrl.data import Categorical
 from torchrl.modules import set_recurrent_mode
-from torchrl.objectives import ClipPPOLoss
 
 from tests.modules.frames import CountedFrames
 from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT, VanillaTIT
-from torchrl_tit.modules import make_actor, make_value
 from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.networks import MLP, HistoryNetwork, TwoTrunks, build_network
 from torchrl_tit.settings import NETWORKS, Flat, Inner, Linear, Outer, PairedOuter
@@ -234,24 +231,6 @@ def test_bytes_and_floats_of_flat_frames_stand_side_by_side():
     pixels = torch.randint(0, 256, (5, 3, 2, 4), dtype=torch.uint8)
     state = torch.randn(5, 3, 8)
     assert_near(network(pixels, state), network(pixels / 255, state))
-
-
-def test_gradients_of_a_loss_on_heads_reach_the_whole_backbone():
-    network = EnhancedTIT((4,), num_frames=2)
-    loss = ClipPPOLoss(make_actor(64, Categorical(2)), make_value(64))
-    entries = {
-        "history": torch.randn(16, 2, 4),
-        "action": torch.randint(0, 2, (16,)),
-        "action_log_prob": torch.full((16,), -0.7),
-        "advantage": torch.randn(16, 1),
-        "value_target": torch.randn(16, 1),
-    }
-    terms = loss(Backbone(network)(TensorDict(entries, [16])))
-    (terms["loss_objective"] + terms["loss_critic"]).backward()
-    for parameter in network.parameters():
-        assert parameter.grad is not None
-        assert parameter.grad.isfinite().all()
-        assert parameter.grad.any()
 
 
 @pytest.mark.parametrize("acts", [False, True])

@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.collectors import Collector
 from torchrl.envs import Compose, GymEnv, TargetReturn, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -107,15 +106,6 @@ def test_acts_as_it_predicts(kind, shape, network_class):
         torch.testing.assert_close(action, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_indices_and_one_hot_vectors_are_the_same_actions():
-    network, head = make_network(space="discrete")
-    indices = make_batch(kind="discrete")
-    vectors = indices.clone()
-    vectors["action"] = torch.nn.functional.one_hot(indices["action"].clamp(min=0), 3)
-    outputs = [make_dt_predictor(network, head)(batch)["action"] for batch in (indices, vectors)]
-    torch.testing.assert_close(outputs[0][indices["mask"]], outputs[1][indices["mask"]])
-
-
 def test_a_gaussian_policy_draws_or_takes_the_mean():
     network, head = make_network(space="gaussian")
     actor, td = make_dt_actor(network, head), TensorDict({"sequence": make_batch()}, [4])
@@ -155,31 +145,6 @@ def test_acting_keeps_tokens_and_changes_nothing(network_class):
             if step == 20:  # weights change: what was kept is of no use
                 randomize(network, seed=1)
     assert resets > 6
-
-
-@pytest.mark.parametrize("task", ["Hopper-v5", "CartPole-v1"])
-def test_works_in_a_collector(task):
-    shape, actions = ((11,), 3) if task == "Hopper-v5" else ((4,), 2)
-    space = "continuous" if task == "Hopper-v5" else "discrete"
-    network, head = make_network(shape, actions, space=space)
-    env = make_environment(task, max_episode_steps=6)
-    actor = make_dt_actor(network, head)
-    collector = Collector(
-        env,
-        actor,
-        frames_per_batch=60,
-        total_frames=120,
-        exploration_type=ExplorationType.DETERMINISTIC,
-        auto_register_policy_transforms=False,
-    )
-    with acting(actor):
-        for batch in collector:
-            expected = predict(network, head, batch["sequence"])
-            if space == "discrete":
-                assert torch.equal(batch["action"], expected.argmax(-1))
-            else:
-                assert_near(batch["action"], expected)
-    collector.shutdown()
 
 
 def test_one_hot_environment_without_a_batch():

@@ -14,7 +14,6 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from tests.modules.frames import (
     NETWORKS,
-    SMALL,
     CountedFrames,
     Streams,
     assert_exact,
@@ -27,8 +26,6 @@ from tests.numerics import ROUNDING, assert_near
 from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.modules import FrameCache, acting
 from torchrl_tit.modules.acting import clear_caches
-from torchrl_tit.modules.frame_cache import SlidingWindow
-from torchrl_tit.networks import MLP, TwoTrunks
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -120,28 +117,6 @@ def test_leading_shapes_and_nested_keys(leading):
             frames.take()
 
 
-@pytest.mark.parametrize(
-    ("make_network", "shape"),
-    [
-        (lambda: EnhancedTIT((3,), 1, **SMALL), (1, 3)),
-        (lambda: EnhancedTIT((3,), 4, outer=False, **SMALL), (4, 3)),
-        (lambda: MLP((3,), 4), (4, 3)),
-        (lambda: nn.Flatten(-2), (4, 3)),
-    ],
-    ids=["K=1", "without outer", "MLP", "other module"],
-)
-def test_networks_with_nothing_to_keep_pass_through(make_network, shape):
-    network = make_network()
-    names = ["policy", "value"] if isinstance(network, TwoTrunks) else ["features"]
-    backbone = Backbone(network, out_keys=names)
-    history = torch.rand(5, *shape)
-    expected = backbone(TensorDict({"history": history}, [5]))
-    with backbone.acting():
-        assert backbone._acting is None
-        td = backbone(TensorDict({"history": history}, [5]))
-    assert all(torch.equal(td[name], expected[name]) for name in names)
-
-
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 7, 8])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_one_changed_byte_is_seen_at_any_size_and_offset(size, dtype):
@@ -172,18 +147,6 @@ def test_frames_that_are_not_numbers_are_encoded():
     with backbone.acting():
         for start in range(3):
             assert_exact(backbone, stream[:, start : start + 4])
-
-
-def test_a_sliding_window_holds_copies_of_the_last_entries():
-    stream = torch.randn(3, 40, 2, 5)
-    for count in (1, 2, 7):
-        first = stream[:, :count].clone()
-        window = SlidingWindow(first)
-        first.fill_(7)
-        for step in range(count, 40):
-            window.append(stream[:, step])
-            assert torch.equal(window.entries, stream[:, step + 1 - count : step + 1])
-            assert window.entries.untyped_storage().nbytes() == 2 * count * 3 * 2 * 5 * 8
 
 
 def test_acting_within_acting_leaves_what_the_outer_one_kept():

@@ -10,7 +10,6 @@ from torchrl.data import (
     Binary,
     Bounded,
     Categorical,
-    Composite,
     MultiCategorical,
     MultiOneHot,
     OneHot,
@@ -216,8 +215,6 @@ def test_a_row_without_any_action_is_refused():
         actor(features(4).set(("agent", "mask"), mask))
     with pytest.raises(ValueError, match=r"bool mask of the shape \[4, 5\], not torch.int8"):
         actor(features(4).set(("agent", "mask"), mask.to(torch.int8)))
-    with pytest.raises(ValueError, match="no action mask for the action space Binary"):
-        make_actor(16, Binary(2), mask_key="action_mask")
 
 
 def test_value_and_keys():
@@ -227,17 +224,3 @@ def test_value_and_keys():
     assert make_actor(16, Categorical(2), in_key="policy", action_key="move")(td)["move"].shape == (
         5,
     )
-
-
-@pytest.mark.parametrize(
-    "spec", [Unbounded((2,), dtype=torch.int64), Composite(a=Categorical(2), b=Categorical(2))]
-)
-def test_other_action_spaces_are_refused(spec):
-    with pytest.raises(ValueError, match="no policy head"):
-        make_actor(16, spec)
-    with pytest.raises(ValueError, match="batch_dims must be at least 0 and at most 1"):
-        make_actor(16, OneHot(3), batch_dims=2)
-    with pytest.raises(ValueError, match=r"shape \[8, 3\] .* raise batch_dims"):
-        make_actor(16, OneHot(3, shape=(8, 3)), batch_dims=0)
-    with pytest.raises(ValueError, match="other numbers of options in each row"):
-        make_actor(16, MultiCategorical(NVEC))

@@ -67,13 +67,3 @@ def test_given_actions_at_a_bound_are_evaluated_next_to_it(dtype, gap):
     torch.testing.assert_close(log_prob.double(), density(x, mean, std), **tolerance)
     (slope,) = torch.autograd.grad(log_prob.sum(), dist.loc)
     torch.testing.assert_close(slope.double(), (x - mean) / std**2, **tolerance)
-
-
-@pytest.mark.parametrize(
-    ("low", "high"),
-    [(-math.inf, math.inf), (0.0, math.inf), (-3e38, 3e38), (2e38, 3e38), (math.nan, 1.0)],
-)
-def test_bounds_without_a_finite_width_are_refused(low, high):
-    spec = Bounded(torch.tensor([-1.0, low]), torch.tensor([1.0, high]))
-    with pytest.raises(ValueError, match=r"^no squashed policy for actions from \[[^\n]*finite"):
-        make_squashed_actor(8, spec)

@@ -13,7 +13,6 @@ from torchrl_tit.settings import (
     Inner,
     Linear,
     NatureCNNFrames,
-    Network,
     ResNetFrames,
 )
 from torchrl_tit.settings.networks import catformer, enhanced_tit, mlp, nature_cnn
@@ -108,9 +107,3 @@ def test_nothing_reads_an_image_whose_sides_no_patch_divides():
         r"--backbone.frames.image.*--observation-keys.*resize them",
     ):
         frames_by_kind(mlp(), task)
-
-
-@pytest.mark.parametrize("frames", [{"image": "inner"}, {3: Inner()}, [Inner()]])
-def test_frames_are_settings_by_name(frames):
-    with pytest.raises(ValueError, match=r"frames"):
-        Network(frame=Inner(), history=mlp().history, frames=frames)

@@ -219,31 +219,6 @@ def test_both_residuals_of_a_block_are_dropped(part: str) -> None:
     torch.testing.assert_close(update[~dropped], kept[~dropped] / 0.75, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("hyperparameters", "message"),
-    [
-        ({"num_frames": 31, "max_ep_len": 30}, "num_frames 31 is more than max_ep_len 30"),
-        ({"num_frames": 0}, "num_frames must be at least 1, not 0"),
-        ({"ffn_dim": 0}, "ffn_dim must be at least 1, not 0"),
-        ({"num_heads": 3}, "width 128 cannot be split over 3 attention heads"),
-        ({"dropout": 1.0}, r"dropout must be a probability in \[0, 1\), not 1.0"),
-        ({"activation": "gelo"}, "field 'activation' is 'gelo', not one of"),
-        ({"action_dim": 0}, "action_dim must be at least 1, not 0"),
-        ({"action_dim": None}, "reads actions and returns beside observations: give action_dim"),
-        ({"observation_shape": ()}, r"observation_shape \(\) is not"),
-    ],
-)
-def test_wrong_settings(hyperparameters: dict[str, Any], message: str) -> None:
-    fields = {"observation_shape": (11,), "action_dim": 3, **hyperparameters}
-    with pytest.raises(ValueError, match=message):
-        DecisionTransformer(**fields)
-
-
-def test_a_patch_of_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="patch_size must be at least 1, not 0"):
-        DTTIT((11,), action_dim=3, patch_size=0)
-
-
 def test_wrong_shapes_and_types_are_named() -> None:
     predictor, inputs = make("dt"), make_inputs("dt", 2)
     names = ["of shape", "action", "return_to_go", "timestep", "mask"]

@@ -167,34 +167,6 @@ def test_steps_that_are_no_slices_are_refused():
         History(3)(flat[0])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "error", "words"),
-    [
-        ({"num_frames": 0}, ValueError, "num_frames must be at least 1, not 0"),
-        ({"num_frames": 2.0}, ValueError, "'num_frames' is 2.0: Expected `int`"),
-        ({"num_frames": 2, "observation_ndim": -1}, ValueError, "observation_ndim .* -1"),
-        ({"num_frames": 2, "padding": "zeros"}, ValueError, "'padding' is 'zeros', not one of"),
-        ({"num_frames": 2, "in_keys": ["a", "b"]}, ValueError, r"in_keys=\['a', 'b'\]"),
-        ({"num_frames": 2, "in_keys": [], "out_keys": []}, ValueError, "at least one"),
-        ({"num_frames": 2, "out_keys": ["observation"]}, ValueError, "needs a key of its own"),
-        (
-            {"num_frames": 2, "in_keys": [("next", "observation")]},
-            ValueError,
-            r"'history' of \('next', 'observation'\) cannot be made: name the observation itself",
-        ),
-        (
-            {"num_frames": 2, "in_keys": ["o", ("next", "o")], "out_keys": ["h", "next_h"]},
-            ValueError,
-            "'next_h' of .* cannot be made: .*its history under \"next\" like the one at the root",
-        ),
-        ({"num_frames": 2, "in_keys": -2}, TypeError, "in_keys must be .* -2; .* no dim"),
-    ],
-)
-def test_wrong_arguments(arguments, error, words):
-    with pytest.raises(error, match=words):
-        History(**arguments)
-
-
 @pytest.mark.parametrize("wrap", [lambda history: history, lambda history: Compose(history)])
 def test_wrong_environment(wrap):
     with pytest.raises(ValueError, match=r"shape \[2, 4, 5\], so observation_ndim must be 3"):

@@ -88,18 +88,6 @@ def test_specs_say_what_is_written(make):
     assert written.shape == (*env.batch_size, 3, *before.shape[len(env.batch_size) :])
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"num_frames": 0}, "num_frames must be at least 1, not 0"),
-        ({"return_scale": -1.0}, "return_scale must be positive, not -1.0"),
-    ],
-)
-def test_wrong_settings(settings, message):
-    with pytest.raises(ValueError, match=message):
-        SequenceHistory(**settings)
-
-
 @pytest.mark.parametrize("ask", ["observation_spec", "reset"])
 @pytest.mark.parametrize("late", [False, True])
 def test_a_target_is_needed(ask, late):
