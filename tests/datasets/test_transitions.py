@@ -224,31 +224,23 @@ def _as(**changes: Callable[[Transitions], Any]) -> Callable[[Transitions], None
         (_as(rewards=lambda a: a["rewards"][:-1]), r"'rewards': has \d+ rows, but 'observations' "),
         (_at("rewards", 7, np.nan), "'rewards', row 7: is nan"),
         (_at("observations", (8, 2), -np.inf), "'observations', row 8: is -inf"),
-        (
-            _as(rewards=lambda a: a["rewards"] + np.eye(1, len(a["rewards"]), 7)[0] * 1e300),
-            r"'rewards', row 7: is 1e\+300, but all values must be finite as float32",
-        ),
+        (_as(rewards=lambda a: a["rewards"] + np.eye(1, len(a["rewards"]), 7)[0] * 1e300),
+         r"'rewards', row 7: is 1e\+300, but all values must be finite as float32"),
         (_at("next_observations", (9, 0), np.nan), "'next_observations', row 9: is nan"),
         (_at("actions", (123, 1), 1.01), r"'actions', row 123: is 1.0\d*, but the task's actions"),
         (_as(terminals=lambda a: a["rewards"] * 0 + 3), "'terminals', row 0: is 3.0, but must be "),
         (_as(rewards=lambda a: a["actions"]), r"'rewards': one row has the shape \[3\]"),
         (_as(observations=lambda a: a["rewards"]), "'observations': one row is one number"),
         (_as(actions=lambda a: a["actions"].astype("S5")), r"'actions': has the dtype \|S5, but m"),
-        (
-            _as(actions=lambda a: a["actions"][:, :2]),
-            r"'actions': one row has the shape \[2\], but in Hopper-v5",
-        ),
-        (
-            _as(next_observations=lambda a: a["actions"]),
-            r"'next_observations': one row has the shape \[3\]",
-        ),
-        (
-            _at("next_observations", (3, 0), 9),
-            "'next_observations', row 3: is not the observation of the next row",
-        ),
+        (_as(actions=lambda a: a["actions"][:, :2]),
+         r"'actions': one row has the shape \[2\], but in Hopper-v5"),
+        (_as(next_observations=lambda a: a["actions"]),
+         r"'next_observations': one row has the shape \[3\]"),
+        (_at("next_observations", (3, 0), 9),
+         "'next_observations', row 3: is not the observation of the next row"),
         (_as(**{n: lambda a, n=n: a[n][:0] for n in NAMES}), "'observations': has no rows"),
     ],
-)
+)  # fmt: skip
 @pytest.mark.parametrize("chunk_bytes", [64, 2**22])
 def test_errors_name_file_field_and_row(
     tmp_path: Path,

@@ -226,23 +226,15 @@ def test_text_is_left_out():
         ("not_an_env", {}, ValueError, "must make a TorchRL EnvBase, but made a str"),
         ("cart_pole", {"speed": 3}, ValueError, "cannot be made: TypeError: .*'speed'"),
         ("cart_pole", {"mask_actions": True}, ValueError, 'observation "action_mask": leave out'),
-        (
-            "masked",
-            {"observation_keys": ["up"]},
-            ValueError,
-            "no observation 'up', .* only pixels, place",
-        ),
-        (
-            "cart_pole",
-            {"wrappers": ["gymnasium.wrappers:ClipAction"]},
-            ValueError,
-            "takes TorchRL transforms and no gymnasium.Wrapper",
-        ),
+        ("masked", {"observation_keys": ["up"]}, ValueError,
+         "no observation 'up', .* only pixels, place"),
+        ("cart_pole", {"wrappers": ["gymnasium.wrappers:ClipAction"]}, ValueError,
+         "takes TorchRL transforms and no gymnasium.Wrapper"),
         ("CORRIDOR", {}, ValueError, "has a str of that name; expected a registered name, or a cl"),
         ("nothing", {}, ValueError, "no 'nothing' after importing .* has no such name"),
         ("TensorReader", {}, ValueError, "a class of that name, which is no EnvBase"),
     ],
-)
+)  # fmt: skip
 def test_one_line_says_what_is_wrong(name, settings, kind, words):
     with pytest.raises(kind, match=words) as caught:
         make_env(f"{__name__}:{name}", **settings)

@@ -56,11 +56,6 @@ def test_transforms_before_histories():
     assert torch.equal(env.reset(seed=1)["history"], 2 * plain.reset(seed=1)["history"])
 
 
-def test_settings_of_a_task():
-    env = make_env("FrozenLake-v1", map_name="8x8", is_slippery=False)
-    assert kinds(env) == [64]
-
-
 def test_names_in_modules():
     assert find_task("tests.envs.tasks:Robot-v0") == "tests.envs.tasks:Robot-v0"
     assert time_limit("tests.envs.tasks:Robot-v0") == 50

@@ -72,10 +72,3 @@ def test_class_tokens_tell_every_category_apart() -> None:
     tokens = encoder(x.unsqueeze(1)).flatten(1)
     assert len(tokens.detach().round(decimals=6).unique(dim=0)) == len(x) == 60
     assert [maps.shape[-1] for maps in encoder.attention_maps(x)] == [4, 4]
-
-
-@pytest.mark.parametrize("frame", [settings.ResNetFrames(), settings.NatureCNNFrames()])
-def test_convolutions_read_images_only(frame: settings.FrameSettings) -> None:
-    message = rf"{frame.name} frames do not read a row of categories \(4, 3, 5 values\): take inner"
-    with pytest.raises(ValueError, match=message):
-        build_frame(frame, OBSERVATION)

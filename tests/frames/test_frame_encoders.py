@@ -10,7 +10,6 @@ from torch import nn
 
 from tests.networks.reference import randomize
 from torchrl_tit import settings
-from torchrl_tit.frames import FrameEncoder
 from torchrl_tit.frames.cnn import CNNFrameEncoder
 from torchrl_tit.frames.flat import Flat
 from torchrl_tit.frames.linear import LinearFrameEncoder
@@ -62,9 +61,3 @@ def test_linear_frames_are_a_linear_layer(
         expected = getattr(torch, activation)(expected)
     torch.testing.assert_close(encoder(frames), expected)
     torch.testing.assert_close(encoder(frames / 255), expected)
-
-
-def test_an_encoder_without_blocks_has_no_attention_maps() -> None:
-    encoder = settings.Linear().build((5,))
-    assert isinstance(encoder, FrameEncoder)
-    assert encoder.attention_maps(torch.rand(2, 5)) == []

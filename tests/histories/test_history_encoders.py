@@ -11,7 +11,7 @@ from torchrl.modules import set_recurrent_mode
 
 from tests.networks.reference import randomize
 from torchrl_tit import settings
-from torchrl_tit.histories import HistoryEncoder, HistoryShape
+from torchrl_tit.histories import HistoryShape
 from torchrl_tit.settings import HistorySettings
 
 ONE_TOKEN: list[HistorySettings] = [
@@ -103,9 +103,3 @@ def test_recurrent_encoders_read_sequences_from_a_given_state(name: str) -> None
         torch.autograd.grad(expected.square().sum(), list(reference.parameters())),
     )
     torch.testing.assert_close(after["recurrent_state_h"][:, -1, 0], second[:, -1])
-
-
-def test_an_encoder_without_blocks_has_no_attention_maps() -> None:
-    encoder = settings.MLP().build(HistoryShape(num_frames=3, num_tokens=1, width=8))
-    assert isinstance(encoder, HistoryEncoder)
-    assert encoder.attention_maps(torch.randn(2, 3, 1, 8)) == []

@@ -111,17 +111,6 @@ def test_same_outputs_and_gradients(variant: str, case: str, share: bool) -> Non
 
 
 @both_variants
-def test_bytes_are_divided_and_floats_are_not(variant: str) -> None:
-    config, reference = make(variant, "image")
-    network = from_official(config, parameters(reference)).eval()
-    image = torch.randint(0, 256, (3, 4, 12, 12), dtype=torch.uint8)
-    expected = reference(image / 255)
-    assert_near(network(image), expected)
-    assert_near(network(image / 255), expected)
-    assert_near(network(image.double()), reference(image.double()))
-
-
-@both_variants
 @pytest.mark.parametrize("prefix", ["", PREFIX, "actor._encoder."])
 def test_prefix_masks_and_what_lies_outside(variant: str, prefix: str) -> None:
     config, reference = make(variant, "image")

@@ -172,19 +172,13 @@ def test_evaluation_side_by_side_equals_one_after_another():
 @pytest.mark.parametrize(
     ("space", "kind", "message"),
     [
-        (
-            "continuous",
-            "discrete",
-            r"int64 are discrete, but .* continuous: set action_space='disc",
-        ),
-        (
-            "discrete",
-            "continuous",
-            r"float32 are continuous, but .* discrete: set action_space='co",
-        ),
+        ("continuous", "discrete",
+         r"int64 are discrete, but .* continuous: set action_space='disc"),
+        ("discrete", "continuous",
+         r"float32 are continuous, but .* discrete: set action_space='co"),
         ("gaussian", "one-hot", r"int64 are discrete, but this head's are gaussian"),
     ],
-)
+)  # fmt: skip
 def test_actions_of_the_other_kind_are_refused(space, kind, message):
     network, head = make_network(space=space)
     batch = make_batch(kind=kind)

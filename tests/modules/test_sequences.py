@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from functools import partial
 from typing import Any
 
@@ -18,61 +17,38 @@ from torchrl.modules import set_recurrent_mode
 from torchrl.objectives.value import GAE
 
 from tests.modules.frames import CountedFrames
-from tests.networks.test_pairs import NUM_FRAMES, PAIRS, Pair, build, network_of, shape_of
+from tests.networks.test_pairs import (
+    CASES,
+    IS_INIT,
+    NUM_FRAMES,
+    PAIRS,
+    N,
+    Pair,
+    T,
+    build,
+    network_of,
+    sequences,
+)
 from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT, settings
 from torchrl_tit.envs import make_env
-from torchrl_tit.modules import make_value
-from torchrl_tit.networks import HistoryNetwork, TwoTrunks
+from torchrl_tit.modules import history_keys, make_value
+from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.choices import Padding
 
 pytestmark = pytest.mark.numerics
 
-N, T, ACTIONS = 3, 7, 2
 PADDINGS: list[Padding] = ["same", "constant"]
 # Each history encoder and each frame encoder once; test_pairs.py compiles every pair.
 EACH_ONCE = [p for p in PAIRS if p[0] == ("flat" if p[1].startswith("stacked") else "linear")]
 EACH_ONCE += [p for p in PAIRS if p[1] == "outer" and p[0] != "linear"]
-# Episodes begin within the first two sequences; the third lies inside one.
-IS_INIT = torch.zeros(N, T, 1, dtype=torch.bool)
-IS_INIT[0, 0] = IS_INIT[0, 2] = IS_INIT[0, 3] = IS_INIT[1, 4] = True
+CASE = ("inner", "paired-outer")
 
 
-def sequences(
-    shape: tuple[int, ...], num_frames: int, padding: Padding, dtype: torch.dtype = torch.float64
-) -> TensorDict:
-    """What an environment with `History` writes: N sequences of T steps, [N, T]."""
-    generator = torch.Generator().manual_seed(2)
-    before = torch.randn(N, num_frames - 1, *shape, generator=generator, dtype=torch.float64)
-    observations = torch.randn(N, T, *shape, generator=generator, dtype=torch.float64)
-    histories, window = [], torch.cat([before, before[:, :1]], 1)  # the newest is pushed out
-    for t in range(T):
-        newest = observations[:, t : t + 1]
-        window = torch.cat([before if t == 0 else window[:, 1:], newest], 1)
-        padded = newest if padding == "same" else torch.zeros_like(newest)
-        first = torch.cat([padded.expand(-1, num_frames - 1, *shape), newest], 1)
-        window = torch.where(IS_INIT[:, t].view(N, 1, *[1] * len(shape)), first, window)
-        histories.append(window)
-    entries = {"history": torch.stack(histories, 1), "observation": observations}
-    return TensorDict({k: x.to(dtype) for k, x in entries.items()} | {"is_init": IS_INIT}, [N, T])
-
-
-def context_of(network: HistoryNetwork) -> dict[str, Tensor]:
-    """What the history encoder reads beside the tokens, [N, T, K, ...]."""
-    generator = torch.Generator().manual_seed(3)
-    shape = (N, T, network.num_frames)
-    entries = {
-        "action": torch.randn(*shape, ACTIONS, generator=generator, dtype=torch.float64),
-        "return_to_go": torch.randn(*shape, 1, generator=generator, dtype=torch.float64),
-        "timestep": torch.arange(network.num_frames).expand(shape),
-        "mask": torch.ones(shape, dtype=torch.bool),
-    }
-    return {name: entries[name] for name in network.history_encoder.context}
-
-
-def backbone_of(network: torch.nn.Module, **options: Any) -> Backbone:
-    context = network.history_encoder.context if isinstance(network, HistoryNetwork) else ()
-    return Backbone(network, in_keys=["history", *context], **options)
+def backbone_of(network: HistoryNetwork, **options: Any) -> Backbone:
+    several = len(network.observations) > 1
+    keys = history_keys(network.observations) if several else ["history"]
+    return Backbone(network, in_keys=[*keys, *network.history_encoder.context], **options)
 
 
 def spoil(td: TensorDictBase, *, keep_starts: bool) -> TensorDictBase:
@@ -80,7 +56,9 @@ def spoil(td: TensorDictBase, *, keep_starts: bool) -> TensorDictBase:
     td = td.clone()
     kept = IS_INIT.squeeze(-1).clone() if keep_starts else torch.zeros(N, T, dtype=torch.bool)
     kept[:, 0] = True
-    td["history"][~kept] = torch.nan
+    for key, history in td.items(True, True):
+        if "history" in key:
+            history[~kept] = torch.nan if history.is_floating_point() else 0
     return td
 
 
@@ -96,11 +74,10 @@ def gradients(features: Tensor, network: torch.nn.Module) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("padding", PADDINGS)
-@pytest.mark.parametrize("pair", PAIRS, ids="+".join)
+@pytest.mark.parametrize("pair", CASES, ids="+".join)
 def test_every_pair_equals_single_steps(pair: Pair, padding: Padding) -> None:
     network = network_of(pair)
-    td = sequences(shape_of(pair), NUM_FRAMES, padding)
-    td.update(context_of(network))
+    td = sequences(pair, padding)
     expected = backbone_of(network)(td.clone())["features"]
     expected_gradients = gradients(expected, network)
     for options, given in [
@@ -119,8 +96,8 @@ def test_every_pair_equals_single_steps(pair: Pair, padding: Padding) -> None:
 def test_without_histories_the_valid_steps_are_those_of_single_steps(
     padding: Padding | None,
 ) -> None:
-    network = build(("inner", "paired-outer")).double()
-    td = sequences((6,), NUM_FRAMES, padding or "same")
+    network = build(CASE).double()
+    td = sequences(CASE, padding or "same")
     expected = Backbone(network)(td.clone())["features"]
     out = TensorDict(dict(td.exclude("history").items()), [N, T])
     features = read(Backbone(network, padding=padding), out)
@@ -159,7 +136,7 @@ def test_dropout_is_drawn_once_a_frame() -> None:
         frame, settings.Outer(), observation_shape=(6,), num_frames=NUM_FRAMES
     ).double()
     network.history_encoder.eval()
-    td = sequences((6,), NUM_FRAMES, "same")[2:]
+    td = sequences(CASE, "same")[2:]
     torch.manual_seed(0)
     features = read(Backbone(network, padding="same"), td.clone())
     frames = torch.cat([td["history"][0, 0], td["observation"][0, 1:]])
@@ -174,7 +151,7 @@ def test_compiles_without_a_graph_break(pair: Pair) -> None:
     torch.compiler.reset()
     network = network_of(pair)
     backbone = backbone_of(network, padding="same")
-    td = sequences(shape_of(pair), NUM_FRAMES, "same").update(context_of(network))
+    td = sequences(pair, "same")
 
     def features(td: TensorDictBase) -> Tensor:
         return read(backbone, td.copy())
@@ -185,34 +162,10 @@ def test_compiles_without_a_graph_break(pair: Pair) -> None:
     torch.compiler.reset()
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("c++") is None, reason="there is no C++ compiler")
-def test_inductor_has_the_same_gradients() -> None:
-    """Enhanced_TIT, with padding of zeros, is in tests/recipes/ppo/test_rollout.py."""
-    torch.compiler.reset()
-    network = HistoryNetwork(
-        settings.Linear(embed_dim=4),
-        settings.Outer(num_blocks=1, num_heads=1, ffn_expansion=1),
-        observation_shape=(6,),
-        num_frames=NUM_FRAMES,
-    ).double()
-    backbone = Backbone(network, padding="same")
-    td = sequences((6,), NUM_FRAMES, "same")
-
-    def features(td: TensorDictBase) -> Tensor:
-        return read(backbone, td.copy())
-
-    expected = features(td)
-    actual = torch.compile(features, fullgraph=True)(td)
-    assert_near(actual, expected)
-    assert_near(gradients(actual, network), gradients(expected, network))
-    torch.compiler.reset()
-
-
 @pytest.mark.parametrize("pair", EACH_ONCE, ids="+".join)
 def test_vmap_over_weights_and_over_sequences(pair: Pair) -> None:
     networks = [build(pair, seed).double() for seed in range(2)]
-    td = sequences(shape_of(pair), NUM_FRAMES, "same").update(context_of(networks[0]))
+    td = sequences(pair, "same")
     backbones = [backbone_of(network, padding="same") for network in networks]
     weights, buffers = stack_module_state([b.module for b in backbones])
 
@@ -231,8 +184,8 @@ def test_vmap_over_weights_and_over_sequences(pair: Pair) -> None:
 
 
 def test_bfloat16_autocast() -> None:
-    network = build(("inner", "paired-outer"))
-    td = sequences((6,), NUM_FRAMES, "same", torch.float32)
+    network = build(CASE)
+    td = sequences(CASE, "same").apply(lambda x: x.float() if x.is_floating_point() else x)
     expected = Backbone(network, autocast=torch.bfloat16)(td.clone())["features"]
     features = read(Backbone(network, padding="same", autocast=torch.bfloat16), td.clone())
     assert features.dtype == torch.float32
@@ -294,39 +247,10 @@ def test_gae_reads_whole_rollouts() -> None:
     assert counted.take() < 2 * 3 * 60 * 4
 
 
-@pytest.mark.parametrize("padding", [None, "same"])
-def test_two_trunks_and_two_observations(padding: Padding | None) -> None:
-    shapes = {"pixels": (8, 8), "state": (3,)}
-    frame = {"pixels": settings.Inner(patch_size=4), "state": settings.Linear(embed_dim=32)}
-    torch.manual_seed(0)
-    trunks = [
-        HistoryNetwork(frame, settings.Outer(), observation_shape=shapes, num_frames=4).double()
-        for _ in range(2)
-    ]
-    pixels, state = sequences((8, 8), 4, "same"), sequences((3,), 4, "same")
-    td = TensorDict(
-        {
-            "seen": {"history": pixels["history"], "observation": pixels["observation"]},
-            "state_history": state["history"],
-            "state_observation": state["observation"],
-            "is_init": IS_INIT,
-        },
-        [N, T],
-    )
-    keys: dict[str, Any] = {
-        "in_keys": [("seen", "history"), "state_history"],
-        "out_keys": ["policy", "value"],
-    }
-    expected = Backbone(TwoTrunks(*trunks), **keys)(td.clone())
-    with set_recurrent_mode(True):
-        out = Backbone(TwoTrunks(*trunks), **keys, padding=padding)(td.clone())
-    assert_near([out["policy"], out["value"]], [expected["policy"], expected["value"]])
-
-
 def test_every_frame_and_leading_dimensions() -> None:
     pair = ("linear", "decision-transformer")
     network = network_of(pair)
-    td = sequences((6,), NUM_FRAMES, "same").update(context_of(network))
+    td = sequences(pair, "same")
     expected = backbone_of(network, every_frame=True)(td.clone())["features"]
     assert expected.shape == (N, T, NUM_FRAMES, 4)
     assert_near(read(backbone_of(network, every_frame=True, padding="same"), td.clone()), expected)
@@ -337,7 +261,7 @@ def test_every_frame_and_leading_dimensions() -> None:
 
 
 def test_other_modules_read_the_windows() -> None:
-    td = sequences((2,), 3, "constant")
+    td = sequences(CASE, "constant")
     module = torch.nn.Flatten(-2)
     features = read(Backbone(module, padding="constant"), spoil(td, keep_starts=False))
     assert torch.equal(features, td["history"].flatten(-2))
@@ -346,34 +270,22 @@ def test_other_modules_read_the_windows() -> None:
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        (
-            lambda td: td.exclude("observation"),
-            KeyError,
-            "have no 'observation' here, only history",
-        ),
+        (lambda td: td.exclude("observation"), KeyError,
+         "have no 'observation' here, only history"),
         (lambda td: td.exclude("is_init", "history"), KeyError, "no 'is_init'.*add .*InitTracker"),
         (lambda td: td[0, 0], ValueError, "this tensordict has none: read a single step within"),
-        (
-            lambda td: td.set("observation", torch.zeros(N, T, 5, dtype=torch.float64)),
-            ValueError,
-            r"observations of shape \(5,\) do not fit this network: expected \(4,\)",
-        ),
-        (
-            lambda td: td.set("history", td["history"][:, :, :2]),
-            ValueError,
-            "which is 3 observations of shape",
-        ),
-        (
-            lambda td: td.set("observation", td["observation"].int()),
-            TypeError,
-            "int32 does not fit this network",
-        ),
+        (lambda td: td.set("observation", torch.zeros(N, T, 5, dtype=torch.float64)), ValueError,
+         r"observations of shape \(5,\) do not fit this network: expected \(6,\)"),
+        (lambda td: td.set("history", td["history"][:, :, :2]), ValueError,
+         "which is 3 observations of shape"),
+        (lambda td: td.set("observation", td["observation"].int()), TypeError,
+         "int32 does not fit this network"),
     ],
-)
+)  # fmt: skip
 def test_wrong_sequences_say_what_to_do(change: Any, error: type[Exception], message: str) -> None:
-    backbone = Backbone(EnhancedTIT((4,), 3).double())
+    backbone = Backbone(EnhancedTIT((6,), NUM_FRAMES).double())
     with pytest.raises(error, match=message) as raised:
-        read(backbone, change(sequences((4,), 3, "same")))
+        read(backbone, change(sequences(CASE, "same")))
     assert "\n" not in str(raised.value)
 
 

@@ -33,9 +33,12 @@ from torchrl_tit.networks import (
 )
 from torchrl_tit.settings import FrameSettings, HistorySettings
 from torchrl_tit.settings.choices import Padding
-from torchrl_tit.windows import find_windows
 
 NUM_FRAMES, WIDTH, ACTIONS = 3, 8, 2
+N, T = 3, 7
+# Episodes begin within the first two sequences; the third lies inside one.
+IS_INIT = torch.zeros(N, T, 1, dtype=torch.bool)
+IS_INIT[0, 0] = IS_INIT[0, 2] = IS_INIT[0, 3] = IS_INIT[1, 4] = True
 
 BLOCKS: dict[str, Any] = {"num_heads": 2, "ffn_expansion": 1}
 FRAMES: dict[str, FrameSettings] = {
@@ -218,57 +221,45 @@ def test_bytes_are_divided_by_255(case: Pair) -> None:
     torch.testing.assert_close(network(history, *context), expected)
 
 
-def sequences(case: Pair, count: int, steps: int, padding: Padding) -> TensorDict:
-    """Observations and histories of steps, [count, steps]; one episode ends inside."""
-    is_init = torch.zeros(count, steps, 1, dtype=torch.bool)
-    is_init[:, 0] = is_init[-1, steps // 2] = True
-    sequence = TensorDict({"is_init": is_init}, [count, steps])
-    start = torch.where(is_init.squeeze(-1), torch.arange(steps), 0).cummax(1).values
-    for key, frames in zip(history_keys(CASES[case]), frames_of(case, count, steps), strict=True):
-        rows = find_windows(torch.arange(steps).expand(count, -1), start, NUM_FRAMES, padding)
-        windows = []
-        for number, table in enumerate(frames):
-            missing = None if rows.missing is None else rows.missing[number]
-            windows.append(type(rows)(rows.rows[number], missing).gather(table))
-        own = "observation" if key == "history" else ("observation", *key[1:])
-        sequence[own], sequence[key] = frames, torch.stack(windows)
-    for name, entry in zip(
-        network_of(case).history_encoder.context, context_of(case, count, steps), strict=True
+def sequences(case: Pair, padding: Padding) -> TensorDict:
+    """What an environment with `History` writes: N sequences of T steps, [N, T]."""
+    before = frames_of(case, N, NUM_FRAMES - 1, seed=2)
+    entries: dict[Any, Tensor] = {"is_init": IS_INIT}
+    for key, past, frames in zip(
+        history_keys(CASES[case]), before, frames_of(case, N, T, seed=3), strict=True
     ):
-        sequence[name] = entry
+        histories, window = [], torch.cat([past, past[:, :1]], 1)  # the newest is pushed out
+        for t in range(T):
+            newest = frames[:, t : t + 1]
+            window = torch.cat([window[:, 1:] if t else past, newest], 1)
+            padded = newest if padding == "same" else torch.zeros_like(newest)
+            first = torch.cat([padded] * (NUM_FRAMES - 1) + [newest], 1)
+            start = IS_INIT[:, t].view(N, *[1] * (window.ndim - 1))
+            window = torch.where(start, first, window)
+            histories.append(window)
+        own = "observation" if key == "history" else ("observation", *key[1:])
+        entries |= {own: frames, key: torch.stack(histories, 1)}
+    context = network_of(case).history_encoder.context
+    entries |= dict(zip(context, context_of(case, N, T), strict=True))
+    sequence = TensorDict({}, [N, T])
+    for key, entry in entries.items():
+        sequence[key] = entry
     return sequence
 
 
 @every_case
 @torch.no_grad()
 def test_acting_with_kept_frames_equals_the_full_pass(case: Pair) -> None:
-    network, steps = network_of(case), sequences(case, 2, 6, "same")
+    network, steps = network_of(case), sequences(case, "same")
     in_keys = [*history_keys(CASES[case]), *network.history_encoder.context]
     backbone = Backbone(network, in_keys, ["features"])
     expected = network(*(steps[key] for key in in_keys))
     with backbone.acting():
-        for step in range(6):
+        for step in range(T):
             features = backbone(steps[:, step].clone())["features"]
             torch.testing.assert_close(features, expected[:, step])
     # Flat frames of several observations would be of several widths, so others are chosen.
     assert backbone.keeps_frames == ("several" in case or case[0] != "flat")
-
-
-@pytest.mark.parametrize("case", OF_KINDS, ids="+".join)
-@pytest.mark.parametrize("padding", ["same", "constant"])
-@torch.no_grad()
-def test_sequences_equal_single_steps(case: Pair, padding: Any) -> None:
-    """Of arrays and images: tests/modules/test_sequences.py."""
-    network, keys = network_of(case), history_keys(CASES[case])
-    steps = sequences(case, 2, 6, padding)
-    expected = network(*(steps[key] for key in keys))
-    with set_recurrent_mode(True):
-        for known in (None, padding):
-            features = Backbone(network, keys, padding=known)(steps.clone())["features"]
-            torch.testing.assert_close(features, expected)
-        if padding == "same":
-            features = Backbone(network, keys)(steps.exclude("history"))["features"]
-            torch.testing.assert_close(features, expected)
 
 
 @every_case
@@ -399,37 +390,18 @@ def test_vmap_drops_differently_for_each(kind: str, part: str) -> None:
     assert not torch.allclose(first, second)
 
 
-def test_acting_encodes_each_frame_of_each_observation_once() -> None:
-    case = ("inner", "paired-outer", "several")
-    network, keys = build(case).double(), history_keys(SEVERAL)
-    steps, counts = sequences(case, 2, 6, "same"), dict.fromkeys(SEVERAL, 0)
-    for name, encoder in zip(SEVERAL, network.frames, strict=True):
-
-        def count(module: Any, inputs: Any, name: str = name) -> None:
-            observation_ndim = len(module.observation_shape)
-            counts[name] += inputs[0].shape[: inputs[0].ndim - observation_ndim].numel()
-
-        encoder.register_forward_pre_hook(count)
-    backbone = Backbone(network, keys)
-    with torch.no_grad(), backbone.acting():
-        for step in range(6):
-            backbone(steps[:, step].clone())
-    # Of two environments: six steps, and no more for the padding of the episodes that began.
-    assert counts == dict.fromkeys(SEVERAL, 12)
-
-
 def test_two_trunks_read_sequences_and_act_apart() -> None:
     case = ("flat", "d2rl", "several")
     network = build(case, trunks="separate").double()
     assert isinstance(network, TwoTrunks)
-    keys, steps = history_keys(SEVERAL), sequences(case, 2, 6, "same")
+    keys, steps = history_keys(SEVERAL), sequences(case, "same")
     expected = network(*(steps[key] for key in keys))
     assert not torch.allclose(*expected)
     backbone = Backbone(network, keys, ["policy", "value"], padding="same")
     with set_recurrent_mode(True):
         read = [backbone(steps.clone())]
     with torch.no_grad(), backbone.acting():
-        read.append(torch.stack([backbone(steps[:, step].clone()) for step in range(6)], 1))
+        read.append(torch.stack([backbone(steps[:, step].clone()) for step in range(T)], 1))
     for outputs in read:
         for name, features in zip(("policy", "value"), expected, strict=True):
             torch.testing.assert_close(outputs[name], features)
@@ -439,30 +411,6 @@ def test_two_trunks_read_sequences_and_act_apart() -> None:
         frame=FRAMES["linear"], history=HISTORIES["mlp"], trunks="separate", num_frames=2
     )
     assert isinstance(build_network(shared, (6,), trunks="shared"), HistoryNetwork)
-
-
-@pytest.mark.parametrize(
-    "case",
-    [*((f, "lstm") for f in FRAMES), ("linear", "gru"), ("linear", "lstm", "categories")],
-    ids="+".join,
-)
-def test_a_carried_state_reads_a_sequence_as_single_steps(case: Pair) -> None:
-    """With one frame an LSTM carries its state, whichever frame encoder stands before it."""
-    backbone = Backbone(build(case, num_frames=1).double(), ["history"], ["features"])
-    assert backbone.is_recurrent
-    steps = sequences(case, 2, 5, "same").exclude("observation")
-    shape = read_observations(CASES[case])["observation"].shape
-    steps["history"] = steps["history"].unflatten(2, (NUM_FRAMES,))[:, :, -1:]
-    assert steps["history"].shape == (2, 5, 1, *shape)
-    for key, state_shape in backbone.state_shapes.items():
-        steps[key] = torch.zeros(2, 5, *state_shape, dtype=torch.float64)
-    with set_recurrent_mode(True):
-        expected = backbone(steps.clone())["features"]
-    state = steps[:, 0].select(*backbone.state_shapes)
-    for step in range(5):
-        outputs = backbone(steps[:, step].clone().update(state))
-        torch.testing.assert_close(outputs["features"], expected[:, step])
-        state = outputs["next"].select(*backbone.state_shapes)
 
 
 PIXELS_AND_STATE = {"pixels": (36, 36), "state": (6,)}
@@ -510,14 +458,6 @@ def test_parts_that_do_not_fit_each_other_or_the_observation(
     with pytest.raises(ValueError, match=message) as error:
         HistoryNetwork(frame, history, observation_shape=shape, num_frames=NUM_FRAMES)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("num_frames", [0, -1, True, 2.0, "4"])
-def test_number_of_frames(num_frames: Any) -> None:
-    with pytest.raises(ValueError, match="num_frames"):
-        HistoryNetwork(
-            settings.Linear(), settings.Outer(), observation_shape=(6,), num_frames=num_frames
-        )
 
 
 def test_observations_by_name() -> None:

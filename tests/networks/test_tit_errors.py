@@ -23,14 +23,6 @@ def test_history_of_another_shape(kind: type[Any], shape: tuple[int, ...]) -> No
 
 
 @BOTH
-def test_image_of_another_shape(kind: type[Any]) -> None:
-    tit = kind((8, 8), 2, patch_size=4)
-    for call in (tit, tit.attention_maps):
-        with pytest.raises(ValueError, match=r"\(5, 2, 8, 9\).* expected \[\.\.\., 2, 8, 8\]"):
-            call(torch.zeros(5, 2, 8, 9))
-
-
-@BOTH
 @pytest.mark.parametrize("dtype", [torch.float64, torch.int64, torch.bool, torch.bfloat16])
 def test_history_of_another_dtype(kind: type[Any], dtype: torch.dtype) -> None:
     tit = kind((3,), 2)
