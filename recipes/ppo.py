@@ -233,6 +233,12 @@ class Minibatch(NamedTuple):
     windows: Windows
     """The rows of the K frames that the network reads in each step, [N, T, K]."""
 
+    @property
+    def observations(self) -> list[Tensor]:
+        """The newest observation of each step, [N, T, *observation_shape] each, not normalized."""
+        newest = Windows(self.windows.rows[..., -1], None)
+        return [newest.gather(table) for table in self.frames]
+
 
 class ActorCritic(nn.Module):
     """A backbone, and the heads that read its features.
@@ -267,6 +273,8 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         "clip_fraction",
     )
     """The terms of :meth:`loss` whose means are metrics; a subclass adds its own."""
+    step_keys: Sequence[str] = ("action", "action_log_prob", "advantage", "value_target")
+    """The entries of a collected batch that minibatches carry; a subclass adds its own."""
 
     def __init__(self, recipe: PPO) -> None:
         super().__init__(recipe)
@@ -378,9 +386,9 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         """Estimates advantages, then takes a gradient step on each minibatch of each epoch."""
         recipe, model = self.recipe, self.model
         learning_rate = self._set_schedules(step)
-        batch = self.collected(batch)
-        rollout = self.rollout(batch)
         with torch.no_grad():
+            batch = self.collected(batch)
+            rollout = self.rollout(batch)
             self.advantages(batch, rollout)
         floor = recipe.advantage_floor
         if recipe.running_advantage_floor:
@@ -483,8 +491,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         """
         recipe = self.recipe
         masks = [MASK] if recipe.mask_actions else []
-        results = ["action", "action_log_prob", "advantage", "value_target"]
-        steps = batch.select(*self._state_keys, *masks, *results).reshape(-1)
+        steps = batch.select(*self._state_keys, *masks, *self.step_keys).reshape(-1)
         if not self._state_keys:
             steps["is_init"] = rollout.is_init.unsqueeze(-1)
         length = recipe.steps_per_sequence

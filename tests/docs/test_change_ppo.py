@@ -113,3 +113,32 @@ def test_the_prediction_does_not_cross_an_episodes_end(in_float64, own_modules, 
                     error = 1 - torch.cosine_similarity(predicted, features[t + 1], dim=0)
                     errors.append(error * (not is_init[t + 1]))
             assert_near(loss, torch.stack(errors).mean())
+
+
+class Bonus(PPOAlgorithm):
+    """Adds the size of an observation to the reward, and reads both again in the loss."""
+
+    step_keys = (*PPOAlgorithm.step_keys, "bonus")
+
+    def collected(self, batch):
+        assert not torch.is_grad_enabled()
+        batch["bonus"] = batch["observation"].norm(dim=-1, keepdim=True)
+        batch["next", "reward"] = batch["next", "reward"] + batch["bonus"]
+        return super().collected(batch)
+
+    def loss(self, minibatch):
+        [newest] = minibatch.observations
+        torch.testing.assert_close(newest.norm(dim=-1, keepdim=True), minibatch.steps["bonus"])
+        return super().loss(minibatch)
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_what_is_collected_reaches_the_loss_with_its_observations(frames, tmp_path):
+    backbone = enhanced_tit(frames, embed_dim=8, features_dim=8)
+    algorithm = Bonus(PPO(**SMALL | {"backbone": backbone}))
+    algorithm.prepare(0, tmp_path)
+    batch = next(iter(algorithm.batches()))
+    algorithm.close()
+    returns = algorithm.returns(batch)
+    assert algorithm.update(batch, 0)["epochs"] == 2
+    assert set(returns.tolist()) <= set(map(float, range(1, 12)))  # without the bonus

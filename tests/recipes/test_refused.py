@@ -33,7 +33,6 @@ from tests.recipes.small import (
     make_odt,
     tit,
 )
-from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import (
     catformer,
     coberl,
@@ -259,8 +258,7 @@ def test_of_games(fields, message):
 
 
 def test_networks_that_fit_after_all() -> None:
-    settings: dict[str, Network] = {"backbone": lstm(2)}
-    replace(SAC_RECIPE, **settings)
+    replace(SAC_RECIPE, backbone=lstm(2))
     replace(PPO_RECIPE, sequence_length=5, backbone=mlp())  # which has no use for it
     with pytest.raises(ValueError, match="num_frames"):
         enhanced_tit(1, temporal_positions="learned")
