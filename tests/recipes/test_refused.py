@@ -56,9 +56,9 @@ class Endless(gymnasium.Env):
         self.action_space = several_actions if several else one
 
 
-gymnasium.register("EndlessActions-v0", Endless)
-gymnasium.register("UnboundedActions-v0", Endless, kwargs={"begin": -np.inf})
-gymnasium.register("SeveralActions-v0", Endless, kwargs={"several": True})
+gymnasium.register("EndlessActions-v0", f"{__name__}:Endless")
+gymnasium.register("UnboundedActions-v0", f"{__name__}:Endless", kwargs={"begin": -np.inf})
+gymnasium.register("SeveralActions-v0", f"{__name__}:Endless", kwargs={"several": True})
 
 PPO_RECIPE = PPO(
     env="CartPole-v1",
