@@ -347,9 +347,10 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         # Sequence lengths depend on where episodes begin, so recurrent networks are not compiled.
         recurrent, keeps_frames = model.backbone.is_recurrent, model.backbone.keeps_frames
         compiled = not recurrent and should_compile(recipe.compile, recipe.gradient_steps)
-        self.objective = (
-            compile_and_time(self._objective, "the loss") if compiled else self._objective
-        )
+        self.objective = self._objective
+        if compiled:  # a subclass may change numbers that its loss reads
+            ours = type(self) is PPOAlgorithm
+            self.objective = compile_and_time(self._objective, "the loss", only_tensors=ours)
         if compiled and keeps_frames:
             model.backbone.compile_parts(**STATIC_SHAPES)
         # The tokens to reuse are chosen between two parts that are compiled separately.

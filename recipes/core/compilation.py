@@ -70,14 +70,18 @@ def check_compiler(setting: Compile) -> None:
         )
 
 
-def compile_and_time(function: Callable[P, T], name: str) -> Callable[P, T]:
+def compile_and_time(
+    function: Callable[P, T], name: str, *, only_tensors: bool = True
+) -> Callable[P, T]:
     """Compiles a function, and prints how long its first call took, which includes compilation.
 
     Args:
-        function: the function; only tensors may change between its calls (no mode, no setting).
+        function: the function.
         name: what it is, for the message.
+        only_tensors: whether only tensors change between its calls, no mode and no number: a
+            function that is compiled so would go on with the numbers of its first call.
     """
-    fast = torch.compile(function, **ONLY_TENSORS)
+    fast = torch.compile(function, **(ONLY_TENSORS if only_tensors else STATIC_SHAPES))
     first = True
 
     @wraps(function)

@@ -2,6 +2,7 @@
 
 import shutil
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -17,6 +18,7 @@ from recipes.core.runner import train
 from recipes.ppo import PPO, ActorCritic, PPOAlgorithm
 from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import prepared
+from torchrl_tit.settings.networks import mlp
 
 RECIPE = get_recipe("ppo/cartpole/enhanced-tit")
 assert isinstance(RECIPE, PPO)
@@ -27,10 +29,36 @@ SMALL = replace(RECIPE, total_steps=64, steps_per_batch=32, num_envs=2, epochs=2
 def test_the_loss_is_compiled_if_the_recipe_says_so(setting, tmp_path, monkeypatch):
     """What it computes then is in test_rollout.py."""
     monkeypatch.setattr(shutil, "which", lambda name: name)
-    monkeypatch.setattr("recipes.ppo.compile_and_time", lambda function, name: name)
+    monkeypatch.setattr("recipes.ppo.compile_and_time", lambda function, name, **_: name)
     algorithm = prepared(replace(SMALL, compile=setting), tmp_path)
     objective: object = algorithm.objective
     assert (objective == "the loss") is (setting == "on")
+
+
+def test_numbers_that_a_subclass_changes_change_its_compiled_loss(tmp_path, monkeypatch):
+    class Scheduled(PPOAlgorithm):
+        weight = 1.0
+
+        def loss(self, minibatch):
+            terms = super().loss(minibatch)
+            return terms.set("clip_fraction", torch.full((), self.weight))
+
+    monkeypatch.setattr(shutil, "which", lambda name: name)
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    algorithm = Scheduled(replace(SMALL, compile="on", backbone=mlp(1)))
+    algorithm.prepare(0, tmp_path)
+    with torch.no_grad():
+        batch = next(iter(algorithm.batches()))
+        algorithm.close()
+        rollout = algorithm.rollout(batch)
+        algorithm.advantages(batch, rollout)
+    minibatch = next(algorithm.minibatches(batch, rollout))
+    found = []
+    for weight in (1.0, 2.0):
+        algorithm.weight = weight
+        _, terms = algorithm.objective(minibatch._replace(steps=minibatch.steps.copy()))
+        found.append(terms[algorithm.terms.index("clip_fraction")].item())
+    assert found == [1, 2]
 
 
 @pytest.mark.parametrize(
