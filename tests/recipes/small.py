@@ -13,6 +13,7 @@ from tensordict import TensorDictBase
 
 from recipes.bc import BC
 from recipes.core import algorithm, runner
+from recipes.core.callback import Callback
 from recipes.core.metrics import read_metrics
 from recipes.core.recipe import Recipe
 from recipes.core.run import Run
@@ -188,6 +189,20 @@ RECIPES: dict[str, Callable[[Path], Recipe]] = {
     "odt, offline": partial(make_odt, rounds=0, pretraining_updates=10),
 }
 """Makes a small recipe of each algorithm, with the data that it needs in a folder."""
+
+
+class Batches(Callback):
+    """Keeps the collected batches, and may end the training at a step."""
+
+    def __init__(self, last: int | None = None) -> None:
+        self.last = last
+        self.batches: list[Any] = []
+
+    def collected(self, step: int, batch: Any) -> None:
+        self.batches.append(batch.clone())
+
+    def updated(self, step: int, policy: Any) -> bool:
+        return self.last is not None and step >= self.last
 
 
 def train(recipe: Recipe, folder: Path) -> Run:

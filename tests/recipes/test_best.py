@@ -7,9 +7,9 @@ from torch import nn
 
 from recipes.cli import main
 from recipes.core.best import EPISODES, Best
-from recipes.core.run import Run
-from recipes.core.runner import evaluate, load_trained, train
+from recipes.core.runner import evaluate, load_trained
 from recipes.ppo import PPO
+from tests.recipes.small import train
 from tests.recipes.states import assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import mlp
@@ -57,8 +57,7 @@ def test_the_weights_with_the_highest_return_are_kept():
 
 @pytest.fixture
 def run(tmp_path):
-    with Run.create(tmp_path / "run", RECIPE) as run:
-        train(RECIPE, run)
+    run = train(RECIPE, tmp_path / "run")
     return run
 
 

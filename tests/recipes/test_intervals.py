@@ -29,6 +29,7 @@ from recipes.dqn import DQN
 from recipes.ppo import PPO
 from recipes.sac import SAC
 from tests.envs import tasks
+from tests.recipes.small import Batches
 from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.envs import AtariGames
@@ -138,20 +139,6 @@ def test_nothing_depends_on_checkpoints_and_evaluations(kind: str, tmp_path: Pat
     assert [row["evaluation_return"] for row in written] == pytest.approx(means)
 
 
-class Stop(Callback):
-    """Ends the training at a step, and keeps what is observed first after a resume."""
-
-    def __init__(self, step: int = 0) -> None:
-        self.step = step
-        self.batches: list[Any] = []
-
-    def collected(self, step: int, batch: Any) -> None:
-        self.batches.append(batch.clone())
-
-    def updated(self, step: int, policy: Any) -> bool:
-        return step == self.step
-
-
 def starts_of(batch: Any) -> list[tuple[float, ...]]:
     """The first observation of each copy."""
     observation = batch["observation"]
@@ -163,7 +150,7 @@ def starts_of(batch: Any) -> list[tuple[float, ...]]:
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path: Path) -> None:
     recipe = recipe_of(kind)
-    begun = Stop(96)
+    begun = Batches(96)
     train_in(tmp_path / "first", recipe, begun)
     shutil.copytree(tmp_path / "first", tmp_path / "second")
     stopped = rows_of(tmp_path / "first")
@@ -172,7 +159,7 @@ def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path
         torch.manual_seed(number)  # the resuming process may be in any state
         random.seed(number)
         np.random.seed(number)
-        stop = Stop()
+        stop = Batches()
         states.append(train_in(tmp_path / name, recipe, stop))
         seen.append(stop.batches)
     assert [len(batches) for batches in seen] == [2, 2]

@@ -269,13 +269,13 @@ TASKS_OF_MEMORY = sorted({name.rpartition("/")[0] for name in MEMORY_RECIPES})
 def test_recipes_of_memory_differ_in_the_memory_alone(task: str) -> None:
     pytest.importorskip("minigrid")
     pytest.importorskip("popgym")
-    names = [name for name in MEMORY_RECIPES if name.startswith(f"{task}/")]
-    recipes = [recipe for recipe in map(get_recipe, names) if isinstance(recipe, PPO)]
-    inner = [r.backbone.frame for r in recipes if isinstance(r.backbone.frame, Inner)]
-    assert len(inner) == len(recipes) == len(names)
-    assert len({replace(frame, every_block=False) for frame in inner}) == 1
+    recipes = [get_recipe(name) for name in MEMORY_RECIPES if name.startswith(f"{task}/")]
+    frames: set[Any] = {recipe.backbone.frame for recipe in recipes}
+    assert all(isinstance(frame, Inner) for frame in frames)
+    assert len({replace(frame, every_block=False) for frame in frames}) == 1
     first, sizes = recipes[0], []
     for recipe in recipes:
+        assert isinstance(recipe, PPO)
         assert replace(recipe, name=first.name, backbone=first.backbone) == first
         algorithm = make_algorithm(recipe)
         algorithm.check()

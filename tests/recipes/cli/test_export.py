@@ -8,6 +8,7 @@ import torch
 from recipes.cli import main
 from recipes.core.run import Run
 from recipes.ppo import PPO
+from tests.recipes.commands import fails
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import mlp
 
@@ -40,11 +41,7 @@ def test_a_run_becomes_a_file(run, tmp_path, capsys):
 
 def test_bad_input(run, tmp_path, capsys):
     def error(*words):
-        with pytest.raises(SystemExit) as stop:
-            main(["export", *map(str, words)])
-        assert stop.value.code == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        return line
+        return fails(capsys, "export", *words)
 
     out = ["--out", tmp_path / "agent.pt2"]
     (tmp_path / "empty").mkdir()

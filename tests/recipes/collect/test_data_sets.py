@@ -16,7 +16,6 @@ from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict
 
 from recipes.core.algorithm import NotFiniteError, make_algorithm
-from recipes.core.callback import Callback
 from recipes.core.recipe_json import recipe_to_json
 from recipes.core.run import Run
 from recipes.core.runner import train
@@ -33,6 +32,7 @@ from tests.recipes.collect.collected import (
     check_episodes,
     read,
 )
+from tests.recipes.small import Batches
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buffer
 from torchrl_tit.settings.networks import mlp, nature_cnn
@@ -133,21 +133,6 @@ def test_sampled_actions_differ_from_the_most_likely(pendulum: Path) -> None:
     )
 
 
-class Recorder(Callback):
-    """Keeps every batch, and ends the training at a step."""
-
-    def __init__(self, last: int) -> None:
-        self.last = last
-        self.batches: list[Any] = []
-
-    def collected(self, step: int, batch: Any) -> None:
-        names = ["observation", "action", ("next", "reward"), ("next", "terminated")]
-        self.batches.append(batch.select(*names, ("next", "observation")).clone())
-
-    def updated(self, step: int, policy: object) -> bool:
-        return step >= self.last
-
-
 @pytest.mark.parametrize("which", ["cartpole", "pendulum"])
 def test_mixed_is_everything_that_training_saw(
     which: str, tmp_path: Path, request: pytest.FixtureRequest
@@ -156,7 +141,7 @@ def test_mixed_is_everything_that_training_saw(
     folder: Path = request.getfixturevalue(which)
     recipe = CARTPOLE_RECIPE if which == "cartpole" else PENDULUM_RECIPE
     mixed, noted = read(folder / "mixed.hdf5"), attributes(folder / "mixed.hdf5")
-    recorder = Recorder(noted["agent_steps"])
+    recorder = Batches(noted["agent_steps"])
     with Run.create(tmp_path / "run", recipe) as run:
         train(recipe, run, [recorder])
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
 from recipes.core.algorithm import make_algorithm
-from recipes.core.callback import Callback
 from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
 from recipes.core.runner import train
 from recipes.dqn import DQN, DQNAlgorithm
-from tests.recipes.small import tit
+from tests.recipes.small import Batches, tit
 from torchrl_tit.settings.networks import mlp
 
 SMALL = DQN(
@@ -33,20 +31,6 @@ SMALL = DQN(
     checkpoint_interval=30,
     evaluation_episodes=1,
 )
-
-
-class Batches(Callback):
-    """Keeps the collected batches, and may end the training at a step."""
-
-    def __init__(self, last: int | None = None) -> None:
-        self.last = last
-        self.batches: list[TensorDictBase] = []
-
-    def collected(self, step: int, batch: Any) -> None:
-        self.batches.append(batch.clone())
-
-    def updated(self, step: int, policy: Any) -> bool:
-        return step == self.last
 
 
 def make(recipe: DQN) -> DQNAlgorithm:

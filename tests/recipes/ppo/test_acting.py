@@ -2,10 +2,10 @@
 
 import pytest
 
-from recipes.core.run import Run
-from recipes.core.runner import evaluate, train
+from recipes.core.runner import evaluate
 from recipes.ppo import PPO, ActorCritic
 from tests.modules.frames import CountedFrames
+from tests.recipes.small import train
 from torchrl_tit.settings.networks import enhanced_tit
 
 RECIPE = PPO(
@@ -37,10 +37,9 @@ def frames(monkeypatch):
 
 
 def test_collection_and_evaluation_encode_each_frame_once(frames, tmp_path):
-    with Run.create(tmp_path / "run", RECIPE) as run:
-        train(RECIPE, run)
-        # A batch has 64 steps, the 3 older frames of both environments at its start, the 4 of both
-        # next histories at its end, and two sequences of 16 that are checked to be finite.
-        assert frames[0].take() <= 2 * (64 + 2 * 3 + 2 * 4 + 2 * (16 + 3))
-        evaluate(run)
+    run = train(RECIPE, tmp_path / "run")
+    # A batch has 64 steps, the 3 older frames of both environments at its start, the 4 of both
+    # next histories at its end, and two sequences of 16 that are checked to be finite.
+    assert frames[0].take() <= 2 * (64 + 2 * 3 + 2 * 4 + 2 * (16 + 3))
+    evaluate(run)
     assert frames[1].take() <= 2 * (200 + 3)  # two episodes

@@ -6,10 +6,10 @@ pytest.importorskip("ale_py")
 
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
-from recipes.core.run import Run
-from recipes.core.runner import evaluate, train
+from recipes.core.runner import evaluate
 from recipes.ppo import PPO, PPOAlgorithm
 from tests.recipes.ppo.algorithms import named
+from tests.recipes.small import train
 from torchrl_tit.settings.networks import mlp
 
 
@@ -50,9 +50,8 @@ def test_training_sees_the_signs_and_returns_are_raw(clip, seen_rewards, tmp_pat
         evaluation_episodes=2,
         clip_rewards=clip,
     )
-    with Run.create(tmp_path / "run", recipe) as run:
-        train(recipe, run)
-        returns = evaluate(run)["returns"]
+    run = train(recipe, tmp_path / "run")
+    returns = evaluate(run)["returns"]
     (rewards,) = seen_rewards
     assert set(rewards.unique().tolist()) <= {-1.0, 0.0} if clip else rewards.min() < -2
     assert read_metrics(run.folder / "metrics.csv")[0]["return_mean"] < -200

@@ -13,11 +13,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from recipes.core.compilation import should_compile
 from recipes.core.registry import get_recipe
-from recipes.core.run import Run
-from recipes.core.runner import train
 from recipes.ppo import PPO, ActorCritic, PPOAlgorithm
 from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import prepared
+from tests.recipes.small import train
 from torchrl_tit.settings.networks import mlp
 
 RECIPE = get_recipe("ppo/cartpole/enhanced-tit")
@@ -127,8 +126,7 @@ class Recorder:
 
 def test_backbone_runs_once_a_step_and_once_a_minibatch(monkeypatch, tmp_path):
     recorder = Recorder(monkeypatch)
-    with Run.create(tmp_path / "run", SMALL) as run:
-        train(SMALL, run)
+    train(SMALL, tmp_path / "run")
     updates = [mode for mode in recorder.modes if mode[0] == "update"]
     acts = [mode for mode in recorder.modes if mode[0] == "act"]
     batches, minibatches_each, epochs = 2, 2, 2

@@ -6,11 +6,11 @@ import pytest
 import torch
 from torchrl.objectives.value import GAE
 
-from recipes.core.run import Run
-from recipes.core.runner import evaluate, train
+from recipes.core.runner import evaluate
 from recipes.ppo import PPO, PPOAlgorithm
 from recipes.tools.results.film import film
 from tests.numerics import assert_near
+from tests.recipes.small import train
 from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings.networks import lstm
 
@@ -90,13 +90,12 @@ def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
 
 
 def test_a_film_is_evaluated_alike(tmp_path):
-    with Run.create(tmp_path / "run", RECIPE) as run:
-        train(RECIPE, run)
-        returns = evaluate(run)["returns"]
-        # One episode after the other remembers no more of them than all side by side.
-        rendered = replace(RECIPE, evaluation_seed=RECIPE.evaluation_seed)
-        video = tmp_path / "film.gif"
-        assert film(rendered, run, video, episodes=3) == returns
+    run = train(RECIPE, tmp_path / "run")
+    returns = evaluate(run)["returns"]
+    # One episode after the other remembers no more of them than all side by side.
+    rendered = replace(RECIPE, evaluation_seed=RECIPE.evaluation_seed)
+    video = tmp_path / "film.gif"
+    assert film(rendered, run, video, episodes=3) == returns
 
 
 def test_with_several_frames_it_reads_those_and_carries_no_state():

@@ -17,7 +17,6 @@ from recipes.core.compilation import compile_and_time
 from recipes.ppo import PPO, PPOAlgorithm
 from tests.modules.frames import CountedFrames
 from tests.numerics import assert_near
-from tests.recipes.ppo import by_hand
 from tests.recipes.ppo.algorithms import perturb
 from torchrl_tit.envs import make_env
 from torchrl_tit.rollout import FrameCollector, Rollout
@@ -181,7 +180,7 @@ def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstr
     stops = done & ~truncated if bootstrap else done
     assert_near(batch["next", "state_value"], next_value.masked_fill(stops, 0))
     reward = batch["next", "reward"]
-    expected = by_hand.advantages(reward, value, next_value, done, stops, 0.875, 0.75)
+    expected = advantages_by_hand(reward, value, next_value, done, stops, 0.875, 0.75)
     assert_near(batch["advantage"], expected)
     assert_near(batch["value_target"], expected + value)
 
@@ -199,6 +198,32 @@ def test_no_frame_is_encoded_for_what_follows_a_termination(tmp_path):
     algorithm.advantages(batch, rollout)
     assert counted.take() == 0
     assert batch["advantage"].isfinite().all()
+
+
+def numbers_of(minibatch, rollout):
+    """The numbers of a minibatch's steps in the batch, [N, T], found by their newest frame."""
+    newest = minibatch.windows.gather(minibatch.frames[0])[..., -1, :].unsqueeze(-2)
+    same = (newest == rollout.frames[0][rollout.newest]).all(-1)  # [N, T, steps]
+    assert (same.sum(-1) == 1).all()
+    return same.int().argmax(-1)
+
+
+def advantages_by_hand(reward, value, next_value, done, stops, gamma, lmbda):
+    """Generalised advantage estimation (arXiv 1506.02438), [envs, time, 1].
+
+    Args:
+        stops: where no value follows: at terminations, and at time limits if they count as such.
+    """
+    expected = torch.zeros_like(value)
+    for i in range(value.shape[0]):
+        running = 0.0
+        for t in reversed(range(value.shape[1])):
+            # A termination has no value after it, a time limit has that of the true next state.
+            bootstrapped = 0.0 if stops[i, t, 0] else next_value[i, t, 0]
+            delta = reward[i, t, 0] + gamma * bootstrapped - value[i, t, 0]
+            running = delta + gamma * lmbda * (0.0 if done[i, t, 0] else running)
+            expected[i, t, 0] = running
+    return expected
 
 
 def features_by_hand(model, minibatch, histories):
@@ -238,7 +263,7 @@ def test_loss_and_gradient_are_those_of_whole_windows(name, envs, padding, tmp_p
         steps, frames, windows = minibatch
         assert steps.shape == (2, 16)
         resets += int(steps["is_init"][:, 1:].sum())
-        [histories] = rollout.histories(by_hand.numbers_of(minibatch, rollout))
+        [histories] = rollout.histories(numbers_of(minibatch, rollout))
         assert torch.equal(windows.gather(frames[0]), histories)
         torch.manual_seed(1)
         total, terms = algorithm._objective(minibatch._replace(steps=steps.copy()))

@@ -10,11 +10,10 @@ from recipes import ppo
 from recipes.core.adaptive import KLAdaptiveRate, ReturnScale, normalize_advantages
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
-from recipes.core.run import Run
-from recipes.core.runner import train
 from recipes.ppo import PPO, PPOAlgorithm
 from tests.recipes.ppo import tasks
 from tests.recipes.ppo.algorithms import trained
+from tests.recipes.small import train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.frames.normalized import NormalizedFrames
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
@@ -30,12 +29,6 @@ RECIPE = PPO(
     checkpoint_interval=64,
     evaluation_episodes=2,
 )
-
-
-def run_of(recipe, folder):
-    with Run.create(folder, recipe) as run:
-        train(recipe, run)
-    return run
 
 
 def normalized_frames(networks):
@@ -85,7 +78,7 @@ def test_rewards_are_divided_by_the_deviation_of_returns(tmp_path, monkeypatch):
 
     monkeypatch.setattr(PPOAlgorithm, "collected", recording)
     recipe = replace(RECIPE, normalize_rewards=True, reward_scale=100.0)
-    run = run_of(recipe, tmp_path / "run")
+    run = train(recipe, tmp_path / "run")
     _, state = load_checkpoint(run.checkpoints)
     count, _, squares = state["return_scale"]["statistics"]
     assert count == 256
@@ -124,7 +117,7 @@ def test_advantages_are_divided_by_a_share_of_their_running_deviation(tmp_path, 
     monkeypatch.setattr(ppo, "normalize_advantages", recording)
     monkeypatch.setattr(PPOAlgorithm, "advantages", shrinking)
     recipe = replace(RECIPE, running_advantage_floor=0.5, total_steps=192)
-    run = run_of(recipe, tmp_path / "run")
+    run = train(recipe, tmp_path / "run")
     batches = [seen[start : start + 4] for start in (0, 4, 8)]  # 2 minibatches, 2 epochs
     variances = [torch.cat([raw for raw, *_ in batch[:2]]).var().item() for batch in batches]
     for count, batch in enumerate(batches, start=1):
@@ -249,18 +242,18 @@ def divergences(monkeypatch):
 def test_an_update_ends_after_the_first_epoch_beyond_the_target(divergences, tmp_path):
     """Nothing is clipped here, so it is the divergence that ends it."""
     recipe = replace(RECIPE, total_steps=64, learning_rate=0.01, epochs=8, clip_epsilon=0.9)
-    run_of(recipe, tmp_path / "free")
+    train(recipe, tmp_path / "free")
     free = divergences()
     target = (free[0] + free[1]) / 2
     assert free[0] < target < free[1] < 3 * target
-    run = run_of(replace(recipe, target_kl=target), tmp_path / "ended")
+    run = train(replace(recipe, target_kl=target), tmp_path / "ended")
     assert divergences()[8:] == pytest.approx(free[:2])
     assert read_metrics(run.folder / "metrics.csv")[-1]["epochs"] == 2
 
 
 def test_the_learning_rate_follows_the_target_divergence(divergences, tmp_path):
     recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=1e-3, at_target_kl="adapt")
-    rows = read_metrics(run_of(recipe, tmp_path / "run").folder / "metrics.csv")
+    rows = read_metrics(train(recipe, tmp_path / "run").folder / "metrics.csv")
     expected, factors = KLAdaptiveRate(1e-3), [1.0]
     for kl in divergences():
         expected.update(kl)
@@ -290,7 +283,7 @@ def test_the_larger_of_two_floors_applies(tmp_path, monkeypatch):
     monkeypatch.setattr(ppo, "normalize_advantages", recording)
     recipe = replace(RECIPE, total_steps=64, running_advantage_floor=0.5)
     for constant in (1e-6, 1e6):
-        run_of(replace(recipe, advantage_floor=constant), tmp_path / f"{constant}")
+        train(replace(recipe, advantage_floor=constant), tmp_path / f"{constant}")
     assert min(floors[:4]) > 1e-3
     assert floors[4:] == [1e6] * 4
 
@@ -324,6 +317,6 @@ def test_collectors_of_other_processes_get_the_statistics(tmp_path, monkeypatch)
     recipe = replace(
         RECIPE, backbone=backbone, collectors=2, normalize_observations=True, learning_rate=0.0
     )
-    run_of(recipe, tmp_path / "run")
+    train(recipe, tmp_path / "run")
     assert len(differences) == 4
     assert max(differences) < 1e-4

@@ -8,12 +8,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from recipes.core.run import Run
-from recipes.core.runner import train
 from recipes.ppo import PPO, PPOAlgorithm
 from tests.numerics import assert_near
 from tests.recipes.ppo import tasks
 from tests.recipes.ppo.algorithms import perturb
+from tests.recipes.small import train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings import Flat
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
@@ -44,10 +43,9 @@ TASKS: dict[str, dict[str, Any]] = {
 
 def trained(recipe, folder):
     """The networks after training, and the rows of metrics without their times."""
-    with Run.create(folder, recipe) as run:
-        train(recipe, run)
-        rows = [line.split(",") for line in (run.folder / "metrics.csv").read_text().splitlines()]
-        weights = TensorDict(load_checkpoint(run.checkpoints)[1]["networks"])
+    run = train(recipe, folder)
+    rows = [line.split(",") for line in (run.folder / "metrics.csv").read_text().splitlines()]
+    weights = TensorDict(load_checkpoint(run.checkpoints)[1]["networks"])
     return weights, [[row[0], *row[3:]] for row in rows]
 
 

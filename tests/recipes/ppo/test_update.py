@@ -12,10 +12,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from recipes.core.metrics import read_metrics
-from recipes.core.run import Run
-from recipes.core.runner import train
 from recipes.ppo import PPO, Minibatch, PPOAlgorithm
 from tests.recipes.ppo.algorithms import named, prepared
+from tests.recipes.small import train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.networks import masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
@@ -130,8 +129,7 @@ def updates_by_hand(recipe, batches):
 @pytest.mark.parametrize("env", ["CartPole-v1", "Pendulum-v1"])
 def test_two_updates_equal_those_by_hand(env, batches, tmp_path):
     recipe = PPO(**(vars(RECIPE) | {"env": env}))
-    with Run.create(tmp_path / "run", recipe) as run:
-        train(recipe, run)
+    run = train(recipe, tmp_path / "run")
     _, state = load_checkpoint(run.checkpoints)
     sizes = [[minibatch.numel() for minibatch in minibatches] for _, minibatches in batches]
     assert sizes == [[24, 24, 16] * 2] * 2
@@ -153,9 +151,8 @@ def test_metrics_tell_how_far_features_are_spread(tmp_path, monkeypatch):
         batches.append(batch.clone())
 
     monkeypatch.setattr(PPOAlgorithm, "advantages", recording)
-    with Run.create(tmp_path / "run", RECIPE) as run:
-        train(RECIPE, run)
-        rows = read_metrics(run.folder / "metrics.csv")
+    run = train(RECIPE, tmp_path / "run")
+    rows = read_metrics(run.folder / "metrics.csv")
     for row, batch in zip(rows, batches, strict=True):
         deviations = batch["features"].reshape(-1, 8).std(0)
         assert row["feature_spread"] == pytest.approx(deviations.mean().item(), rel=1e-5)
@@ -171,8 +168,7 @@ COBERL = coberl(4, embed_dim=16, num_heads=2, num_blocks=1, features_dim=8, gate
 )
 def test_warm_up_rises_linearly_and_decay_follows(decay, expected, tmp_path):
     recipe = replace(SMALL, total_steps=256, warmup_steps=192, decay_learning_rate=decay, epochs=1)
-    with Run.create(tmp_path / "run", recipe) as run:
-        train(recipe, run)
+    run = train(recipe, tmp_path / "run")
     rates = [row["learning_rate"] for row in read_metrics(run.folder / "metrics.csv")]
     assert rates == pytest.approx([3e-4 * fraction for fraction in expected])
 

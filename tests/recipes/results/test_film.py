@@ -7,23 +7,15 @@ import pytest
 from PIL import Image, ImageSequence
 
 from recipes.cli import main
-from recipes.core import runner
 from recipes.core.algorithm import make_algorithm
 from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
 from recipes.tools.results.film import film_policy
+from tests.recipes.commands import fails
+from tests.recipes.untrained import untrained
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.settings.networks import enhanced_tit, mlp
-
-SMALL = {"total_steps": 64, "steps_per_batch": 64, "minibatch_size": 32, "epochs": 1}
-
-
-def trained(folder, **fields):
-    recipe = PPO(**{**SMALL, **fields})
-    with Run.create(folder, recipe) as run:
-        runner.train(recipe, run)
-    return run
 
 
 def durations(film):
@@ -34,7 +26,7 @@ def durations(film):
 
 @pytest.fixture(scope="module")
 def cartpole(tmp_path_factory):
-    return trained(tmp_path_factory.mktemp("run"), env="CartPole-v1", backbone=mlp())
+    return untrained(tmp_path_factory.mktemp("run"), PPO(env="CartPole-v1", backbone=mlp()))
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
@@ -73,9 +65,7 @@ def test_atari(tmp_path):
 
 def test_bad_input(cartpole, tmp_path, capsys):
     def error(*words):
-        with pytest.raises(SystemExit):
-            main(["render", *map(str, words)])
-        return capsys.readouterr().err
+        return fails(capsys, "render", *words)
 
     folder, film = cartpole.folder, tmp_path / "film.gif"
     assert "a film is one of .gif, .mp4, not 'film.avi'" in error(
@@ -102,9 +92,7 @@ def test_pictures_that_cannot_be_drawn(cartpole, tmp_path, capsys, monkeypatch):
         raise FatalError("OpenGL has not been loaded")
 
     monkeypatch.setattr("torchrl_tit.envs.GymVectorEnv.render", fail)
-    with pytest.raises(SystemExit):
-        main(["render", str(cartpole.folder), "--out", str(tmp_path / "film.gif")])
-    error = capsys.readouterr().err
+    error = fails(capsys, "render", cartpole.folder, "--out", tmp_path / "film.gif")
     assert "cannot be rendered: OpenGL has not been loaded; for MuJoCo without a screen" in error
     assert "MUJOCO_GL to egl" in error
     assert not any(tmp_path.iterdir())

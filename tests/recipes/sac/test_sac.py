@@ -10,11 +10,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from recipes.core.algorithm import make_algorithm
-from recipes.core.callback import Callback
 from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
 from recipes.core.runner import train
 from recipes.sac import SAC, SACAlgorithm
+from tests.recipes.small import Batches
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
@@ -34,23 +34,6 @@ SMALL = SAC(
 )
 
 NO_DROPOUT = enhanced_tit(num_frames=4, embed_dim=8, num_blocks=2, features_dim=8)
-
-
-class Batches(Callback):
-    """Keeps the policy's actions, and may fail or end the training at a step."""
-
-    def __init__(self, last: int | None = None, fail: int | None = None) -> None:
-        self.last = last
-        self.fail = fail
-        self.actions: list[Tensor] = []
-
-    def collected(self, step: int, batch: Any) -> None:
-        self.actions.append(batch["action"].clone())
-
-    def updated(self, step: int, policy: Any) -> bool:
-        if step == self.fail:
-            raise KeyError("killed")
-        return step == self.last
 
 
 def make(recipe: SAC) -> SACAlgorithm:
@@ -100,7 +83,7 @@ def test_random_steps_are_uniform_and_learn_nothing(tmp_path: Path) -> None:
         _, before = trained(run.folder)
         train(recipe, run)
         _, after = trained(run.folder)
-    actions = torch.cat([action.flatten() for action in batches.actions])
+    actions = torch.cat([batch["action"].flatten() for batch in batches.batches])
     quartiles = actions.quantile(torch.tensor([0.25, 0.5, 0.75]))
     torch.testing.assert_close(quartiles, torch.tensor([-1.0, 0.0, 1.0]), atol=0.35, rtol=0)
     assert before["optimizer"]["state"] == {}
