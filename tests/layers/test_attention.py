@@ -62,7 +62,7 @@ def test_equals_multihead_attention(
     expected, weights = reference(x, x, x, attn_mask=~seen, average_attn_weights=False)
     for read, positions in READS:
         assert_near(ours(x, read, given), expected[:, positions])
-    assert_near(ours.weights(x, mask=given), weights)
+    assert_near(ours.weights(x, given), weights)
     rows_of = x.unflatten(0, (2, 2))
     assert_near(ours(rows_of, mask=given), expected.unflatten(0, (2, 2)))
 

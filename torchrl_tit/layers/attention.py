@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
+from inspect import signature
 from typing import Any, Literal
 
 import torch
@@ -127,12 +128,11 @@ class SelfAttention(nn.Module):
         mixed = self.out_proj(mixed)  # [N, positions, out_dim]
         return mixed.reshape(*leading, *mixed.shape[1:])
 
-    def weights(self, x: Tensor, read: Read | slice = "all", mask: Tensor | None = None) -> Tensor:
+    def weights(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """Returns the attention weights, float [..., heads, S, S], rows (queries) summing to 1.
 
         Args:
             x: tokens, as in ``forward``.
-            read: ignored: the weights of all positions are returned.
             mask: as in ``forward``.
         """
         leading, x = x.shape[:-2], _flatten(x)
@@ -347,13 +347,12 @@ class RelativeSelfAttention(nn.Module):
         mixed = self._weights(query, key, causal, read) @ value  # [..., heads, steps, D / heads]
         return self.out_proj(mixed.transpose(-3, -2).flatten(-2))
 
-    def weights(self, x: Tensor, *, causal: bool, read: Read = "all") -> Tensor:
+    def weights(self, x: Tensor, *, causal: bool) -> Tensor:
         """Returns the attention weights, float [..., heads, K, K], rows (queries) summing to 1.
 
         Args:
             x: as in ``forward``.
             causal: as in ``forward``.
-            read: ignored: the weights of all steps are returned.
         """
         query, key, _ = self._heads(x, "all")
         return self._weights(query, key, causal, "all")
@@ -430,7 +429,9 @@ def attention_maps(module: nn.Module, *inputs: Tensor) -> list[Tensor]:
 
     def record(layer: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
         assert isinstance(layer, SelfAttention | RelativeSelfAttention)
-        maps.append(layer.weights(*args, **kwargs))
+        given = signature(layer.forward).bind(*args, **kwargs).arguments
+        given.pop("read", None)  # the weights of all positions are returned
+        maps.append(layer.weights(**given))
 
     with ExitStack() as hooks:
         for layer in module.modules():
