@@ -191,7 +191,7 @@ def test_attention_maps(network: str, leading: tuple[int, ...], case: str) -> No
 def test_usual_pass_computes_no_attention_maps(monkeypatch: pytest.MonkeyPatch) -> None:
     tit = EnhancedTIT((8, 8), 3, patch_size=4)
 
-    def never(*_: object) -> None:
+    def never(*_: object, **__: object) -> None:
         raise AssertionError("attention weights were computed")
 
     for name in ("weights", "_weights"):
