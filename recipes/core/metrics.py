@@ -14,7 +14,7 @@ from typing import Any
 
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
-from torchrl_tit.agents.folder import MOST_STEPS, is_number
+from torchrl_tit.evaluation_file import MOST_STEPS, is_number
 from torchrl_tit.extras import missing
 from torchrl_tit.files import naming, write_text_atomic
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import msgspec
 
-from torchrl_tit.agents.folder import parse_evaluation, read_evaluation
 from torchrl_tit.checkpoint import (
     CheckpointError,
     checkpoint_steps,
@@ -23,6 +22,7 @@ from torchrl_tit.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
+from torchrl_tit.evaluation_file import parse_evaluation, read_evaluation
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.settings.imports import allowed_modules
 

@@ -12,8 +12,9 @@ from typing import Any, Literal
 import torch
 
 from torchrl_tit.agents import AgentError, TrainedAgent
-from torchrl_tit.agents.folder import RECIPE, AgentFiles, read_evaluation
+from torchrl_tit.agents.folder import RECIPE, AgentFiles
 from torchrl_tit.checkpoint import latest_step
+from torchrl_tit.evaluation_file import read_evaluation
 
 from ...core.algorithm import Algorithm, load_weights, make_algorithm
 from ...core.recipe import Recipe

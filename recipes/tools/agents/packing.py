@@ -14,8 +14,9 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from torchrl_tit.agents import AgentError
-from torchrl_tit.agents.folder import CARD, EVALUATION, RECIPE, VERSIONS, WEIGHTS
+from torchrl_tit.agents.folder import CARD, RECIPE, VERSIONS, WEIGHTS
 from torchrl_tit.agents.hub import import_hub
+from torchrl_tit.evaluation_file import EVALUATION
 
 from ...core.dataset_recipe import DatasetRecipe
 from ...core.recipe import Recipe

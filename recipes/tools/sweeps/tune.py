@@ -22,7 +22,7 @@ from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 from tqdm import tqdm
 
-from torchrl_tit.agents.folder import read_evaluation
+from torchrl_tit.evaluation_file import read_evaluation
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 
 from ...core.algorithm import make_algorithm

@@ -17,7 +17,8 @@ from recipes.tools.agents import pack
 from tests.agents.runs import make_run, packed
 from torchrl_tit import load_agent
 from torchrl_tit.agents import AgentError, TrainedAgent
-from torchrl_tit.agents.folder import CONTENTS, EVALUATION, RECIPE, WEIGHTS, write_agent
+from torchrl_tit.agents.folder import CONTENTS, RECIPE, WEIGHTS, write_agent
+from torchrl_tit.evaluation_file import EVALUATION
 from torchrl_tit.modules import acting
 from torchrl_tit.settings.networks import dt_tit, lstm, mlp
 
