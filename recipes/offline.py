@@ -26,7 +26,14 @@ from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
-from .core.algorithm import Algorithm, Stateful, Terms, check_finite, numbers
+from .core.algorithm import (
+    Algorithm,
+    LearnsFromSamples,
+    Stateful,
+    Terms,
+    check_finite,
+    numbers,
+)
 from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import Outcome
 from .core.networks import make_backbone, make_critic
@@ -137,7 +144,7 @@ class ActorCriticRecipe(TransitionRecipe):
 RecipeT = TypeVar("RecipeT", bound=TransitionRecipe)
 
 
-class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
+class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
     """An algorithm whose model is a TorchRL loss on all its networks.
 
     Args:
@@ -155,7 +162,6 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
 
     optimizer: torch.optim.Optimizer
     """The optimizer of all weights, once :meth:`prepare` has made it."""
-    _policy: TensorDictModuleBase
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
@@ -173,30 +179,6 @@ class TransitionAlgorithm(DatasetAlgorithm[RecipeT]):
                     f"{observation.dtype}, not floats: switch it off"
                 )
             self.model = self.networks(task).to(self.device)
-
-    @abstractmethod
-    def networks(self, env: EnvBase) -> nn.Module:
-        """Builds the loss with all networks: the policy, critics, and what a subclass adds to it.
-
-        Args:
-            env: the task, for its observations and actions.
-        """
-
-    @abstractmethod
-    def loss(self, samples: TensorDictBase) -> Terms:
-        """Returns the terms of the loss, float [] each.
-
-        Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
-        add one, override this method and call it first.
-
-        Args:
-            samples: transitions [B], or slices of consecutive ones, [N, T].
-        """
-
-    @property
-    def policy(self) -> TensorDictModuleBase:
-        """The policy, from histories to actions; its weights are among those of the model."""
-        return self._policy
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories."""

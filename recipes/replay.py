@@ -12,7 +12,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase
 
@@ -20,7 +20,7 @@ from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_chec
 from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
 from torchrl_tit.settings.numbers import Batch, Steps, Weight
 
-from .core.algorithm import Stateful, Terms, check_finite, numbers
+from .core.algorithm import LearnsFromSamples, Stateful, Terms, check_finite, numbers
 from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
 
@@ -85,7 +85,7 @@ class ReplayRecipe(OnlineRecipe):
 RecipeT = TypeVar("RecipeT", bound=ReplayRecipe)
 
 
-class ReplayAlgorithm(OnlineAlgorithm[RecipeT]):
+class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
     """An algorithm with a replay buffer, whose model is a TorchRL loss on all its networks.
 
     Args:
@@ -98,36 +98,11 @@ class ReplayAlgorithm(OnlineAlgorithm[RecipeT]):
 
     optimizer: torch.optim.Optimizer
     """The optimizer, once :meth:`prepare` has made it."""
-    _policy: TensorDictModuleBase
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
         with closing(self.make_env(1)) as task:
             self.model = self.networks(task).to(self.device)
-
-    @abstractmethod
-    def networks(self, env: EnvBase) -> nn.Module:
-        """Builds the loss with all networks: the policy, critics, and what a subclass adds to it.
-
-        Args:
-            env: the task, for its observations and actions.
-        """
-
-    @abstractmethod
-    def loss(self, samples: TensorDictBase) -> Terms:
-        """Returns the terms of the loss, float [] each.
-
-        Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
-        add one, override this method and call it first.
-
-        Args:
-            samples: transitions [B], or slices of consecutive ones, [N, T].
-        """
-
-    @property
-    def policy(self) -> TensorDictModuleBase:
-        """The policy, from histories to actions; its weights are among those of the model."""
-        return self._policy
 
     @property
     def behaviour(self) -> TensorDictModuleBase:

@@ -148,6 +148,39 @@ class Algorithm(ABC, Generic[RecipeT]):
         """Closes the environments and processes that :meth:`prepare` started."""
 
 
+class LearnsFromSamples(ABC):
+    """What algorithms have in common that learn from samples of transitions.
+
+    Their model is the loss, with the weights of all networks, the policy's among them.
+    """
+
+    _policy: TensorDictModuleBase
+
+    @abstractmethod
+    def networks(self, env: EnvBase) -> nn.Module:
+        """Builds the loss with all networks: the policy, critics, and what a subclass adds to it.
+
+        Args:
+            env: the task, for its observations and actions.
+        """
+
+    @abstractmethod
+    def loss(self, samples: TensorDictBase) -> Terms:
+        """Returns the terms of the loss, float [] each.
+
+        Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
+        add one, override this method and call it first.
+
+        Args:
+            samples: transitions [B], or slices of consecutive ones, [N, T].
+        """
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """The policy, from histories to actions; its weights are among those of the model."""
+        return self._policy
+
+
 def make_algorithm(recipe: Recipe) -> Algorithm[Any]:
     """Builds the algorithm of a recipe.
 
