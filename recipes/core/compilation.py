@@ -70,18 +70,21 @@ def check_compiler(setting: Compile) -> None:
         )
 
 
-def compile_and_time(
-    function: Callable[P, T], name: str, *, only_tensors: bool = True
-) -> Callable[P, T]:
+def compile_and_time(function: Callable[P, T], name: str, owner: object) -> Callable[P, T]:
     """Compiles a function, and prints how long its first call took, which includes compilation.
+
+    Between calls, only tensors change in the algorithms of this package, and no mode and no number.
+    A user's subclass may change numbers, which code without guards would keep as they were in the
+    first call.
 
     Args:
         function: the function.
         name: what it is, for the message.
-        only_tensors: whether only tensors change between its calls, no mode and no number: a
-            function that is compiled so would go on with the numbers of its first call.
+        owner: the algorithm that calls it.
     """
-    fast = torch.compile(function, **(ONLY_TENSORS if only_tensors else STATIC_SHAPES))
+    package = str(__package__).rpartition(".")[0]
+    ours = type(owner).__module__.startswith(f"{package}.")
+    fast = torch.compile(function, **(ONLY_TENSORS if ours else STATIC_SHAPES))
     first = True
 
     @wraps(function)

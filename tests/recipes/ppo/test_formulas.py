@@ -28,7 +28,7 @@ SMALL = replace(RECIPE, total_steps=64, steps_per_batch=32, num_envs=2, epochs=2
 def test_the_loss_is_compiled_if_the_recipe_says_so(setting, tmp_path, monkeypatch):
     """What it computes then is in test_rollout.py."""
     monkeypatch.setattr(shutil, "which", lambda name: name)
-    monkeypatch.setattr("recipes.ppo.compile_and_time", lambda function, name, **_: name)
+    monkeypatch.setattr("recipes.ppo.compile_and_time", lambda function, name, owner: name)
     algorithm = prepared(replace(SMALL, compile=setting), tmp_path)
     objective: object = algorithm.objective
     assert (objective == "the loss") is (setting == "on")

@@ -305,7 +305,7 @@ def test_the_compiled_objective_is_one_graph_and_the_eager_one(tmp_path):
     with torch.no_grad():
         algorithm.advantages(batch, rollout)
     counters.clear()
-    fast = compile_and_time(algorithm._objective, "the loss")
+    fast = compile_and_time(algorithm._objective, "the loss", algorithm)
     for minibatch in algorithm.minibatches(batch, rollout):
         results = []
         for objective in (algorithm._objective, fast):
