@@ -21,6 +21,8 @@ from ..core.trust import allow_names
 from .arguments import Parser, add_machine_options, fail, option, parse_fields, program
 from .backbone_options import check_recipe, choose_network, option_fields
 
+_OF_A_RUN = {"--out", "--init-from", "--wandb"}
+"""The options of a new run that are not fields of its recipe."""
 WANDB_HELP = "Project of Weights & Biases that metrics are sent to, beside CSV and TensorBoard."
 
 
@@ -72,8 +74,11 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
 def _check_length(recipe: Recipe, arguments: list[str]) -> None:
     """Exits with a hint if the arguments set the length by another algorithm's field."""
     typed = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
-    for length in _lengths().keys() - {recipe.length}:
-        if option(length) in typed and length not in field_types(type(recipe)):
+    fields = {option(field) for field in field_types(type(recipe))}
+    if not {word for word in typed if word.startswith("--")} - fields - _OF_A_RUN:
+        return  # the other algorithms, whose fields they might be, need not be imported
+    for length in _lengths():
+        if option(length) in typed - fields:
             fail(
                 f"{recipe.algorithm} has no {option(length)}: the length of its runs is "
                 f"{option(recipe.length)} (see `{program()} train {recipe.name} --help`)"
