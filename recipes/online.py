@@ -121,12 +121,14 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
         returns = evaluate(self.make_env, self.policy, episodes, seed=seed)
         return [Outcome(step, returns.tolist())]
 
-    def check(self) -> None:
-        """Lets the policy act once in the task; a cluster must have room for the collectors."""
+    def check(self, **settings: Any) -> None:
+        """As :meth:`Algorithm.check`; a cluster must have room for the collectors.
+
+        Args:
+            **settings: further settings of the task.
+        """
         check_cluster(self.recipe.ray, self.recipe.collectors, self.recipe.threads)
-        mode = getattr(self.recipe, "vectorization_mode", "sync")  # PPO's
-        env = self.make_env(1, self.recipe.seed, vectorization_mode=mode)
-        with closing(env), torch.no_grad():
+        with closing(self.make_env(1, self.recipe.seed, **settings)) as env, torch.no_grad():
             self.policy(env.reset())
 
     def close(self) -> None:

@@ -321,7 +321,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories, and with the state of a recurrent network."""
-        env = make_task(self.recipe, num_envs, seed, **settings)
+        env = super().make_env(num_envs, seed, **settings)
         return _with_state(self.model.backbone.make_transforms(), env)
 
     def prepare(self, step: int, folder: Path) -> None:
@@ -347,10 +347,9 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         # Sequence lengths depend on where episodes begin, so recurrent networks are not compiled.
         recurrent, keeps_frames = model.backbone.is_recurrent, model.backbone.keeps_frames
         compiled = not recurrent and should_compile(recipe.compile, recipe.gradient_steps)
-        self.objective = self._objective
-        if compiled:  # a subclass may change numbers that its loss reads
-            ours = type(self) is PPOAlgorithm
-            self.objective = compile_and_time(self._objective, "the loss", only_tensors=ours)
+        self.objective = (
+            compile_and_time(self._objective, "the loss", self) if compiled else self._objective
+        )
         if compiled and keeps_frames:
             model.backbone.compile_parts(**STATIC_SHAPES)
         # The tokens to reuse are chosen between two parts that are compiled separately.
@@ -475,13 +474,14 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         values = batch["state_value"].roll(-1, dims=1).masked_fill(terminated, 0)
         cut_off = rollout.ends & ~terminated.squeeze(-1)
         states = batch["next"][cut_off].select(*self._state_keys)
-        found: list[Tensor] = []
+        start, found = 0, []
         for frames, windows in rollout.next_windows(cut_off):
-            samples = states[len(found) :][: len(windows.rows)]
+            samples = states[start : start + len(windows.rows)]
+            start += len(samples)
             self._encode(samples, frames, windows, sequences=False)
-            found += self.model.critic(samples)["state_value"]
+            found.append(self.model.critic(samples)["state_value"])
         if found:
-            values[cut_off] = torch.stack(found)
+            values[cut_off] = torch.cat(found)
         return values
 
     def minibatches(self, batch: TensorDictBase, rollout: Rollout) -> Iterator[Minibatch]:
@@ -520,10 +520,10 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
             terms["loss_contrastive"] = self.recipe.contrastive_coeff * contrast
         return terms
 
-    def check(self) -> None:
+    def check(self, **settings: Any) -> None:
         """As :meth:`OnlineAlgorithm.check`; a compiler must be there if it is required."""
         check_compiler(self.recipe.compile)
-        super().check()
+        super().check(vectorization_mode=self.recipe.vectorization_mode, **settings)
 
     @property
     def _state_keys(self) -> list[str]:
