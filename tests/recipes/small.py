@@ -205,9 +205,11 @@ class Batches(Callback):
         return self.last is not None and step >= self.last
 
 
-def train(recipe: Recipe, folder: Path) -> Run:
-    with Run.create(folder, recipe) as run:
-        runner.train(recipe, run)
+def train(recipe: Recipe, folder: Path, *callbacks: Callback) -> Run:
+    """Trains in a run folder, new or not."""
+    run = Run(folder, recipe) if folder.exists() else Run.create(folder, recipe)
+    with run:
+        runner.train(recipe, run, callbacks)
     return run
 
 

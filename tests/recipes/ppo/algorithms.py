@@ -40,3 +40,15 @@ def perturb(model):
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.2 * torch.randn_like(parameter))
+
+
+def note_calls(monkeypatch, method, note):
+    """Calls ``note(result, algorithm, *arguments)`` after each call of a method of PPO's."""
+    original = getattr(PPOAlgorithm, method)
+
+    def noting(*arguments):
+        result = original(*arguments)
+        note(result, *arguments)
+        return result
+
+    monkeypatch.setattr(PPOAlgorithm, method, noting)

@@ -14,10 +14,12 @@ from torchrl.modules import RandomPolicy
 from torchrl.objectives.value import GAE
 
 from recipes.core.compilation import compile_and_time
-from recipes.ppo import PPO, PPOAlgorithm
+from recipes.core.runner import evaluate
+from recipes.ppo import PPO, ActorCritic, PPOAlgorithm
 from tests.modules.frames import CountedFrames
 from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import perturb
+from tests.recipes.small import train
 from torchrl_tit.envs import make_env
 from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings import CoBERL, Inner, Network
@@ -294,6 +296,23 @@ def test_each_frame_of_a_sequence_is_encoded_once(tmp_path):
         for minibatch in algorithm.minibatches(batch, rollout):
             algorithm.loss(minibatch)
             assert counted.take() == 2 * (16 + 3)
+
+
+def test_collection_and_evaluation_encode_each_frame_once(tmp_path, monkeypatch):
+    counted, init = [], ActorCritic.__init__
+
+    def counting(model, *args):
+        init(model, *args)
+        counted.append(CountedFrames(model.backbone.module))
+        counted[-1].only_without_gradients = True
+
+    monkeypatch.setattr(ActorCritic, "__init__", counting)
+    recipe = replace(RECIPE, env="Pendulum-v1", evaluation_episodes=2)
+    evaluate(train(recipe, tmp_path / "run"))
+    # A batch has 96 steps, the 3 older frames of each environment at its start, the 4 of each next
+    # history at its end, and two sequences of 16 that are checked to be finite.
+    assert counted[0].take() <= 2 * (96 + 3 * 3 + 3 * 4 + 2 * (16 + 3))
+    assert counted[1].take() <= 2 * (200 + 3)  # two episodes
 
 
 @pytest.mark.slow

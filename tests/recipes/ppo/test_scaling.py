@@ -10,9 +10,10 @@ from recipes import ppo
 from recipes.core.adaptive import KLAdaptiveRate, ReturnScale, normalize_advantages
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
+from recipes.core.runner import evaluate
 from recipes.ppo import PPO, PPOAlgorithm
 from tests.recipes.ppo import tasks
-from tests.recipes.ppo.algorithms import trained
+from tests.recipes.ppo.algorithms import note_calls, trained
 from tests.recipes.small import train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.frames.normalized import NormalizedFrames
@@ -68,23 +69,28 @@ def test_learning_rate_follows_the_divergence():
 
 def test_rewards_are_divided_by_the_deviation_of_returns(tmp_path, monkeypatch):
     """With gamma 0 the value's target is the reward, and CartPole's are all 1."""
-    batches = []
-    original = PPOAlgorithm.collected
-
-    def recording(algorithm, batch):
-        batch = original(algorithm, batch)
-        batches.append(batch["next", "reward"].clone())
-        return batch
-
-    monkeypatch.setattr(PPOAlgorithm, "collected", recording)
+    rewards = []
+    note_calls(monkeypatch, "collected", lambda batch, *_: rewards.append(batch["next", "reward"]))
     recipe = replace(RECIPE, normalize_rewards=True, reward_scale=100.0)
     run = train(recipe, tmp_path / "run")
     _, state = load_checkpoint(run.checkpoints)
     count, _, squares = state["return_scale"]["statistics"]
     assert count == 256
     deviation = (squares / count).sqrt().item()
-    assert batches[-1].unique().item() == pytest.approx(100 / (deviation + 1e-4), rel=1e-5)
+    assert rewards[-1].unique().item() == pytest.approx(100 / (deviation + 1e-4), rel=1e-5)
     assert read_metrics(run.folder / "metrics.csv")[-1]["return_mean"] > 5  # not scaled
+
+
+@pytest.mark.parametrize("clip", [True, False])
+def test_training_sees_the_signs_of_rewards_and_returns_are_raw(clip, tmp_path, monkeypatch):
+    """Of Pendulum, whose rewards are between -16 and 0."""
+    rewards = []
+    note_calls(monkeypatch, "collected", lambda batch, *_: rewards.append(batch["next", "reward"]))
+    recipe = replace(RECIPE, env="Pendulum-v1", steps_per_batch=400, total_steps=400, epochs=1)
+    run = train(replace(recipe, clip_rewards=clip), tmp_path / "run")
+    assert set(rewards[0].unique().tolist()) <= {-1.0, 0.0} if clip else rewards[0].min() < -2
+    assert read_metrics(run.folder / "metrics.csv")[0]["return_mean"] < -200
+    assert max(evaluate(run)["returns"]) < -200
 
 
 def test_a_resumed_run_begins_with_returns_of_zero():
@@ -107,15 +113,11 @@ def test_advantages_are_divided_by_a_share_of_their_running_deviation(tmp_path, 
         seen.append((advantage, floor, normalize_advantages(advantage, floor)))
         return seen[-1][-1]
 
-    advantages = PPOAlgorithm.advantages
     sizes = iter([1.0, 1e-3, 1.0])
-
-    def shrinking(algorithm, batch, rollout):
-        advantages(algorithm, batch, rollout)
-        batch["advantage"] *= next(sizes)
-
     monkeypatch.setattr(ppo, "normalize_advantages", recording)
-    monkeypatch.setattr(PPOAlgorithm, "advantages", shrinking)
+    note_calls(
+        monkeypatch, "advantages", lambda _, __, batch, ___: batch["advantage"].mul_(next(sizes))
+    )
     recipe = replace(RECIPE, running_advantage_floor=0.5, total_steps=192)
     run = train(recipe, tmp_path / "run")
     batches = [seen[start : start + 4] for start in (0, 4, 8)]  # 2 minibatches, 2 epochs
@@ -208,17 +210,16 @@ def test_acting_and_updating_read_the_same_statistics(backbone, tmp_path, monkey
 
 def test_the_divergence_is_never_negative(tmp_path, monkeypatch):
     """It is Schulman's estimate, as in Stable-Baselines3, of the whole minibatch."""
-    found, original = [], PPOAlgorithm.loss
+    found = []
 
-    def recording(algorithm, minibatch):
-        terms, steps = original(algorithm, minibatch), minibatch.steps
+    def note(terms, algorithm, minibatch):
+        steps = minibatch.steps
         with torch.no_grad():
             log_prob = algorithm.model.actor.get_dist(steps).log_prob(steps["action"])
         log_ratio = (log_prob - steps["action_log_prob"]).double()
         found.append((terms["kl_approx"].item(), (log_ratio.expm1() - log_ratio).mean().item()))
-        return terms
 
-    monkeypatch.setattr(PPOAlgorithm, "loss", recording)
+    note_calls(monkeypatch, "loss", note)
     trained(replace(RECIPE, learning_rate=0.01, epochs=8), tmp_path, batches=2)
     assert min(expected for _, expected in found[2:16]) > 1e-5
     for mine, expected in found:
@@ -228,14 +229,8 @@ def test_the_divergence_is_never_negative(tmp_path, monkeypatch):
 @pytest.fixture
 def divergences(monkeypatch):
     """The mean divergence of each epoch of an update, which has two minibatches an epoch."""
-    found, original = [], PPOAlgorithm.loss
-
-    def recording(algorithm, minibatch):
-        terms = original(algorithm, minibatch)
-        found.append(terms["kl_approx"].item())
-        return terms
-
-    monkeypatch.setattr(PPOAlgorithm, "loss", recording)
+    found = []
+    note_calls(monkeypatch, "loss", lambda terms, *_: found.append(terms["kl_approx"].item()))
     return lambda: [(one + two) / 2 for one, two in zip(found[::2], found[1::2], strict=True)]
 
 

@@ -1,7 +1,8 @@
-"""Whole updates of PPO, repeated by hand; warm-up, and CoBERL's contrastive loss."""
+"""Whole updates of PPO, repeated by hand; warm-up, CoBERL's loss, and parameters in one tensor."""
 
 from __future__ import annotations
 
+import copy
 import math
 from copy import deepcopy
 from dataclasses import replace
@@ -10,19 +11,18 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import nn
 
+from recipes.core.flat_parameters import FlatParameters
 from recipes.core.metrics import read_metrics
 from recipes.ppo import PPO, Minibatch, PPOAlgorithm
+from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import named, prepared
-from tests.recipes.small import train
+from tests.recipes.small import Batches, train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.networks import masked_predictions
 from torchrl_tit.objectives import contrastive_prediction_loss
-from torchrl_tit.settings.networks import (
-    coberl,
-    enhanced_tit,
-    mlp,
-)
+from torchrl_tit.settings.networks import coberl, enhanced_tit, mlp
 from torchrl_tit.windows import Windows
 
 RECIPE = PPO(
@@ -142,18 +142,10 @@ def test_two_updates_equal_those_by_hand(env, batches, tmp_path):
     assert moved > 1e-2  # a tolerance of 5e-5 is a small part of it
 
 
-def test_metrics_tell_how_far_features_are_spread(tmp_path, monkeypatch):
-    batches = []
-    original = PPOAlgorithm.advantages
-
-    def recording(algorithm, batch, rollout):
-        original(algorithm, batch, rollout)
-        batches.append(batch.clone())
-
-    monkeypatch.setattr(PPOAlgorithm, "advantages", recording)
-    run = train(RECIPE, tmp_path / "run")
-    rows = read_metrics(run.folder / "metrics.csv")
-    for row, batch in zip(rows, batches, strict=True):
+def test_metrics_tell_how_far_features_are_spread(tmp_path):
+    seen = Batches()
+    run = train(RECIPE, tmp_path / "run", seen)
+    for row, batch in zip(read_metrics(run.folder / "metrics.csv"), seen.batches, strict=True):
         deviations = batch["features"].reshape(-1, 8).std(0)
         assert row["feature_spread"] == pytest.approx(deviations.mean().item(), rel=1e-5)
 
@@ -206,3 +198,34 @@ def test_the_contrastive_loss_is_added_with_its_weight(tmp_path):
     gradient = torch.autograd.grad(total, network.history_encoder.mask_token)
     assert gradient[0].any()
     assert "loss_contrastive" in algorithm.columns
+
+
+@pytest.mark.usefixtures("float64")
+def test_clipping_and_adam_take_the_same_steps():
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(3, 5), nn.LayerNorm(5), nn.Tanh(), nn.Linear(5, 2))
+    alone = copy.deepcopy(network)
+    flat = FlatParameters(list(network.parameters())).flat
+    optimizer = torch.optim.Adam([flat], lr=0.1, fused=True)
+    other = torch.optim.Adam(alone.parameters(), lr=0.1, fused=True)
+    for _ in range(5):
+        x = torch.randn(7, 3)
+        optimizer.zero_grad(set_to_none=False)
+        network(x).square().sum().backward()
+        norm = nn.utils.clip_grad_norm_(flat, 0.5)
+        optimizer.step()
+        other.zero_grad()
+        alone(x).square().sum().backward()
+        assert_near(norm, nn.utils.clip_grad_norm_(alone.parameters(), 0.5))
+        other.step()
+        assert_near(list(network.parameters()), list(alone.parameters()))
+
+
+def test_parameters_stay_views_when_weights_are_loaded():
+    network, saved = nn.Linear(2, 2), nn.Linear(2, 2)
+    flat = FlatParameters(list(network.parameters())).flat
+    network.load_state_dict(saved.state_dict())
+    assert torch.equal(flat, torch.cat([p.flatten() for p in saved.parameters()]))
+    network(torch.ones(1, 2)).sum().backward()
+    assert flat.grad is not None
+    assert torch.equal(flat.grad, torch.ones(6))
