@@ -171,6 +171,18 @@ _REPLAY: dict[str, Any] = {
 _NORMALIZED: dict[str, Any] = {"backbone": tit(3), "normalize_observations": True}
 _CRITIC: dict[str, Any] = {**_NORMALIZED, "critic": "backbone", "total_updates": 9}
 
+TINY = PPO(
+    name="ppo/cartpole/mlp",
+    env="CartPole-v1",
+    backbone=mlp(hidden_dim=8),
+    total_steps=128,
+    steps_per_batch=64,
+    minibatch_size=32,
+    epochs=1,
+    checkpoint_interval=64,
+    evaluation_episodes=2,
+)
+
 RECIPES: dict[str, Callable[[Path], Recipe]] = {
     "ppo": lambda folder: PPO(env="CartPole-v1", **_ROLLOUTS),
     "ppo, continuous": lambda folder: PPO(env="Pendulum-v1", **_ROLLOUTS),

@@ -2,27 +2,21 @@
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
-from tensordict.nn import set_interaction_type
-from tensordict.nn.probabilistic import InteractionType
 
 from recipes.core import runner
 from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
 from tests.agents.runs import packed
 from tests.recipes.small import (
-    BC,
     RECIPES,
     assert_resumes_bit_for_bit,
-    make,
     make_algorithm,
-    tit,
     train,
 )
 from torchrl_tit.agents import load_agent
@@ -142,24 +136,3 @@ def test_its_files_act_as_the_agent(trained, format, step_by_step, tmp_path):
         step_by_step=step_by_step,
     )
     assert facts["difference"] < 1e-5
-
-
-def test_a_cloned_policy_acts_on_raw_histories(tmp_path):
-    """As the same network without statistics does on observations normalised by hand."""
-    recipe = make(BC, tmp_path, backbone=tit(3), normalize_observations=True, total_updates=30)
-    run = train(recipe, tmp_path / "run")
-    policy = load_agent(run.folder).policy
-    trained: Any = runner.load_trained(run)[1]
-    trained.prepare(30, tmp_path)
-    mean, std = trained.load_data().observation_statistics()
-    raw = trained.buffer.sample()
-    by_hand = raw.clone()
-    by_hand["history"] = (raw["history"] - mean) / (std + 1e-3)
-    (frames,) = (m for m in trained.policy.eval().modules() if isinstance(m, NormalizedFrames))
-    frames.set_statistics(torch.zeros(11), torch.full((11,), 1 - 1e-3))
-    errors = []
-    with torch.no_grad(), set_interaction_type(InteractionType.DETERMINISTIC):
-        for acts, batch in ((policy, raw), (trained.policy, by_hand)):
-            errors.append(acts(batch.clone())["action"] - raw["action"])
-    torch.testing.assert_close(*errors, rtol=1e-4, atol=1e-5)
-    assert errors[0].std() > 1e-3

@@ -16,38 +16,21 @@ from recipes.cli import main
 from recipes.core import runner
 from recipes.core.initial_weights import weights_from
 from recipes.core.run import Run
-from recipes.ppo import PPO
+from tests.recipes.small import TINY, train
 from torchrl_tit.checkpoint import CheckpointError, load_checkpoint
-from torchrl_tit.settings.networks import mlp
-
-STEPS = 32
-RECIPE = PPO(
-    name="ppo/cartpole/hostile",
-    env="CartPole-v1",
-    backbone=mlp(hidden_dim=4, num_layers=1),
-    total_steps=STEPS,
-    steps_per_batch=STEPS,
-    minibatch_size=16,
-    epochs=1,
-    num_envs=2,
-    evaluation_episodes=1,
-    compile="off",
-)
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory) -> tuple[Path, dict[str, Any]]:
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    with Run.create(folder, RECIPE) as run:
-        runner.train(RECIPE, run)
-    return folder, load_checkpoint(run.checkpoints)[1]
+    run = train(TINY, tmp_path_factory.mktemp("runs") / "run")
+    return run.folder, load_checkpoint(run.checkpoints)[1]
 
 
 @pytest.fixture
 def run(trained, tmp_path) -> Run:
     """A copy of the run, which is to be trained further."""
     shutil.copytree(trained[0], tmp_path / "run")
-    return Run(tmp_path / "run", replace(RECIPE, total_steps=2 * STEPS))
+    return Run(tmp_path / "run", replace(TINY, total_steps=192))
 
 
 def change_weight(change: Callable[[torch.Tensor], Any]) -> Callable[[dict[str, Any]], None]:
@@ -65,6 +48,7 @@ def change_moment(state: dict[str, Any]) -> None:
 
 
 WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+    "no weights": (lambda s: s["networks"].clear(), "does not fit"),
     "generators lost": (lambda s: s.pop("rng"), "rng"),
     "weights of another dtype": (change_weight(lambda w: w.double()), "float64, not torch.float32"),
     "weights that are no numbers": (change_weight(lambda w: w * torch.nan), "not finite"),
@@ -82,25 +66,27 @@ def test_a_run_does_not_go_on_from_it(what, run, trained):
     edit, reason = WRONG[what]
     state = copy.deepcopy(trained[1])
     edit(state)
-    run.save(STEPS, state)
+    run.save(128, state)
     before = (run.folder / "metrics.csv").read_bytes()
-    with run, pytest.raises(ValueError, match=r"checkpoint of step 32 .* does not fit") as error:
+    with run, pytest.raises(ValueError, match=r"checkpoint of step 128 .* does not fit") as error:
         runner.train(run.recipe, run)
     assert reason in str(error.value)
     assert "\n" not in str(error.value)
     assert (run.folder / "metrics.csv").read_bytes() == before
 
 
-def test_text_is_no_state(run):
-    run.save(STEPS, "networks")
-    with run, pytest.raises(CheckpointError, match=r"the checkpoint of step 32 in .* is from"):
-        runner.train(run.recipe, run)
+@pytest.mark.parametrize("state", ["networks", {"agent": {}}])
+def test_what_an_older_version_wrote_is_no_state(state, run):
+    run.save(128, state)
+    for use in (lambda: runner.train(run.recipe, run), lambda: runner.evaluate(run)):
+        with run, pytest.raises(CheckpointError, match=r"step 128 in .* is from an older version"):
+            use()
 
 
 def test_weights_that_are_no_numbers_are_not_evaluated(run, trained, capsys):
     state = copy.deepcopy(trained[1])
     change_weight(lambda w: w * torch.nan)(state)
-    run.save(STEPS, state)
+    run.save(128, state)
     before = sorted(path.name for path in run.folder.iterdir())
     for command in ("evaluate", "play"):
         with pytest.raises(SystemExit) as exit_:
@@ -111,4 +97,4 @@ def test_weights_that_are_no_numbers_are_not_evaluated(run, trained, capsys):
         assert not printed.out
     assert sorted(path.name for path in run.folder.iterdir()) == before
     with pytest.raises(ValueError, match=r"of .*run .* has entries that are not finite"):
-        weights_from(run.folder, runner.make_algorithm(RECIPE))
+        weights_from(run.folder, runner.make_algorithm(TINY))

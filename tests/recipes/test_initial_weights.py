@@ -15,7 +15,7 @@ from recipes.core.initial_weights import weights_from
 from recipes.core.run import Run
 from recipes.sac import SAC
 from tests.recipes.commands import fails
-from tests.recipes.sweeps.sweep_runs import TINY
+from tests.recipes.small import TINY
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import mlp

@@ -23,13 +23,13 @@ from recipes.core.metrics import read_metrics
 from recipes.core.recipe import Recipe
 from recipes.core.recipe_json import recipe_to_json
 from recipes.core.run import Run
-from recipes.core.runner import evaluate, train
+from recipes.core.runner import evaluate
 from recipes.core.task import make_task, seed_copies
 from recipes.dqn import DQN
 from recipes.ppo import PPO
 from recipes.sac import SAC
 from tests.envs import tasks
-from tests.recipes.small import Batches
+from tests.recipes.small import Batches, train
 from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.envs import AtariGames
@@ -104,10 +104,7 @@ def recipe_of(kind: str) -> Recipe:
 
 def train_in(folder: Path, recipe: Recipe, *callbacks: Callback) -> dict[str, Any]:
     """Trains in a run folder, new or not, and returns the newest checkpoint."""
-    run = Run(folder, recipe) if folder.exists() else Run.create(folder, recipe)
-    with run:
-        train(recipe, run, callbacks)
-    return load_checkpoint(run.checkpoints)[1]
+    return load_checkpoint(train(recipe, folder, *callbacks).checkpoints)[1]
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

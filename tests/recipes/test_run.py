@@ -14,38 +14,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from recipes.cli import main
 from recipes.core import run as run_module
 from recipes.core import runner
 from recipes.core.algorithm import make_algorithm
-from recipes.core.dataset_recipe import DatasetRecipe
 from recipes.core.metrics import read_metrics
 from recipes.core.recipe_json import recipe_to_json, settings_to_dict
-from recipes.core.registry import RECIPES
 from recipes.core.run import Run
-from recipes.ppo import PPO
 from recipes.tools.results.plot import plot_run
 from tests.recipes.commands import Command, fails
-from tests.recipes.small import assert_same_run
+from tests.recipes.small import TINY, assert_same_run, train
 from tests.recipes.states import unchecked
 from tests.recipes.untrained import untrained
 from torchrl_tit.checkpoint import latest_step
 from torchrl_tit.settings.networks import enhanced_tit
 
 ROOT = Path(__file__).parents[2]
-SMALL = PPO(
+SMALL = replace(
+    TINY,
     name="ppo/cartpole/small",
-    env="CartPole-v1",
     backbone=enhanced_tit(embed_dim=8, features_dim=8),
-    total_steps=128,
-    steps_per_batch=64,
     num_envs=2,
-    minibatch_size=32,
-    epochs=1,
-    checkpoint_interval=64,
-    evaluation_episodes=2,
 )
 LONG = replace(SMALL, total_steps=64 * 400)
 BACKBONE = settings_to_dict(SMALL.backbone)
@@ -56,15 +46,9 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def trained(folder: Path, recipe: PPO = SMALL) -> Run:
-    with Run.create(folder, recipe) as run:
-        runner.train(recipe, run)
-    return run
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(tmp_path_factory.mktemp("runs") / "run").folder
+    return train(SMALL, tmp_path_factory.mktemp("runs") / "run").folder
 
 
 @pytest.fixture
@@ -131,11 +115,7 @@ def test_a_run_is_complete_when_trained_evaluated_and_drawn(run):
     versions = json.loads((run.folder / "versions.json").read_text())
     assert versions["torch"] == version("torch")
     evaluation = runner.evaluate(run)
-    assert (evaluation["env"], evaluation["steps"], evaluation["episodes"]) == (
-        "CartPole-v1",
-        128,
-        2,
-    )
+    assert [evaluation[x] for x in ("env", "steps", "episodes")] == ["CartPole-v1", 128, 2]
     assert evaluation["mean"] == pytest.approx(sum(evaluation["returns"]) / 2)
     assert not run.is_complete()
     run.save_evaluation(evaluation)
@@ -232,7 +212,7 @@ def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(run):
 
 
 def test_no_episode_ends_at_all(tmp_path):
-    run = trained(tmp_path / "run", replace(SMALL, env="Pendulum-v1"))
+    run = train(replace(SMALL, env="Pendulum-v1"), tmp_path / "run")
     rows = read_metrics(run.folder / "metrics.csv")
     assert [row["episodes"] for row in rows] == [0, 0]
     assert np.isnan([row["return_mean"] for row in rows]).all()
@@ -241,7 +221,8 @@ def test_no_episode_ends_at_all(tmp_path):
 
 
 def test_fewer_steps_than_a_batch_are_one_batch(tmp_path):
-    assert latest_step(trained(tmp_path / "run", replace(SMALL, total_steps=1)).checkpoints) == 64
+    run = train(replace(SMALL, total_steps=1), tmp_path / "run")
+    assert latest_step(run.checkpoints) == 64
 
 
 @pytest.mark.parametrize(
@@ -254,7 +235,7 @@ def test_fewer_steps_than_a_batch_are_one_batch(tmp_path):
 )
 def test_what_explodes_is_never_saved(poison, message, tmp_path):
     recipe = replace(SMALL, total_steps=192)
-    run = trained(tmp_path / "run", replace(recipe, total_steps=64))
+    run = train(replace(recipe, total_steps=64), tmp_path / "run")
     where = " in the update at step 128; the checkpoint of step 64 is good"
     with run, pytest.raises(FloatingPointError, match=message + where):
         runner.train(unchecked(recipe, **poison), run)
@@ -367,22 +348,3 @@ def test_a_run_of_any_algorithm_is_opened_by_a_script_of_its_own():
         [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.stdout == "CartPole-v1\n", done.stderr
-
-
-@pytest.mark.slow
-def test_every_named_recipe_builds_its_agent():
-    built = set()
-    for name, recipe in RECIPES.items():
-        # Recipes of Atari games differ in the game alone (tests/recipes/test_named_recipes.py).
-        if recipe.env.startswith("ALE/") and "pong" not in name and "nature-cnn" not in name:
-            continue
-        if isinstance(recipe, DatasetRecipe) and recipe.dataset in D4RL_DATASETS:  # not read here
-            alike = replace(recipe, name="", dataset="hopper-medium-v2")
-            if alike in built:
-                continue
-            built.add(alike)
-        if name.startswith("discrete-cql/"):  # on data that its user collects
-            with pytest.raises(FileNotFoundError, match=r"no data file data/.*create it first"):
-                make_algorithm(recipe).check()
-        else:
-            make_algorithm(recipe).check()

@@ -25,10 +25,10 @@ from recipes.core.evaluation import Outcome
 from recipes.core.metrics import Metrics, read_metrics
 from recipes.core.recipe import Recipe
 from recipes.core.run import Run
-from recipes.core.runner import evaluate, load_trained, train
-from tests.recipes.small import assert_same_run
+from recipes.core.runner import evaluate, load_trained
+from tests.recipes.small import assert_same_run, train
 from tests.recipes.states import assert_same
-from torchrl_tit.checkpoint import CheckpointError, checkpoint_steps, load_checkpoint
+from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import mlp
 
 
@@ -130,13 +130,6 @@ def log():
 HOOKS = ("collected", "updated", "evaluated", "logged", "saving", "saved")
 
 
-def start(recipe: Toy, folder: Path, *callbacks: Callback) -> Run:
-    run = Run(folder, recipe) if folder.exists() else Run.create(folder, recipe)
-    with run:
-        train(recipe, run, callbacks)
-    return run
-
-
 def steps_of(run: Run) -> list[int]:
     return [int(row["step"]) for row in read_metrics(run.folder / "metrics.csv")]
 
@@ -185,7 +178,7 @@ def interrupt(times: int = 1, error: Exception | None = None) -> None:
 )
 def test_rows_evaluations_and_checkpoints_come_at_their_steps(tmp_path, batch, rows, saved, log):
     hooks = Hooks()
-    run = start(replace(SMALL, batch=batch), tmp_path / "run", hooks)
+    run = train(replace(SMALL, batch=batch), tmp_path / "run", hooks)
     assert steps_of(run) == rows
     of = {name: [call[2] for call in hooks.calls if call[1] == name] for name in HOOKS}
     ends = list(range(batch, 25, batch))
@@ -200,7 +193,7 @@ def test_rows_evaluations_and_checkpoints_come_at_their_steps(tmp_path, batch, r
 
 
 def test_rows_hold_means_and_episodes_since_the_last(tmp_path, log):
-    rows = read_metrics(start(SMALL, tmp_path / "run").folder / "metrics.csv")
+    rows = read_metrics(train(SMALL, tmp_path / "run").folder / "metrics.csv")
     first = ["step", "time", "steps_per_second", "return_mean", "episodes"]
     assert list(rows[0]) == [*first, *ToyAlgorithm.columns]
     # Batches 0 to 4 end with 0, 1, 2, 0, 1 episodes, which return 0; 0, 1; 0.
@@ -213,14 +206,10 @@ def test_rows_hold_means_and_episodes_since_the_last(tmp_path, log):
 
 @pytest.mark.parametrize("stop", [3, 7, 10, 20])
 def test_a_run_that_was_interrupted_resumes_bit_for_bit(tmp_path, stop):
-    whole = start(SMALL, tmp_path / "whole")
+    whole = train(SMALL, tmp_path / "whole")
     handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
-        start(
-            SMALL,
-            tmp_path / "run",
-            Hooks(stop, interrupt),
-        )
+        train(SMALL, tmp_path / "run", Hooks(stop, interrupt))
     assert signal.getsignal(signal.SIGINT) is handler
     assert ToyAlgorithm.log[-1] == ("close",)
     assert checkpoint_steps(tmp_path / "run" / "checkpoints")[-1] == stop
@@ -228,7 +217,7 @@ def test_a_run_that_was_interrupted_resumes_bit_for_bit(tmp_path, stop):
     random.seed(123)
     np.random.seed(123)
     ToyAlgorithm.log.clear()
-    resumed = start(SMALL, tmp_path / "run")
+    resumed = train(SMALL, tmp_path / "run")
     assert ToyAlgorithm.log[:2] == [("prepare", stop, tmp_path / "run"), ("update", stop)]
     state, expected = (load_checkpoint(run.checkpoints)[1] for run in (resumed, whole))
     for name in ("networks", "optimizer", "rng"):
@@ -241,17 +230,17 @@ def test_a_run_that_was_interrupted_resumes_bit_for_bit(tmp_path, stop):
 
 
 def test_a_run_that_is_trained_is_not_trained_further(tmp_path):
-    whole = start(SMALL, tmp_path / "run")
+    whole = train(SMALL, tmp_path / "run")
     ToyAlgorithm.log.clear()
-    again = start(SMALL, tmp_path / "run")
+    again = train(SMALL, tmp_path / "run")
     assert [entry[0] for entry in ToyAlgorithm.log] == ["prepare", "close"]
     assert_same_run(again, whole)
 
 
 def test_a_resumed_optimizer_has_the_recipes_settings_and_its_own_counters(tmp_path):
-    start(SMALL, tmp_path / "run")
+    train(SMALL, tmp_path / "run")
     longer = replace(SMALL, total_steps=25, learning_rate=0.03)
-    state = load_checkpoint(start(longer, tmp_path / "run").checkpoints)[1]["optimizer"]
+    state = load_checkpoint(train(longer, tmp_path / "run").checkpoints)[1]["optimizer"]
     assert state["param_groups"][0]["lr"] == 0.03
     assert state["state"][0]["step"].item() == 25
 
@@ -269,17 +258,17 @@ def test_a_disk_that_is_full_at_any_write_loses_nothing(tmp_path, monkeypatch):
         fsync(descriptor)
 
     monkeypatch.setattr(os, "fsync", until_full)
-    whole = start(recipe, tmp_path / "whole")
+    whole = train(recipe, tmp_path / "whole")
     writes = written
     assert writes > 20
     for number in range(writes):
         folder, written, limit = tmp_path / str(number), 0, number
         with pytest.raises(OSError, match=rf"No space left on device.*{folder}|{folder}.*No space"):
-            start(recipe, folder)
+            train(recipe, folder)
         limit = 10**6
         if not (folder / "recipe.json").exists():
             Run.create(folder, recipe)
-        assert_same_run(start(recipe, folder), whole)
+        assert_same_run(train(recipe, folder), whole)
         assert not [path for path in folder.rglob("*") if ".tmp" in path.name]
         shutil.rmtree(folder)
 
@@ -300,7 +289,7 @@ def test_rows_are_on_the_disk_before_a_checkpoint_and_memory_is_returned_after(
 
     for owner, name in ((Metrics, "sync"), (Run, "save"), (runner, "return_free_memory")):
         noted(owner, name)
-    start(replace(SMALL, total_steps=8), tmp_path / "run")
+    train(replace(SMALL, total_steps=8), tmp_path / "run")
     assert done == ["sync", "save", "return_free_memory"] * 2
 
 
@@ -308,7 +297,7 @@ def test_rows_are_on_the_disk_before_a_checkpoint_and_memory_is_returned_after(
 def test_a_second_ctrl_c_or_an_error_that_it_brings_about_stops_at_once(tmp_path, act):
     """A compiler that the batch runs is stopped by the same Ctrl-C."""
     with pytest.raises(KeyboardInterrupt):
-        start(SMALL, tmp_path / "run", Hooks(6, act))
+        train(SMALL, tmp_path / "run", Hooks(6, act))
     assert checkpoint_steps(tmp_path / "run" / "checkpoints") == [4]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
@@ -316,21 +305,21 @@ def test_a_second_ctrl_c_or_an_error_that_it_brings_about_stops_at_once(tmp_path
 def test_a_callback_ends_the_training_at_a_checkpoint_and_says_so_in_the_bar(tmp_path, capsys):
     callback = Hooks(7, lambda: True)
     callback.last_step = 8
-    run = start(SMALL, tmp_path / "run", callback, Hooks())
+    run = train(SMALL, tmp_path / "run", callback, Hooks())
     assert "/8 " in capsys.readouterr().err
     assert checkpoint_steps(run.checkpoints)[-1] == 7
     assert ToyAlgorithm.log[-1] == ("close",)
 
 
 def test_a_finished_run_is_trained_further_as_if_it_had_been_that_long(tmp_path):
-    long = start(replace(SMALL, total_steps=40), tmp_path / "long")
-    run = start(SMALL, tmp_path / "run")
+    long = train(replace(SMALL, total_steps=40), tmp_path / "long")
+    run = train(SMALL, tmp_path / "run")
     with run, pytest.raises(ValueError, match=r"total_steps 23 ends at .* trained for 24 steps"):
         run.lengthen(23)
     assert run.recipe == SMALL
     with run:
         run.lengthen(40)
-        train(run.recipe, run)
+        runner.train(run.recipe, run)
     assert (run.folder / "recipe.json").read_text() == (long.folder / "recipe.json").read_text()
     assert_same_run(run, long)
 
@@ -344,7 +333,7 @@ def test_what_is_not_finite_is_neither_logged_nor_saved(tmp_path, value, bad_ste
     good = f"the checkpoint of step {saved} is good" if saved else "none was saved"
     message = rf"^weight became {value} in the update at step {at}; {good}$"
     with pytest.raises(NotFiniteError, match=message):
-        start(recipe, tmp_path / "run")
+        train(recipe, tmp_path / "run")
     run = Run(tmp_path / "run", recipe)
     assert ([0, *checkpoint_steps(run.checkpoints)])[-1] == saved
     assert all(step <= bad_step for step in steps_of(run))
@@ -355,12 +344,12 @@ def test_hooks_are_called_in_their_order_and_from_the_checkpoint_on(tmp_path):
     calls: list[Any] = []
     hooks = [Hooks(name=name, calls=calls) for name in "ab"]
     recipe = replace(SMALL, total_steps=3, evaluation_interval=3)
-    start(recipe, tmp_path / "run", *hooks)
+    train(recipe, tmp_path / "run", *hooks)
     steps = [(hook, n) for n in (1, 2, 3) for hook in ("collected", "updated")]
     end = [("evaluated", 3, [3, 4]), ("logged", 3, 3), ("saving", 3), ("saved", 3)]
     assert calls == [(n, *call) for call in [*steps, *end] for n in "ab"]
     calls.clear()
-    run = start(replace(recipe, total_steps=4), tmp_path / "run", *hooks)
+    run = train(replace(recipe, total_steps=4), tmp_path / "run", *hooks)
     evaluate(run, callbacks=hooks[:1])
     four = [(n, *call) for call in [("collected", 4), ("updated", 4)] for n in "ab"]
     saved = [(n, *call) for call in [("saving", 4), ("saved", 4)] for n in "ab"]
@@ -368,7 +357,7 @@ def test_hooks_are_called_in_their_order_and_from_the_checkpoint_on(tmp_path):
 
 
 def test_evaluations_are_played_once(tmp_path):
-    run = start(replace(SMALL, total_steps=20), tmp_path / "run")
+    run = train(replace(SMALL, total_steps=20), tmp_path / "run")
     log = ToyAlgorithm.log
     log.clear()
     result = evaluate(run)
@@ -382,7 +371,7 @@ def test_evaluations_are_played_once(tmp_path):
 
 def test_the_best_weights_play_new_episodes(tmp_path):
     """Their evaluation in training chose them: its episodes and its return do not count."""
-    run = start(replace(SMALL, total_steps=22), tmp_path / "run")
+    run = train(replace(SMALL, total_steps=22), tmp_path / "run")
     ToyAlgorithm.log.clear()
     best = evaluate(run, best=True)
     assert ToyAlgorithm.log == [("play", 20)]
@@ -396,32 +385,8 @@ def test_the_best_weights_play_new_episodes(tmp_path):
 def test_evaluations_choose_the_best_weights_as_soon_as_there_are_any(tmp_path, monkeypatch):
     """Until then, training episodes do, whose returns are not compared with evaluations."""
     monkeypatch.setattr(ToyAlgorithm, "returns", lambda self, batch: torch.full((20,), 1000.0))
-    run = start(SMALL, tmp_path / "run", Hooks(7, lambda: True))
+    run = train(SMALL, tmp_path / "run", Hooks(7, lambda: True))
     assert load_trained(run, best=True)[0] == 6
-    run = start(SMALL, tmp_path / "run")
+    run = train(SMALL, tmp_path / "run")
     best = load_checkpoint(run.checkpoints)[1]["best"]
     assert (best["step"], best["return_mean"]) == (20, 20.5)
-
-
-def test_evaluations_of_other_weights_do_not_count(tmp_path):
-    run = start(SMALL, tmp_path / "run")
-    ToyAlgorithm.log.clear()
-    assert evaluate(run)["returns"] == [24, 25]
-    assert ToyAlgorithm.log == [("play", 24)]
-
-
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda state: {"agent": state["networks"]}, "is from an older version of torchrl-tit"),
-        (lambda state: {**state, "networks": {}}, r"the checkpoint of step 25 in .* does not fit"),
-    ],
-)
-def test_checkpoints_that_do_not_fit(tmp_path, damage, message):
-    run = start(SMALL, tmp_path / "run")
-    step, state = load_checkpoint(run.checkpoints)
-    with run:
-        run.save(step + 1, damage(state))
-    for use in (lambda: start(replace(SMALL, total_steps=30), run.folder), lambda: evaluate(run)):
-        with pytest.raises((ValueError, CheckpointError), match=message):
-            use()

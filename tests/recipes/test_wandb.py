@@ -13,23 +13,11 @@ from recipes.cli import main
 from recipes.core.metrics import read_metrics
 from recipes.core.recipe_json import recipe_to_json
 from recipes.core.run import Run
-from recipes.ppo import PPO
 from recipes.tools.wandb_metrics import WandbMetrics
 from tests.recipes.commands import fails
-from torchrl_tit.settings.networks import mlp
+from tests.recipes.small import TINY
 
-RECIPE = PPO(
-    name="ppo/cartpole/mine",
-    env="CartPole-v1",
-    backbone=mlp(hidden_dim=8),
-    num_envs=2,
-    total_steps=64,
-    steps_per_batch=32,
-    epochs=1,
-    minibatch_size=32,
-    evaluation_episodes=2,
-    checkpoint_interval=64,
-)
+RECIPE = replace(TINY, name="ppo/cartpole/mine")
 _BLOCK = 32768
 
 
@@ -91,17 +79,17 @@ def test_rows_of_a_run_that_is_trained_further(tmp_path):
     (tmp_path / "recipe.json").write_text(recipe_to_json(RECIPE))
     run = tmp_path / "run"
     main(["train", str(tmp_path / "recipe.json"), "--out", str(run), "--wandb", "mine"])
-    main(["train", "--resume", str(run), "--total-steps", "96", "--wandb", "mine"])
+    main(["train", "--resume", str(run), "--total-steps", "192", "--wandb", "mine"])
     rows, summary, names, config = uploads(run)
     expected = read_metrics(run / "metrics.csv")
-    assert [row["step"] for row in rows] == [row["step"] for row in expected] == [32, 64, 96]
+    assert [row["step"] for row in rows] == [row["step"] for row in expected] == [64, 128, 192]
     for row, known in zip(rows, expected, strict=True):
         for name, value in known.items():
             if name != "time":
                 assert row.get(name, math.nan) == pytest.approx(value, rel=1e-6, nan_ok=True), name
     evaluation = json.loads((run / "evaluation.json").read_text())
     assert summary["evaluation"] == evaluation["mean"]
-    assert summary["evaluation_step"] == 96
+    assert summary["evaluation_step"] == 192
     assert names == {("mine", json.loads((run / "wandb.json").read_text())["id"])}
     assert config["env"] == "CartPole-v1"
     assert list((run / "tensorboard").iterdir()), "W&B stands beside TensorBoard"
@@ -128,7 +116,7 @@ def test_what_cannot_be_sent(tmp_path, capsys, monkeypatch):
         assert "pip install 'torchrl-tit[wandb]'" in fails(capsys, *words, "mine")
     assert not (tmp_path / "run").exists(), "nothing was begun"
 
-    run = Run.create(tmp_path / "run", replace(RECIPE, total_steps=32))
+    run = Run.create(tmp_path / "run", RECIPE)
     (run.folder / "wandb.json").write_text('{"project": "other", "id": "abc"}')
     assert "is in the project 'other' already" in fails(
         capsys, "train", "--resume", run.folder, "--wandb", "mine"

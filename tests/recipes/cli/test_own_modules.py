@@ -11,7 +11,7 @@ from recipes.core.run import Run
 from recipes.tools.sweeps import sweep
 from tests.recipes.cli.test_cli import SHORT
 from tests.recipes.commands import fails
-from tests.recipes.sweeps.sweep_runs import TINY
+from tests.recipes.small import TINY
 
 OWN = """
 from dataclasses import dataclass, replace

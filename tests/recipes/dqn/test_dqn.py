@@ -11,10 +11,8 @@ from tensordict import TensorDict, TensorDictBase
 
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
-from recipes.core.run import Run
-from recipes.core.runner import train
 from recipes.dqn import DQN, DQNAlgorithm
-from tests.recipes.small import Batches, tit
+from tests.recipes.small import Batches, tit, train
 from torchrl_tit.settings.networks import mlp
 
 SMALL = DQN(
@@ -125,9 +123,7 @@ def test_slices_have_the_loss_of_their_transitions(tmp_path: Path) -> None:
 def test_exploration(tmp_path: Path) -> None:
     """Random actions first, then less and less, and none in evaluations."""
     recipe = replace(SMALL, exploration_fraction=0.5, final_epsilon=0.1, random_steps=30)
-    with Run.create(tmp_path / "run", recipe) as run:
-        batches = Batches()
-        train(recipe, run, [batches])
+    run = train(recipe, tmp_path / "run", batches := Batches())
     actions = torch.cat([batch["action"].flatten() for batch in batches.batches[:3]])
     assert 0.2 < actions.double().mean() < 0.8
     rows = read_metrics(run.folder / "metrics.csv")
@@ -140,9 +136,7 @@ def test_exploration(tmp_path: Path) -> None:
 
 def test_forbidden_actions_are_neither_taken_nor_valued(tmp_path: Path) -> None:
     recipe = replace(SMALL, env="Taxi-v4", mask_actions=True, num_envs=2, total_steps=40)
-    with Run.create(tmp_path / "run", recipe) as run:
-        batches = Batches()
-        train(recipe, run, [batches])
+    train(recipe, tmp_path / "run", batches := Batches())
     masks, actions = (
         torch.cat([batch[name].flatten(0, 1) for batch in batches.batches])
         for name in ("action_mask", "action")

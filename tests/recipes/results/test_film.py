@@ -24,9 +24,12 @@ def durations(film):
         return [picture.info["duration"] for picture in ImageSequence.Iterator(file)]
 
 
+SHORT = PPO(env="CartPole-v1", env_settings=("max_episode_steps=9",), backbone=mlp())
+
+
 @pytest.fixture(scope="module")
 def cartpole(tmp_path_factory):
-    return untrained(tmp_path_factory.mktemp("run"), PPO(env="CartPole-v1", backbone=mlp()))
+    return untrained(tmp_path_factory.mktemp("run"), SHORT)
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])

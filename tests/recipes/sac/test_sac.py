@@ -11,10 +11,8 @@ from torch import Tensor, nn
 
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
-from recipes.core.run import Run
-from recipes.core.runner import train
 from recipes.sac import SAC, SACAlgorithm
-from tests.recipes.small import Batches
+from tests.recipes.small import Batches, train
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
@@ -42,29 +40,24 @@ def make(recipe: SAC) -> SACAlgorithm:
     return algorithm
 
 
-def trained(folder: Path) -> tuple[int, dict[str, Any]]:
-    return load_checkpoint(folder / "checkpoints")
-
-
 def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
-    with Run.create(tmp_path / "run", SMALL) as run:
-        train(SMALL, run, [Batches(last=30)])
-        algorithm = make(SMALL)
-        algorithm.prepare(0, run.folder)
-        for number in (15, 45):  # of a process that was killed before its checkpoint
-            steps = {"action": torch.zeros(number, 1), **observed(number, torch.nan)}
-            steps["next"] = {**observed(number, torch.nan), **outcome(number)}
-            algorithm.buffer.extend(TensorDict(steps, [number]).unsqueeze(0))
-            algorithm.buffer_state.state_dict()
-        assert checkpoint_steps(run.folder / "replay") == [15, 30, 60]
-        algorithm.close()
-        train(SMALL, run)
-        state = trained(run.folder)[1]["buffer"]
-        assert state["parts"] == [30, 60]
-        algorithm = make(SMALL)
-        algorithm.prepare(60, run.folder)
-        algorithm.buffer_state.load_state_dict(state)
-        algorithm.close()
+    run = train(SMALL, tmp_path / "run", Batches(last=30))
+    algorithm = make(SMALL)
+    algorithm.prepare(0, run.folder)
+    for number in (15, 45):  # of a process that was killed before its checkpoint
+        steps = {"action": torch.zeros(number, 1), **observed(number, torch.nan)}
+        steps["next"] = {**observed(number, torch.nan), **outcome(number)}
+        algorithm.buffer.extend(TensorDict(steps, [number]).unsqueeze(0))
+        algorithm.buffer_state.state_dict()
+    assert checkpoint_steps(run.folder / "replay") == [15, 30, 60]
+    algorithm.close()
+    train(SMALL, run.folder)
+    state = load_checkpoint(run.checkpoints)[1]["buffer"]
+    assert state["parts"] == [30, 60]
+    algorithm = make(SMALL)
+    algorithm.prepare(60, run.folder)
+    algorithm.buffer_state.load_state_dict(state)
+    algorithm.close()
     stored = algorithm.buffer.storage.get(slice(None))[:, 0]
     assert len(stored) == 60
     assert stored["observation"].isfinite().all()
@@ -77,12 +70,10 @@ def test_parts_of_lost_work_are_replaced_or_ignored(tmp_path: Path) -> None:
 
 def test_random_steps_are_uniform_and_learn_nothing(tmp_path: Path) -> None:
     recipe = replace(SMALL, random_steps=200, total_steps=220, steps_per_batch=20)
-    batches = Batches(last=200)
-    with Run.create(tmp_path / "run", recipe) as run:
-        train(recipe, run, [batches])
-        _, before = trained(run.folder)
-        train(recipe, run)
-        _, after = trained(run.folder)
+    run = train(recipe, tmp_path / "run", batches := Batches(last=200))
+    _, before = load_checkpoint(run.checkpoints)
+    train(recipe, run.folder)
+    _, after = load_checkpoint(run.checkpoints)
     actions = torch.cat([batch["action"].flatten() for batch in batches.batches])
     quartiles = actions.quantile(torch.tensor([0.25, 0.5, 0.75]))
     torch.testing.assert_close(quartiles, torch.tensor([-1.0, 0.0, 1.0]), atol=0.35, rtol=0)

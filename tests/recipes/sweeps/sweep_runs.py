@@ -6,22 +6,8 @@ from pathlib import Path
 
 from recipes.core.recipe import Recipe
 from recipes.core.run import Run
-from recipes.ppo import PPO
 from recipes.tools.sweeps.sweep import Job
 from tests.recipes.commands import Command
-from torchrl_tit.settings.networks import mlp
-
-TINY = PPO(
-    name="ppo/cartpole/mlp",
-    env="CartPole-v1",
-    backbone=mlp(hidden_dim=8),
-    total_steps=128,
-    steps_per_batch=64,
-    minibatch_size=32,
-    epochs=1,
-    checkpoint_interval=64,
-    evaluation_episodes=2,
-)
 
 
 def begin(folder: Path, recipe: Recipe) -> Job:

@@ -19,7 +19,8 @@ from recipes.tools.sweeps import sweep_ray
 from recipes.tools.sweeps.sweep import Job, run_jobs
 from recipes.tools.sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
 from tests.recipes.commands import fails
-from tests.recipes.sweeps.sweep_runs import TINY, begin
+from tests.recipes.small import TINY
+from tests.recipes.sweeps.sweep_runs import begin
 from torchrl_tit.checkpoint import checkpoint_steps
 
 ROOT = Path(__file__).parents[3]

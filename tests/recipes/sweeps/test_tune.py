@@ -5,6 +5,7 @@ import json
 import math
 import signal
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,8 @@ from recipes.cli import main
 from recipes.core.recipe_json import recipe_from_json, recipe_to_json
 from recipes.core.registry import get_recipe
 from recipes.core.run import Run
-from recipes.ppo import PPO
 from tests.recipes.commands import Command, fails
+from tests.recipes.small import TINY
 from tests.recipes.sweeps.sweep_runs import fork_worker
 from torchrl_tit.settings.networks import mlp
 
@@ -26,16 +27,7 @@ from recipes.tools.sweeps import tune  # noqa: E402
 from recipes.tools.sweeps.search_space import load_space, with_values  # noqa: E402
 from recipes.tools.sweeps.tune import Search, Settings, importances  # noqa: E402
 
-RECIPE = PPO(
-    name="ppo/cartpole/mine",
-    env="CartPole-v1",
-    backbone=mlp(),
-    total_steps=256,
-    steps_per_batch=64,
-    epochs=1,
-    evaluation_episodes=2,
-    checkpoint_interval=64,
-)
+RECIPE = replace(TINY, name="ppo/cartpole/mine", backbone=mlp(), total_steps=256)
 SPACE: dict[str, Any] = {
     "learning_rate": {"type": "float", "low": 1e-4, "high": 1e-2, "log": True},
     "epochs": {"type": "int", "low": 1, "high": 2},
