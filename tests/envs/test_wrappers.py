@@ -2,7 +2,6 @@
 
 import gymnasium
 import pytest
-import torch
 
 from tests.envs.test_spaces import kinds
 from torchrl_tit.envs import make_env, time_limit
@@ -46,14 +45,6 @@ def test_observations_that_do_not_fit_their_space_are_named():
     ]
     with pytest.raises(ValueError, match=r"shape \(56, 56, 3\), but its space says \(24, 24, 3\)"):
         make_env(MINIGRID, 2, wrappers=names).reset()
-
-
-def test_transforms_before_histories():
-    scaled = "torchrl.envs:ObservationNorm(loc=0.0, scale=2.0, in_keys=['observation'])"
-    env, plain = (
-        make_env("CartPole-v1", 2, seed=0, num_frames=2, wrappers=names) for names in ([scaled], [])
-    )
-    assert torch.equal(env.reset(seed=1)["history"], 2 * plain.reset(seed=1)["history"])
 
 
 def test_names_in_modules():

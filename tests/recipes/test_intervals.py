@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -29,6 +28,7 @@ from recipes.dqn import DQN
 from recipes.ppo import PPO
 from recipes.sac import SAC
 from tests.envs import tasks
+from tests.recipes.ppo import tasks as ppo_tasks
 from tests.recipes.small import Batches, train
 from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import load_checkpoint
@@ -194,26 +194,10 @@ def test_neighbouring_seeds_share_no_game(monkeypatch: pytest.MonkeyPatch) -> No
     assert len(set(seeds)) == len(seeds) == 6
 
 
-class Paying(gymnasium.RewardWrapper):
-    """Pays another reward in an episode's fifth step."""
-
-    def __init__(self, env: gymnasium.Env, reward: str) -> None:
-        super().__init__(env)
-        self.value, self.steps = float(reward), 0
-
-    def reset(self, **kwargs: Any) -> Any:
-        self.steps = 0
-        return self.env.reset(**kwargs)
-
-    def reward(self, reward: Any) -> float:
-        self.steps += 1
-        return self.value if self.steps == 5 else float(reward)
-
-
 @pytest.fixture
 def paying(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recipe]:
-    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", __name__)  # in other processes, too
-    wrapper = f"{__name__}:Paying"
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", ppo_tasks.__name__)  # in other processes, too
+    wrapper = f"{ppo_tasks.__name__}:Paying"
     return lambda recipe, value: replace(recipe, wrappers=(f"{wrapper}(reward={value!r})",))
 
 

@@ -13,10 +13,10 @@ from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
 from tests.recipes.commands import fails
-from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt
+from tests.recipes.small import make_cartpole_dt, make_discrete_cql
 from tests.recipes.untrained import untrained
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, lstm, mlp
+from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
 TIT: dict[str, Any] = {"patch_size": "auto", "embed_dim": 8, "num_blocks": 1, "features_dim": 8}
 PAGE = (432, 768, 3)
@@ -77,17 +77,8 @@ def test_a_whole_episode_and_a_picture_of_a_step_of_it(cartpole, tmp_path, capsy
     explain(cartpole.folder, "--out", tmp_path / "step.png", "--seed", 7, "--step", length - 1)
     assert drawn[1:] == numbers[-1:], "a picture is that of the film"
     capsys.readouterr()
-    line = fails(
-        capsys,
-        "explain",
-        cartpole.folder,
-        "--out",
-        tmp_path / "no.png",
-        "--seed",
-        7,
-        "--step",
-        length,
-    )
+    words = [cartpole.folder, "--out", tmp_path / "no.png", "--seed", 7, "--step", length]
+    line = fails(capsys, "explain", *words)
     assert f"the episode of seed 7 has {length} steps, so there is no step {length}" in line
     assert {path.name for path in tmp_path.iterdir()} == {"film.gif", "step.png"}
 
@@ -124,16 +115,6 @@ def test_several_observations_and_a_recurrent_state(tmp_path):
     assert imageio.imread(tmp_path / "a.mp4").shape == (2, *PAGE)
 
 
-def make_cartpole_dt(folder):
-    return make_dt(
-        folder,
-        env="CartPole-v1",
-        target_returns=(20.0,),
-        backbone=decision_transformer(**SMALL_DT),
-        action_space="discrete",
-    )
-
-
 def make_pendulum(folder):
     return make_ppo("Pendulum-v1", mlp())
 
@@ -149,26 +130,25 @@ def test_other_policies(make, tmp_path):
 
 def test_files_and_steps_that_cannot_be(cartpole, tmp_path, capsys):
     run, png, gif = cartpole.folder, tmp_path / "a.png", tmp_path / "a.gif"
-    assert "a picture of one step (.png), not 'a.avi'" in fails(
-        capsys, "explain", run, "--out", tmp_path / "a.avi"
-    )
-    assert "step 3 is one step" in fails(capsys, "explain", run, "--out", gif, "--step", 3)
-    assert "max_steps 3 is the length of a film" in fails(
-        capsys, "explain", run, "--out", png, "--max-steps", 3
-    )
-    assert "there is no step -1" in fails(capsys, "explain", run, "--out", png, "--step", -1)
-    assert "max_steps must be at least 1" in fails(
-        capsys, "explain", run, "--out", gif, "--max-steps", 0
-    )
-    assert "is neither an agent nor a run" in fails(capsys, "explain", tmp_path, "--out", png)
-    assert "--seed must be from 0" in fails(capsys, "explain", run, "--out", png, "--seed", -1)
-    assert "there is no folder" in fails(capsys, "explain", run, "--out", tmp_path / "no" / "a.png")
+    empty = Run.create(tmp_path / "run", cartpole.recipe).folder
     png.write_bytes(b"mine")
-    assert "exists already" in fails(capsys, "explain", run, "--out", png)
+    step = tmp_path / "b.png"
+    for words, message in (
+        ([run, tmp_path / "a.avi"], "a picture of one step (.png), not 'a.avi'"),
+        ([run, gif, "--step", 3], "step 3 is one step"),
+        ([run, step, "--max-steps", 3], "max_steps 3 is the length of a film"),
+        ([run, step, "--step", -1], "there is no step -1"),
+        ([run, gif, "--max-steps", 0], "max_steps must be at least 1"),
+        ([tmp_path, step], "is neither an agent nor a run"),
+        ([run, step, "--seed", -1], "--seed must be from 0"),
+        ([run, tmp_path / "no" / "a.png"], "there is no folder"),
+        ([run, png], "exists already"),
+        ([empty, gif], "holds no checkpoint"),
+    ):
+        source, out, *others = words
+        assert message in fails(capsys, "explain", source, "--out", out, *others)
     assert png.read_bytes() == b"mine"
-    empty = Run.create(tmp_path / "run", cartpole.recipe)
-    assert "holds no checkpoint" in fails(capsys, "explain", empty.folder, "--out", gif)
-    assert not gif.exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "run"]
 
 
 def test_maps_that_a_network_does_not_have(cartpole, tmp_path, capsys, monkeypatch):

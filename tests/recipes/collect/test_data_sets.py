@@ -32,6 +32,7 @@ from tests.recipes.collect.collected import (
     check_episodes,
     read,
 )
+from tests.recipes.ppo.tasks import Paying
 from tests.recipes.small import Batches
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buffer
@@ -265,23 +266,11 @@ def test_rewards_are_the_tasks_own(tmp_path: Path) -> None:
     assert np.abs(data["actions"]).max() == 2  # a Gaussian's, clipped as the task does
 
 
-class Paying(CartPoleEnv):
-    """CartPole that pays infinity in every fifth step."""
-
-    paid = 0
-
-    def step(self, action: Any) -> Any:
-        self.paid += 1
-        observation, reward, *others = super().step(action)
-        return observation, np.inf if self.paid % 5 == 0 else reward, *others
-
-
 def test_rewards_that_are_not_finite_are_named_before_they_are_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(
-        gymnasium.registry, "Paying-v0", EnvSpec("Paying-v0", lambda **settings: Paying(**settings))
-    )
+    task = EnvSpec("Paying-v0", lambda **_: Paying(CartPoleEnv(), "inf"))
+    monkeypatch.setitem(gymnasium.registry, "Paying-v0", task)
     settings = Collection(env="Paying-v0", sets=("random",), num_envs=2, transitions=40)
     with pytest.raises(NotFiniteError, match=r"^the reward of copy \d is inf in Paying-v0$"):
         collect(settings, tmp_path / "data")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -16,6 +15,7 @@ from recipes.core import runner
 from recipes.core.metrics import read_metrics
 from recipes.online_decision_transformer import OnlineData, make_lamb
 from tests.datasets.rollouts import roll
+from tests.recipes.ppo import tasks
 from tests.recipes.small import (
     SMALL_DT,
     make_algorithm,
@@ -136,22 +136,10 @@ def test_episodes_side_by_side_are_whole_and_differ(tmp_path):
     assert (starts[:, 0] > 1.2).all()  # each upright, as an episode begins
 
 
-class Paying(gymnasium.Wrapper):
-    """Pays NaN in its third step."""
-
-    def __init__(self, env):
-        super().__init__(env)
-        self.steps = 0
-
-    def step(self, action):
-        self.steps += 1
-        observation, reward, *others = super().step(action)
-        return observation, math.nan if self.steps == 3 else reward, *others
-
-
 def test_a_reward_that_is_not_finite_is_named(tmp_path, monkeypatch):
-    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", __name__)
-    algorithm = make_algorithm(make_odt(tmp_path, wrappers=(f"{__name__}:Paying",)))
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", tasks.__name__)
+    wrappers = (f"{tasks.__name__}:Paying(reward='nan')",)
+    algorithm = make_algorithm(make_odt(tmp_path, wrappers=wrappers))
     with pytest.raises(FloatingPointError, match=r"^the reward of copy 0 is nan$"):
         algorithm.explore(0)
 

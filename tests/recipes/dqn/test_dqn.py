@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
 from recipes.dqn import DQN, DQNAlgorithm
-from tests.recipes.small import Batches, tit, train
+from tests.recipes.small import Batches, train
 from torchrl_tit.settings.networks import mlp
 
 SMALL = DQN(
@@ -95,29 +95,6 @@ def test_target_updates_and_learning(tmp_path: Path) -> None:
     algorithm.learn(batch, 29)
     state = algorithm.model.state_dict()
     assert all(torch.equal(state[n], state[n.removeprefix("target_")]) for n in targets)
-
-
-def test_slices_have_the_loss_of_their_transitions(tmp_path: Path) -> None:
-    network = tit(3, attention_dropout_outer=0.0, ffn_dropout_inner=0.0)
-    losses = []
-    for length in (1, 4):
-        recipe = replace(SMALL, backbone=network, num_envs=2, slice_length=length)
-        algorithm, _ = double(recipe, tmp_path)
-        generator = torch.Generator().manual_seed(2)
-        seen = torch.randn(2, 21, 4, generator=generator)
-        done = (torch.arange(20) % 7 == 5).expand(2, 20).unsqueeze(-1)
-        after = {"observation": seen[:, 1:], "reward": torch.ones(2, 20, 1), "terminated": done}
-        action = torch.randint(2, (2, 20), generator=generator)
-        steps = {"observation": seen[:, :-1], "action": action, "next": {**after, "done": done}}
-        algorithm.buffer.extend(TensorDict(steps, [2, 20]))
-        time = torch.tensor([[3], [10]]) + torch.arange(4)
-        env = torch.tensor([[0], [1]]).expand(2, 4)
-        index = (time, env) if length > 1 else (time.flatten(), env.flatten())
-        batch = algorithm.buffer.storage.get(index)
-        assert length == 1 or batch["is_init"][:, 1:].any()
-        batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
-        losses.append(algorithm.learn(batch, 0)["loss"])
-    torch.testing.assert_close(losses[1], losses[0], rtol=1e-9, atol=1e-9)
 
 
 def test_exploration(tmp_path: Path) -> None:

@@ -12,7 +12,8 @@ from torch.nn import functional as F
 from torchrl.modules import MLP
 from torchrl.objectives import BCLoss
 
-from recipes.cql import CQL
+from recipes.cql import CQL, DiscreteCQL
+from recipes.dqn import DQN
 from recipes.sac import SAC
 from tests.datasets.rollouts import roll, write
 from tests.recipes.small import (
@@ -23,8 +24,12 @@ from tests.recipes.small import (
     double,
     make,
     make_algorithm,
+    make_cartpole_data,
+    make_data,
     tit,
 )
+from torchrl_tit.datasets import HistoryStorage, load_episodes
+from torchrl_tit.settings.networks import lstm
 
 
 def value(loss, network, td, params=None):
@@ -286,19 +291,39 @@ def test_an_entry_that_is_constant_in_the_data_may_change_a_little(tmp_path):
     torch.testing.assert_close(normal[:, 0], torch.full((len(seen),), 500.0))
 
 
-@pytest.mark.parametrize("kind", [BC, IQL, TD3BC])
-def test_slices_have_the_loss_of_their_transitions(tmp_path, kind):
-    settings = {} if kind is BC else {"critic": "backbone"}
+@pytest.mark.parametrize(
+    ("kind", "settings"),
+    [
+        (BC, {}),
+        *((kind, {"critic": "backbone"}) for kind in (IQL, TD3BC, CQL)),
+        (CQL, {"critic": "backbone", "backbone": lstm(3, embed_dim=8, hidden_dim=8)}),
+        (DiscreteCQL, {"padding": "constant"}),
+        (SAC, {"env": "Hopper-v5", "critic": "backbone"}),
+        (SAC, {"env": "Hopper-v5", "critic": "mlp", "padding": "constant"}),
+        (DQN, {"env": "CartPole-v1"}),
+    ],
+)
+def test_slices_have_the_loss_and_gradient_of_their_transitions(tmp_path, kind, settings):
+    """TorchRL's losses call critics under vmap, so sequences are read there, too."""
     network = tit(3, attention_dropout_outer=0.0, ffn_dropout_inner=0.0)
-    terms = []
+    discrete = kind in (DiscreteCQL, DQN)
+    episodes = load_episodes((make_cartpole_data if discrete else make_data)(tmp_path))
+    results = []
     for length in (1, 4):
-        recipe = make(kind, tmp_path, backbone=network, slice_length=length, **settings)
-        algorithm, _ = double(recipe, tmp_path)
-        index = torch.tensor([[3], [20]]) + torch.arange(4)  # with an end of an episode
-        batch = algorithm.buffer.storage[index if length > 1 else index.flatten()]
+        fields = {"backbone": network, "batch_size": 8, "slice_length": length, **settings}
+        recipe = kind(**fields) if kind in (SAC, DQN) else make(kind, tmp_path, **fields)
+        torch.manual_seed(0)
+        algorithm = make_algorithm(recipe)
+        algorithm.prepare(0, tmp_path)
+        algorithm.close()
+        algorithm.model.double()
+        storage = HistoryStorage(episodes, 3, padding=recipe.padding, is_init=length > 1)
+        index = torch.stack([torch.arange(4), episodes.lengths[0] - 2 + torch.arange(4)])
+        batch = storage[index if length > 1 else index.flatten()]
+        assert length == 1 or batch["is_init"][:, 1:].any()  # an end of an episode
         batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
-        noise = torch.linspace(-0.1, 0.1, 24, dtype=torch.float64)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(torch, "randn_like", lambda x: noise.view(x.shape))  # noqa: B023
-            terms.append(algorithm.update(batch, 0))
-    torch.testing.assert_close(terms[1], terms[0], rtol=1e-9, atol=1e-9)
+        torch.manual_seed(1)
+        terms = (algorithm.learn if kind in (SAC, DQN) else algorithm.update)(batch, 0)
+        gradients = [w.grad for w in algorithm.model.parameters() if w.grad is not None]
+        results.append([*(x for x in terms.values() if isinstance(x, torch.Tensor)), *gradients])
+    torch.testing.assert_close(results[1], results[0], rtol=1e-9, atol=1e-9)

@@ -30,6 +30,22 @@ class Double(DTypeCastTransform):
         super().__init__(torch.float32, torch.float64, in_keys=["observation"])
 
 
+class Paying(gymnasium.RewardWrapper):
+    """Pays another reward in an episode's fifth step."""
+
+    def __init__(self, env: gymnasium.Env, reward: str) -> None:
+        super().__init__(env)
+        self.value, self.steps = float(reward), 0
+
+    def reset(self, **kwargs):
+        self.steps = 0
+        return self.env.reset(**kwargs)
+
+    def reward(self, reward):
+        self.steps += 1
+        return self.value if self.steps == 5 else float(reward)
+
+
 class Mixed(gymnasium.Env):
     """Random observations of several kinds, any actions, random masks, episodes of 5 to 9 steps."""
 

@@ -55,18 +55,3 @@ def test_recipes_with_frames_have_a_hash_and_json():
     assert named == same
     assert len({recipe: 1, named: 2, same: 3}) == 2
     assert recipe_from_json(recipe_to_json(named), "it") == named
-
-
-@pytest.mark.parametrize(
-    ("frames", "message"),
-    [
-        ('{"image": {"encoder": "innr"}}', "'backbone.frames.image.encoder': unknown frame encod"),
-        ('{"image": {"encoder": "inner", "patch_size": 2.5}}', "backbone.frames.image.patch_size"),
-        ('{"image": "inner"}', "field 'backbone.frames.image': expected an object, not 'inner'"),
-        ('["inner"]', r"field 'backbone.frames': expected an object, not \['inner'\]"),
-    ],
-)
-def test_json_of_frames_that_cannot_be(frames, message):
-    text = recipe_to_json(get_recipe("ppo/mlp")).replace('"frames": {}', f'"frames": {frames}')
-    with pytest.raises(ValueError, match=message):
-        recipe_from_json(text, "it")

@@ -6,15 +6,15 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from tensordict import TensorDict
+from torch import nn
 
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
 from recipes.sac import SAC, SACAlgorithm
 from tests.recipes.small import Batches, train
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
-from torchrl_tit.settings.networks import enhanced_tit, mlp
+from torchrl_tit.settings.networks import mlp
 
 SMALL = SAC(
     name="sac/pendulum/small",
@@ -30,8 +30,6 @@ SMALL = SAC(
     checkpoint_interval=30,
     evaluation_episodes=1,
 )
-
-NO_DROPOUT = enhanced_tit(num_frames=4, embed_dim=8, num_blocks=2, features_dim=8)
 
 
 def make(recipe: SAC) -> SACAlgorithm:
@@ -110,50 +108,6 @@ def double(recipe: SAC, folder: Path) -> tuple[SACAlgorithm, TensorDict]:
     actions = torch.rand(size, 1, dtype=torch.float64)
     batch = {**here, "action": actions, "next": {**there, **outcome(size)}}
     return algorithm, TensorDict(batch, [size])
-
-
-def step_of(algorithm: SACAlgorithm, batch: TensorDictBase) -> list[Tensor]:
-    """The terms and the gradients of a gradient step."""
-    torch.manual_seed(1)
-    terms = algorithm.learn(batch.copy(), 0)
-    losses = [terms[name].detach() for name in algorithm.columns]
-    return [*losses, *(w.grad for w in algorithm.model.parameters() if w.grad is not None)]
-
-
-@pytest.mark.parametrize("critic", ["mlp", "backbone"])
-@pytest.mark.parametrize("num_envs", [1, 2])
-def test_slices_have_the_gradient_of_their_transitions(
-    critic: Any, num_envs: int, tmp_path: Path
-) -> None:
-    results = []
-    for length in (1, 4):
-        recipe = replace(
-            SMALL,
-            backbone=NO_DROPOUT,
-            critic=critic,
-            num_envs=num_envs,
-            slice_length=length,
-            total_steps=80,
-        )
-        algorithm, _ = double(recipe, tmp_path)
-        generator = torch.Generator().manual_seed(2)
-        seen = torch.randn(41 * num_envs, 3, generator=generator)
-        done = torch.arange(40 * num_envs).unsqueeze(1) // num_envs % 7 == 5
-        action = torch.rand(40 * num_envs, 1, generator=generator)
-        after = {"observation": seen[num_envs:], **outcome(40 * num_envs), "done": done}
-        after["reward"] = torch.randn(40 * num_envs, 1, generator=generator)
-        steps = {"observation": seen[:-num_envs], "action": action, "next": after}
-        steps = TensorDict(steps, [40 * num_envs]).unflatten(0, (40, num_envs))
-        algorithm.buffer.extend(steps.transpose(0, 1))
-        first = torch.tensor([[2], [9], [17], [20]])
-        index = first + torch.arange(4) * num_envs
-        index = index if length > 1 else index.flatten()
-        batch = algorithm.buffer.storage.get((index // num_envs, index % num_envs))
-        assert length == 1 or batch["is_init"][:, 1:].any()
-        batch = batch.apply(lambda x: x.double() if x.is_floating_point() else x)
-        results.append(step_of(algorithm, batch))
-        algorithm.close()
-    torch.testing.assert_close(results[1], results[0], rtol=1e-9, atol=1e-9)
 
 
 def test_the_loss_of_terminal_transitions(tmp_path: Path) -> None:
