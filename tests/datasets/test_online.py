@@ -178,7 +178,7 @@ def test_on_a_gpu() -> None:
             buffer.extend(batch)
     buffers[1].load_state_dict(buffers[0].state_dict())
     for buffer in buffers:
-        assert buffer.sample()["history", "pixels"].device.type == buffer.storage.device.type
+        assert buffer.sample()["history", "camera"].device.type == buffer.storage.device.type
         assert_items(buffer.storage.get(slice(None)).cpu(), newest(steps, STEPS, 60))
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import sys
+import warnings
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call, stack_module_state
 
 from tests.networks.reference import randomize
 from tests.numerics import assert_near
@@ -120,3 +124,25 @@ def test_one_position_attends_to_itself_under_dropout() -> None:
     torch.testing.assert_close(heads[~dropped], value[~dropped] / 0.6, rtol=1e-4, atol=1e-6)
     assert dropped.float().mean().item() == pytest.approx(0.4, abs=0.03)
     assert not torch.equal(dropped[..., 0], dropped[..., 1])
+
+
+def call_two_as_one(dropout: float) -> None:
+    layers = [SelfAttention(4, 1, dropout=dropout) for _ in range(2)]
+    weights, buffers = stack_module_state(list(layers))
+    x = torch.randn(3, 5, 4)
+
+    def call(weights: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:
+        return functional_call(layers[0], (weights, buffers), (x,))
+
+    with warnings.catch_warnings(record=True) as seen:
+        torch.vmap(call, randomness="different")(weights, buffers)
+    sys.exit(len(seen))
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.1])
+def test_no_warning(dropout: float) -> None:
+    """In a process of its own, as pytest has filters of its own."""
+    process = multiprocessing.Process(target=call_two_as_one, args=(dropout,))
+    process.start()
+    process.join()
+    assert process.exitcode == 0

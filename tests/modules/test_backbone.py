@@ -117,14 +117,6 @@ def test_keys_are_fixed():
     assert (backbone.in_keys, backbone.out_keys) == (["history"], ["features"])
 
 
-@torch.no_grad()
-def test_export_by_keyword():
-    network = EnhancedTIT((4,), 2)
-    history, other = torch.randn(2, 5, 2, 4)
-    program = torch.export.export(Backbone(network), (), {"history": history}).module()
-    assert_near(program(history=other), network(other))
-
-
 @pytest.mark.parametrize(("name", "num_frames"), [("enhanced-tit", 3), ("lstm", 3), ("lstm", 1)])
 @pytest.mark.parametrize("trunks", ["shared", "separate"])
 @torch.no_grad()

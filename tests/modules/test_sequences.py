@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import pytest
@@ -10,7 +9,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
-from torch.func import functional_call, stack_module_state
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import InitTracker
 from torchrl.modules import set_recurrent_mode
@@ -160,27 +158,6 @@ def test_compiles_without_a_graph_break(pair: Pair) -> None:
     with torch.no_grad():
         assert_near(compiled(td), features(td))
     torch.compiler.reset()
-
-
-@pytest.mark.parametrize("pair", EACH_ONCE, ids="+".join)
-def test_vmap_over_weights_and_over_sequences(pair: Pair) -> None:
-    networks = [build(pair, seed).double() for seed in range(2)]
-    td = sequences(pair, "same")
-    backbones = [backbone_of(network, padding="same") for network in networks]
-    weights, buffers = stack_module_state([b.module for b in backbones])
-
-    def features(weights: Any, buffers: Any, td: TensorDictBase) -> Tensor:
-        prefixed = {f"module.{name}": x for name, x in {**weights, **buffers}.items()}
-        return functional_call(backbones[0], prefixed, (td.copy(),))["features"]
-
-    with set_recurrent_mode(True), torch.no_grad():
-        stacked = torch.vmap(features, (0, 0, None))(weights, buffers, td)
-        alone = [backbone(td.copy())["features"] for backbone in backbones]
-        assert_near(list(stacked), alone)
-        mapped = torch.vmap(
-            partial(features, *({k: v[0] for k, v in x.items()} for x in (weights, buffers)))
-        )(td)
-        assert_near(mapped, alone[0])
 
 
 def test_bfloat16_autocast() -> None:

@@ -156,24 +156,6 @@ def test_time_steps_matter_unless_switched_off() -> None:
         assert torch.allclose(later, predictor(*inputs)) != matters
 
 
-def test_defaults_are_the_protocols() -> None:
-    network = DecisionTransformer((11,), action_dim=3)
-    assert network.num_frames == 20
-    shapes = {name: tuple(p.shape) for name, p in network.history_encoder.named_parameters()}
-    assert shapes["timestep_embedding.weight"] == (1000, 128)
-    assert shapes["blocks.2.ffn.0.weight"] == (512, 128)
-    assert "blocks.3.ffn.0.weight" not in shapes
-    drops = [module.p for module in network.modules() if isinstance(module, nn.Dropout)]
-    assert drops == [0.1] * 10  # tokens; weights, attention's and FFN's output of three blocks
-    block = network.history_encoder.get_submodule("blocks.0")
-    assert isinstance(block, GPT2Block)
-    assert block.attention.num_heads == 1
-    inner = {n: tuple(p.shape) for n, p in DTTIT((11,), action_dim=3).frames[0].named_parameters()}
-    assert inner["patch_embedding.weight"] == (128, 1, 11)
-    assert inner["blocks.0.ffn.0.weight"] == (128, 128)
-    assert not any("positions" in n or "blocks.1" in n for n in inner)
-
-
 def test_gpt2_blocks_start_as_gpt2_and_the_rest_as_pytorch() -> None:
     torch.manual_seed(0)
     network = DecisionTransformer((11,), action_dim=3)

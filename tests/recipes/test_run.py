@@ -189,7 +189,8 @@ def test_an_edited_recipe_that_no_longer_fits_changes_nothing(fields, run, capsy
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        *((text, "") for text in (b"\xff\xfe{", b"[" * 100_000, b"{}", b"null")),
+        *((text, "") for text in (b"\xff\xfe{", b"[" * 100_000, b"{}", b"null", b"", b"[]", b"{")),
+        *((b'{"algorithm": %s}' % text, "") for text in (b"1", b'["ppo"]')),
         (b'{"algorithm": "ppo", "backbone": {"network": "enhanced-tit"}}', "unknown field"),
     ],
 )

@@ -1,6 +1,5 @@
 """Tasks of every kind are trained, evaluated, resumed and rendered from the command line."""
 
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -67,29 +66,6 @@ def test_trains_evaluates_and_renders(name, tmp_path, capsys):
     else:
         main(render)
         assert imageio.imread(film).shape[-1] == 3
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--env-settings", "slippery"], "expected NAME=VALUE, such as is_slippery=False"),
-        (["--env-settings", "num_frames=3"], "num_frames is none: it is a field of the recipe"),
-        (["--env-settings", "depth=3"], "'CartPole-v1' cannot be made: TypeError: .*'depth'"),
-        (["--wrappers", "gymnasium.wrappers:Flat"], "gymnasium.wrappers has no 'Flat'"),
-        (["--wrappers", "gymnasium.wrappers:Flat(n=m)"], "n=m in .* is no literal"),
-        (["--mask-actions"], "no mask of its actions"),
-        (["--observation-keys", "speed"], "no observation 'speed', .* only observation"),
-        (["--env", "no_such_module:Task-v0"], "there is no module 'no_such_module'"),
-        (["--env", "tests.envs.tasks:Nothing"], "'Nothing' after importing .* has no such name"),
-    ],
-)
-def test_one_line_says_what_is_wrong(options, words, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        main(["train", "ppo/cartpole/mlp", *options, "--out", str(tmp_path / "run")])
-    error = capsys.readouterr().err
-    assert re.search(words, error)
-    assert error.startswith("error: ")
-    assert error.count("\n") == 1
 
 
 def test_settings_for_every_algorithm():

@@ -154,9 +154,6 @@ def test_data_that_do_not_fit_the_network(tmp_path):
     arrays["next_observations"][:-1] = arrays["observations"][1:]
     path = write(tmp_path / "long.hdf5", arrays)
     long = len(arrays["rewards"])
-    recipe = make_dt(tmp_path, dataset=str(path), env="InvertedPendulum-v5")
-    with pytest.raises(ValueError, match="range from -3 to 3"):
-        make_algorithm(recipe).check()
     episodes = load_episodes(str(path), task="Hopper-v5")
     recipe = make_dt(tmp_path, backbone=decision_transformer(5, max_ep_len=long - 1))
     with pytest.raises(ValueError, match=f"have up to {long} steps, but max_ep_len is {long - 1}"):

@@ -8,13 +8,10 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
-from torchrl.collectors import Collector
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from recipes.core.compilation import should_compile
 from recipes.core.registry import get_recipe
 from recipes.ppo import PPO, ActorCritic, PPOAlgorithm
-from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import prepared
 from tests.recipes.small import train
 from torchrl_tit.settings.networks import mlp
@@ -135,25 +132,3 @@ def test_backbone_runs_once_a_step_and_once_a_minibatch(monkeypatch, tmp_path):
     assert len(acts) == batches * (16 + 1)
     assert all(training for _, training, _ in updates)
     assert not any(training for _, training, _ in acts)
-
-
-def test_continuous_actions_are_stored_unclipped_and_evaluated_at_the_mean():
-    algorithm = PPOAlgorithm(replace(SMALL, env="Pendulum-v1"))
-    env, policy = algorithm.make_env(2, seed=0), algorithm.policy
-    with torch.no_grad():
-        td = policy(env.reset())
-    assert_near(td["scale"], torch.ones_like(td["scale"]))  # log std 0
-    collector = Collector(
-        env,
-        policy,
-        frames_per_batch=400,
-        total_frames=400,
-        auto_register_policy_transforms=False,
-    )
-    batch = next(iter(collector))
-    assert batch["action"].abs().max() > 2.0  # Pendulum's bounds are +-2
-    dist = torch.distributions.Normal(batch["loc"], batch["scale"])
-    assert_near(batch["action_log_prob"], dist.log_prob(batch["action"]).sum(-1))
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        td = policy(env.reset())
-    assert_near(td["action"], td["loc"])

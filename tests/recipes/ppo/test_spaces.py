@@ -107,15 +107,3 @@ def test_an_observation_in_parts_trains_as_a_whole(tmp_path):
     other, other_rows = trained(parts, tmp_path / "parts")
     assert (weights == other).all()
     assert rows == other_rows
-
-
-@pytest.mark.parametrize(
-    ("env", "message"),
-    [
-        ("BoxActions-v0", "Only Discrete and MultiDiscrete actions can be masked"),
-        ("CartPole-v1", "no mask of its actions"),
-    ],
-)
-def test_masks_that_there_are_not_are_refused(env, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        PPOAlgorithm(replace(RECIPE, env=env, mask_actions=True))

@@ -256,19 +256,6 @@ def test_files_that_cannot_be_written(runs, tmp_path, capsys, monkeypatch):
     assert "may not be written to" in line
 
 
-def test_a_full_disk_leaves_the_earlier_report(runs, tmp_path, capsys, monkeypatch):
-    out = tmp_path / "a.html"
-    out.write_text("before")
-
-    def full(descriptor):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    assert "No space left" in fails(capsys, "report", runs / "mlp", "--out", out, "--no-pictures")
-    assert out.read_text() == "before"
-    assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
-
-
 def test_agents_in_the_middle_are_shown(tmp_path, monkeypatch):
     for seed, value in enumerate([10.0, 500.0, 300.0]):
         folder = write_run(tmp_path / f"seed-{seed}", MLP, seed, [value], backbone=mlp())

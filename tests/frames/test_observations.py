@@ -1,13 +1,22 @@
-"""Categories: linear frames are a linear layer on one-hot vectors, patches sums of embeddings."""
+"""What networks know of observations, the patch size "auto", and categories: one-hot vectors."""
 
 import pytest
 import torch
 from torch.nn import functional as F
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    Unbounded,
+)
 
 from torchrl_tit import settings
-from torchrl_tit.frames import Observation
+from torchrl_tit.frames import Observation, read_observation, read_observations
 from torchrl_tit.frames.linear import LinearFrameEncoder
 from torchrl_tit.layers.categories import CategoryIndex, CategoryPatchEmbedding
+from torchrl_tit.layers.patches import find_patch_size
 from torchrl_tit.networks.building import build_frame
 
 COUNTS = (4, 3, 5)
@@ -72,3 +81,67 @@ def test_class_tokens_tell_every_category_apart() -> None:
     tokens = encoder(x.unsqueeze(1)).flatten(1)
     assert len(tokens.detach().round(decimals=6).unique(dim=0)) == len(x) == 60
     assert [maps.shape[-1] for maps in encoder.attention_maps(x)] == [4, 4]
+
+
+@pytest.mark.parametrize(
+    ("observation", "shape", "kind", "entries"),
+    [
+        ((5,), (5,), "array", 5),
+        (torch.Size([3, 8, 8]), (3, 8, 8), "image", 192),
+        (Unbounded(5), (5,), "array", 5),
+        (Bounded(0, 255, (8, 8), dtype=torch.uint8), (8, 8), "image", 64),
+        (MultiCategorical([4]), (1,), "categories", 4),
+        (MultiCategorical([4, 3]), (2,), "categories", 7),
+        (Categorical(4, shape=(2,)), (2,), "categories", 8),
+        (Binary(3), (3,), "categories", 6),
+        (Observation((2,), categories=(4, 3)), (2,), "categories", 7),
+    ],
+)
+def test_shapes_and_specs(observation, shape, kind, entries):
+    seen = read_observation(observation)
+    assert (seen.shape, seen.kind, seen.entries) == (shape, kind, entries)
+    assert seen.zeros(2, 3).shape == (2, 3, *shape)
+    assert seen.zeros().is_floating_point() == (kind != "categories" and seen.dtype != torch.uint8)
+
+
+def test_one_observation_or_several_by_name():
+    assert list(read_observations((4,))) == ["observation"]
+    specs = {"image": (3, 7, 7), "arm/left": Unbounded(2)}
+    assert [seen.kind for seen in read_observations(specs).values()] == ["image", "array"]
+    nested = Composite(pixels=Unbounded((8, 8)), arm=Composite(left=Unbounded(2)))
+    assert set(read_observations(nested)) == {"pixels", "arm/left"}
+
+
+@pytest.mark.parametrize(
+    ("shape", "patch_size"),
+    [
+        ((1,), 1),
+        ((17,), 17),
+        ((376,), 376),
+        ((7, 7), 1),
+        ((3, 84, 84), 12),
+        ((3, 56, 56), 8),
+        ((3, 64, 64), 8),
+        ((3, 96, 96), 16),
+        ((3, 64, 48), 8),
+        ((3, 210, 160), 10),
+        ((83, 83), 83),
+    ],
+)
+def test_auto(shape, patch_size):
+    assert find_patch_size(shape, "auto") == patch_size
+    auto = build_frame(settings.Inner(embed_dim=4, patch_size="auto"), Observation(shape))
+    named = build_frame(settings.Inner(embed_dim=4, patch_size=patch_size), Observation(shape))
+    assert str(auto) == str(named)
+
+
+@pytest.mark.parametrize(
+    ("entries", "patch_size"),
+    [(1, 1), (16, 1), (18, 2), (27, 3), (105, 7), (17, 17), (376, 47)],  # nothing divides 17
+)
+def test_auto_of_categories(entries, patch_size):
+    assert find_patch_size((entries,), "auto", categories=True) == patch_size
+    observation = Observation((entries,), categories=(3,) * entries)
+    auto = build_frame(settings.Inner(embed_dim=4, patch_size="auto"), observation)
+    named = build_frame(settings.Inner(embed_dim=4, patch_size=patch_size), observation)
+    assert str(auto) == str(named)
