@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from importlib.metadata import version
@@ -30,7 +28,6 @@ from tests.recipes.untrained import untrained
 from torchrl_tit.checkpoint import latest_step
 from torchrl_tit.settings.networks import enhanced_tit
 
-ROOT = Path(__file__).parents[2]
 SMALL = replace(
     TINY,
     name="ppo/cartpole/small",
@@ -338,14 +335,3 @@ def test_a_run_in_use_is_evaluated_into_another_file_only(tmp_path, capsys):
     main(["evaluate", str(run.folder)])
     text = (run.folder / "evaluation.json").read_text()
     assert (tmp_path / "elsewhere.json").read_text() == text
-
-
-def test_a_run_of_any_algorithm_is_opened_by_a_script_of_its_own():
-    script = (
-        "from recipes.core.records import Records; from recipes.core.run import RecordedRun; "
-        "print(RecordedRun(Records('docs/results/cartpole'), 'mlp/seed-0').recipe.env)"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.stdout == "CartPole-v1\n", done.stderr

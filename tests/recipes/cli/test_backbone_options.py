@@ -125,36 +125,6 @@ def test_what_only_fits_with_a_later_option(tmp_path, monkeypatch, capsys):
     assert "Outer(" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["frame", "resnt"], "--backbone.frame has no choice 'resnt': did you mean resnet"),
-        (["history", "out"], "did you mean outer"),
-        (["network", "enhanced"], "did you mean enhanced-tit"),
-        (
-            ["frames.image", "innr"],
-            "--backbone.frames.image has no choice 'innr': did you mean inn",
-        ),
-        (["frames.image.patch-size", "x"], "Error parsing --backbone.frames.image.patch-size"),
-        (
-            ["frames.image", "inner"],
-            "frames names the observation 'image', which the task does not",
-        ),
-        (["history"], "--backbone.history needs a name: choose from outer, paired-outer"),
-        (["history", "--num-envs"], "--backbone.history needs a name"),
-        (["frame", "resnet"], "take inner, linear or flat frames"),  # CartPole has no images
-        (["history", "catformer"], "num_frames is 1: set it to 2 or more"),
-        (["frame", "linear", "--backbone.frame.num-blocks", "2"], "--backbone.frame.num-blocks"),
-        (["history", "decision-transformer"], "use a dt or odt recipe"),
-    ],
-)
-def test_what_cannot_work_is_one_line(words, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    words = [f"--backbone.{words[0]}", *words[1:]]
-    assert message in fails(capsys, "train", CARTPOLE.name, *words)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_help_names_the_choices_and_the_fields_of_the_chosen_part(capsys):
     with pytest.raises(SystemExit) as exit_:
         main(["train", "ppo/pong/enhanced-tit", "--backbone.history", "catformer", "--help"])

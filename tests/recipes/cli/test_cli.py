@@ -93,34 +93,6 @@ def test_help_explains_every_field(capsys):
     assert "\n\nThe defaults are those of the paper" in out  # not indented, as in the source
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["train", "ppo/cartpole/enhanced-tt"], "did you mean ppo/cartpole/enhanced-tit"),
-        (["train", "NAME", "--env", "CartPole-v7"], "CartPole-v1"),
-        (["train", "NAME", "--backbone.num-frames", "0"], "num_frames must be at least 1, not 0"),
-        (["train", "NAME", "--backbone.frame.num-heads", "3"], "width 32"),
-        (["train", "NAME", "--num-envs", "3"], "num_envs 3 does not divide steps_per_batch 1024"),
-        (["train", "NAME", "--critic-coeff", "0"], "critic_coeff must be positive, not 0.0"),
-        (["train", "."], ". is a folder, not a recipe"),
-        (["train", "NAME", "--backbone.frame.patch-size", "0"], "patch_size"),
-        (["train"], "train needs the name of a recipe"),
-        (["train", "--resume", "nowhere"], "is not a run folder"),
-        (["evaluate", "nowhere"], "is not a run folder"),
-        (["show", "nothing.json"], "nothing.json"),
-        (["list", "atlantis"], "no recipe's name contains 'atlantis'"),
-        (["fly"], "unknown command 'fly'"),
-        (["train", "cql/hopper-medium-v0/mlp", "--total-steps", "9"], "runs is --total-updates"),
-        (["train", "dt/hopper-medium-v2/dt", "--total_updates=9"], "its runs is --iterations"),
-    ],
-)
-def test_bad_words_are_one_line_and_leave_nothing(words, message, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = ["ppo/cartpole/enhanced-tit" if word == "NAME" else word for word in words]
-    assert message in fails(capsys, *words)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_version(capsys):
     main(["--version"])
     assert capsys.readouterr().out == f"torchrl-tit {torchrl_tit.__version__}\n"

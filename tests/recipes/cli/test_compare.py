@@ -56,17 +56,6 @@ def test_the_logs_of_a_sweep_are_passed_over(begun, drawn, capsys):
     assert "seed-0.log is not a run folder, but a log" in fails(capsys, "compare", "seed-0.log")
 
 
-def test_other_settings_under_package_alias_are_another_curve(begun, drawn):
-    begun("a"), begun("b", learning_rate=1e-3), begun("c", seed=2)
-    assert drawn("a", "b", "c") == {NAME: ["a", "c"], f"{NAME} (learning_rate 0.001)": ["b"]}
-
-
-def test_runs_without_a_name_are_called_as_their_folder(begun, drawn):
-    begun("a", name=""), begun("b", name="", learning_rate=1e-3)
-    assert drawn("a") == {"a": ["a"]}
-    assert drawn("a", "b") == {"a": ["a"], "b": ["b"]}
-
-
 def test_tasks_are_not_compared(begun, capsys):
     begun("a"), begun("b", "ppo/acrobot/mlp")
     with pytest.raises(SystemExit):
@@ -88,10 +77,3 @@ def test_runs_in_which_no_episode_has_ended(begun, tmp_path, capsys):
     Run.create(tmp_path / "b", get_recipe("ppo/cartpole/d2rl"))
     assert "no episode has ended in a, b" in fails(capsys, "compare", "a", "b")
     assert not (tmp_path / "comparison.png").exists()
-
-
-def test_a_picture_is_called_what_it_is(begun, capsys):
-    begun("a")
-    assert "--out curves.pdf must end in .png" in fails(
-        capsys, "compare", "a", "--out", "curves.pdf"
-    )

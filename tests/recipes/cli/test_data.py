@@ -61,31 +61,3 @@ def test_convert_there_and_back(
         assert set(file) == set(rolled)
         for name, array in rolled.items():
             np.testing.assert_array_equal(file[name][:], array)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["info", "{file}", "--env", "Walker2d-v5"], "field 'observations': one row has the shape"),
-        (["info", "hopper"], "'hopper' is not a data set"),
-        (["convert", "{file}", "{file}"], "exists already"),
-        (["convert", "{file}", "unnumbered"], "'unnumbered' is not a valid name"),
-        (["info"], "the following arguments are required: source"),
-        (["inspect"], "invalid choice: 'inspect'"),
-    ],
-)
-def test_errors_are_one_line(
-    tmp_path: Path,
-    rolled: Transitions,
-    capsys: pytest.CaptureFixture[str],
-    words: list[str],
-    message: str,
-) -> None:
-    path = write(tmp_path / "a.hdf5", rolled)
-    with pytest.raises(SystemExit) as stop:
-        main(["data", *(word.format(file=path) for word in words)])
-    errors = capsys.readouterr().err
-    assert stop.value.code == 2
-    assert errors.startswith("error: ")
-    assert message in errors
-    assert errors.count("\n") == 1

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from recipes.cli import main
-from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
 from tests.recipes.commands import fails
@@ -126,29 +125,6 @@ def test_other_policies(make, tmp_path):
     run = untrained(tmp_path / "run", make(tmp_path))
     explain(run.folder, "--out", tmp_path / "a.png", "--step", 1)
     assert imageio.imread(tmp_path / "a.png").shape == PAGE
-
-
-def test_files_and_steps_that_cannot_be(cartpole, tmp_path, capsys):
-    run, png, gif = cartpole.folder, tmp_path / "a.png", tmp_path / "a.gif"
-    empty = Run.create(tmp_path / "run", cartpole.recipe).folder
-    png.write_bytes(b"mine")
-    step = tmp_path / "b.png"
-    for words, message in (
-        ([run, tmp_path / "a.avi"], "a picture of one step (.png), not 'a.avi'"),
-        ([run, gif, "--step", 3], "step 3 is one step"),
-        ([run, step, "--max-steps", 3], "max_steps 3 is the length of a film"),
-        ([run, step, "--step", -1], "there is no step -1"),
-        ([run, gif, "--max-steps", 0], "max_steps must be at least 1"),
-        ([tmp_path, step], "is neither an agent nor a run"),
-        ([run, step, "--seed", -1], "--seed must be from 0"),
-        ([run, tmp_path / "no" / "a.png"], "there is no folder"),
-        ([run, png], "exists already"),
-        ([empty, gif], "holds no checkpoint"),
-    ):
-        source, out, *others = words
-        assert message in fails(capsys, "explain", source, "--out", out, *others)
-    assert png.read_bytes() == b"mine"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "run"]
 
 
 def test_maps_that_a_network_does_not_have(cartpole, tmp_path, capsys, monkeypatch):

@@ -37,17 +37,6 @@ def test_changes_are_those_from_the_recipe_of_that_name(tmp_path):
     assert found.changes == "backbone.history.torso nature-cnn"
 
 
-def test_without_a_name(tmp_path):
-    (found,) = group_runs([Run(tmp_path / "own", replace(RECIPE, name=""))])
-    assert found.label == str(tmp_path / "own")
-
-
-def test_the_same_run_twice(tmp_path):
-    runs = [Run(tmp_path / "0", RECIPE), Run(tmp_path / "3", RECIPE)]
-    with pytest.raises(ValueError, match=r"0 and .*3 are the same run: a with seed 0; name one"):
-        group_runs(runs)
-
-
 ROOT = Path(__file__).parents[3]
 assert registry.RECIPES  # every algorithm is registered
 ALGORITHMS = sorted(

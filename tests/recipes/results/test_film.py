@@ -8,7 +8,6 @@ from PIL import Image, ImageSequence
 
 from recipes.cli import main
 from recipes.core.algorithm import make_algorithm
-from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
 from recipes.tools.results.film import film_policy
@@ -64,27 +63,6 @@ def test_atari(tmp_path):
     assert len(pictures) <= 30
     assert pictures.shape[1:] == (210, 160, 3)
     assert (pictures[0] != pictures[-1]).any()
-
-
-def test_bad_input(cartpole, tmp_path, capsys):
-    def error(*words):
-        return fails(capsys, "render", *words)
-
-    folder, film = cartpole.folder, tmp_path / "film.gif"
-    assert "a film is one of .gif, .mp4, not 'film.avi'" in error(
-        folder, "--out", tmp_path / "film.avi"
-    )
-    assert "is not a run folder" in error(tmp_path, "--out", film)
-    assert "episodes must be at least 1" in error(folder, "--out", film, "--episodes", 0)
-    assert not any(tmp_path.iterdir())
-    film.write_bytes(b"mine")
-    assert "exists already" in error(folder, "--out", film)
-    assert film.read_bytes() == b"mine"
-    empty = Run.create(tmp_path / "run", cartpole.recipe)
-    assert "holds no checkpoint" in error(empty.folder, "--out", tmp_path / "other.gif")
-    assert "film.gif cannot be written: there is no folder" in error(
-        folder, "--out", tmp_path / "missing" / "film.gif"
-    )
 
 
 def test_pictures_that_cannot_be_drawn(cartpole, tmp_path, capsys, monkeypatch):
