@@ -6,7 +6,7 @@ from gymnasium.spaces import Box, Discrete
 
 pytest.importorskip("minigrid")
 
-from benchmarks import memory_tasks, recurrent_ppo
+from benchmarks import memory_tasks, recurrent_ppo, sb3_returns
 from benchmarks.measuring import read_rows
 
 
@@ -92,3 +92,15 @@ def test_the_environment_is_that_of_the_recipes():
     for _ in range(95):
         assert not any(env.step(0)[2:4])  # it turns
     assert env.step(0)[2:4] == (False, True)
+
+
+def test_a_row_a_run(tmp_path, capsys):
+    out = tmp_path / "new" / "sb3.csv"
+    words = ["CartPole-v1", "--total-steps", "2048", "--episodes", "2", "--out", str(out)]
+    sb3_returns.main([*words, "--seeds", "0"])
+    (row,) = read_rows(out)
+    assert list(row) == sb3_returns.COLUMNS
+    assert (row["env"], row["seed"], row["total_steps"]) == ("CartPole-v1", "0", "2048")
+    assert 8 <= float(row["evaluation"]) <= 500
+    assert 8 <= float(row["training_last_fifth"]) <= 500
+    assert capsys.readouterr().out.startswith("CartPole-v1 0 2048 ")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 from collections import OrderedDict
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,14 @@ from safetensors.torch import load, save
 from tensordict import LazyStackedTensorDict, TensorDict
 
 from tests.recipes.states import assert_same
-from torchrl_tit.checkpoint import decode, encode
+from torchrl_tit.checkpoint import (
+    decode,
+    encode,
+    global_rng_state,
+    load_checkpoint,
+    save_checkpoint,
+    set_global_rng_state,
+)
 
 INFINITY = float("inf")
 DTYPES = [
@@ -146,3 +154,39 @@ def test_keys_that_cannot_be_saved(key: Any) -> None:
 def test_foreign_trees_are_refused(tree: Any) -> None:
     with pytest.raises(ValueError, match=r"."):
         decode({"x": torch.zeros(8, dtype=torch.uint8)}, tree)
+
+
+def draw() -> tuple[object, ...]:
+    numbers = random.random(), random.gauss(0, 1), np.random.normal(), *np.random.rand(3)
+    return *numbers, *torch.randn(5).tolist(), *torch.randn(17).tolist()
+
+
+def seed(number: int) -> None:
+    for set_seed in (random.seed, np.random.seed, torch.manual_seed):
+        set_seed(number)
+
+
+def draw_on_gpu() -> list[float]:
+    return torch.rand(3, device="cuda").tolist()
+
+
+GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+
+
+@pytest.mark.parametrize("numbers", [draw, pytest.param(draw_on_gpu, marks=GPU)])
+def test_generators_go_on_where_they_were(tmp_path, numbers: Callable[[], object]) -> None:
+    seed(1)
+    numbers()  # leaves halves of normal pairs behind
+    save_checkpoint(tmp_path, 1, global_rng_state())
+    expected = numbers()
+    seed(2)
+    set_global_rng_state(load_checkpoint(tmp_path)[1])
+    assert numbers() == expected
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="is about machines without a GPU")
+def test_state_with_gpus_is_taken_on_a_machine_without() -> None:
+    state = global_rng_state()
+    expected = draw()
+    set_global_rng_state(state | {"cuda": [torch.zeros(16, dtype=torch.uint8)]})
+    assert draw() == expected

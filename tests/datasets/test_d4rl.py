@@ -1,4 +1,4 @@
-"""D4RL's files are downloaded once, atomically, and verified by checksum."""
+"""D4RL's files are downloaded once, atomically, and verified by checksum; and its scores."""
 
 import io
 import threading
@@ -13,10 +13,18 @@ from urllib.response import addinfourl
 import h5py
 import numpy as np
 import pytest
+import torch
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from tests.datasets.rollouts import Transitions, write
-from torchrl_tit.datasets import DatasetError, download_d4rl, load_episodes
+from torchrl_tit.datasets import (
+    DatasetError,
+    download_d4rl,
+    has_reference,
+    load_episodes,
+    normalized_score,
+    normalized_spread,
+)
 from torchrl_tit.datasets.sources import address
 
 NAME = "hopper-medium-replay-v0"
@@ -142,3 +150,22 @@ def test_all_come_over_https_and_never_leave_it(
         download_d4rl(NAME, tmp_path)
     assert asked == [address(NAME)]
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "random", "expert"),
+    [
+        ("halfcheetah-medium-replay-v0", -280.178953, 12135.0),
+        ("mujoco/hopper/medium-v0", -20.272305, 3234.3),
+        ("Walker2d-v5", 1.629008, 4592.3),
+    ],
+)
+def test_scores(name: str, random: float, expert: float) -> None:
+    returns = torch.tensor([random, expert, (random + expert) / 2], dtype=torch.float64)
+    expected = torch.tensor([0.0, 100.0, 50.0], dtype=torch.float64)
+    torch.testing.assert_close(normalized_score(returns, name), expected)
+    np.testing.assert_allclose(normalized_score(returns.numpy(), name), expected, atol=1e-12)
+    # The standard deviation of scores is the score of a standard deviation, without the offset.
+    spread = normalized_spread(returns.std(), name)
+    torch.testing.assert_close(spread, normalized_score(returns, name).std())
+    assert not has_reference("CartPole-v1")

@@ -1,4 +1,4 @@
-"""Frame encoders against the layers that they are, one observation at a time."""
+"""Frame encoders against the layers that they are, and behind a running normalization."""
 
 from __future__ import annotations
 
@@ -12,7 +12,10 @@ from tests.networks.reference import randomize
 from torchrl_tit import settings
 from torchrl_tit.frames.cnn import CNNFrameEncoder
 from torchrl_tit.frames.flat import Flat
+from torchrl_tit.frames.inner import InnerTransformer
 from torchrl_tit.frames.linear import LinearFrameEncoder
+from torchrl_tit.frames.normalized import NormalizedFrames
+from torchrl_tit.layers.patches import ArrayPatchEmbedding
 
 
 @pytest.mark.parametrize(
@@ -61,3 +64,88 @@ def test_linear_frames_are_a_linear_layer(
         expected = getattr(torch, activation)(expected)
     torch.testing.assert_close(encoder(frames), expected)
     torch.testing.assert_close(encoder(frames / 255), expected)
+
+
+def test_statistics_of_parts_are_those_of_the_whole() -> None:
+    torch.manual_seed(0)
+    observations = torch.randn(600, 4) * torch.tensor([1e-2, 1.0, 50.0, 1.0]) + 3
+    frames = NormalizedFrames(settings.Linear().build((4,)))
+    for part in observations.split([1, 199, 400]):
+        frames.update(part)
+    torch.testing.assert_close(frames.mean, observations.mean(0))
+    torch.testing.assert_close(frames.variance, observations.var(0, unbiased=False))
+
+
+@pytest.mark.parametrize(("shape", "statistics"), [((3, 6, 5), (3, 1, 1)), ((6, 5), (1, 1))])
+def test_each_channel_of_an_image_has_statistics_of_its_own(
+    shape: tuple[int, ...], statistics: tuple[int, ...]
+) -> None:
+    torch.manual_seed(0)
+    images = torch.randint(100, 256, (700, *shape), dtype=torch.uint8)
+    images[:, ..., 2] //= 4
+    frames = NormalizedFrames(settings.Flat().build(shape))
+    for part in images.split([1, 299, 400]):
+        frames.update(part)
+    floats = images.double() / 255
+    over = (0, -2, -1)
+    assert frames.mean.shape == statistics
+    torch.testing.assert_close(
+        frames.mean.double(), floats.mean(over, keepdim=True)[0], rtol=1e-5, atol=1e-6
+    )
+    expected = (floats - floats.mean(over, keepdim=True)) / floats.std(
+        over, unbiased=False, keepdim=True
+    )
+    for read in (images, images.float() / 255):
+        torch.testing.assert_close(frames.normalize(read).double(), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_entries_that_never_change_and_outliers_stay_finite() -> None:
+    frames = NormalizedFrames(settings.Linear().build((2,)), limit=5.0)
+    frames.update(torch.tensor([[1.0, 0.0], [1.0, 2.0]]))
+    normal = frames.normalize(torch.tensor([[1.0, 1e6], [2.0, 1.0]]))
+    assert normal.tolist() == [[0.0, 5.0], [5.0, 0.0]]
+
+
+def test_it_encodes_normalized_observations() -> None:
+    encoder = settings.Inner(embed_dim=8).build((4,))
+    frames = NormalizedFrames(encoder)
+    observations = 100 * torch.randn(16, 4)
+    torch.testing.assert_close(frames(observations), encoder(observations.clamp(-10, 10)))
+    frames.update(observations)
+    expected = (observations - observations.mean(0)) / observations.std(0, unbiased=False)
+    torch.testing.assert_close(frames(observations), encoder(expected), rtol=1e-4, atol=1e-5)
+    maps = zip(frames.attention_maps(observations), encoder.attention_maps(expected), strict=True)
+    for found, wanted in maps:
+        torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)
+    assert set(frames.state_dict()) >= {"count", "mean", "variance"}
+
+
+@pytest.mark.parametrize("patch_size", [1, 3, 11])
+def test_each_patch_has_weights_of_its_own(patch_size: int) -> None:
+    embedding = ArrayPatchEmbedding(11, patch_size, 8, channels=2, own_weights=True)
+    observation = torch.randn(5, 2, 11)
+    padded = torch.nn.functional.pad(observation, (embedding.padding, embedding.padding))
+    tokens = embedding(observation)
+    assert tokens.shape == (5, embedding.num_patches, 8)
+    assert embedding.bias is not None
+    for index in range(embedding.num_patches):
+        patch = padded[..., index * patch_size : (index + 1) * patch_size].flatten(1)
+        expected = patch @ embedding.weight[index].flatten(1).t() + embedding.bias[index]
+        torch.testing.assert_close(tokens[:, index], expected)
+
+
+def test_own_weights_tell_sizes_of_an_entry_apart() -> None:
+    """After the LayerNorm, a shared patch of one number is little more than its sign."""
+    torch.manual_seed(0)
+
+    def distance(patch_weights: str) -> float:
+        """Between the normalised tokens of 1 and 2, relative to that of 1 and -1."""
+        inner = settings.Inner(patch_weights=patch_weights).build((4,))  # type: ignore[arg-type]
+        assert isinstance(inner, InnerTransformer)
+        values = torch.tensor([[1.0], [2.0], [-1.0]]).expand(3, 4)
+        patches = inner.patch_embedding(values.unsqueeze(1))
+        one, two, minus = inner.blocks[0].norm1(patches)  # type: ignore[operator]
+        return ((one - two).norm() / (one - minus).norm()).item()
+
+    assert distance("shared") < 0.05
+    assert distance("own") > 0.15

@@ -126,14 +126,6 @@ def test_sequences_are_made_in_environments_only() -> None:
 
 
 @pytest.mark.parametrize("name", ONLINE)
-def test_has_no_inverse(name: str) -> None:
-    env = transformed(name)
-    before = env.rollout(3)
-    assert_close(env.transform.inv(before.clone()), before, rtol=0, atol=0)
-    assert set(env.full_action_spec.keys()) == {"action"}
-
-
-@pytest.mark.parametrize("name", ONLINE)
 def test_copies_join_other_environments(name: str) -> None:
     env = transformed(name)
     env.rollout(4)
