@@ -1,24 +1,17 @@
-"""From run folders to the paper's tables: runs put together, and their metrics in words."""
+"""From run folders to the paper's tables."""
 
 import csv
 import io
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from recipes.cli import main
-from recipes.core import registry
-from recipes.core.algorithm import make_algorithm
-from recipes.core.recipe import Recipe
-from recipes.core.registry import RECIPES, get_recipe
+from recipes.core.registry import RECIPES
 from recipes.core.run import Run
-from recipes.ppo import PPO
-from recipes.tools.results import metric_words, plot
-from recipes.tools.results.experiments import group_runs
-from recipes.tools.results.metric_words import known_columns, limit, words_of
+from recipes.tools.results import plot
 from recipes.tools.results.table import (
     make_table,
     paper_results,
@@ -28,7 +21,7 @@ from recipes.tools.results.table import (
 )
 from tests.recipes.results.report_runs import write_run
 from torchrl_tit.settings import Linear
-from torchrl_tit.settings.networks import enhanced_tit, mlp, nature_cnn
+from torchrl_tit.settings.networks import enhanced_tit, mlp
 
 MLP = "ppo/cartpole/mlp"
 
@@ -295,60 +288,3 @@ def test_a_run_evaluated_before_its_end_is_left_out(tmp_path):
     (cell,), notes = make_table([tmp_path])
     assert (cell.runs, cell.mean) == (1, 400)
     assert notes == [f"{early} is left out: evaluated after 10 of {cell.steps} steps"]
-
-
-RECIPE = PPO(name="a", env="CartPole-v1", backbone=mlp())
-
-
-def test_whatever_their_seed_and_machine(tmp_path):
-    one = Run(tmp_path / "0", RECIPE)
-    other = Run(tmp_path / "1", replace(RECIPE, seed=1, device="cpu", threads=2, compile="on"))
-    third = Run(tmp_path / "2", replace(RECIPE, learning_rate=0.1))
-    assert [(e.label, e.runs) for e in group_runs([one, third, other])] == [
-        ("a", (one, other)),
-        ("a (learning_rate 0.1)", (third,)),
-    ]
-
-
-def test_changes_are_those_from_the_recipe_of_that_name(tmp_path):
-    changed = replace(get_recipe("ppo/breakout/resnet"), backbone=nature_cnn(4), seed=3)
-    (found,) = group_runs([Run(tmp_path, changed)])
-    assert found.name == "ppo/breakout/resnet"
-    assert found.changes == "backbone.history.torso nature-cnn"
-
-
-ROOT = Path(__file__).parents[3]
-assert registry.RECIPES  # every algorithm is registered
-ALGORITHMS = sorted(
-    name for name, kind in Recipe.registered.items() if kind.__module__.startswith("recipes.")
-)
-
-
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_every_column_is_described(algorithm):
-    recipe = next(r for r in registry.RECIPES.values() if r.algorithm == algorithm)
-    columns = [*make_algorithm(recipe).columns]
-    if algorithm == "ppo":  # which depend on the recipe
-        columns.append("loss_contrastive")
-    for column in ("steps_per_second", "return_mean", *columns):
-        assert words_of(algorithm, column).what, f"{column} of {algorithm} in metrics.csv"
-        assert column in known_columns(algorithm)
-
-
-def test_the_documents_have_the_same_words():
-    page = ROOT / "docs" / "reference" / "metrics.md"  # the site adds the other algorithms
-    assert metric_words.to_markdown("ppo") in page.read_text()
-
-
-def test_limits():
-    recipe = get_recipe("ppo/cartpole/mlp")
-    assert limit(words_of("ppo", "gradient_norm").high, recipe) == pytest.approx(5)
-    assert limit(words_of("ppo", "kl_approx").high, recipe) == 0.02
-    assert limit(words_of("ppo", "entropy").high, recipe) is None
-    assert limit("10 * no_field", recipe) is None
-
-
-def test_columns_that_are_not_known():
-    assert words_of("ppo", "mine").what == ""
-    assert words_of("dt", "return_-20").what == "mean return of the evaluation that aims for -20"
-    assert words_of("dt", "return_scale").what == ""
