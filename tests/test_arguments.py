@@ -343,6 +343,8 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     ),
     (lambda: cql(alpha_init=NAN), "alpha_init must be positive, not nan"),
     (lambda: cql(target_entropy=NAN), "target_entropy must be at least .*, not nan"),
+    (lambda: cql(num_random=0), "num_random must be"),
+    (lambda: cql(over_critics="max"), "'over_critics' is 'max'"),
     (lambda: cql(loss_function="l3"), "'loss_function' is 'l3', not one of"),
     (lambda: discrete_cql(loss_function="l3"), "'loss_function' is 'l3', not one of"),
     (lambda: MaskedDTLoss(torch.nn.Linear(1, 1), reduction="no"), "'reduction' is 'no'"),

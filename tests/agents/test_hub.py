@@ -10,6 +10,7 @@ from huggingface_hub import errors
 from recipes.cli import main
 from tests.agents.hub import LocalHub
 from tests.agents.runs import make_run
+from tests.recipes.commands import fails
 from torchrl_tit.agents import AgentError, load_agent
 from torchrl_tit.agents.folder import CARD, CONTENTS, MANIFEST, WEIGHTS
 
@@ -24,15 +25,6 @@ def hub(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     return make_run(tmp_path_factory.mktemp("runs") / "run")
-
-
-def failure(capsys, *words):
-    """What a command that fails prints: one line."""
-    with pytest.raises(SystemExit) as stop:
-        main([str(word) for word in words])
-    assert stop.value.code == 2
-    [line] = capsys.readouterr().err.splitlines()
-    return line
 
 
 def test_upload_and_download(hub, run, tmp_path, capsys):
@@ -76,11 +68,11 @@ def test_an_agent_is_shared_as_it_is(hub, run, tmp_path, capsys):
     main(["share", str(tmp_path / "agent"), "me/again"])
     files = {path.name: path.read_bytes() for path in (tmp_path / "agent").iterdir()}
     assert files.items() <= hub.commits["me/again"][-1].items()
-    assert "is an agent already" in failure(
+    assert "is an agent already" in fails(
         capsys, "share", tmp_path / "agent", "--out", tmp_path / "b"
     )
     (tmp_path / "agent" / CARD).write_text("another")
-    assert f"{CARD} was changed" in failure(capsys, "share", tmp_path / "agent", "me/changed")
+    assert f"{CARD} was changed" in fails(capsys, "share", tmp_path / "agent", "me/changed")
     assert "me/changed" not in hub.commits
 
 
@@ -97,17 +89,17 @@ def test_what_was_changed_on_the_hub(hub, run):
 
 
 def test_what_the_hub_refuses(hub, run, capsys):
-    assert "there is no repository 'me/unknown'" in failure(capsys, "play", "hf:me/unknown")
+    assert "there is no repository 'me/unknown'" in fails(capsys, "play", "hf:me/unknown")
     main(["share", str(run), "me/small"])
     capsys.readouterr()
-    assert "has no revision '9'" in failure(capsys, "play", "hf:me/small@9")
+    assert "has no revision '9'" in fails(capsys, "play", "hf:me/small@9")
     for name in ("small", "me/small/more", "../small", "me/", ""):
-        assert "expected user/name" in failure(capsys, "play", f"hf:{name}")
-        assert "expected user/name" in failure(capsys, "share", run, name)
+        assert "expected user/name" in fails(capsys, "play", f"hf:{name}")
+        assert "expected user/name" in fails(capsys, "share", run, name)
     hub.failure = errors.LocalEntryNotFoundError("cannot reach\nthe Hub")
-    assert "is not on this machine yet" in failure(capsys, "play", "hf:me/small")
+    assert "is not on this machine yet" in fails(capsys, "play", "hf:me/small")
     hub.failure = RuntimeError("its HTTP client\nhas errors of its own")
-    line = failure(capsys, "share", run, "me/other")
+    line = fails(capsys, "share", run, "me/other")
     assert "for hf:me/other failed: its HTTP client has errors of its own" in line
     assert "me/other" not in hub.commits
 
@@ -115,5 +107,5 @@ def test_what_the_hub_refuses(hub, run, capsys):
 def test_without_huggingface_hub(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "huggingface_hub.errors", None)
     for words in (["play", "hf:me/small"], ["share", run, "--out", tmp_path / "agent"]):
-        assert "pip install 'torchrl-tit[share]'" in failure(capsys, *words)
+        assert "pip install 'torchrl-tit[share]'" in fails(capsys, *words)
     assert not any(tmp_path.iterdir())

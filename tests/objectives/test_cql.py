@@ -296,18 +296,6 @@ def test_actions_without_bounds_are_refused(spec):
         ContinuousCQLLoss(actor, critic, action_spec=endless)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"num_random": 0}, "num_random must be"),
-        ({"over_critics": "max"}, "'over_critics' is 'max'"),
-    ],
-)
-def test_impossible_settings_are_refused(settings, message):
-    with pytest.raises(ValueError, match=message):
-        make_loss(**settings)
-
-
 def test_critics_that_do_not_read_the_action_are_refused():
     actor = make_squashed_actor(OBSERVATION, SPEC, in_key="observation")
     blind = ValueOperator(nn.Linear(OBSERVATION, 1), in_keys=["observation"])

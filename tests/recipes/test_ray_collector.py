@@ -18,27 +18,16 @@ from recipes.core.ray_collector import _check_own_name
 from recipes.core.run import Run
 from recipes.core.runner import evaluate, train
 from recipes.core.task import seed_copies
-from recipes.ppo import PPO
 from recipes.sac import SAC, SACAlgorithm
 from tests.numerics import assert_near
+from tests.recipes.ppo import test_collector
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.rollout import FrameCollector, Rollout
 from torchrl_tit.settings.imports import import_allowed
 from torchrl_tit.settings.networks import enhanced_tit
 
 BACKBONE = enhanced_tit(2, embed_dim=8, features_dim=8)
-RECIPE = PPO(
-    env="Noted-v0",
-    backbone=BACKBONE,
-    total_steps=192,
-    steps_per_batch=64,
-    num_envs=4,
-    collectors=2,
-    minibatch_size=16,
-    epochs=1,
-    evaluation_episodes=2,
-    checkpoint_interval=64,
-)
+RECIPE = replace(test_collector.RECIPE, env="Noted-v0")
 SAC_RECIPE = SAC(
     env="Pendulum-v1",
     backbone=BACKBONE,

@@ -17,13 +17,13 @@ from recipes.core.registry import get_recipe
 from recipes.cql import CQL, DiscreteCQL
 from recipes.dqn import DQN
 from recipes.iql import IQL
-from recipes.ppo import PPO
 from recipes.sac import SAC
 from recipes.td3bc import TD3BC
 from tests.datasets.rollouts import roll, write
 from tests.recipes.small import (
     BC,
     SMALL,
+    TINY,
     make,
     make_cartpole_data,
     make_cql,
@@ -60,13 +60,7 @@ gymnasium.register("EndlessActions-v0", f"{__name__}:Endless")
 gymnasium.register("UnboundedActions-v0", f"{__name__}:Endless", kwargs={"begin": -np.inf})
 gymnasium.register("SeveralActions-v0", f"{__name__}:Endless", kwargs={"several": True})
 
-PPO_RECIPE = PPO(
-    env="CartPole-v1",
-    backbone=enhanced_tit(2, embed_dim=8, features_dim=8),
-    num_envs=4,
-    steps_per_batch=64,
-    minibatch_size=32,
-)
+PPO_RECIPE = replace(TINY, backbone=enhanced_tit(2, embed_dim=8, features_dim=8), num_envs=4)
 RECURRENT = {"backbone": lstm(embed_dim=8), "num_envs": 2}
 COLLECTORS = {"collectors": 2}
 REPLAY: dict[str, Any] = {"backbone": SMALL, "random_steps": 20, "steps_per_batch": 10}

@@ -16,23 +16,21 @@ from recipes.core.metrics import Metrics
 from recipes.core.run import Run
 from recipes.core.runner import evaluate, train
 from recipes.core.task import seed_copies
-from recipes.ppo import PPO, PPOAlgorithm
+from recipes.ppo import PPOAlgorithm
 from tests.numerics import assert_near
+from tests.recipes import small
 from tests.recipes.ppo import tasks
+from tests.recipes.small import TINY
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
 from torchrl_tit.settings.networks import enhanced_tit
 
-RECIPE = PPO(
-    env="CartPole-v1",
+RECIPE = replace(
+    TINY,
     backbone=enhanced_tit(2, embed_dim=8, features_dim=8),
     total_steps=192,
-    steps_per_batch=64,
     num_envs=4,
     collectors=2,
     minibatch_size=16,
-    epochs=1,
-    evaluation_episodes=2,
-    checkpoint_interval=64,
 )
 
 
@@ -103,9 +101,8 @@ def test_a_run_in_processes_is_the_run_in_one(tmp_path, monkeypatch):
     monkeypatch.setattr("torchrl_tit.envs.gymnasium_tasks.AsyncVectorEnv", Processes)
     for mode in ("sync", "async"):
         recipe = replace(recipe, vectorization_mode=mode)
-        with Run.create(tmp_path / mode, recipe) as run:
-            train(recipe, run)
-            evaluation = evaluate(run)
+        run = small.train(recipe, tmp_path / mode)
+        evaluation = evaluate(run)
         results.append((load_checkpoint(run.checkpoints)[1]["networks"], evaluation["returns"]))
     assert made == ["async"]
     (sync, returns), (async_, async_returns) = results

@@ -11,24 +11,20 @@ from recipes.core.adaptive import KLAdaptiveRate, ReturnScale, normalize_advanta
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
 from recipes.core.runner import evaluate
-from recipes.ppo import PPO, PPOAlgorithm
+from recipes.ppo import PPOAlgorithm
 from tests.recipes.ppo import tasks
 from tests.recipes.ppo.algorithms import note_calls, trained
-from tests.recipes.small import train
+from tests.recipes.small import TINY, train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.frames.normalized import NormalizedFrames
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
-RECIPE = PPO(
-    env="CartPole-v1",
+RECIPE = replace(
+    TINY,
     backbone=enhanced_tit(2, embed_dim=8, features_dim=8),
     total_steps=256,
-    steps_per_batch=64,
     num_envs=2,
-    minibatch_size=32,
     epochs=2,
-    checkpoint_interval=64,
-    evaluation_episodes=2,
 )
 
 

@@ -216,17 +216,7 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, naps, monkeypatch):
 )
 def test_bad_spaces_are_refused_before_anything_runs(space, message, files, capsys):
     (files / "space.json").write_text(json.dumps(space))
-    with pytest.raises(SystemExit) as stop:
-        main(words(files, 2))
-    assert stop.value.code == 2
-    assert message in capsys.readouterr().err
-    assert not (files / "out").exists()
-
-
-def test_seeds_that_cannot_be_are_refused_before_anything_runs(files, capsys):
-    assert "seed must be at least 0, not -1" in fails(
-        capsys, *words(files, 1), "--seeds", "0", "-1"
-    )
+    assert message in fails(capsys, *words(files, 2))
     assert not (files / "out").exists()
 
 
