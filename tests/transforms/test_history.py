@@ -16,7 +16,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from tests.transforms.streams import StreamEnv, assert_histories
-from torchrl_tit.transforms import History, frames_before
+from torchrl_tit.transforms import History
 
 
 @pytest.mark.parametrize("padding", ["same", "constant"])
@@ -173,19 +173,3 @@ def test_wrong_environment(wrap):
         TransformedEnv(StreamEnv([3], shape=(2, 4, 5)), wrap(History(2)))
     with pytest.raises(KeyError, match=r"'pixels' in the environment, which has \['observation'\]"):
         TransformedEnv(StreamEnv([3]), wrap(History(2, in_keys=["pixels"])))
-
-
-@pytest.mark.parametrize("num_frames", [1, 3])
-def test_the_frames_before_a_batch_complete_its_windows(num_frames):
-    transforms = Compose(RewardSum(), History(num_frames))
-    env = TransformedEnv(StreamEnv([4]), transforms)
-    root = env.reset()
-    for _ in range(12):
-        before = frames_before(env)
-        if num_frames == 1:
-            assert before == {}
-        else:
-            window = torch.cat([before["observation"], root["observation"].unsqueeze(1)], 1)
-            assert torch.equal(window, root["history"])
-            before["observation"].fill_(7)  # a copy
-        _, root = env.step_and_maybe_reset(env.rand_action(root))

@@ -140,6 +140,7 @@ def test_each_observation_counts_once(frames, padding, tmp_path, monkeypatch):
     wrappers = (f"{tasks.__name__}:Split",)
     recipe = replace(RECIPE, backbone=backbone, padding=padding, wrappers=wrappers)
     recipe = replace(recipe, normalize_observations=True, steps_per_batch=16, minibatch_size=16)
+    recipe = replace(recipe, total_steps=128)
     seen: list[Any] = []
     algorithm = make_algorithm(recipe)
     algorithm.prepare(0, tmp_path)
@@ -151,7 +152,7 @@ def test_each_observation_counts_once(frames, padding, tmp_path, monkeypatch):
     assert len(encoders) == 2
     for key, encoder in zip(["cart", "pole"], encoders, strict=True):
         expected = torch.cat([batch[key] for batch in seen])
-        assert encoder.count == len(expected) == 256
+        assert encoder.count == len(expected) == 128
         torch.testing.assert_close(encoder.mean, expected.mean(0), rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(encoder.variance, expected.var(0, unbiased=False))
 

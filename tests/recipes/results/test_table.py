@@ -179,6 +179,7 @@ def test_command(runs, tmp_path, capsys):
         ({"returns": [25.0]}, "not have a return for each of its 'episodes'"),
         ({"steps": -5}, "Expected `int` >= 0 - at `$.steps`"),
         ({"steps": 10**400}, "at `$.steps`"),
+        ({"seed": -1}, "Expected `int` >= 0 - at `$.seed`"),
         ({"episodes": "100\x1b[2J"}, "Expected `int`, got `str` - at `$.episodes`"),
         ({"score": {"best": float("inf"), "last": 0.0}}, "at `$.score.best`"),
         ({"score_std": -1.0}, "Expected `float` >= 0.0 - at `$.score_std`"),
