@@ -38,16 +38,6 @@ def test_windows_of_rows(num_frames, padding, stride, dtype):
         assert torch.equal(gathered[step], expected)
 
 
-@pytest.mark.parametrize("padding", ["same", "constant"])
-def test_used_rows_make_the_same_windows(padding):
-    frames = torch.rand(50, 3)
-    newest = torch.tensor([[40, 41], [7, 8]])
-    windows = find_windows(newest, newest - 2, 4, padding)
-    rows, renumbered = windows.used()
-    assert rows.tolist() == [5, 6, 7, 8, 38, 39, 40, 41]
-    assert torch.equal(renumbered.gather(frames[rows]), windows.gather(frames))
-
-
 def test_gathering_copies():
     frames = torch.zeros(3, 2)
     Windows(torch.tensor([0, 1]), None).gather(frames).fill_(1)

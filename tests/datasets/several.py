@@ -29,7 +29,8 @@ def _play(envs: int | None, steps: int, padding: Any, seed: int) -> TensorDictBa
     )
     first = steps // 3
     parts = [env.rollout(count, break_when_any_done=False) for count in (first, steps - first)]
-    played = torch.cat(parts, -1).exclude(*UNSTORED)
+    played: Any = torch.cat(parts, -1)
+    played = played.exclude(*UNSTORED)
     return played[0] if envs is None else played
 
 

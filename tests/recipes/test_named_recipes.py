@@ -161,7 +161,7 @@ def test_recipes_of_data_sets() -> None:
     assert {name for name in RECIPES if name.startswith(algorithms)} == expected
     # Those of an algorithm and a network differ in what test_settings says, and CQL's TITs, alone.
     changes: dict[str, Any] = {"name": "", "env": "", "dataset": "hopper-medium-v2"}
-    varied = {"cql": {"conservative_weight": 1.0}, "dt": {"target_returns": (1.0,)}}
+    varied: dict[str, Any] = {"cql": {"conservative_weight": 1.0}, "dt": {"target_returns": (1.0,)}}
     alike = set()
     for name in expected - named("cql", both, 0, "enhanced-tit"):
         algorithm, _, network = name.split("/")
