@@ -12,10 +12,10 @@ from recipes.cli import main
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
 from tests.recipes.commands import fails
-from tests.recipes.small import make_cartpole_dt, make_discrete_cql
+from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt
 from tests.recipes.untrained import untrained
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
+from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, lstm, mlp
 
 TIT: dict[str, Any] = {"patch_size": "auto", "embed_dim": 8, "num_blocks": 1, "features_dim": 8}
 PAGE = (432, 768, 3)
@@ -112,6 +112,16 @@ def test_several_observations_and_a_recurrent_state(tmp_path):
     run = untrained(tmp_path / "run", recipe)
     explain(run.folder, "--out", tmp_path / "a.mp4", "--max-steps", 2)
     assert imageio.imread(tmp_path / "a.mp4").shape == (2, *PAGE)
+
+
+def make_cartpole_dt(folder):
+    return make_dt(
+        folder,
+        env="CartPole-v1",
+        target_returns=(20.0,),
+        backbone=decision_transformer(**SMALL_DT),
+        action_space="discrete",
+    )
 
 
 def make_pendulum(folder):

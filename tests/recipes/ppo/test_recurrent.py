@@ -96,3 +96,9 @@ def test_a_film_is_evaluated_alike(tmp_path):
     rendered = replace(RECIPE, evaluation_seed=RECIPE.evaluation_seed)
     video = tmp_path / "film.gif"
     assert film(rendered, run, video, episodes=3) == returns
+
+
+def test_with_several_frames_it_reads_those_and_carries_no_state():
+    recipe = replace(RECIPE, backbone=replace(RECIPE.backbone, num_frames=4))
+    assert not recipe.backbone.carries_state
+    PPOAlgorithm(recipe).check()
