@@ -8,6 +8,7 @@ import sys
 import torchrl_tit
 from torchrl_tit.extras import EXTRAS, missing
 from torchrl_tit.settings import resolve
+from torchrl_tit.settings.checks import nearest
 
 from .arguments import fail, import_what_is_typed, one_line_warnings, program
 
@@ -112,6 +113,5 @@ def _run(arguments: list[str]) -> None:
         return
     name, *rest = arguments
     if name not in COMMANDS:
-        print(USAGE.format(program=program()), file=sys.stderr)
-        fail(f"unknown command {name!r}: choose from {', '.join(COMMANDS)}")
+        fail(f"unknown command {name!r}: {nearest(name, COMMANDS)} (see `{program()} --help`)")
     resolve(f"{__package__}.{COMMANDS[name]}")(rest)

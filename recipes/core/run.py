@@ -279,7 +279,9 @@ class Run:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ValueError(
                 f"the checkpoint of step {step} in {self.checkpoints} does not fit "
-                f"{self.folder / 'recipe.json'}; was that file changed since? ({reason})"
+                f"{self.folder / 'recipe.json'} ({reason}): an older version of torchrl-tit made "
+                "it, or that file was changed since; a new run can take its weights with "
+                "--init-from"
             ) from error
 
     def metrics(self, columns: list[str], last_step: int) -> Metrics:

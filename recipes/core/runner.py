@@ -400,6 +400,8 @@ def _load(run: Run, parts: Mapping[str, Stateful]) -> None:
     step, state = loaded
     with run.restoring(step):
         for name, part in parts.items():
+            if name not in state:
+                raise ValueError(f"it has no state of the part {name}")
             _load_part(part, state[name])
         set_global_rng_state(state["rng"])
 

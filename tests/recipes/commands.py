@@ -19,6 +19,7 @@ def fails(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     assert exit_.value.code == 2
     errors = capsys.readouterr().err
     assert "Traceback" not in errors
+    assert "usage:" not in errors
     [line] = [line for line in errors.splitlines() if line.startswith("error: ")]
     return line
 

@@ -52,6 +52,10 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
     "generators lost": (lambda s: s.pop("rng"), "rng"),
     "weights of another dtype": (change_weight(lambda w: w.double()), "float64, not torch.float32"),
     "weights that are no numbers": (change_weight(lambda w: w * torch.nan), "not finite"),
+    "parts of an older version": (
+        lambda s: s.pop("optimizer"),
+        "(it has no state of the part optimizer): an older version of torchrl-tit made it, or",
+    ),
     "moments of another dtype": (change_moment, "exp_avg of weight 0 is torch.float64"),
     "negative count of updates": (lambda s: s["record"].update(count=-1), "count"),
     "sums of nothing": (lambda s: s["record"].update(sums=[1.0]), "1 sums of 0 updates"),

@@ -14,6 +14,7 @@ EXPLAIN, BACKBONE = "explain run --out", f"train {TIT} --backbone"
 
 MISTAKES = [
     ("fly", "unknown command 'fly'"),
+    ("trian", "unknown command 'trian': did you mean train"),
     ("list atlantis", "no recipe's name contains 'atlantis'"),
     ("show nothing.json", "nothing.json"),
     ("train", "train needs the name of a recipe"),
