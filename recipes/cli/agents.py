@@ -1,29 +1,28 @@
-"""`play` and `share`: let trained agents act, and turn runs into agents that others can load."""
+"""`play`, `explain`, `export`, `share`: what is done with a trained agent."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from .arguments import Parser, check_seed, fail, program, say
+from torchrl_tit.settings.literals import parse_assignments
+
+from .arguments import Parser, add_agent, check_seed, fail, say
 
 _EPISODES = 10
 _MOST = 1_000_000
+_MAPS = ("grad-cam", "integrated-gradients", "attention")
 
 
 def play(arguments: list[str]) -> None:
     """Lets a trained agent play, or lists the agents that come with this package."""
     parser = Parser(
-        f"{program()} play",
-        description="Let a trained agent play whole episodes; without AGENT, list those that come "
-        "with torchrl-tit.",
+        "play",
+        "Let a trained agent play whole episodes; without AGENT, list those that come with "
+        "torchrl-tit.",
     )
-    parser.add_argument(
-        "agent",
-        nargs="?",
-        metavar="AGENT",
-        help="name, folder of an agent or of a run, or hf:user/name on the Hugging Face Hub",
-    )
+    add_agent(parser, nargs="?")
     parser.add_argument("--episodes", type=int, help=f"default: {_EPISODES}, or 1 in a film")
     parser.add_argument("--seed", type=int, help="seed of the first; default: the evaluation's")
     parser.add_argument("--out", type=Path, help="film them: a new file, .gif or .mp4")
@@ -70,12 +69,138 @@ def play(arguments: list[str]) -> None:
         say(f"written to {options.out}")
 
 
+def _list() -> None:
+    from torchrl_tit.agents import agent_names
+    from torchrl_tit.agents.folder import read_agent
+    from torchrl_tit.agents.loading import find_agent
+
+    names = agent_names()
+    if not names:
+        fail("no agents come with this copy of torchrl-tit: name a folder or hf:user/name")
+    for name in names:
+        evaluation = read_agent(find_agent(name)).evaluation
+        say(
+            f"{name}: {evaluation['env']}, return {evaluation['mean']:.1f} ± "
+            f"{evaluation['std']:.1f} over {evaluation['episodes']} episodes"
+        )
+
+
+def explain(arguments: list[str]) -> None:
+    """Films what a trained agent looks at, or draws one step of it."""
+    parser = Parser("explain", "Film what a trained agent looks at, or draw one step of it.")
+    add_agent(parser)
+    parser.add_argument(
+        "--out", type=Path, required=True, help="new file: a film (.gif, .mp4) or a picture (.png)"
+    )
+    parser.add_argument("--seed", type=int, help="seed of the episode; default: the evaluation's")
+    parser.add_argument("--step", type=int, help="of a picture: which step; default: 0, the first")
+    parser.add_argument("--max-steps", type=int, help="of a film: stop after so many steps")
+    parser.add_argument(
+        "--target",
+        choices=["action", "value"],
+        default="action",
+        help="what is explained: the chosen action, or the value; default: action",
+    )
+    parser.add_argument(
+        "--map",
+        choices=_MAPS,
+        help="how; default: grad-cam of images, integrated-gradients of arrays",
+    )
+    parser.add_argument(
+        "--layer", help="layer of grad-cam; default: the last that is laid out over the image"
+    )
+    options = parser.parse_args(arguments)
+    check_seed(options.seed)
+    import torch  # not at the top: help needs no PyTorch
+
+    from torchrl_tit import load_agent
+
+    from ..tools.results.explanation import check_explanation, explain_policy
+
+    check_explanation(options.out, options.step, options.max_steps)
+    agent = load_agent(options.agent)
+    torch.set_num_threads(agent.recipe["threads"])
+    seed = agent.first_seed if options.seed is None else options.seed
+    shown = explain_policy(
+        agent.make_env,
+        agent.policy,
+        agent.name,
+        options.out,
+        seed=seed,
+        step=options.step,
+        max_steps=options.max_steps,
+        title=agent.recipe["name"],
+        target=options.target,
+        kind=options.map,
+        layer=options.layer,
+    )
+    steps = f"{shown} steps" if shown > 1 else "1 step"
+    say(f"{steps} of the episode of seed {seed}\nwritten to {options.out}")
+
+
+def export(arguments: list[str]) -> None:
+    """Exports an agent's policy as a PyTorch or ONNX program."""
+    parser = Parser(
+        "export",
+        "Write an agent's policy, with its normalization, to a file that acts without torchrl-tit "
+        "and TorchRL, and check it against the agent on 100 observations.",
+    )
+    add_agent(parser)
+    parser.add_argument("--out", type=Path, required=True, help="new file: .pt2 or .onnx")
+    parser.add_argument(
+        "--format",
+        choices=["pt2", "onnx"],
+        help="torch.export's program or ONNX; default: as FILE ends",
+    )
+    parser.add_argument(
+        "--step-by-step",
+        action="store_true",
+        help="read one observation and the tokens of those before it, so that each is encoded "
+        "once, instead of the last K observations",
+    )
+    parser.add_argument(
+        "--sample",
+        action="store_true",
+        help="draw actions, from noise that is an input, instead of taking the most likely",
+    )
+    options = parser.parse_args(arguments)
+    from torchrl_tit import load_agent  # not at the top: help needs no PyTorch
+    from torchrl_tit.export import export_policy
+    from torchrl_tit.export.formats import find_format
+
+    find_format(options.out, options.format).check_installed()  # before an agent is loaded
+    agent = load_agent(options.agent)
+    facts = export_policy(
+        agent.policy,
+        agent.make_env,
+        options.out,
+        format=options.format,
+        step_by_step=options.step_by_step,
+        sample=options.sample,
+        facts=_facts(agent.recipe, agent.steps),
+    )
+    say(
+        f"{agent.name}: {', '.join(facts['inputs'])} -> {', '.join(facts['outputs'])}; differs by "
+        f"{facts['difference']:.0e} at most\nwritten to {options.out}"
+    )
+
+
+def _facts(recipe: Any, steps: int) -> dict[str, Any]:
+    """Further facts about an agent: its task, as `gymnasium.make` takes it, and its origin."""
+    return {
+        "task": {"id": recipe["env"], **parse_assignments(recipe["env_settings"])},
+        "wrappers": list(recipe["wrappers"]),
+        "recipe": recipe["name"],
+        "steps": steps,
+    }
+
+
 def share(arguments: list[str]) -> None:
     """Turns a run into an agent, in a folder or on the Hugging Face Hub."""
     parser = Parser(
-        f"{program()} share",
-        description="Make an agent of a run: its weights, recipe, evaluation, versions and a model "
-        "card. Upload it to the Hugging Face Hub, write it to a folder, or both.",
+        "share",
+        "Make an agent of a run: its weights, recipe, evaluation, versions and a model card. "
+        "Upload it to the Hugging Face Hub, write it to a folder, or both.",
     )
     parser.add_argument("run", metavar="RUN", help="run folder that is evaluated, or an agent")
     parser.add_argument("repository", nargs="?", metavar="REPO", help="user/name on the Hub")
@@ -121,19 +246,3 @@ def _upload(folder: Path, repository: str, private: bool) -> None:
     read_agent(folder)  # only complete, unmodified agents are uploaded
     address = upload(folder, repository, private=private)
     say(f"uploaded to {address}\nload_agent({PREFIX + repository!r}) loads it")
-
-
-def _list() -> None:
-    from torchrl_tit.agents import agent_names
-    from torchrl_tit.agents.folder import read_agent
-    from torchrl_tit.agents.loading import find_agent
-
-    names = agent_names()
-    if not names:
-        fail("no agents come with this copy of torchrl-tit: name a folder or hf:user/name")
-    for name in names:
-        evaluation = read_agent(find_agent(name)).evaluation
-        say(
-            f"{name}: {evaluation['env']}, return {evaluation['mean']:.1f} ± "
-            f"{evaluation['std']:.1f} over {evaluation['episodes']} episodes"
-        )

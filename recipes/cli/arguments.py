@@ -34,10 +34,17 @@ _OURS = (str(Path(torchrl_tit.__file__).parent), str(Path(__file__).parents[1]))
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that reports errors as the rest of the command line does."""
+    """A parser that reports errors as the rest of the command line does.
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    Args:
+        command: the command.
+        description: what it does, for its help.
+        **settings: as in :class:`argparse.ArgumentParser`.
+    """
+
+    def __init__(self, command: str = "", description: str | None = None, **settings: Any) -> None:
+        settings.setdefault("prog", f"{program()} {command}")  # subparsers have their own
+        super().__init__(description=description, **settings)
         # Only for the help text: the option itself is parsed before the command is known.
         self.add_argument(IMPORT, metavar="MODULE", help=IMPORT_HELP)
 
@@ -83,6 +90,12 @@ def _named(arguments: list[str]) -> Iterator[str]:
         # `hf:user/name` is an agent, whose files are not the user's own word.
         if found and found[1] != "hf" and not found[1].endswith((".", ".py")):
             yield found[1]
+
+
+def add_agent(parser: argparse.ArgumentParser, **settings: Any) -> None:
+    """Adds the argument that names a trained agent."""
+    words = "run folder, or a name that `play` lists, folder of an agent, hf:user/name on the Hub"
+    parser.add_argument("agent", metavar="AGENT", help=words, **settings)
 
 
 def add_machine_options(parser: argparse.ArgumentParser) -> None:

@@ -32,7 +32,7 @@ def data(arguments: list[str]) -> None:
     """Describes data sets, converts them, or makes them."""
     if arguments[:1] == ["collect"]:
         return _collect(arguments[1:])
-    parser = Parser(f"{program()} data")
+    parser = Parser("data", "Describe data sets, convert them, or make them.")
     _add_options(parser)
     options = parser.parse_args(arguments)
     reading = {

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from ..core.recipe import Recipe
-from .arguments import Parser, add_machine_options, fail, override, program, say
+from .arguments import Parser, add_machine_options, check_seed, fail, override, say
 
 
 def evaluate(arguments: list[str]) -> None:
     """Evaluates the newest checkpoint of a run: its last weights, or its best ones."""
-    parser = Parser(f"{program()} evaluate")
+    parser = Parser("evaluate", "Evaluate a run's newest checkpoint.")
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("--episodes", type=int, help="episodes; default: the recipe's")
     parser.add_argument("--seed", type=int, help="seed of the first episode; default: the recipe's")
@@ -75,7 +75,7 @@ def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
 
 def render(arguments: list[str]) -> None:
     """Films the agent of a run."""
-    parser = Parser(f"{program()} render")
+    parser = Parser("render", "Film a run's agent.")
     parser.add_argument("run", type=Path, help="run folder")
     parser.add_argument("--out", type=Path, required=True, help="new file: .gif or .mp4")
     parser.add_argument("--episodes", type=int, default=1, help="episodes, or whole Atari games")
@@ -83,10 +83,16 @@ def render(arguments: list[str]) -> None:
         "--seed", type=int, help="seed of the first episode; default: the evaluation's"
     )
     options = parser.parse_args(arguments)
-    from ..core.run import Run
-    from ..tools.results.film import film  # not at the top: help needs no PyTorch
+    check_seed(options.seed)
+    from ..core.run import Run  # not at the top: help needs no PyTorch
+    from ..core.runner import load_trained
+    from ..tools.results.film import check_film, film_policy
 
+    check_film(options.out)
     run = Run.open(options.run)
-    recipe = override(run.recipe, evaluation_seed=options.seed)
-    returns = film(recipe, run, options.out, options.episodes)
+    _, algorithm, _ = load_trained(run)
+    seed = run.recipe.evaluation_seed if options.seed is None else options.seed
+    returns = film_policy(
+        algorithm.make_env, algorithm.policy, run.folder, options.out, options.episodes, seed
+    )
     say(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")

@@ -13,7 +13,7 @@ from .arguments import Parser, fail, note, program, say
 
 def list_recipes(arguments: list[str]) -> None:
     """Prints the names of recipes, including those of installed packages."""
-    parser = Parser(f"{program()} list")
+    parser = Parser("list", "List the named recipes.")
     parser.add_argument("pattern", nargs="?", default="", help="part of a name; * is any text")
     pattern = parser.parse_args(arguments).pattern
     for failure in load_plugins():
@@ -26,6 +26,6 @@ def list_recipes(arguments: list[str]) -> None:
 
 def show(arguments: list[str]) -> None:
     """Prints a recipe as JSON."""
-    parser = Parser(f"{program()} show")
+    parser = Parser("show", "Print a recipe's settings as JSON.")
     parser.add_argument("name", help="name of a recipe, or a JSON or Python file")
     say(recipe_to_json(find_recipe(parser.parse_args(arguments).name)).rstrip("\n"))

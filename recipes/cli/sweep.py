@@ -5,24 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from ..core.algorithm import make_algorithm
-from ..core.registry import find_recipe
-from ..core.trust import allow_names
-from ..tools.sweeps.sweep import make_jobs, run_jobs
-from ..tools.wandb_metrics import check_wandb
-from .arguments import Parser, fail, note, program, say
+from .arguments import Parser, fail, note, option, say
+
+# What needs PyTorch or an extra is imported once the arguments are read: help is fast.
 
 
 def sweep(arguments: list[str]) -> None:
     """Trains recipes with seeds."""
-    parser = Parser(f"{program()} sweep")
+    parser = Parser("sweep", "Train many recipes and seeds at once; the same command resumes them.")
     parser.add_argument(
         "names",
         nargs="+",
         help="names of recipes, patterns such as 'ppo/*/mlp', JSON files with a recipe, or Python "
         "files with recipes",
     )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each recipe")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0], help="of each recipe; default: 0"
+    )
     parser.add_argument(
         "--workers",
         type=int,
@@ -34,10 +33,18 @@ def sweep(arguments: list[str]) -> None:
     parser.add_argument(
         "--wandb", metavar="PROJECT", help="project of Weights & Biases that metrics are sent to"
     )
-    parser.add_argument("--out", type=Path, default=Path("runs/sweep"), help="folder of the runs")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("runs/sweep"),
+        help="folder of the runs; default: %(default)s",
+    )
     options = parser.parse_args(arguments)
     if options.workers is not None and options.workers < 1:
         fail(f"--workers must be at least 1, not {options.workers}")
+    from ..tools.sweeps.sweep import make_jobs, run_jobs
+    from ..tools.wandb_metrics import check_wandb
+
     if options.wandb is not None:
         check_wandb(options.wandb)
     jobs = [
@@ -48,7 +55,6 @@ def sweep(arguments: list[str]) -> None:
         if options.ray is None:
             failed = run_jobs(jobs, options.workers or 1)
         else:
-            # Not at the top: Ray is an extra.
             from ..core.ray_cluster import connect
             from ..tools.sweeps.sweep_ray import RayWorker, count_begun, find_unmet_needs
 
@@ -68,21 +74,35 @@ def sweep(arguments: list[str]) -> None:
 
 def tune(arguments: list[str]) -> None:
     """Searches for the best values of a recipe's fields."""
-    parser = Parser(f"{program()} tune")
-    parser.add_argument("name", help="name of a recipe, or a JSON or Python file")
-    parser.add_argument("--space", type=Path, help="JSON file with the search space")
-    parser.add_argument("--trials", type=int, default=50, help="trials of the whole search")
-    parser.add_argument("--workers", type=int, default=1, help="trials at a time, each a process")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of each trial")
-    parser.add_argument(
-        "--startup-trials", type=int, default=5, help="trials that run before any is pruned"
+    parser = Parser(
+        "tune",
+        "Search for the best values of a recipe's fields, with Optuna: trials are runs, and those "
+        "whose returns stay low are pruned. The same command resumes a search.",
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the search")
+    parser.add_argument("name", help="name of a recipe, or a JSON or Python file")
+    parser.add_argument(
+        "--space", type=Path, help="JSON file with the search space; default: the recipe's, if ppo"
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0], help="of each trial; default: 0"
+    )
+    for name, default, words in (
+        ("trials", 50, "trials of the whole search"),
+        ("workers", 1, "trials at a time, each a process"),
+        ("startup_trials", 5, "trials that run before any is pruned"),
+    ):
+        help = f"{words}; default: {default}"
+        parser.add_argument(option(name), type=int, default=default, metavar="N", help=help)
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of the search; best.json is its result"
+    )
     options = parser.parse_args(arguments)
     for name in ("trials", "workers", "startup_trials"):
         if getattr(options, name) < 1:
-            fail(f"--{name.replace('_', '-')} must be at least 1, not {getattr(options, name)}")
-    # Not at the top: Optuna is an extra.
+            fail(f"{option(name)} must be at least 1, not {getattr(options, name)}")
+    from ..core.algorithm import make_algorithm
+    from ..core.registry import find_recipe
+    from ..core.trust import allow_names
     from ..tools.sweeps.search_space import load_space
     from ..tools.sweeps.tune import Search, Settings, importances
 

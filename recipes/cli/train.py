@@ -12,17 +12,14 @@ from typing import Annotated, Any
 import tyro
 
 from torchrl_tit.settings import resolve
-from torchrl_tit.settings.checks import field_types
 from torchrl_tit.settings.imports import load_plugins
 
-from ..core.recipe import Recipe, recipe_classes
+from ..core.recipe import LENGTHS, Recipe
 from ..core.registry import find_recipe
 from ..core.trust import allow_names
 from .arguments import Parser, add_machine_options, fail, option, parse_fields, program
 from .backbone_options import check_recipe, choose_network, option_fields
 
-_OF_A_RUN = {"--out", "--init-from", "--wandb"}
-"""The options of a new run that are not fields of its recipe."""
 WANDB_HELP = "Project of Weights & Biases that metrics are sent to, beside CSV and TensorBoard."
 
 
@@ -31,10 +28,10 @@ def train(arguments: list[str]) -> None:
     if not arguments:
         fail("train needs the name of a recipe first, or --resume RUN")
     if arguments[0].startswith("-"):
-        options = vars(_parse_resume(arguments))
-        run, device, threads = (options.pop(name) for name in ("resume", "device", "threads"))
-        lengths = {name: value for name in _lengths() if (value := options[name]) is not None}
-        resolve(f"{__package__}.training:resume")(run, device, threads, lengths, options["wandb"])
+        options = _parse_resume(arguments)
+        resolve(f"{__package__}.training:resume")(
+            options.resume, options.device, options.threads, options.lengths, options.wandb
+        )
     else:
         recipe, options = _parse_recipe(find_recipe(arguments[0]), arguments[1:])
         resolve(f"{__package__}.training:start")(
@@ -74,11 +71,8 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
 def _check_length(recipe: Recipe, arguments: list[str]) -> None:
     """Exits with a hint if the arguments set the length by another algorithm's field."""
     typed = {argument.partition("=")[0].replace("_", "-") for argument in arguments}
-    fields = {option(field) for field in field_types(type(recipe))}
-    if not {word for word in typed if word.startswith("--")} - fields - _OF_A_RUN:
-        return  # the other algorithms, whose fields they might be, need not be imported
-    for length in _lengths():
-        if option(length) in typed - fields:
+    for length in LENGTHS:
+        if option(length) in typed and not hasattr(recipe, length):
             fail(
                 f"{recipe.algorithm} has no {option(length)}: the length of its runs is "
                 f"{option(recipe.length)} (see `{program()} train {recipe.name} --help`)"
@@ -87,29 +81,21 @@ def _check_length(recipe: Recipe, arguments: list[str]) -> None:
 
 def _parse_resume(arguments: list[str]) -> argparse.Namespace:
     parser = Parser(
-        f"{program()} train",
+        "train",
+        "Train a named recipe, or one in a JSON or Python file; `train NAME --help` explains every "
+        "field. Or resume a run that was stopped or killed, or train a finished one further.",
         usage="%(prog)s NAME [--FIELD VALUE ...] [--init-from RUN]\n       %(prog)s --resume RUN "
         "[--total-steps N] [--device DEVICE] [--threads THREADS]",
-        description="Train a named recipe, or one in a JSON or Python file; `train NAME --help` "
-        "explains every field. Or resume a run that was stopped or killed, or train a finished one "
-        "further.",
     )
     parser.add_argument("--resume", type=Path, metavar="RUN", required=True, help="run folder")
-    for length, algorithms in _lengths().items():
-        parser.add_argument(
-            option(length),
-            type=int,
-            metavar="N",
-            help=f"new length of the whole run ({', '.join(algorithms)})",
-        )
+    imported = [kind.length for kind in Recipe.registered.values()]  # of one's own algorithms
+    lengths = dict.fromkeys([*LENGTHS, *imported])
+    for length in lengths:
+        words = "new length of the whole run, where this is the field that sets it"
+        parser.add_argument(option(length), type=int, metavar="N", help=words)
     parser.add_argument("--wandb", metavar="PROJECT", help=WANDB_HELP)
     add_machine_options(parser)
-    return parser.parse_args(arguments)
-
-
-def _lengths() -> dict[str, list[str]]:
-    """Returns the fields that set the length of a run, each with its algorithms."""
-    lengths: dict[str, list[str]] = {}
-    for algorithm, kind in recipe_classes().items():
-        lengths.setdefault(kind.length, []).append(algorithm)
-    return lengths
+    options = parser.parse_args(arguments)
+    typed = {name: getattr(options, name) for name in lengths}
+    options.lengths = {name: value for name, value in typed.items() if value is not None}
+    return options

@@ -201,6 +201,9 @@ _MODULES = {
 }
 """The modules of this package's algorithms, which are imported when one of them is looked up."""
 
+LENGTHS = ("total_steps", "total_updates", "iterations", "rounds")
+"""The fields that set the length of a run, of all of these algorithms."""
+
 
 def recipe_classes() -> dict[str, type[Recipe]]:
     """Imports all algorithms, and returns their recipe classes by name.

@@ -12,6 +12,7 @@ from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from recipes.core.algorithm import make_algorithm
 from recipes.core.dataset_recipe import DatasetRecipe
+from recipes.core.recipe import LENGTHS, recipe_classes
 from recipes.core.registry import RECIPES, get_recipe
 from recipes.ppo import PPO
 from recipes.presets.ppo_memory import MEMORY_RECIPES
@@ -135,6 +136,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "dt/hopper-*": {"target_returns": (3600, 1800)},
     "dt/walker2d-*": {"target_returns": (5000, 2500)},
 }  # fmt: skip
+
+
+def test_every_length_is_an_option_of_train() -> None:
+    assert {kind.length for kind in recipe_classes().values()} == set(LENGTHS)
 
 
 def test_settings() -> None:

@@ -18,36 +18,7 @@ from torchrl_tit.evaluation import evaluate
 from torchrl_tit.extras import install
 from torchrl_tit.files import whole_or_not_at_all
 
-from ...core.recipe import Recipe
-from ...core.run import Run
-from ...core.runner import load_trained
-
 FILMS = (".gif", ".mp4")
-
-
-def film(recipe: Recipe, run: Run, video: Path, episodes: int = 1) -> list[float]:
-    """Films a run's newest agent while it plays as in the evaluation.
-
-    Args:
-        recipe: the run's recipe; episode i begins from its ``evaluation_seed + i``.
-        run: a run folder with a checkpoint.
-        video: the GIF or MP4 file to write, which must not exist yet.
-        episodes: number of episodes, shown one after another in one film.
-
-    Returns:
-        The return of each episode.
-
-    Raises:
-        FileExistsError: if there is such a file already.
-        FileNotFoundError: if there is no checkpoint.
-        ValueError: if the file is of another kind, ``episodes`` is less than 1, the task cannot be
-            rendered, or something that rendering needs is missing: a package, or OpenGL for a
-            MuJoCo task.
-    """
-    check_film(video)
-    _, algorithm, _ = load_trained(run, recipe)
-    seed = recipe.evaluation_seed
-    return film_policy(algorithm.make_env, algorithm.policy, run.folder, video, episodes, seed)
 
 
 def check_film(video: Path) -> None:
@@ -71,7 +42,7 @@ def film_policy(
         make_env: makes the task, given the number of copies and ``render_mode``.
         policy: the policy.
         name: name of the policy in messages.
-        video: as in :func:`film`.
+        video: the GIF or MP4 file to write, which must not exist yet.
         episodes: number of episodes, shown one after another in one film.
         seed: seed of the first episode; episode i begins from ``seed + i``.
         max_pictures: length of the film, after which the policy plays on without being filmed; by
@@ -82,7 +53,9 @@ def film_policy(
 
     Raises:
         FileExistsError: if there is such a file already.
-        ValueError: as in :func:`film`.
+        ValueError: if the file is of another kind, ``episodes`` is less than 1, the task cannot be
+            rendered, or something that rendering needs is missing: a package, or OpenGL for a
+            MuJoCo task.
     """
     check_film(video)
     left = math.inf if max_pictures is None else max_pictures

@@ -33,7 +33,7 @@ def drawn(monkeypatch):
     def compare(*folders):
         found = {}
         monkeypatch.setattr(
-            "recipes.cli.compare.plot_comparison",
+            "recipes.tools.results.plot.plot_comparison",
             lambda experiments, picture, title: found.update(
                 {experiment.label: experiment.runs for experiment in experiments}
             ),

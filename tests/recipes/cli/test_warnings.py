@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 import recipes
 from recipes.cli.arguments import one_line_warnings
-from recipes.cli.unused_frames import UnusedFrames
+from recipes.cli.training import UnusedFrames
 from recipes.ppo import PPO
 from tests.recipes.commands import Command
 from torchrl_tit.settings.networks import enhanced_tit

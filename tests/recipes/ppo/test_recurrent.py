@@ -6,9 +6,9 @@ import pytest
 import torch
 from torchrl.objectives.value import GAE
 
+from recipes.cli import main
 from recipes.core.runner import evaluate
 from recipes.ppo import PPO, PPOAlgorithm
-from recipes.tools.results.film import film
 from tests.numerics import assert_near
 from tests.recipes.small import train
 from torchrl_tit.rollout import FrameCollector, Rollout
@@ -89,13 +89,12 @@ def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
         assert_near(features, batch["features"].flatten(0, 1)[rows])
 
 
-def test_a_film_is_evaluated_alike(tmp_path):
+def test_a_film_is_evaluated_alike(tmp_path, capsys):
     run = train(RECIPE, tmp_path / "run")
     returns = evaluate(run)["returns"]
     # One episode after the other remembers no more of them than all side by side.
-    rendered = replace(RECIPE, evaluation_seed=RECIPE.evaluation_seed)
-    video = tmp_path / "film.gif"
-    assert film(rendered, run, video, episodes=3) == returns
+    main(["render", str(run.folder), "--out", str(tmp_path / "film.gif"), "--episodes", "3"])
+    assert f"returns {', '.join(f'{value:g}' for value in returns)}" in capsys.readouterr().out
 
 
 def test_with_several_frames_it_reads_those_and_carries_no_state():

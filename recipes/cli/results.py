@@ -1,0 +1,109 @@
+"""`compare`, `table`, `record`, `report`: several runs side by side."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .arguments import Parser, fail, note, say
+
+# What needs PyTorch or an extra is imported once the arguments are read: help is fast.
+
+
+def compare(arguments: list[str]) -> None:
+    """Plots learning curves of several runs."""
+    parser = Parser("compare", "Plot learning curves of runs, a recipe's seeds as one band.")
+    parser.add_argument("runs", type=Path, nargs="+", help="run folders, or tables of runs")
+    parser.add_argument("--out", type=Path, default=Path("comparison.png"), help="PNG to write")
+    parser.add_argument("--title", default="", help="title of the figure")
+    options = parser.parse_args(arguments)
+    if options.out.suffix != ".png":
+        fail(f"--out {options.out} must end in .png: the figure is a PNG")
+    from ..tools.results.experiments import check_together, find_runs, group_runs
+    from ..tools.results.plot import plot_comparison
+
+    # The logs of a sweep lie next to its runs, so `sweep/*/seed-*` matches them too.
+    folders = {path.resolve(): path for path in options.runs if path.suffix != ".log"}
+    if not folders:
+        fail(f"{options.runs[0]} is not a run folder, but a log: name the folder beside it")
+    experiments = group_runs(find_runs(folders.values()))
+    check_together(experiments)
+    plot_comparison(experiments, options.out, title=options.title)
+    say(f"written to {options.out}")
+
+
+def table(arguments: list[str]) -> None:
+    """Prints the paper's tables for the runs in the folders."""
+    parser = Parser("table", "Print the paper's tables with all runs in the folders.")
+    parser.add_argument("folders", type=Path, nargs="+", help="folders of runs, or tables of runs")
+    parser.add_argument("--format", choices=["md", "csv"], default="md", help="format to print")
+    parser.add_argument("--out", type=Path, help="folder for table.md, table.csv and table.png")
+    options = parser.parse_args(arguments)
+    from torchrl_tit.files import write_text_atomic
+
+    from ..tools.results.plot import plot_table
+    from ..tools.results.table import make_table, to_csv, to_markdown
+
+    cells, notes = make_table(options.folders)
+    for line in notes:
+        note(line)
+    say((to_csv(cells) if options.format == "csv" else to_markdown(cells)).rstrip("\n"))
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        write_text_atomic(options.out / "table.md", to_markdown(cells))
+        write_text_atomic(options.out / "table.csv", to_csv(cells))
+        plot_table(cells, options.out / "table.png")
+        say(f"written to {options.out}")
+
+
+def record(arguments: list[str]) -> None:
+    """Adds runs to a table of runs."""
+    parser = Parser(
+        "record",
+        "Add finished runs to a table of runs, which is small enough to lie beside the code: "
+        "settings, versions, evaluations and metrics of four digits, without checkpoints. compare, "
+        "table and report read it as they read run folders.",
+    )
+    parser.add_argument(
+        "runs", type=Path, nargs="+", metavar="RUN", help="run folders, or folders of run folders"
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FOLDER", help="folder of the table"
+    )
+    parser.add_argument(
+        "--under", default="", metavar="PATH", help="path in the table; default: its top"
+    )
+    parser.add_argument("--commit", default="", help="commit of the code that the runs had")
+    options = parser.parse_args(arguments)
+    from ..tools.results.recording import record_runs
+
+    names = record_runs(options.runs, options.out, under=options.under, commit=options.commit)
+    for name in names:
+        say(str(options.out / name))
+    say(f"{len(names)} recorded in {options.out}")
+
+
+def report(arguments: list[str]) -> None:
+    """Writes a report of runs."""
+    parser = Parser(
+        "report",
+        "Write everything about runs into one HTML file that needs no network: results beside the "
+        "paper's, learning curves, metrics of health with their meaning, a film, what the agent "
+        "looks at, settings and versions. Several runs make a comparison.",
+    )
+    parser.add_argument(
+        "runs", type=Path, nargs="+", metavar="RUN", help="run folders, or tables of runs"
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the .html file")
+    parser.add_argument("--title", default="", help="title of the report; default: the recipe's")
+    parser.add_argument(
+        "--no-pictures",
+        action="store_true",
+        help="leave out the film and what the agent looks at, which take most of the time",
+    )
+    options = parser.parse_args(arguments)
+    from ..tools.results.report import report as write
+
+    pictures = not options.no_pictures
+    write(options.runs, options.out, title=options.title, pictures=pictures, say=say)
+    size = options.out.stat().st_size / 1e6
+    say(f"written to {options.out}: {size:.1f} MB, which needs no network")
