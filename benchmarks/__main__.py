@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import importlib
 
-from .measuring import folder
+import torch
+
+from .measuring import folder, publish, summary
 
 BENCHMARKS = [
     "acting",
@@ -20,7 +22,7 @@ BENCHMARKS = [
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Runs benchmarks, prints their Markdown, and writes it and the numbers as JSON."""
+    """Runs benchmarks, prints their numbers, and writes them as JSON."""
     parser = argparse.ArgumentParser("python -m benchmarks")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(BENCHMARKS)}")
     parser.add_argument("--out", type=folder, help="folder for NAME.md and NAME.json")
@@ -28,7 +30,12 @@ def main(arguments: list[str] | None = None) -> None:
     if unknown := set(options.names) - set(BENCHMARKS):
         parser.error(f"unknown benchmark {sorted(unknown)}: choose from {', '.join(BENCHMARKS)}")
     for name in options.names or BENCHMARKS:
-        importlib.import_module(f"benchmarks.{name}").main(options.out)
+        module = importlib.import_module(f"benchmarks.{name}")
+        torch.set_num_threads(1)
+        torch.manual_seed(0)
+        numbers = module.main()
+        markdown = f"# {name}\n\n{module.__doc__}\n{summary(numbers)}"
+        publish(name, markdown, numbers, options.out, f"python -m benchmarks {name}")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ import statistics
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,7 +21,7 @@ from torch import Tensor
 
 from torchrl_tit.modules import Backbone
 
-from .measuring import publish, ratios, spread, table, take_turns
+from .measuring import ratios, take_turns
 from .straightforward import Case
 
 ROUNDS, SECONDS, STEPS = 7, 0.5, 100
@@ -91,24 +90,6 @@ def measure(case: Case, rounds: int, seconds: float, *, compiled: bool) -> dict[
     return row
 
 
-def main(out: Path | None) -> None:
-    """Measures on one thread and reports."""
-    torch.set_num_threads(1)
-    rows = [measure(case, ROUNDS, SECONDS, compiled=is_compiled(case)) for case in CASES]
-    lines = [
-        [
-            *(row[name] for name in ("variant", "inputs", "num_frames")),
-            *(spread(row.get(f"{x}_ms", []), 2) for x in ("ours", "compiled", "straightforward")),
-            *(spread(row.get(f"{x}_ratios", []), 1) for x in ("ours", "compiled")),
-            *(spread(row.get(f"{x}_growth", []), 2) for x in ("ours", "compiled")),
-        ]
-        for row in rows
-    ]
-    times = ["ours", "ours, compiled", "straightforward", "ratio", "ratio, compiled"]
-    header = ["variant", "inputs", "K", *times, "K = 64 against 4", "the same, compiled"]
-    markdown = (
-        f"# Acting\n\nMilliseconds a step of {CASES[0].batch} environments together, float32, "
-        f"processor time of one thread.\n{ROUNDS} rounds of at least {SECONDS} seconds, "
-        "alternating: median (range); ratios are taken round by round.\n\n" + table(header, lines)
-    )
-    publish("acting", markdown, {"rows": rows}, out)
+def main() -> dict[str, Any]:
+    """Measures all cases."""
+    return {"rows": [measure(case, ROUNDS, SECONDS, compiled=is_compiled(case)) for case in CASES]}

@@ -32,7 +32,7 @@ from recipes.core.registry import RECIPES
 from recipes.cql import CQL, CQLAlgorithm
 from torchrl_tit.networks import build_network
 
-from .measuring import publish, ratios, spread, table, take_turns
+from .measuring import ratios, take_turns
 
 ROUNDS, SECONDS = 10, 1.0
 OBSERVATION, ACTION = 11, 3
@@ -169,37 +169,24 @@ def make_floor() -> Callable[[TensorDictBase], Any]:
     return products
 
 
-def main(out: Path | None) -> None:
-    """Measures on one thread, alternating, and reports."""
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    batch = make_batch()
+def main() -> dict[str, Any]:
+    """Measures milliseconds an update, alternating."""
     updates = {
         "d3rlpy": make_theirs(),
         "this library": make_ours("off"),
         "this library, its policy compiled": make_ours("on"),
         "the critics' matrix products alone": make_floor(),
     }
+    batch = make_batch()
     steps = {name: partial(update, batch) for name, update in updates.items()}
     times = take_turns(steps, ROUNDS, SECONDS)
     theirs, *ours, floor = times
     above = {
-        name: [a - b for a, b in zip(times[name], times[floor], strict=True)]
-        for name in (theirs, *ours)
-    }
-    whole = {name: ratios(times[theirs], times[name]) for name in ours}
-    rest = {name: ratios(above[theirs], above[name]) for name in ours}
-    rows = [
-        [name, spread(taken), spread(whole.get(name, []), 2), spread(rest.get(name, []), 2)]
+        name: [a - b for a, b in zip(taken, times[floor], strict=True)]
         for name, taken in times.items()
-    ]
-    markdown = (
-        "# Conservative Q-learning\n\n"
-        "One update of CQL_TIT with the networks of the paper's hopper-medium-replay, batch 256, "
-        "one thread,\nprocessor time, compile time apart. "
-        f"{ROUNDS} rounds of at least {SECONDS} seconds, alternating: median (range), round by"
-        "\nround for ratios.\n\n"
-        + table(["", "ms an update", "times as fast as d3rlpy", "without the products"], rows)
-    )
-    numbers = {"ms": times, "ratios": whole, "ratios_beside_the_floor": rest}
-    publish("cql", markdown, numbers, out)
+    }
+    return {
+        "ms": times,
+        "ratios": {name: ratios(times[theirs], times[name]) for name in ours},
+        "ratios_beside_the_floor": {name: ratios(above[theirs], above[name]) for name in ours},
+    }

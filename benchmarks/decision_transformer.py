@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -28,25 +28,10 @@ from torchrl_tit.networks import DTTIT, DecisionTransformer, HistoryNetwork
 from torchrl_tit.objectives import MaskedDTLoss
 from torchrl_tit.transforms import SequenceHistory
 
-from .measuring import (
-    count_flops,
-    milliseconds,
-    peak_flops,
-    publish,
-    ratios,
-    spread,
-    table,
-    take_turns,
-)
+from .measuring import count_flops, milliseconds, peak_flops, take_turns
 
 ROUNDS, SECONDS, EPISODES = 10, 1.0, 100
 NETWORKS = {"DT": DecisionTransformer, "DT_TIT": DTTIT}
-TITLES = {
-    "TorchRL": "`DTActor` in `DTLoss`",
-    "DT": "DT of this library",
-    "DT_TIT": "DT_TIT of this library",
-    "floor": "matrix products of DT's step alone",
-}
 TASKS = {"HalfCheetah-v5": 30, "Hopper-v5": 200}  # with the longest episode
 
 
@@ -119,8 +104,8 @@ def measure_training() -> dict[str, list[float]]:
     return {**take_turns(steps, ROUNDS, SECONDS), "floor": [floor] * ROUNDS}
 
 
-def measure_evaluation(task: str, longest: int, name: str) -> tuple[float, float]:
-    """Seconds of a hundred episodes one after another, and side by side."""
+def measure_evaluation(task: str, longest: int, name: str) -> dict[str, float]:
+    """Seconds of a hundred episodes of an untrained network, one after another or side by side."""
     torch.manual_seed(0)
     single = make_evaluation_env(task, longest, 1)
     (size,) = single.observation_spec["observation"].shape[1:]
@@ -129,7 +114,7 @@ def measure_evaluation(task: str, longest: int, name: str) -> tuple[float, float
     with acting(actor):
         apart = milliseconds(partial(evaluate, single, actor, EPISODES), 0) / 1000
         beside = milliseconds(partial(evaluate, many, actor, EPISODES, shrink=True), 0) / 1000
-    return apart, beside
+    return {"one_after_another": apart, "side_by_side": beside}
 
 
 def make_evaluation_env(task: str, longest: int, num_envs: int) -> TransformedEnv:
@@ -138,38 +123,15 @@ def make_evaluation_env(task: str, longest: int, num_envs: int) -> TransformedEn
     return TransformedEnv(env, Compose(TargetReturn(3600.0), SequenceHistory(20)))
 
 
-def main(out: Path | None) -> None:
-    """Measures on one thread and reports."""
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
+def main() -> dict[str, Any]:
+    """Measures training and evaluation."""
     times = measure_training()
-    peer = times["TorchRL"]
-    training = [
-        [TITLES[name], spread(taken), "" if taken is peer else spread(ratios(peer, taken), 2)]
-        for name, taken in times.items()
-    ]
     evaluation = {
         f"{task} {name}": measure_evaluation(task, longest, name)
         for task, longest in TASKS.items()
         for name in NETWORKS
     }
-    rows = [[k, f"{a:.1f}", f"{b:.1f}", f"{a / b:.1f}"] for k, (a, b) in evaluation.items()]
-    markdown = (
-        "# Decision Transformer\n\n"
-        "## A training step\n\n"
-        "Batch 64, 20 steps, width 128, 3 layers, 1 head, dropout 0.1, Hopper's sizes; forward, "
-        "backward,\nclipping and fused AdamW, one thread, processor time. "
-        f"{ROUNDS} rounds of at least {SECONDS} seconds,\nalternating: median (range), ratios "
-        "round by round.\n\n"
-        + table(["", "ms a step", "times as fast as `DTActor`"], training)
-        + "\nOurs computes an embedding of time steps and a mask of padding in addition, and of "
-        "the last\nblock only the state tokens, which are all that is read.\n\n"
-        f"## {EPISODES} episodes of evaluation\n\n"
-        "Untrained networks, one thread, processor time: the same episodes in one environment, "
-        "one after\nanother, and in as many environments side by side. HalfCheetah's episodes have "
-        f"{TASKS['HalfCheetah-v5']} steps each,\nHopper's differ in length.\n\n"
-        + table(["task and network", "one by one, s", "side by side, s", "ratio"], rows)
-    )
-    seconds = {name: [one / 1000 for one in taken] for name, taken in times.items()}
-    numbers = {"training": {"seconds": seconds}, "evaluation_seconds": evaluation}
-    publish("decision_transformer", markdown, numbers, out)
+    return {
+        "training": {"seconds": {n: [one / 1000 for one in taken] for n, taken in times.items()}},
+        "evaluation_seconds": evaluation,
+    }

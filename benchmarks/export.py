@@ -7,7 +7,6 @@ are the processor time of one thread, which other programs on the machine hardly
 
 from __future__ import annotations
 
-import statistics
 import tempfile
 from collections.abc import Callable
 from functools import partial
@@ -24,7 +23,7 @@ from torchrl_tit.export import export_policy
 from torchrl_tit.export.formats import FORMATS
 from torchrl_tit.modules import Backbone, acting, make_actor
 
-from .measuring import publish, ratios, spread, table, take_turns
+from .measuring import take_turns
 from .straightforward import Case
 
 STEPS, ROUNDS = 30, 5
@@ -111,25 +110,6 @@ def play(act: Act, frames: Tensor, num_frames: int) -> list[Tensor]:
     return [act(frames[:, :end], end == num_frames) for end in ends]
 
 
-def main(out: Path | None) -> None:
-    """Measures on one thread and reports."""
-    torch.set_num_threads(1)
-    rows = []
-    numbers = []
-    for case in CASES:
-        forms = measure(case, STEPS, ROUNDS)
-        numbers.append({**case.record(), "forms": forms})
-        for name, found in forms.items():
-            rates = [found["rates"][size] for size in SIZES]
-            times_live = statistics.median(ratios(rates[0], forms["live"]["rates"][SIZES[0]]))
-            of = [case.inputs, case.num_frames, name, "" if name == "live" else found["kB"]]
-            rows.append([*of, *map(spread, rates), f"{times_live:.1f}"])
-    environments = [f"steps/s, {n} env{'s' * (n > 1)}" for n in SIZES]
-    markdown = (
-        "# Exported policies\n\nEnhanced_TIT with the paper's sizes. Steps a second of all "
-        f"environments together: median (range) of {ROUNDS} rounds of {STEPS} steps, "
-        "alternating, by the\nprocessor time of one thread. The last column is the median ratio "
-        "for one environment.\n\n"
-        + table(["inputs", "K", "form", "kB", *environments, "times live"], rows)
-    )
-    publish("export", markdown, {"rows": numbers}, out)
+def main() -> dict[str, Any]:
+    """Measures all cases."""
+    return {"rows": [{**case.record(), "forms": measure(case, STEPS, ROUNDS)} for case in CASES]}

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Iterable
-from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -19,7 +19,7 @@ from torchrl.envs.transforms import CatFrames, Compose, UnsqueezeTransform
 
 from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays, make_replay_buffer
 
-from .measuring import publish, ratios, spread, table, take_turns
+from .measuring import ratios, take_turns
 
 BATCH, ROUNDS, SECONDS = 256, 5, 1.0
 CASES = {  # observation shape, dtype, transitions, K
@@ -109,10 +109,9 @@ def bytes_per_step(stream: dict[str, torch.Tensor], num_frames: int) -> tuple[fl
     return ours / steps, stacked
 
 
-def main(out: Path | None) -> None:
-    """Measures, alternating, and reports."""
-    torch.set_num_threads(1)
-    rows, numbers = [], {}
+def main() -> dict[str, Any]:
+    """Measures transitions per second, alternating."""
+    numbers = {}
     for case, (shape, dtype, steps, num_frames) in CASES.items():
         torch.manual_seed(0)
         stream = make_stream(shape, dtype, steps)
@@ -121,21 +120,11 @@ def main(out: Path | None) -> None:
             assert buffer.sample()["next", "history"].shape == (BATCH, num_frames, *shape)
         times = take_turns({"ours": ours.sample, "theirs": theirs.sample}, ROUNDS, SECONDS)
         speeds = [[1000 * BATCH / one for one in times[name]] for name in ("ours", "theirs")]
-        found = ratios(*speeds)
         sizes = bytes_per_step(stream, num_frames)
-        rows.append([case, *map(spread, speeds), spread(found, 1), *(f"{x:.0f}" for x in sizes)])
         numbers[case] = {
             "our_windows_per_second": speeds[0],
             "catframes_windows_per_second": speeds[1],
-            "ratios": found,
-            "median_ratio": statistics.median(found),
+            "median_ratio": statistics.median(ratios(*speeds)),
             "bytes": {"ours": sizes[0], "stacked": sizes[1]},
         }
-    header = ["", "HistoryStorage", "CatFrames in a replay buffer", "ratio, pair by pair"]
-    header += ["bytes a transition", "stacked frames"]
-    markdown = (
-        "# Histories cut from stored episodes\n\n"
-        f"Transitions a second in batches of {BATCH} with both histories; {ROUNDS} rounds of "
-        f"{SECONDS:.0f} second each, alternating: median (range).\n\n" + table(header, rows)
-    )
-    publish("history_windows", markdown, numbers, out)
+    return numbers

@@ -82,18 +82,42 @@ def peak_flops(rows: int = 2048, inner: int = 2048, columns: int = 2048) -> floa
     return 2000 * rows * inner * columns / best
 
 
-def spread(values: Sequence[float], digits: int = 0) -> str:
-    """Formats the median and the range of repeats, as ``300 (280 to 310)``; nothing for none."""
-    if not values:
-        return ""
-    low, middle, high = min(values), statistics.median(values), max(values)
-    return f"{middle:.{digits}f} ({low:.{digits}f} to {high:.{digits}f})"
+def spread(values: Sequence[float]) -> str:
+    """Formats the median and the range of repeats, as ``300 (280 to 310)``."""
+    middle, low, high = map(_digits, (statistics.median(values), min(values), max(values)))
+    return f"{middle} ({low} to {high})"
+
+
+def _digits(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Makes a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in lines) + "\n"
+
+
+def summary(numbers: Mapping[str, Any]) -> str:
+    """Makes a Markdown table of nested numbers; lists of repeats become medians and ranges.
+
+    Args:
+        numbers: rows by their names, or a list of rows under "rows".
+    """
+    rows = numbers.get("rows") or [{"": name, **_cells(row)} for name, row in numbers.items()]
+    flat = [_cells(row) for row in rows]
+    header = list(dict.fromkeys(name for row in flat for name in row))
+    return table(header, [[row.get(name, "") for name in header] for row in flat])
+
+
+def _cells(numbers: Any, path: str = "") -> dict[str, object]:
+    """Nested numbers by their paths."""
+    if isinstance(numbers, Mapping):
+        below = [_cells(part, f"{path} / {name}".strip(" /")) for name, part in numbers.items()]
+        return {name: cell for part in below for name, cell in part.items()}
+    if isinstance(numbers, float):
+        return {path: _digits(numbers)}
+    return {path: spread(numbers) if isinstance(numbers, list | tuple) else numbers}
 
 
 def folder(text: str) -> Path:
@@ -109,7 +133,7 @@ def publish(
     markdown: str,
     numbers: dict[str, Any],
     out: Path | None,
-    command: str | None = None,
+    command: str,
 ) -> None:
     """Prints the Markdown; writes Markdown and numbers, with date and versions, to a folder."""
     facts = {
@@ -122,7 +146,6 @@ def publish(
             if find_spec(package.replace("-", "_"))
         },
     }
-    command = command or f"python -m benchmarks {name}"
     listed = ", ".join(f"{key} {value}" for key, value in facts.items())
     markdown += f"\nMeasured with `{command}`: {listed}.\n"
     print(markdown)

@@ -16,7 +16,6 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -33,18 +32,13 @@ from recipes.core.recipe import Compile
 from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 
-from .measuring import empty_compile_cache, publish, ratios, spread, table
+from .measuring import empty_compile_cache
 from .straightforward import StraightforwardTIT
 
 STEPS, ENVS = 2048, 8
 SETTINGS = {1: (5, 5), 8: (3, 3)}
 """How many batches a run has, and how many rounds there are, by the number of frames."""
 MODES: dict[str, Compile] = {"compiled": "on", "ours": "off"}
-TITLES = {
-    "sb3": "Stable-Baselines3, straightforward network",
-    "compiled": "this library, compiled",
-    "ours": "this library, `--compile off`",
-}
 
 
 @dataclass
@@ -150,50 +144,22 @@ def run_ours(num_frames: int, batches: int, seed: int, compile: Compile) -> Laps
     return callback.laps
 
 
-def main(out: Path | None) -> None:
-    """Measures on one thread, with an empty compile cache, and reports."""
-    torch.set_num_threads(1)
-    markdown = (
-        "# PPO on CartPole-v1, end to end\n\n"
-        f"Enhanced_TIT (width 32, 2 blocks, 1 head, features 64), {ENVS} environments, {STEPS} "
-        "steps a batch,\nminibatches of 64, 10 epochs, one thread. Runs alternate, and the first "
-        "batch of each is left out. Medians\nand ranges; ratios are taken round by round. The "
-        "return is that of the episodes that ended in the last\nbatch.\n"
-    )
+def main() -> dict[str, Any]:
+    """Measures with an empty compile cache."""
     numbers = {}
     for num_frames, (batches, rounds) in SETTINGS.items():
         with empty_compile_cache():
             runs = take_turns(num_frames, batches, rounds)
-        speeds = {name: [laps.speed() for laps in found] for name, found in runs.items()}
-        processor = {name: [laps.speed(1) for laps in found] for name, found in runs.items()}
-        returns = {name: [one.training_return for one in found] for name, found in runs.items()}
-        first = {name: [x.ends[0][0] - x.start for x in found] for name, found in runs.items()}
-        rows = [
-            [
-                TITLES[name],
-                spread(speeds[name]),
-                spread(ratios(speeds[name], speeds["sb3"]), 2),
-                spread(ratios(processor[name], processor["sb3"]), 2),
-                spread(returns[name]),
-            ]
-            for name in TITLES
-        ]
-        header = ["", "steps a second", "ratio", "ratio of processor time"]
-        markdown += (
-            f"\nK = {num_frames}: {rounds} rounds of {batches} batches; compiling took "
-            f"{first['compiled'][0]:.0f} seconds in the first batch, with nothing cached.\n\n"
-            + table([*header, "return after training"], rows)
-        )
         numbers[f"K = {num_frames}"] = {
             name: {
-                "steps_per_second": speeds[name],
-                "steps_per_second_of_processor_time": processor[name],
-                "training_return": returns[name],
-                "first_batch_seconds": first[name],
+                "steps_per_second": [laps.speed() for laps in found],
+                "steps_per_second_of_processor_time": [laps.speed(1) for laps in found],
+                "training_return": [laps.training_return for laps in found],
+                "first_batch_seconds": [laps.ends[0][0] - laps.start for laps in found],
             }
-            for name in TITLES
+            for name, found in runs.items()
         }
-    publish("ppo_cartpole", markdown, numbers, out)
+    return numbers
 
 
 def take_turns(num_frames: int, batches: int, rounds: int) -> dict[str, list[Laps]]:

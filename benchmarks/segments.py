@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,16 +20,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torchrl_tit import Backbone
 
-from .measuring import (
-    count_flops,
-    empty_compile_cache,
-    peak_flops,
-    publish,
-    ratios,
-    spread,
-    table,
-    take_turns,
-)
+from .measuring import count_flops, empty_compile_cache, peak_flops, take_turns
 from .straightforward import Case
 
 SAMPLES, ROUNDS, SECONDS = 64, 5, 0.5
@@ -125,45 +115,8 @@ def measure(row: Row, rounds: int, seconds: float) -> dict[str, Any]:
     return {**case.record(), "length": row.length, "ms": times, "flops": flops}
 
 
-def cells(result: dict[str, Any], rate: float) -> list[str]:
-    """Makes the cells of a table row."""
-    times = result["ms"]
-
-    def against(peer: str, ours: str) -> str:
-        return spread(ratios(times[peer], times[ours]), 2) if ours in times else ""
-
-    return [
-        result["variant"],
-        result["inputs"],
-        str(result["num_frames"]),
-        f"{SAMPLES // result['length']} of {result['length']}",
-        f"{1000 * result['flops'] / rate:.1f}",
-        spread(times["segments"], 1),
-        spread(times.get("segments, compiled", []), 1),
-        against("full windows", "segments"),
-        against("full windows, compiled", "segments, compiled"),
-        against("straightforward", "segments"),
-        against("straightforward", "full windows"),
-        against("straightforward", "full windows, compiled"),
-    ]
-
-
-def main(out: Path | None) -> None:
-    """Measures on one thread, with an empty compile cache, and reports."""
-    torch.set_num_threads(1)
+def main() -> dict[str, Any]:
+    """Measures with an empty compile cache."""
     with empty_compile_cache():
         results = [measure(row, ROUNDS, SECONDS) for row in ROWS]
-    rate = peak_flops()
-    header = ["variant", "inputs", "K", "segments", "floor", "ms a step", "ms compiled"]
-    header += ["full windows", "both compiled", "straightforward", "ours on full windows"]
-    header += ["the same, compiled"]
-    markdown = (
-        f"# Training on segments\n\n{SAMPLES} samples, forward, backward and Adam, one thread, "
-        f"processor time. {ROUNDS} rounds of at least\n{SECONDS} seconds, alternating: median "
-        "(range). Three columns say how many times as long the same step takes on\nfull windows, "
-        "eager and compiled, and with the straightforward network; the last two, how many times as "
-        "long\nas ours the straightforward network takes, both on full windows. The floor is the "
-        f"time of our matrix products at\n{rate / 1e9:.0f} GFLOP/s, the rate of one large "
-        "product.\n\n" + table(header, [cells(result, rate) for result in results])
-    )
-    publish("segments", markdown, {"rows": results, "flops_a_second": rate}, out)
+    return {"rows": results, "flops_a_second": peak_flops()}

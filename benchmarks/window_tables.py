@@ -10,11 +10,10 @@ window first.
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Sequence
 from functools import partial
 from itertools import product
-from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +22,7 @@ from torchrl_tit.modules.frame_tables import FrameTable, table_of_first
 from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, build_network
 from torchrl_tit.settings import GTrXL, Inner, Network
 
-from .measuring import publish, ratios, spread, table, take_turns
+from .measuring import ratios, take_turns
 from .segments import make_descent
 
 SAMPLES, WIDTH, ROUNDS, SECONDS = 512, 4, 5, 0.5
@@ -58,33 +57,19 @@ def make_network(name: str, num_frames: int) -> HistoryNetwork:
     return network
 
 
-def main(
-    out: Path | None, num_frames: Sequence[int] = NUM_FRAMES, seconds: float = SECONDS
-) -> None:
-    """Measures, alternating, and reports."""
-    torch.set_num_threads(1)
-    rows, numbers = [], {}
+def main(num_frames: Sequence[int] = NUM_FRAMES, seconds: float = SECONDS) -> dict[str, Any]:
+    """Measures, alternating."""
+    numbers = {}
     for name, k in product(NETWORKS, num_frames):
         torch.manual_seed(0)
         frames, network = make_table(k), make_network(name, k)
         losses = [read(network, in_table, frames).item() for in_table in (True, False)]
         torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-6)
         steps = {
-            way: make_descent(network, partial(read, network, way == "table"), frames)
-            for way in ("table", "copies")
+            way: make_descent(network, partial(read, network, way == "table_ms"), frames)
+            for way in ("table_ms", "copies_ms")
         }
         times = take_turns(steps, ROUNDS, seconds)
-        found = ratios(times["copies"], times["table"])
-        rows.append([name, k, *(spread(x, 1) for x in (*times.values(), found))])
-        numbers[f"{name}, K = {k}"] = {
-            "table_ms": times["table"],
-            "copies_ms": times["copies"],
-            "ratios": found,
-            "median_ratio": statistics.median(found),
-        }
-    markdown = (
-        "# Windows on a table of frames\n\n"
-        f"{SAMPLES} steps, one thread, {ROUNDS} rounds, alternating: median (range).\n\n"
-        + table(["network", "K", "table, ms", "copies of windows, ms", "ratio, pair by pair"], rows)
-    )
-    publish("window_tables", markdown, numbers, out)
+        found = ratios(times["copies_ms"], times["table_ms"])
+        numbers[f"{name}, K = {k}"] = {**times, "ratios": found}
+    return numbers
