@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 import os
 import shutil
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from torchrl_tit.evaluation_file import MOST_STEPS, is_number
 from torchrl_tit.extras import missing
 from torchrl_tit.files import naming, write_text_atomic
+
+from .records import to_csv
 
 
 class Metrics:
@@ -44,8 +44,7 @@ class Metrics:
         self._last = (last_step, time.monotonic())
         kept = [row for row in read_metrics(self.path) if row["step"] <= last_step]
         # Written atomically: a process that is killed here loses no row.
-        lines = [self._line(self._columns), *(self._line(self._cells(row)) for row in kept)]
-        write_text_atomic(self.path, "".join(lines))
+        write_text_atomic(self.path, to_csv([self._columns, *map(self._cells, kept)]))
         events = folder / "tensorboard"
         if events.is_symlink():  # its target is not ours
             events.unlink()
@@ -61,7 +60,7 @@ class Metrics:
         self._last = (step, time.monotonic())
         speed = (step - before) / max(self._last[1] - then, 1e-9)
         row = {"step": step, "time": time.time(), "steps_per_second": speed, **values}
-        line = self._line(self._cells(row))
+        line = to_csv([self._cells(row)])
         with naming(self.path):
             self._file.write(line)
             self._file.flush()
@@ -85,12 +84,6 @@ class Metrics:
             raise ValueError(
                 f"{self.path} has no column {error}: it belongs to another run"
             ) from error
-
-    @staticmethod
-    def _line(cells: list[Any]) -> str:
-        buffer = io.StringIO()
-        csv.writer(buffer, lineterminator="\n").writerow(cells)
-        return buffer.getvalue()
 
     def _draw(self, row: dict[str, float]) -> None:
         for name in self._columns[2:]:

@@ -22,7 +22,7 @@ from torchrl_tit.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from torchrl_tit.evaluation_file import parse_evaluation, read_evaluation
+from torchrl_tit.evaluation_file import EVALUATION, parse_evaluation, read_evaluation
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.settings.imports import allowed_modules
 
@@ -206,18 +206,13 @@ class Run:
             ) from error
 
     def __enter__(self) -> Run:
-        self._lock = filelock.FileLock(self.folder / ".lock", timeout=0)
-        try:
-            self._lock.acquire()
-        except filelock.Timeout as error:
-            raise RuntimeError(
-                f"{self.folder} is in use by another process: wait for it, or stop it"
-            ) from error
+        self._lock = locked(self.folder)
+        self._lock.__enter__()
         remove_leftovers(self.folder, _WRITTEN_WHOLE)
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._lock.release()
+        self._lock.__exit__(None, None, None)
 
     @property
     def checkpoints(self) -> Path:
@@ -297,7 +292,7 @@ class Run:
     def is_complete(self) -> bool:
         """Whether the run is trained and evaluated and its learning curve is drawn."""
         try:
-            evaluation = read_evaluation(self.folder)
+            evaluation = self.read_evaluation()
         except (OSError, ValueError):  # it is written again
             return False
         evaluated = evaluation is not None and evaluation["steps"] >= self.recipe.final_step
@@ -347,8 +342,28 @@ class RecordedRun(Run):
 
     def read_evaluation(self) -> dict[str, Any] | None:
         """Reads and checks the run's evaluation; None if there is none."""
-        content = self.read("evaluation.json")
+        content = self.read(EVALUATION)
         return None if content is None else parse_evaluation(content, self.folder)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Locks a folder, which only one process at a time may change.
+
+    Raises:
+        RuntimeError: if another process has locked it.
+    """
+    lock = filelock.FileLock(folder / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except filelock.Timeout as error:
+        raise RuntimeError(
+            f"{folder} is in use by another process: wait for it, or stop it"
+        ) from error
+    try:
+        yield
+    finally:
+        lock.release()
 
 
 def _import_hint(folder: Path) -> str:

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import filelock
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete
@@ -40,7 +39,7 @@ from torchrl_tit.modules import acting
 from ...core.algorithm import naming
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
-from ...core.run import package_versions
+from ...core.run import locked, package_versions
 from .agents import Agent, AgentInTraining, as_fields, find_agent
 from .settings import KINDS, Collection, Kind
 
@@ -97,16 +96,11 @@ def collect(settings: Collection, folder: Path, command: str = "") -> list[str]:
         )
     agent = find_agent(settings, folder / "training", task.action)
     folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with filelock.FileLock(folder / ".lock", timeout=0):
-            remove_leftovers(folder)
-            record = _claim(folder, settings, None if agent is None else agent.recipe, command)
-            sets = _Sets(settings, folder, task, agent, record)
-            return [sets.make(kind) for kind in KINDS if kind in settings.sets]
-    except filelock.Timeout as error:
-        raise RuntimeError(
-            f"{folder} is in use by another process: wait for it, or stop it"
-        ) from error
+    with locked(folder):
+        remove_leftovers(folder)
+        record = _claim(folder, settings, None if agent is None else agent.recipe, command)
+        sets = _Sets(settings, folder, task, agent, record)
+        return [sets.make(kind) for kind in KINDS if kind in settings.sets]
 
 
 def _is_recorded_as_it_is(task: TaskSpaces) -> bool:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-import filelock
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
@@ -31,6 +30,8 @@ from ...core.metrics import read_metrics
 from ...core.networks import name_chosen_encoders
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
+from ...core.records import to_csv
+from ...core.run import locked
 from .search_space import SearchSpace, make_distributions, with_values
 from .sweep import Job, start
 
@@ -87,26 +88,19 @@ class Search:
         self.folder = folder
         self.settings = settings
         self.space = make_distributions(settings.space)
-        self._lock = filelock.FileLock(folder / ".lock", timeout=0)
+        self._held = ExitStack()
 
     def __enter__(self) -> Search:
         self.folder.mkdir(parents=True, exist_ok=True)
-        try:
-            self._lock.acquire()
-        except filelock.Timeout as error:
-            raise RuntimeError(
-                f"{self.folder} is in use by another process: wait for it, or stop it"
-            ) from error
-        try:
+        with ExitStack() as stack:
+            stack.enter_context(locked(self.folder))
             remove_leftovers(self.folder)
             self._load()
-        except BaseException:
-            self._lock.release()
-            raise
+            self._held = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._lock.release()
+        self._held.close()
 
     def _load(self) -> None:
         settings = self.settings
@@ -264,10 +258,10 @@ class Search:
                 value = trial.intermediate_values[max(trial.intermediate_values)]
             cells = [_cell(trial.params[field]) for field in self.space]
             rows.append([trial.number, trial.state.name.lower(), value, trial.last_step, *cells])
-        write_text_atomic(self.folder / "trials.csv", _to_csv(rows))
+        write_text_atomic(self.folder / "trials.csv", to_csv(rows))
         if shares := importances(self.study):
             rows = [["field", "importance"], *map(list, shares.items())]
-            write_text_atomic(self.folder / "importance.csv", _to_csv(rows))
+            write_text_atomic(self.folder / "importance.csv", to_csv(rows))
 
 
 class _Trial:
@@ -385,12 +379,6 @@ def _value(cell: str, distribution: BaseDistribution) -> Any:
     if isinstance(distribution, CategoricalDistribution):
         return {_cell(choice): choice for choice in distribution.choices}[cell]
     return float(cell) if isinstance(distribution, FloatDistribution) else int(cell)
-
-
-def _to_csv(rows: Iterable[list[Any]]) -> str:
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
-    return buffer.getvalue()
 
 
 def _to_json(settings: Settings) -> str:
