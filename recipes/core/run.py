@@ -26,7 +26,6 @@ from torchrl_tit.evaluation_file import EVALUATION, parse_evaluation, read_evalu
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.settings.imports import allowed_modules
 
-from .metrics import Metrics
 from .optional import filelock
 from .recipe import Recipe
 from .recipe_json import recipe_from_json, recipe_to_json
@@ -278,10 +277,6 @@ class Run:
                 "it, or that file was changed since; a new run can take its weights with "
                 "--init-from"
             ) from error
-
-    def metrics(self, columns: list[str], last_step: int) -> Metrics:
-        """Opens the metrics and keeps the rows up to a step."""
-        return Metrics(self.folder, columns, last_step)
 
     def save_evaluation(self, evaluation: dict[str, Any], path: Path | None = None) -> Path:
         """Writes an evaluation as JSON, by default to ``evaluation.json``."""

@@ -31,6 +31,7 @@ from .callback import Callback
 from .evaluation import Outcome, summarize
 from .free_memory import return_free_memory
 from .interrupt import Interrupt
+from .metrics import Metrics
 from .optional import tqdm
 from .recipe import Recipe
 from .run import Run
@@ -79,7 +80,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             "best": best,
         }
         _load(run, parts)
-        metrics = stack.enter_context(closing(run.metrics(record.columns, last_step=step)))
+        metrics = stack.enter_context(closing(Metrics(run.folder, record.columns, last_step=step)))
         progress = stack.enter_context(
             tqdm.tqdm(
                 total=min([recipe.final_step, *(c.last_step for c in callbacks if c.last_step)]),

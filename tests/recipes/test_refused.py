@@ -150,7 +150,7 @@ def test_of_recipes_that_act(recipe, fields, message):
 ON_DATA: list[tuple[Any, dict[str, Any], str]] = [
     (CQL, {"env": "CartPole-v1"}, "cql needs continuous actions within bounds, but those of CartP"),
     (CQL, {"env": "ALE/Pong-v5"}, "those of ALE/Pong-v5 are discrete"),
-    (CQL, {"env": "Hoper-v5"}, "did you mean 'Hopper-v5'"),
+    (CQL, {"env": "Hoper-v5"}, "did you mean Hopper-v5"),
     (CQL, {"env": "Walker2d-v5"}, r"\[11\], but in Walker2d-v5 it is \[17\]"),
     (CQL, {"dataset": "hopper"}, "'hopper' is not a data set: give an HDF5 file"),
     (CQL, {"dataset": "./no.hdf5"}, r"no\.hdf5"),

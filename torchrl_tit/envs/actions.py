@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
@@ -27,28 +25,24 @@ class ActionWriter:
 
     Example:
         >>> write = ActionWriter(Discrete(3, start=-1), clip=True)
-        >>> write.spec.space.n, write(np.array([0, 2]))
-        (3, array([-1,  1]))
-        >>> ActionWriter(Box(0, 9, (1,), np.int64), clip=False)(np.array([[1e20]]))
-        array([[9]])
+        >>> write.spec.space.n, write(torch.tensor([0, 2]))
+        (3, tensor([-1,  1]))
+        >>> ActionWriter(Box(0, 9, (1,), np.int64), clip=False)(torch.tensor([[1e20]]))
+        tensor([[9]])
     """
 
     def __init__(self, space: Space, *, clip: bool) -> None:
-        self.start: int | NDArray | None = None
+        self.start: Tensor | None = None
         """Offset that is added to integers; None for no offset."""
-        self.bounds: tuple[NDArray, NDArray] | None = None
-        """Bounds to which actions are clipped, float32 or the integers' dtype; None if they are
+        self.bounds: tuple[Tensor, Tensor] | None = None
+        """Bounds to which actions are clipped, float32 or of the task's integers; None if they are
         not."""
-        self.shape: tuple[int, ...] | None = None
-        """The shape of a task's action; None if it is the same as the spec's."""
-        self.dtype: np.dtype | None = None
-        """The integer dtype to which floats are rounded; None if they are not."""
         if isinstance(space, Discrete):
             self.spec: TensorSpec = Categorical(int(space.n), dtype=torch.int64)
-            self.start = int(space.start) or None
+            self.start = torch.tensor(int(space.start)) if space.start else None
         elif isinstance(space, MultiDiscrete):
             self.spec = categories_spec(space.nvec.flatten().tolist())
-            self.start = space.start.flatten() if space.start.any() else None
+            self.start = torch.from_numpy(space.start.flatten()) if space.start.any() else None
         elif isinstance(space, MultiBinary):
             size = int(np.prod(space.shape))
             self.spec = Binary(size, shape=(size,), dtype=torch.int8)
@@ -56,46 +50,36 @@ class ActionWriter:
             low, high = (np.asarray(x).reshape(-1) for x in (space.low, space.high))
             self.spec = box_action_spec(low, high, clip=clip)
             if space.dtype.kind != "f":
-                self.dtype, self.bounds = space.dtype, (low, high)
+                self.bounds = torch.from_numpy(low), torch.from_numpy(high)
             elif clip:
-                self.bounds = _float32_bounds(low, high)
+                low, high = _float32_bounds(low, high)
+                self.bounds = torch.from_numpy(low), torch.from_numpy(high)
         else:
             raise ValueError(
                 f"Actions of the kind {space} are not supported, only Discrete, MultiDiscrete, "
                 "MultiBinary and Box; a wrapper of the task can convert them."
             )
-        if self.spec.shape != space.shape:
-            self.shape = space.shape
+        self.shape: tuple[int, ...] | None = None if self.spec.shape == space.shape else space.shape
+        """The shape of a task's action; None if it is the same as the spec's."""
 
-    def __call__(self, actions: NDArray) -> NDArray:
-        """Converts actions [N, *spec] to the tasks' actions, [N, *space].
-
-        Raises:
-            ValueError: if an action is NaN.
-        """
-        if actions.dtype.kind == "f":
-            refuse_nan(actions)
-        if self.dtype is not None:
-            actions = self._round(actions)
+    def __call__(self, actions: Tensor) -> Tensor:
+        """Converts actions [N, *spec], which are not NaN, to the tasks' actions, [N, *space]."""
+        if self.bounds is not None and self.bounds[0].is_floating_point():
+            actions = actions.clamp(*self.bounds)
         elif self.bounds is not None:
-            actions = actions.clip(*self.bounds)
+            # Clipped to the bounds before a conversion to integers could wrap them.
+            (low, high), actions = self.bounds, actions.round()
+            below, above = actions <= low, actions >= high
+            inside = torch.where(below | above, 0, actions).to(low.dtype)
+            actions = torch.where(below, low, torch.where(above, high, inside))
         if self.start is not None:
             actions = actions + self.start
         return actions if self.shape is None else actions.reshape(len(actions), *self.shape)
 
-    def _round(self, actions: NDArray) -> NDArray:
-        """Rounds floats to integers, clipped to the bounds before a conversion could wrap them."""
-        assert self.bounds is not None
-        low, high = self.bounds
-        actions = np.rint(actions)
-        below, above = actions <= low, actions >= high
-        inside = np.where(below | above, 0, actions).astype(self.dtype)
-        return np.where(below, low, np.where(above, high, inside))
 
-
-def refuse_nan(actions: NDArray | Tensor) -> None:
+def refuse_nan(actions: Tensor) -> None:
     """Raises ValueError if an action, [..., A], is NaN, which clipping would let pass."""
-    wrong: Any = actions != actions
+    wrong = actions.isnan()
     if wrong.any():
         raise ValueError(
             f"the action {actions[wrong.any(-1)][0].tolist()} is not a number: expected numbers "

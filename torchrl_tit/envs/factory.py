@@ -118,7 +118,7 @@ def make_env(
         >>> make_env("CartPole-v2")
         Traceback (most recent call last):
         ...
-        ValueError: Unknown task 'CartPole-v2'; did you mean 'CartPole-v1' or 'CartPole-v0'...
+        ValueError: Unknown task 'CartPole-v2'; did you mean CartPole-v1 or CartPole-v0...
     """
     wraps, transforms = load_wrappers(wrappers)
     reading: dict[str, Any] = {
@@ -307,11 +307,6 @@ def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
         >>> make_games("ALE/Pong-v5").single_observation_space
         Box(0, 255, (84, 84), uint8)
     """
-    return AtariGames(_rom(name), num_envs, **kwargs)
-
-
-def _rom(name: str) -> str:
-    """The name of an Atari game's ROM file."""
     try:
         import ale_py  # an optional extra
     except ImportError as error:
@@ -319,4 +314,4 @@ def _rom(name: str) -> str:
     gymnasium.register_envs(ale_py)
     if name not in gymnasium.registry:
         raise unknown(name)
-    return gymnasium.registry[name].kwargs["game"]
+    return AtariGames(gymnasium.registry[name].kwargs["game"], num_envs, **kwargs)

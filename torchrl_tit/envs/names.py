@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
@@ -13,6 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from torchrl_tit.extras import install
+from torchrl_tit.settings.checks import nearest
 from torchrl_tit.settings.imports import import_module, import_named, load_plugins
 from torchrl_tit.settings.literals import parse_call
 
@@ -65,16 +65,9 @@ def task_spec(name: str) -> Any:
 
 def unknown(name: str) -> ValueError:
     """The error for a name that Gymnasium has not registered."""
-    known = {key.lower(): key for key in gymnasium.registry}
-    nearest = [known[key] for key in difflib.get_close_matches(name.lower(), known, n=3)]
-    hint = (
-        f"did you mean {' or '.join(map(repr, nearest))}"
-        if nearest
-        else "is it registered by a module of yours, as in 'module:Name-v0', or is it an Atari "
-        "game, with a name such as 'ALE/Pong-v5'"
-    )
     return ValueError(
-        f"Unknown task {name!r}; {hint}? `gymnasium.pprint_registry()` lists all names"
+        f"Unknown task {name!r}; {nearest(name, gymnasium.registry)} (all names: "
+        "gymnasium.pprint_registry(); that of a module of yours is module:Name-v0)"
     )
 
 

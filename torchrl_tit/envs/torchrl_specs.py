@@ -8,7 +8,6 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torch.nn.functional import one_hot
 from torchrl.data import (
     Binary,
     Bounded,
@@ -118,17 +117,12 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
     if isinstance(found, Binary):
         spec = Binary(shape.numel(), shape=(shape.numel(),), dtype=torch.int8)
         return spec, lambda action: action.reshape(shape).to(dtype)
-    if sizes and isinstance(found, OneHot | MultiOneHot):
-        spec = Categorical(sizes[0]) if len(sizes) == 1 else categories_spec(sizes)
-
-        def encode(action: Tensor) -> Tensor:
-            parts = zip(action.reshape(-1), sizes, strict=True)
-            return torch.cat([one_hot(part, size) for part, size in parts]).reshape(shape).to(dtype)
-
-        return spec, encode
     if sizes:
         spec = Categorical(sizes[0]) if len(sizes) == 1 else categories_spec(sizes)
-        return spec, lambda action: action.reshape(shape).to(dtype)
+        if not isinstance(found, OneHot | MultiOneHot):
+            return spec, lambda action: action.reshape(shape).to(dtype)
+        theirs = found.to_categorical_spec()
+        return spec, lambda action: theirs.to_one_hot(action.reshape(theirs.shape)).to(dtype)
     if _is_array(found) and dtype.is_floating_point:
         bounded = isinstance(found, Bounded)
         low = found.space.low if bounded else torch.full(shape, -torch.inf)
@@ -182,15 +176,6 @@ def _observation(name: str, spec: TensorSpec, layout: ImageLayout) -> tuple[Tens
             return value.to(ours.dtype).reshape(ours.shape)
 
         return ours, bring
-    ours = categories_spec(sizes)
-    if not isinstance(spec, OneHot | MultiOneHot):
-        return ours, lambda value: value.long().reshape(-1)
-    widths = [spec.shape[-1]]
-    if isinstance(spec, MultiOneHot):
-        widths = torch.as_tensor(spec.nvec).flatten().tolist()
-
-    def decode(value: Tensor) -> Tensor:
-        parts = value.to(torch.uint8).split(widths, -1)
-        return torch.stack([part.argmax(-1) for part in parts], -1).reshape(-1)
-
-    return ours, decode
+    if isinstance(spec, OneHot | MultiOneHot):
+        return categories_spec(sizes), lambda value: spec.to_categorical(value).long().reshape(-1)
+    return categories_spec(sizes), lambda value: value.long().reshape(-1)

@@ -15,7 +15,7 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK, ActionMasks
-from torchrl_tit.envs.actions import ActionWriter
+from torchrl_tit.envs.actions import ActionWriter, refuse_nan
 from torchrl_tit.envs.spaces import ObservationReader
 from torchrl_tit.settings.choices import ImageLayout
 
@@ -125,8 +125,11 @@ class GymVectorEnv(EnvBase):
         stepped = tensordict.get("_step", None)
         if stepped is not None and not stepped.all():
             raise NotImplementedError("GymVectorEnv cannot step only some of its environments.")
-        action = self._write(tensordict["action"].numpy(force=True))
-        observations, rewards, terminated, truncated, info = self._env.step(action)
+        action = tensordict["action"].detach().cpu()
+        if action.is_floating_point():
+            refuse_nan(action)
+        stepped = self._env.step(self._write(action).numpy())
+        observations, rewards, terminated, truncated, info = stepped
         return self._tensordict(
             **self._observed(observations, info),
             reward=self._tensor(rewards.astype(np.float32)).unsqueeze(-1),

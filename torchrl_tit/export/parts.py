@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +21,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 from torchrl.modules import QValueModule
 
-from torchrl_tit.export.task_action import TaskAction
 from torchrl_tit.modules.backbone import Backbone, trunks_of
 from torchrl_tit.modules.distributions import IndependentBernoulli
 from torchrl_tit.networks import HistoryNetwork
@@ -258,7 +257,7 @@ class Parts:
     """Keys of the head's other inputs from the environment, such as masks, by name of the input."""
     entries: Mapping[str, Entry]
     """Shapes and dtypes of these."""
-    to_task: nn.Module
+    to_task: Callable[[Tensor], Tensor]
     """Converts actions to those of the task."""
     action: Entry
     """An action of the policy."""
@@ -323,7 +322,7 @@ def read_parts(policy: nn.Module, env: EnvBase) -> Parts:
         entries={
             name: Entry(tuple(spec.shape[env.ndim :]), spec.dtype) for name, spec in specs.items()
         },
-        to_task=nn.Identity() if writer is None else TaskAction(writer),
+        to_task=writer or nn.Identity(),
         action=Entry(tuple(action.shape), action.dtype),
         sequence=sequences[0] if sequences else None,
     )

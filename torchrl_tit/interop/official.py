@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, TypeAlias
 
 from torch import Tensor, nn
@@ -202,14 +203,6 @@ def _rename_torso(torso: str) -> Renaming:
     ]
 
 
-def _build_ofenet(config: _Config, params: _Params) -> _Built:
-    return _build_trunks(OFENet, config, params)
-
-
-def _build_d2rl(config: _Config, params: _Params) -> _Built:
-    return _build_trunks(D2RL, config, params)
-
-
 def _build_trunks(
     network_class: type[OFENet] | type[D2RL], config: _Config, params: _Params
 ) -> _Built:
@@ -237,10 +230,10 @@ def _choose(config: Mapping[str, Any], entry: str, **choices: Any) -> Any:
 _TRUNKS = "linear1_policy.0.weight"
 _KINDS: dict[str, tuple[str, Callable[[_Config, _Params], _Built]]] = {
     "catformer": ("resnet.0.weight", _build_catformer),
-    "d2rl": (_TRUNKS, _build_d2rl),
+    "d2rl": (_TRUNKS, partial(_build_trunks, D2RL)),
     "dt": ("embed_ln.weight", build_dt),
     "dt_tit": ("embed_ln.weight", build_dt_tit),
-    "ofenet": (_TRUNKS, _build_ofenet),
+    "ofenet": (_TRUNKS, partial(_build_trunks, OFENet)),
     "resnet": ("resnet.0.weight", _build_resnet),
     "tit": ("class_token_encoding", _build_tit),
 }

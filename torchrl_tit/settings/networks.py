@@ -257,12 +257,7 @@ def catformer(
         features_dim: size of the features.
         **hyperparameters: fields of :class:`Catformer`.
     """
-    return Network(
-        frame=ResNetFrames(embed_dim=embed_dim),
-        history=Catformer(**hyperparameters),
-        head=Head(features_dim=features_dim, activation="relu"),
-        num_frames=num_frames,
-    )
+    return _on_images(num_frames, embed_dim, Catformer(**hyperparameters), features_dim)
 
 
 def gtrxl(
@@ -280,12 +275,7 @@ def gtrxl(
         features_dim: size of the features.
         **hyperparameters: fields of :class:`GTrXL`.
     """
-    return Network(
-        frame=ResNetFrames(embed_dim=embed_dim),
-        history=GTrXL(**hyperparameters),
-        head=Head(features_dim=features_dim, activation="relu"),
-        num_frames=num_frames,
-    )
+    return _on_images(num_frames, embed_dim, GTrXL(**hyperparameters), features_dim)
 
 
 def coberl(
@@ -302,12 +292,8 @@ def coberl(
         features_dim: size of the LSTM's state, which is the features.
         **hyperparameters: further fields of :class:`CoBERL`.
     """
-    return Network(
-        frame=ResNetFrames(embed_dim=embed_dim),
-        history=CoBERL(hidden_dim=features_dim, **hyperparameters),
-        head=Head(features_dim=None),
-        num_frames=num_frames,
-    )
+    history = CoBERL(hidden_dim=features_dim, **hyperparameters)
+    return _on_images(num_frames, embed_dim, history, features_dim=None)
 
 
 def mlp(num_frames: int = 1, **hyperparameters: Any) -> Network:
@@ -467,6 +453,19 @@ NETWORKS: dict[str, Callable[..., Network]] = {
     "dt-tit": dt_tit,
 }
 """The systems of the paper, GTrXL, LSTM and GRU by name: each is a pair of encoders."""
+
+
+def _on_images(
+    num_frames: int, embed_dim: int, history: HistorySettings, features_dim: int | None
+) -> Network:
+    """A residual network on each image, a history encoder, and a head with relu, if any."""
+    activation: Activation = "tanh" if features_dim is None else "relu"
+    return Network(
+        frame=ResNetFrames(embed_dim=embed_dim),
+        history=history,
+        head=Head(features_dim=features_dim, activation=activation),
+        num_frames=num_frames,
+    )
 
 
 def _separate(num_frames: int, history: HistorySettings) -> Network:
