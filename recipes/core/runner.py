@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import random
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
-from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Any
+from dataclasses import replace
+from typing import Any
 
-import msgspec
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from torchrl_tit.checkpoint import checkpoint_steps, global_rng_state, set_global_rng_state
 from torchrl_tit.evaluation import watching_episodes
 
-from .algorithm import (
-    Algorithm,
-    Stateful,
-    check_finite,
-    load_weights,
-    make_algorithm,
-    naming,
-)
-from .best import EPISODES, Best
+from .algorithm import Algorithm, Stateful, load_weights, make_algorithm, naming
 from .callback import Callback
-from .evaluation import Outcome, summarize
-from .free_memory import return_free_memory
+from .evaluation import summarize
 from .interrupt import Interrupt
 from .metrics import Metrics
 from .optional import tqdm
+from .progress import EPISODES, Best, Record, RecordState, read_state
 from .recipe import Recipe
 from .run import Run
 
@@ -148,123 +140,6 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
                 break
 
 
-class Record:
-    """The measurements since the last row of metrics, and all evaluations so far.
-
-    Args:
-        recipe: the settings.
-        algorithm: the algorithm.
-    """
-
-    def __init__(self, recipe: Recipe, algorithm: Algorithm[Any]) -> None:
-        self.outcomes: list[Outcome] = []
-        """The results of all evaluations so far."""
-        self._recipe = recipe
-        self._names = list(algorithm.columns)
-        self._required = [name not in algorithm.optional_columns for name in self._names]
-        self._sums: Tensor | None = None
-        self._count = 0
-        self._returns: list[float] = []
-
-    @property
-    def columns(self) -> list[str]:
-        """Names of the numbers in a row of metrics, besides step and time."""
-        targets = self._recipe.target_columns.values()
-        episodes = [] if self._recipe.offline else ["episodes"]
-        return ["return_mean", *targets, *episodes, *self._names]
-
-    def add(self, returns: Tensor | None, values: Mapping[str, Tensor | float]) -> None:
-        """Adds the returns of a batch and the numbers of its update, without waiting for a GPU."""
-        if returns is not None:
-            self._returns += returns.flatten().tolist()
-        device = next((x.device for x in values.values() if isinstance(x, Tensor)), None)
-        terms = torch.stack(
-            [
-                torch.as_tensor(values[name], dtype=torch.float64, device=device)
-                for name in self._names
-            ]
-        )
-        self._sums = terms if self._sums is None else self._sums.to(terms.device) + terms
-        self._count += 1
-
-    def check(self) -> None:
-        """Raises NotFiniteError if a sum is not finite."""
-        if self._sums is not None:
-            required = torch.tensor(self._required, device=self._sums.device)
-            names = [n for n, needed in zip(self._names, self._required, strict=True) if needed]
-            check_finite(names, self._sums[required])
-
-    def take_row(self, step: int, *, means: bool = True) -> dict[str, float]:
-        """Returns a row of metrics: the step's evaluation, and means since the last row of means.
-
-        Args:
-            step: number of steps so far.
-            means: if off, the row has the evaluation only, and the means await a later row: they
-                must not depend on when the run is evaluated.
-        """
-        row = dict.fromkeys(self.columns, math.nan)
-        now = [outcome for outcome in self.outcomes if outcome.step == step]
-        for target, column in self._recipe.target_columns.items():
-            row[column] = next((o.mean for o in now if o.target_return == target), math.nan)
-        if self._recipe.offline:
-            row["return_mean"] = max((outcome.mean for outcome in now), default=math.nan)
-        if not means:
-            return row
-        assert self._sums is not None
-        row |= dict(zip(self._names, (self._sums / self._count).tolist(), strict=True))
-        if not self._recipe.offline:
-            episodes = len(self._returns)
-            row["episodes"] = episodes
-            row["return_mean"] = sum(self._returns) / episodes if episodes else math.nan
-        self._sums, self._count, self._returns = None, 0, []
-        return row
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the state that the next row and the next evaluation need."""
-        return {
-            "outcomes": [asdict(outcome) for outcome in self.outcomes],
-            "evaluation_seed": self._recipe.evaluation_seed,
-            "num_frames": self._recipe.backbone.num_frames,
-            "sums": [] if self._sums is None else self._sums.tolist(),
-            "count": self._count,
-            "returns": self._returns,
-        }
-
-    def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
-        """Restores a state."""
-        state = _record_state(state_dict, self._recipe)
-        if len(state.sums) != (len(self._names) if state.count else 0):
-            raise ValueError(f"the record has {len(state.sums)} sums of {state.count} updates")
-        self.outcomes = state.outcomes
-        self._sums = torch.tensor(state.sums, dtype=torch.float64) if state.sums else None
-        self._count = state.count
-        self._returns = state.returns
-
-
-@dataclass(frozen=True)
-class _RecordState:
-    """The state of a :class:`Record` in a checkpoint."""
-
-    outcomes: list[Outcome]
-    evaluation_seed: int
-    sums: list[float]
-    count: Annotated[int, msgspec.Meta(ge=0)]
-    returns: list[float]
-    num_frames: int | None = None  # which the weights do not always determine
-
-
-def _record_state(state: Mapping[str, Any], recipe: Recipe) -> _RecordState:
-    """Reads the state of a record.
-
-    Raises:
-        ValueError: if it is not one, or the recipe's network now reads another number of frames.
-    """
-    record, num_frames = msgspec.convert(state, _RecordState), recipe.backbone.num_frames
-    if record.num_frames not in (None, num_frames):
-        raise ValueError(f"num_frames is {num_frames}, but it was trained with {record.num_frames}")
-    return record
-
-
 def load_trained(
     run: Run, recipe: Recipe | None = None, *, best: bool = False
 ) -> tuple[int, Algorithm[Any], Any]:
@@ -274,7 +149,7 @@ def load_trained(
         run: a run folder with a checkpoint.
         recipe: the run's recipe, if some of its settings are overridden.
         best: whether to load the weights with the highest return so far (see
-            :class:`~recipes.core.best.Best`) instead of the last ones.
+            :class:`~recipes.core.progress.Best`) instead of the last ones.
 
     Returns:
         The steps that it was trained for, the algorithm with its weights, and the whole checkpoint.
@@ -340,7 +215,7 @@ def evaluate(
     recipe = recipe or run.recipe
     step, state = run.load_trained()
     with run.restoring(step):
-        record = _record_state(state["record"], recipe)
+        record = read_state(state["record"], recipe)
     outcomes = record.outcomes
     if best:
         recipe = replace(recipe, evaluation_seed=_fresh_seed(recipe, record))
@@ -373,7 +248,7 @@ def evaluate(
     }
 
 
-def _fresh_seed(recipe: Recipe, record: _RecordState) -> int:
+def _fresh_seed(recipe: Recipe, record: RecordState) -> int:
     """The recipe's evaluation seed, or the first one after those of the evaluations in training."""
     used = max((len(outcome.returns) for outcome in record.outcomes), default=0)
     first, end = recipe.evaluation_seed, record.evaluation_seed + used
@@ -431,3 +306,19 @@ def _check_moments(optimizer: torch.optim.Optimizer, state: Mapping[int, Any]) -
                     f"{name} of weight {index} is {value.dtype} {list(value.shape)}, not "
                     f"{like.dtype} {list(like.shape)}"
                 )
+
+
+def return_free_memory() -> None:
+    """Returns freed memory to the system, where the C library is glibc; elsewhere does nothing.
+
+    Between two blocks that are in use, glibc keeps what was freed, and a run that frees and
+    allocates tensors of changing sizes grows for hours although it uses no more. See
+    ``man 3 malloc_trim``.
+
+    Example:
+        >>> return_free_memory()
+    """
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(0)

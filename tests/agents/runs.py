@@ -6,6 +6,7 @@ import torch
 
 from recipes.core import runner
 from recipes.core.algorithm import make_algorithm
+from recipes.core.progress import Record
 from recipes.core.recipe import Recipe
 from recipes.core.run import Run
 from recipes.ppo import PPO
@@ -31,7 +32,7 @@ def make_run(folder: Path, recipe: Recipe | None = None) -> Path:
         for name, value in algorithm.model.state_dict().items()
     }
     run = Run.create(folder, recipe)
-    record = runner.Record(recipe, algorithm).state_dict()
+    record = Record(recipe, algorithm).state_dict()
     run.save(7, {"networks": state, "record": record})
     run.save_evaluation(runner.evaluate(run))
     return folder

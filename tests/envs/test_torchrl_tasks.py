@@ -230,9 +230,9 @@ def test_text_is_left_out():
          "no observation 'up', .* only pixels, place"),
         ("cart_pole", {"wrappers": ["gymnasium.wrappers:ClipAction"]}, ValueError,
          "takes TorchRL transforms and no gymnasium.Wrapper"),
-        ("CORRIDOR", {}, ValueError, "has a str of that name; expected a registered name, or a cl"),
+        ("CORRIDOR", {}, ValueError, "has a str of that name; expected a name that it registers"),
         ("nothing", {}, ValueError, "no 'nothing' after importing .* has no such name"),
-        ("TensorReader", {}, ValueError, "a class of that name, which is no EnvBase"),
+        ("TensorReader", {}, ValueError, "a class of that name that is no EnvBase"),
     ],
 )  # fmt: skip
 def test_one_line_says_what_is_wrong(name, settings, kind, words):

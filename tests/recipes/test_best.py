@@ -6,7 +6,7 @@ import pytest
 from torch import nn
 
 from recipes.cli import main
-from recipes.core.best import EPISODES, Best
+from recipes.core.progress import EPISODES, Best
 from recipes.core.runner import evaluate, load_trained
 from recipes.ppo import PPO
 from tests.recipes.small import train

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from recipes.core.free_memory import return_free_memory
+from recipes.core.runner import return_free_memory
 
 BLOCK, COUNT = 100_000, 1_000  # bytes; smaller than what glibc takes from the system piece by piece
 

@@ -18,6 +18,7 @@ from recipes.core import run as run_module
 from recipes.core import runner
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
+from recipes.core.progress import Record
 from recipes.core.recipe_json import recipe_to_json, settings_to_dict
 from recipes.core.run import Run
 from recipes.tools.results.plot import plot_run
@@ -327,7 +328,7 @@ def test_the_second_looks_again_once_it_has_the_folder(tmp_path, monkeypatch):
 
 def test_a_run_in_use_is_evaluated_into_another_file_only(tmp_path, capsys):
     run = untrained(tmp_path / "run", SMALL)
-    record = runner.Record(SMALL, make_algorithm(SMALL)).state_dict()
+    record = Record(SMALL, make_algorithm(SMALL)).state_dict()
     run.save(64, {**run.load_trained()[1], "record": record})
     with run:
         assert "in use by another process" in fails(capsys, "evaluate", run.folder)

@@ -97,21 +97,15 @@ def _registered(name: str) -> str:
 
 def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
     made = getattr(module, own, None)
-    found, hint = f"has a {type(made).__name__} of that name", ""
-    if made is None:
-        found = "has no such name"
-    elif isinstance(made, type):
-        if issubclass(made, EnvBase):
-            return made
-        found = "has a class of that name, which is no EnvBase"
-        if issubclass(made, gymnasium.Env):
-            hint = "; a Gymnasium task needs a name, with gymnasium.register in the module"
-    elif callable(made):
+    if issubclass(made, EnvBase) if isinstance(made, type) else callable(made):
         return made
+    found = "no such name" if made is None else f"a {type(made).__name__} of that name"
+    if isinstance(made, type):
+        found = "a class of that name that is no EnvBase"
     raise ValueError(
-        f"Task {name!r}: Gymnasium knows no {own!r} after importing {module.__name__}, which "
-        f"{found}; expected a registered name, or a class or function that makes a TorchRL "
-        f"EnvBase{hint}."
+        f"Task {name!r}: Gymnasium knows no {own!r} after importing {module.__name__}, which has "
+        f"{found}; expected a name that it registers with gymnasium.register, or a class or "
+        "function that makes a TorchRL EnvBase."
     )
 
 
