@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import make_dataclass, replace
-from inspect import getdoc
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NoReturn
@@ -125,14 +124,14 @@ def override(recipe: Recipe, **fields: Any) -> Recipe:
     return replace(recipe, **{key: value for key, value in fields.items() if value is not None})
 
 
-def parse_fields(fields: list[Any], arguments: list[str], command: str, described: type) -> Any:
+def parse_fields(fields: list[Any], arguments: list[str], command: str, description: str) -> Any:
     """Reads dataclasses from the command line.
 
     Args:
         fields: what to read, as :func:`dataclasses.make_dataclass` takes it.
         arguments: the arguments after the command's name.
         command: the command, for the help.
-        described: the class whose docstring starts the help.
+        description: what starts the help.
     """
     import tyro  # takes half a second; other commands do not need it
 
@@ -144,7 +143,7 @@ def parse_fields(fields: list[Any], arguments: list[str], command: str, describe
                 tyro.conf.AvoidSubcommands[settings],  # type: ignore[misc, valid-type]
                 args=arguments,
                 prog=f"{program()} {command}",
-                description=f"{getdoc(described)}\n\n{IMPORT} MODULE: {IMPORT_HELP}.",
+                description=f"{description}\n\n{IMPORT} MODULE: {IMPORT_HELP}.",
             )
     except SystemExit as stop:
         if stop.code:

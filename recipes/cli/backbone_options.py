@@ -11,9 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import fields, replace
 from itertools import pairwise
-from typing import Annotated, Any, TypeVar
-
-import tyro
+from typing import Any, TypeVar
 
 from torchrl_tit.settings import NETWORKS, FrameSettings, HistorySettings, Part
 from torchrl_tit.settings.checks import field_types, nearest
@@ -100,41 +98,34 @@ def check_recipe(recipe: RecipeT) -> RecipeT:
     return replace(recipe, backbone=backbone)
 
 
-def option_fields(recipe: Recipe) -> list[tuple[str, Any, str]]:
-    """Returns the options as :func:`~dataclasses.make_dataclass` takes them, for tyro and its help.
+def describe_options(recipe: Recipe) -> str:
+    """Describes the options for the help, with the recipe's encoders."""
+    words = {
+        "backbone.network": "a network by its name, with the recipe's number of frames",
+        "backbone.frame": f"the frame encoder, here {recipe.backbone.frame.name}; "
+        "--backbone.frames.KEY is that of one of several observations",
+        "backbone.history": f"the history encoder, here {recipe.backbone.history.name}",
+    }
+    return "\n".join(
+        f"--{option} {{{','.join(_choices(option))}}}: {text}." for option, text in words.items()
+    )
 
-    Their values are those of the recipe, because :func:`choose_network` has already applied them.
+
+def without_names(arguments: list[str]) -> list[str]:
+    """Returns the arguments without the options that :func:`choose_network` has read.
+
+    Example:
+        >>> without_names(["--backbone.frame", "inner", "--backbone.history=outer", "--seed", "3"])
+        ['--seed', '3']
     """
-    help_texts = {
-        "backbone.network": "A network by its name, with the recipe's number of frames.",
-        "backbone.frame": "Frame encoder; its fields are --backbone.frame.FIELD. Of one of several "
-        "observations: --backbone.frames.KEY, with the fields --backbone.frames.KEY.FIELD.",
-        "backbone.history": "History encoder; its fields are --backbone.history.FIELD.",
-    }
-    defaults = {
-        "backbone.network": "",
-        "backbone.frame": recipe.backbone.frame.name,
-        "backbone.history": recipe.backbone.history.name,
-    }
-    for key, frame in recipe.backbone.frames.items():
-        help_texts[_PER_KEY + key] = f"Frame encoder of the observation {key}."
-        defaults[_PER_KEY + key] = frame.name
-    return [
-        (
-            f"option_{number}",
-            Annotated[
-                str,
-                tyro.conf.arg(
-                    name=option,
-                    help=help_texts[option],
-                    metavar="{" + ",".join(_choices(option)) + "}",
-                    help_behavior_hint=None if defaults[option] else "",
-                ),
-            ],
-            defaults[option],
-        )
-        for number, option in enumerate(defaults)
-    ]
+    words, rest = iter(arguments), []
+    for word in words:
+        option, equals, _ = word.removeprefix("--").partition("=")
+        if not (word.startswith("--") and _choices(option)):
+            rest.append(word)
+        elif not equals:
+            next(words)
+    return rest
 
 
 def _choices(option: str) -> Iterable[str]:

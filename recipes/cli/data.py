@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from inspect import getdoc
 from pathlib import Path
 from typing import Annotated
 
@@ -57,7 +58,7 @@ def _collect(arguments: list[str]) -> None:
         ],
         arguments,
         "data collect",
-        Collection,
+        str(getdoc(Collection)),
     )
     words = [*program().split(), "data", "collect", *arguments, *import_options()]
     try:

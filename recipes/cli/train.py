@@ -6,6 +6,7 @@ Help and errors are therefore fast: they do not need PyTorch.
 from __future__ import annotations
 
 import argparse
+from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +19,7 @@ from ..core.recipe import LENGTHS, Recipe
 from ..core.registry import find_recipe
 from ..core.trust import allow_names
 from .arguments import Parser, add_machine_options, fail, option, parse_fields, program
-from .backbone_options import check_recipe, choose_network, option_fields
+from .backbone_options import check_recipe, choose_network, describe_options, without_names
 
 WANDB_HELP = "Project of Weights & Biases that metrics are sent to, beside CSV and TensorBoard."
 
@@ -54,14 +55,13 @@ def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
     parsed = parse_fields(
         [
             ("recipe", Annotated[type(recipe), tyro.conf.arg(name="")], recipe),
-            *option_fields(recipe),
             ("out", Annotated[Path | None, out], None),
             ("init_from", Annotated[Path | None, init_from], None),
             ("wandb", Annotated[str | None, wandb], None),
         ],
-        arguments,
+        without_names(arguments),
         f"train {recipe.name}",
-        type(recipe),
+        f"{getdoc(type(recipe))}\n\n{describe_options(recipe)}",
     )
     checked = check_recipe(parsed.recipe)
     allow_names(checked)

@@ -18,7 +18,7 @@ from recipes.core.trust import WRAPPERS, allow_names, check_names, may_name_task
 from tests.recipes.commands import fails
 from torchrl_tit.agents.folder import CONTENTS, RECIPE, read_agent, write_agent
 from torchrl_tit.agents.loading import find_agent
-from torchrl_tit.settings.imports import allow, allowed_modules, import_named
+from torchrl_tit.settings.imports import allow, allowed_modules, resolve
 
 NAME = "ppo/cartpole/mlp"
 MODULE = """
@@ -145,7 +145,7 @@ def test_named_recipes_pass_without_a_word():
 def test_wrappers_on_the_list_exist():
     for module, names in WRAPPERS.items():
         for name in names:
-            assert isinstance(import_named(f"{module}:{name}"), type)
+            assert isinstance(resolve(f"{module}:{name}"), type)
 
 
 @pytest.mark.parametrize("what", HOSTILE)

@@ -13,7 +13,7 @@ from torchrl.envs.transforms import Transform
 
 from torchrl_tit.extras import install
 from torchrl_tit.settings.checks import nearest
-from torchrl_tit.settings.imports import import_module, import_named, load_plugins
+from torchrl_tit.settings.imports import import_module, load_plugins, resolve
 from torchrl_tit.settings.literals import parse_call
 
 Wrap = Callable[[gymnasium.Env], gymnasium.Env]
@@ -135,7 +135,8 @@ def load_wrappers(names: Sequence[str]) -> tuple[list[Wrap], list[Transform]]:
     for name in names:
         target, arguments = parse_call(name)
         try:
-            found = import_named(target)
+            import_module(target.partition(":")[0])
+            found = resolve(target)
         except ImportError as error:
             raise ValueError(f"Wrapper {name!r} cannot be used: {error}.") from error
         kind = found if isinstance(found, type) else type(None)

@@ -87,20 +87,6 @@ def import_allowed(module: str) -> ModuleType:
     return loaded
 
 
-def import_named(target: str) -> Any:
-    """Imports the object that "module:attribute" names, in the words of a user.
-
-    Raises:
-        ValueError: if the target has another form.
-        ImportError: if the module does not exist, raises an error, or lacks the attribute.
-    """
-    module, colon, attribute = target.partition(":")
-    if not (module and colon and attribute.isidentifier()):
-        raise ValueError(f"{target!r} names nothing to import: expected module:attribute")
-    import_module(module)
-    return resolve(target)
-
-
 def resolve(target: str) -> Any:
     """Imports the object that "module:attribute" names, of code that is trusted.
 

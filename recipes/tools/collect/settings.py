@@ -62,12 +62,11 @@ class Collection:
     """PyTorch's CPU threads."""
 
     def __post_init__(self) -> None:
-        unknown = [kind for kind in self.sets if kind not in KINDS]
-        if unknown or not self.sets or len(set(self.sets)) < len(self.sets):
+        check_fields(self)
+        if not self.sets or len(set(self.sets)) < len(self.sets):
             raise ValueError(
                 f"sets must be some of {', '.join(KINDS)}, each once, not {list(self.sets)}"
             )
-        check_fields(self)
         if self.medium_return is None and {"medium", "expert"} <= set(self.sets):
             raise ValueError(
                 "medium and expert would be the same agent: give medium_return, the mean return at "

@@ -55,7 +55,7 @@ def test_the_agent_of_a_finished_run(cartpole: Path, tmp_path: Path) -> None:
         ({"seed": -1}, "seed must be at least 0"),
         ({"sets": ()}, "sets must be some of random, mixed, medium, expert"),
         ({"sets": ("random", "random")}, "each once, not"),
-        ({"sets": ("good",)}, "sets must be some of"),
+        ({"sets": ("good",)}, "field .sets. is .*good"),
         ({"medium_return": None}, "medium and expert would be the same agent: give medium_return"),
         ({"medium_return": float("nan")}, "medium_return must be at least -1000000000.0, not nan"),
         ({"threads": 5000}, "threads must be at most 1024, not 5000"),
