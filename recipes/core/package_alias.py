@@ -2,7 +2,9 @@
 
 In a clone, the package is called ``recipes``; installed, it is ``torchrl_tit.recipes``, the name
 that users' packages import. An editable install has both. If modules were loaded twice, the command
-line would not see what such a package registers.
+line would not see what such a package registers. Python loads a module once for each name that it
+is imported by, whatever folders and entries of ``sys.modules`` say about its package, so two names
+for one set of submodules need a finder.
 """
 
 from __future__ import annotations

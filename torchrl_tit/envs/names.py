@@ -96,7 +96,7 @@ def _registered(name: str) -> str:
 
 
 def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
-    made = getattr(module, own, None)
+    made: Any = getattr(module, own, None)
     if issubclass(made, EnvBase) if isinstance(made, type) else callable(made):
         return made
     found = "no such name" if made is None else f"a {type(made).__name__} of that name"
