@@ -67,7 +67,8 @@ def unknown(name: str) -> ValueError:
     """The error for a name that Gymnasium has not registered."""
     return ValueError(
         f"Unknown task {name!r}; {nearest(name, gymnasium.registry)} (all names: "
-        "gymnasium.pprint_registry(); that of a module of yours is module:Name-v0)"
+        "gymnasium.pprint_registry(); one of a module of yours is module:Name-v0, an Atari game "
+        "ALE/Pong-v5)"
     )
 
 
