@@ -38,8 +38,9 @@ from typing import Any
 import numpy as np
 
 from recipes.core.records import Records
+from recipes.core.run import RecordedRun
 from recipes.tools.results.interval import interval_of
-from recipes.tools.results.table import paper_results, plain_name
+from recipes.tools.results.paper import match
 from torchrl_tit.files import write_text_atomic
 
 ROOT = Path(__file__).parents[2]
@@ -198,8 +199,10 @@ def _at(runs: Runs, column: str, step: str) -> list[float]:
 
 
 def _paper(runs: Runs, digits: int) -> str:
-    result = paper_results()[plain_name(runs.rows[0]["recipe"])]
-    return f"{number(result.mean, digits)} ± {number(result.std, digits)}"
+    """The paper's number, marked as near if the runs have other settings."""
+    found = match(RecordedRun(*runs.runs[0]).recipe)
+    assert found is not None
+    return f"{'near ' * bool(found.differs)}{found.cell}"
 
 
 def _reaches(runs: Runs, column: str, least: float) -> str:

@@ -29,7 +29,7 @@ _TIT: dict[str, tuple[int, int, int, int, float, float, Activation, int, bool]] 
 }
 
 
-def _tit(dataset: str, observation_dim: int) -> Network:
+def _tit(dataset: str, observation_dim: int, position_encoding: bool = False) -> Network:
     width, blocks, features, heads, attention, ffn, head, expansion, shared = _TIT[dataset]
     return enhanced_tit(
         patch_size=observation_dim,
@@ -40,7 +40,7 @@ def _tit(dataset: str, observation_dim: int) -> Network:
         ffn_expansion_outer=expansion,
         attention_dropout_outer=attention,
         ffn_dropout_outer=ffn,
-        position_encoding=False,
+        position_encoding=position_encoding,
         share_blocks=shared,
         features_dim=features,
         activation_head=head,
@@ -54,6 +54,9 @@ def _continuous() -> list[Preset]:
             networks = {
                 "mlp": mlp(hidden_dim=256, num_layers=3, activation="relu"),
                 "enhanced-tit": _tit(data, observation_dim),
+                # The paper has one table of sizes, which are the released ones of this data set,
+                # and always encodes positions.
+                "enhanced-tit-paper": _tit("halfcheetah-medium", observation_dim, True),
             }
             recipes += [
                 CQL(
@@ -104,5 +107,5 @@ def _discrete() -> list[Preset]:
 
 
 CQL_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in (*_discrete(), *_continuous())}
-"""``cql/DATASET/mlp`` and ``cql/DATASET/enhanced-tit`` for D4RL's data of version 0, and
-``discrete-cql/...`` for collected data."""
+"""``cql/DATASET/mlp``, ``enhanced-tit`` (the authors' code) and ``enhanced-tit-paper`` (the paper's
+table) for D4RL's data of version 0, and ``discrete-cql/...`` for collected data."""

@@ -22,11 +22,15 @@ def _offline() -> list[Preset]:
             dataset=f"{task}-{kind}-v2",
             env=env,
             target_returns=target_returns,
-            backbone=make_network(),
+            backbone=backbone,
         )
         for task, (env, target_returns) in _TASKS.items()
         for kind in ("medium", "medium-replay")
-        for network, make_network in (("dt", decision_transformer), ("dt-tit", dt_tit))
+        for network, backbone in (
+            ("dt", decision_transformer()),
+            ("dt-tit", dt_tit()),
+            ("dt-tit-paper", dt_tit(position_encoding=True)),  # which the authors' code leaves out
+        )
     ]
 
 
@@ -72,4 +76,4 @@ def _online() -> list[Preset]:
 
 
 DT_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in [*_offline(), *_online()]}
-"""``dt/DATASET/dt`` and ``dt/DATASET/dt-tit`` for D4RL's sets of version 2, and ``odt/...``."""
+"""``dt/DATASET/dt``, ``dt-tit``, ``dt-tit-paper`` for D4RL's sets of version 2, and ``odt/...``."""

@@ -1,4 +1,4 @@
-"""The named recipes of Atari games (arXiv 2212.14538, tables 1 and 3)."""
+"""The named recipes of Atari games (arXiv 2212.14538, tables 1, 4 and 11)."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _named(game: str) -> list[Preset]:
         ),
         "coberl-tuned": tuned.replace(backbone=coberl(4, gate_bias=2.0), contrastive_coeff=1.0),
     }
-    tit = base.replace(minibatch_size=64)
+    tit = base.replace(minibatch_size=64)  # the authors' code; the paper names no other than 256
     recipes |= {name: tit.replace(backbone=network) for name, network in _TIT.items()}
     return [recipe.replace(name=f"ppo/{game}/{name}") for name, recipe in recipes.items()]
 

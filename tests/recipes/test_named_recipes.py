@@ -98,6 +98,17 @@ SETTINGS: dict[str, dict[str, Any]] = {
             ),
         )
     },
+    # The paper's letter, where its code has other values.
+    "ppo/mountaincar/vanilla-tit-paper": {"backbone": vanilla_tit(**TIT_OF_ARRAYS)},
+    "ppo/mountaincar/enhanced-tit-paper": {"backbone": enhanced_tit(**TIT_OF_ARRAYS)},
+    "cql/*/enhanced-tit-paper": {
+        "backbone.frame.num_blocks": 2, "backbone.frame.embed_dim": 256,
+        "backbone.frame.num_heads": 1, "backbone.history.num_heads": 4,
+        "backbone.frame.attention_dropout": 0.0, "backbone.frame.ffn_dropout": 0.0,
+        "backbone.history.attention_dropout": 0.0, "backbone.history.ffn_dropout": 0.1,
+        "backbone.frame.position_encoding": True,
+    },
+    "dt/*/dt-tit-paper": {"backbone": dt_tit(20, position_encoding=True)},
     **{
         f"ppo/{game}/{network}": {
             "env": env, "padding": "constant", "num_envs": 8, "steps_per_batch": 1024,
@@ -159,7 +170,8 @@ def test_recipes_of_data_sets() -> None:
         return {f"{algorithm}/{data}/{network}" for data in sets for network in networks.split()}
 
     both, all_three = "medium medium-replay", "medium medium-replay medium-expert"
-    expected = named("cql", both, 0, "mlp enhanced-tit") | named("dt", both, 2, "dt dt-tit")
+    expected = named("cql", both, 0, "mlp enhanced-tit enhanced-tit-paper")
+    expected |= named("dt", both, 2, "dt dt-tit dt-tit-paper")
     for algorithm in ("bc", "iql", "td3bc"):
         expected |= named(algorithm, all_three, 2, "mlp enhanced-tit vanilla-tit")
     algorithms = ("cql/", "dt/", "bc/", "iql/", "td3bc/")
@@ -182,7 +194,7 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
         recipe
         for name, recipe in RECIPES.items()
         if isinstance(recipe, PPO)
-        and not name.endswith("-protocol")
+        and not name.endswith(("-protocol", "-paper"))
         and "ALE" not in recipe.env
         and name not in MEMORY_RECIPES
     ]
@@ -206,7 +218,7 @@ def test_all_tit_networks_differ_only_in_frames_and_positions() -> None:
         for name, recipe in RECIPES.items()
         if isinstance(recipe, PPO)
         and "enhanced-tit" in name
-        and not name.endswith("-protocol")
+        and not name.endswith(("-protocol", "-paper"))
         and "wo-outer" not in name
         and "ALE" not in recipe.env
         and "MiniGrid" not in recipe.env  # whose patch is a tile

@@ -14,12 +14,12 @@ import numpy as np
 
 from torchrl_tit.scores import has_reference
 
-from ...core.dataset_recipe import DatasetRecipe
 from ...core.recipe import Recipe
 from ...core.registry import RECIPES
 from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import interval_of
+from .paper import HEADINGS, Match, has_its_data, match, paper_cells, plain_name
 
 OTHER = "not in the paper"
 HEADER = (
@@ -35,15 +35,6 @@ _TASK = (
 
 
 @dataclass(frozen=True)
-class Result:
-    """The result of an experiment in the paper's tables."""
-
-    table: str
-    mean: float
-    std: float
-
-
-@dataclass(frozen=True)
 class Published:
     """The result of another implementation with the same kind of network."""
 
@@ -53,6 +44,7 @@ class Published:
     """Where."""
     mean: float
     std: float
+    """NaN if none is reported."""
     note: str
     """How it was measured: version of the task, steps, seeds."""
 
@@ -85,9 +77,12 @@ class Cell:
     high: float
     """Upper end."""
     paper_mean: float
-    """The paper's value; NaN if it has none. Recipes with other settings (-protocol, -tuned) have
-    the value of the plain recipe."""
+    """The paper's value for the same task and kind of network; NaN if it has none."""
     paper_std: float
+    """As the paper prints it."""
+    paper: str = ""
+    """The paper's value as text: marked as near, with what differs, unless the runs have the
+    settings that it was measured with."""
     changes: str = ""
     """Fields in which the runs differ from the recipe of that name, with the runs' values."""
 
@@ -150,7 +145,9 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         _cell(experiment, [evaluations[run.folder] for run in experiment.runs])
         for experiment in group_runs(runs)
     ]
-    order = {name: index for index, name in enumerate(paper_results())}
+    order = {
+        plain_name(name): place for place, cell in enumerate(paper_cells()) for name in cell.recipes
+    }
 
     def rank(cell: Cell) -> tuple[bool, int, str]:
         place = order.get(plain_name(cell.recipe), len(order))
@@ -183,14 +180,13 @@ def to_markdown(cells: Sequence[Cell]) -> str:
 def to_columns(cell: Cell) -> list[str]:
     """Writes the numbers of a cell as text, under :data:`HEADER`."""
     interval = f" [{_number(cell.low)}, {_number(cell.high)}]" if cell.runs > 1 else ""
-    known = cell.paper_mean == cell.paper_mean
     return [
         cell.label,
         str(cell.runs),
         f"{_number(cell.mean)} ± {_number(cell.std)}",
         _number(cell.std_episodes),
         f"{_number(cell.iqm)}{interval}",
-        f"{_number(cell.paper_mean)} ± {_number(cell.paper_std)}" if known else "",
+        cell.paper,
     ]
 
 
@@ -211,24 +207,6 @@ def to_csv(cells: Sequence[Cell]) -> str:
 
 
 @cache
-def paper_results() -> dict[str, Result]:
-    """What the paper reports, by the recipe's name.
-
-    arXiv 2212.14538, tables of section 4 and the ablation; the standard deviations of Decision
-    Transformer are taken from the curves that its authors published, since the paper applied the
-    score's offset to them.
-
-    Example:
-        >>> paper_results()["ppo/mountaincar/enhanced-tit"].mean
-        -97.0
-    """
-    return {
-        row["recipe"]: Result(row["table"], float(row["mean"]), float(row["std"]))
-        for row in _rows("paper_results.csv")
-    }
-
-
-@cache
 def published_results() -> dict[str, tuple[Published, ...]]:
     """What others have published, by the name of the recipe with the same task and network.
 
@@ -245,26 +223,20 @@ def published_results() -> dict[str, tuple[Published, ...]]:
     return results
 
 
-def reported_of(recipe: Recipe) -> tuple[Result | None, tuple[Published, ...]]:
-    """What the paper and others report, if task, network and data are those of the recipe's name.
+def reported_of(recipe: Recipe) -> tuple[Match | None, tuple[Published, ...]]:
+    """What the paper reports about a run's cell, and others about the recipe of its name.
 
     Args:
         recipe: the settings of a run.
     """
     plain = plain_name(recipe.name)
     named = RECIPES.get(recipe.name) or RECIPES.get(plain)
+    found = match(recipe)
     if named is None or any(getattr(recipe, x, None) != getattr(named, x, None) for x in _TASK):
+        return found, ()
+    if not has_its_data(recipe):
         return None, ()
-    if isinstance(recipe, DatasetRecipe) and _stem(recipe.dataset) not in plain.split("/"):
-        return None, ()
-    return paper_results().get(plain), published_results().get(plain, ())
-
-
-def plain_name(name: str) -> str:
-    """The name without the suffix that marks other settings: "-tuned", "-protocol"."""
-    if name in paper_results():
-        return name
-    return name.removesuffix("-tuned").removesuffix("-protocol")
+    return found, published_results().get(plain, ())
 
 
 def _value(evaluation: dict) -> float:
@@ -285,9 +257,10 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
     values = np.array([_value(evaluation) for evaluation in evaluations])
     spreads = [evaluation.get("score_std", evaluation["std"]) for evaluation in evaluations]
     interval = interval_of(values)
-    paper, published = reported_of(experiment.settings)
+    found, published = reported_of(experiment.settings)
+    paper = found.cell if found else None
     return Cell(
-        table=paper.table if paper else OTHER,
+        table=HEADINGS[paper.tables[0]] if paper else OTHER,
         recipe=experiment.name,
         runs=len(values),
         steps=min(evaluation["steps"] for evaluation in evaluations),
@@ -299,6 +272,7 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
         high=interval.high,
         paper_mean=paper.mean if paper else float("nan"),
         paper_std=paper.std if paper else float("nan"),
+        paper=str(found or ""),
         changes=experiment.changes,
         measure=_measure(experiment.settings, evaluations[0]),
         published=published,
@@ -306,7 +280,8 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
 
 
 def _published(result: Published) -> str:
-    numbers = f"{_number(result.mean)} ± {_number(result.std)}"
+    spread = "" if result.std != result.std else f" ± {_number(result.std)}"
+    numbers = f"{_number(result.mean)}{spread}"
     return f"[{result.source}]({result.url}) {numbers} ({result.note})"
 
 
@@ -322,8 +297,3 @@ def _number(value: float) -> str:
 def _rows(file: str) -> Iterator[dict[str, str]]:
     text = resources.files(__package__).joinpath(file).read_text(encoding="utf-8")
     yield from csv.DictReader(io.StringIO(text))
-
-
-def _stem(dataset: str) -> str:
-    """A data set's name, also if it is given as D4RL's file: "hopper_medium-v2.hdf5"."""
-    return Path(dataset).name.removesuffix(".hdf5").replace("_", "-")
