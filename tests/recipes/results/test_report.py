@@ -88,7 +88,7 @@ def test_what_a_page_says_of_one_run(alone):
     assert f"<title>{TIT}</title>" in alone.source
     for text in (
         "CartPole-v1, PPO: 1 run of 61,440 environment steps",
-        f"{TIT} 1 485 ± 0.0 15.0 485 500 ± 0.0",
+        f"{TIT} 1 485 ± 0.0 15.0 485 near 500 ± 0: backbone.frame.patch_size auto",
         f"All settings are those of the recipe {TIT}.",
         f"torchrl-tit train {TIT} --seed 0",
         "torch 2.13.0",
@@ -117,8 +117,9 @@ def test_what_a_comparison_says(comparison):
     at = interval_of([485.0, 482.0, 479.0])
     for text in (
         "2 experiments, 5 runs of 61,440 environment steps each",
-        f"{TIT} 3 482 ± 2.4 15.0 {at:.0f} 500 ± 0.0",
-        "mlp (epochs 5) 2 305 ± 0.0 5.0 305 [305, 305] 500 ± 0.0 CleanRL 490",
+        f"{TIT} 3 482 ± 2.4 15.0 {at:.0f} near 500 ± 0: backbone.frame",
+        "mlp (epochs 5) 2 305 ± 0.0 5.0 305 [305, 305] near 500 ± 0: num_envs 8",
+        "CleanRL 490",
         f"What differs from the recipe {MLP}:",
         "epochs 10 5",
         "What differs between the experiments",
