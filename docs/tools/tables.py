@@ -18,6 +18,8 @@ hopper/mlp}`` that of the runs of a path below docs/results, ``{median FILE.json
 number of a benchmark. Where a row names ``FILE.json / KEY``, or a key below ``<!-- table:
 FILE.json``, a measure names the rest: ``{median.1 KEY / ...}``.
 
+A folder ``paper/...`` is a table of docs/paper.md, which :mod:`docs.tools.paper` prints.
+
 With ``--check``, pages that differ from their data are named, and nothing is written.
 """
 
@@ -37,6 +39,7 @@ from typing import Any
 
 import numpy as np
 
+from docs.tools import paper
 from recipes.core.records import Records
 from recipes.core.run import RecordedRun
 from recipes.tools.results.interval import interval_of
@@ -341,6 +344,8 @@ def print_table(folder: str, form: str) -> str:
         folder: the folder below docs/results that the runs of rows are in.
         form: the lines of its comment.
     """
+    if folder.startswith("paper/"):
+        return paper.TABLES[folder.removeprefix("paper/")]()
     lines, pattern = [], ""
     for line in filter(None, map(str.strip, form.splitlines())):
         if line.startswith("="):

@@ -1,0 +1,112 @@
+"""docs/paper.md has every cell of the paper, with a result or "not run", and recipes that exist."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from docs.tools import paper
+from recipes.core.registry import RECIPES
+from recipes.tools.results.paper import hyperparameters, paper_cells
+
+PAGE = (Path(__file__).parents[2] / "docs" / "paper.md").read_text()
+RESULT = r"\[-?[\d.]+(±[\d.]+)?\]\(results/\w+\.md\) \(\d+x\d+[kM]\)"
+WHERE = {"1": "1", "2": "2", "3": "3", "10": "3", "4": "4", "11": "4"}
+"""The table of the page that has a table of the paper."""
+
+
+def grid(table: str) -> dict[tuple[str, str], str]:
+    """The cells of a table of the page, by their row and column, both with their recipe."""
+    [printed] = re.findall(rf"<!-- table: paper/{table}\n-->\n(.*?)<!-- end -->", PAGE, re.DOTALL)
+    head, _, *rows = (
+        [cell.strip() for cell in line.strip("|").split("|")] for line in printed.splitlines()
+    )
+    return {(row[0], name): cell for row in rows for name, cell in zip(head, row, strict=True)}
+
+
+def plain(head: str) -> str:
+    """The head of a row or column as in the paper: without a recipe."""
+    return re.split(":| `", head)[0]
+
+
+@pytest.mark.parametrize("table", WHERE)
+def test_every_cell_has_the_papers_number_and_a_result_or_not_run(table):
+    cells = grid(WHERE[table])
+    expected = [cell for cell in paper_cells() if table in cell.tables]
+    counts = {"1": 36, "2": 36, "3": 36, "10": 12, "4": 10, "11": 20}
+    assert len(expected) == counts[table]
+    for cell in expected:
+        axes = (cell.task, cell.network) if WHERE[table] == "3" else (cell.network, cell.task)
+        [text] = [
+            text for (row, column), text in cells.items() if (plain(row), plain(column)) == axes
+        ]
+        number, *ours = text.split("<br>")
+        assert number.partition(" (curves")[0] == str(cell).replace(" ", "")
+        own = [line for line in ours if not line.startswith("near ")]
+        assert own, f"{cell} has neither a result nor {paper.NOT_RUN}"
+        assert all(re.fullmatch(rf"((code|paper|near):? )?({RESULT}|\*not run\*)", x) for x in ours)
+
+
+@pytest.mark.parametrize("table", ["1", "2", "4"])
+def test_the_names_in_row_and_column_are_the_recipe(table):
+    rows = {row for row, _ in grid(table) if "quoted" not in row}
+    columns = {column for _, column in grid(table) if "`" in column}
+    name = re.compile(r"`(.*)`")
+    found = {f"ppo/{name.findall(c)[0]}/{name.findall(r)[0]}" for r in rows for c in columns}
+    assert found == {
+        cell.recipes[0]
+        for cell in paper_cells()
+        if table.replace("4", "11") in cell.tables and cell.recipes
+    }
+
+
+def test_every_recipe_that_the_page_names_exists():
+    names = set(re.findall(r"\b(?:ppo|cql|dt)/[\w.-]+/[\w.-]+", PAGE))
+    data = {cell.task for cell in paper_cells() if "3" in cell.tables}
+    full = {name.replace("DATA", one) for name in names for one in data if "TASK" not in name}
+    assert len(full) > 20
+    assert {name for name in full if "GAME" not in name} <= set(RECIPES)
+    assert {name for cell in paper_cells() for name in cell.recipes} <= set(RECIPES)
+
+
+def test_every_table_and_figure_is_there():
+    heads = " ".join(re.findall(r"^## (.*)", PAGE, re.MULTILINE))
+    assert {*re.findall(r"\d+", heads)} >= {str(number) for number in range(1, 13)}
+    figures = re.findall(r"^\| ([\d, ]+): ", PAGE, re.MULTILINE)
+    assert {number for row in figures for number in row.split(", ")} == set("1234567")
+
+
+@pytest.mark.parametrize("table", ["5", "6", "7", "9"])
+def test_hyperparameters_are_the_papers(table):
+    rows = [row for row in hyperparameters(table) if row.name]
+    assert len(rows) == 11
+    for row in rows:
+        line = next(line for line in PAGE.splitlines() if line.startswith(f"| {row.name} |"))
+        cell = line.split(" | ")[["5", "6", "7", "9"].index(table) + 1]
+        values, _, ours = cell.strip(" |").partition(" / ")
+        assert values == ", ".join(row.values)
+        assert ours
+
+
+def test_flows_are_counted_as_the_paper_says():
+    for (row, column), text in grid("12").items():
+        if column in ("Vanilla_TIT", "Enhanced_TIT"):
+            [line] = [line for line in PAGE.splitlines() if line.startswith(f"| {row} | ")]
+            counts = line.strip("|").split("|")
+            assert text.endswith(f"= {counts[2 if column == 'Vanilla_TIT' else 4].strip()}")
+
+
+def test_a_new_run_fills_its_cell(monkeypatch):
+    cell = next(c for c in paper_cells() if "ppo/mountaincar/enhanced-tit-paper" in c.recipes)
+    recipe = paper.get_recipe("ppo/mountaincar/enhanced-tit-paper")
+    found = paper.Measured(
+        paper.Match(cell, ""), recipe, "classic_control", (-90.0, -100.0), 100_352
+    )
+    monkeypatch.setattr(paper, "measured", lambda: {cell: [found]})
+    assert paper.ours(cell) == [
+        "code: *not run*",
+        "paper: [-95±5](results/classic_control.md) (2x100k)",
+    ]
+    near = paper.Measured(paper.Match(cell, "epochs 4"), recipe, "pong", (-90.0,), 2_000_000)
+    monkeypatch.setattr(paper, "measured", lambda: {cell: [near]})
+    assert paper.ours(cell) == ["*not run*", "near [-90](results/pong.md) (1x2M)"]
