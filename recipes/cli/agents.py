@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -12,7 +13,7 @@ from .arguments import Parser, add_agent, check_seed, fail, say
 
 _EPISODES = 10
 _MOST = 1_000_000
-_MAPS = ("grad-cam", "integrated-gradients", "attention")
+_MAPS = ("grad-cam", "integrated-gradients", "attention", "weights")
 
 
 def play(arguments: list[str]) -> None:
@@ -86,14 +87,23 @@ def _list() -> None:
 
 
 def explain(arguments: list[str]) -> None:
-    """Films what a trained agent looks at, or draws one step of it."""
-    parser = Parser("explain", "Film what a trained agent looks at, or draw one step of it.")
-    add_agent(parser)
+    """Films what a trained agent looks at, or draws steps of one or several agents."""
+    parser = Parser(
+        "explain",
+        "Film what a trained agent looks at, or draw steps of it. Several agents, which read images, "
+        "are drawn side by side while the first one plays.",
+    )
+    add_agent(parser, nargs="+")
     parser.add_argument(
         "--out", type=Path, required=True, help="new file: a film (.gif, .mp4) or a picture (.png)"
     )
     parser.add_argument("--seed", type=int, help="seed of the episode; default: the evaluation's")
-    parser.add_argument("--step", type=int, help="of a picture: which step; default: 0, the first")
+    parser.add_argument(
+        "--step",
+        type=int,
+        nargs="+",
+        help="of a picture: which step; default: 0, the first. Several are rows of one picture",
+    )
     parser.add_argument("--max-steps", type=int, help="of a film: stop after so many steps")
     parser.add_argument(
         "--target",
@@ -104,7 +114,8 @@ def explain(arguments: list[str]) -> None:
     parser.add_argument(
         "--map",
         choices=_MAPS,
-        help="how; default: grad-cam of images, integrated-gradients of arrays",
+        help="how; default: grad-cam of images, integrated-gradients of arrays. weights: a grid of "
+        "the weights of all inner and outer blocks in one step",
     )
     parser.add_argument(
         "--layer", help="layer of grad-cam; default: the last that is laid out over the image"
@@ -117,25 +128,53 @@ def explain(arguments: list[str]) -> None:
 
     from ..tools.results.explanation import check_explanation, explain_policy
 
-    check_explanation(options.out, options.step, options.max_steps)
-    agent = load_agent(options.agent)
+    steps = options.step or [None]
+    check_explanation(options.out, steps[0], options.max_steps)
+    agents = [load_agent(name) for name in options.agent]
+    agent = agents[0]
     torch.set_num_threads(agent.recipe["threads"])
     seed = agent.first_seed if options.seed is None else options.seed
+    if options.map == "weights" or len(agents) > 1 or len(steps) > 1:
+        _draw_figure(agents, steps if options.step else [0], seed, options)
+        return
     shown = explain_policy(
         agent.make_env,
         agent.policy,
         agent.name,
         options.out,
         seed=seed,
-        step=options.step,
+        step=steps[0],
         max_steps=options.max_steps,
         title=agent.recipe["name"],
         target=options.target,
         kind=options.map,
         layer=options.layer,
     )
-    steps = f"{shown} steps" if shown > 1 else "1 step"
-    say(f"{steps} of the episode of seed {seed}\nwritten to {options.out}")
+    count = f"{shown} steps" if shown > 1 else "1 step"
+    say(f"{count} of the episode of seed {seed}\nwritten to {options.out}")
+
+
+def _draw_figure(agents: list[Any], steps: list[int], seed: int, options: Namespace) -> None:
+    """Draws one of the paper's figures of attention."""
+    from ..tools.results.paper_figures import compare_maps, draw_weights
+
+    if options.out.suffix != ".png":
+        fail(f"several agents or steps, and weights, are a picture (.png), not {options.out.name}")
+    if options.map != "weights":
+        compare_maps(
+            agents,
+            options.out,
+            steps=steps,
+            seed=seed,
+            target=options.target,
+            kind=options.map,
+            layer=options.layer,
+        )
+    elif len(agents) > 1 or len(steps) > 1 or options.layer:
+        fail("--map weights draws one step of one agent: leave the other agents and steps out")
+    else:
+        draw_weights(agents[0], options.out, step=steps[0], seed=seed, target=options.target)
+    say(f"written to {options.out}")
 
 
 def export(arguments: list[str]) -> None:

@@ -9,6 +9,7 @@ from torchrl_tit.analysis.attention import (
     inner_attention,
     map_attention,
     outer_attention,
+    outer_weights,
     roll_out,
 )
 from torchrl_tit.analysis.flows import Flows, count_flows, flow_table
@@ -29,6 +30,7 @@ __all__ = [
     "map_attention",
     "map_change",
     "outer_attention",
+    "outer_weights",
     "roll_out",
     "share_on_objects",
 ]

@@ -140,6 +140,34 @@ def outer_attention(network: HistoryNetwork, *histories: Tensor) -> Tensor:
         >>> outer_attention(tit, torch.rand(5, 8, 4)).shape
         torch.Size([5, 2, 2, 8])
     """
+    return outer_weights(network, *histories)[..., -1, :]
+
+
+def outer_weights(network: HistoryNetwork, *histories: Tensor) -> Tensor:
+    """Returns how much each of the K steps reads from each of them, in each block and head.
+
+    It is figure 7 of arXiv 2212.14538. For Decision Transformer, the weights of a step's return,
+    state and action are added.
+
+    Args:
+        network: the network.
+        *histories: as in its ``forward``.
+
+    Returns:
+        float [..., blocks, heads, K, K], rows (queries) summing to 1, the oldest step first. Where
+        attention is causal, the weights above the diagonal are 0.
+
+    Raises:
+        ValueError: if the network has no attention over time.
+
+    Example:
+        >>> from torchrl_tit import EnhancedTIT
+        >>> weights = outer_weights(EnhancedTIT((4,), num_frames=3), torch.rand(3, 4))
+        >>> weights.shape
+        torch.Size([2, 1, 3, 3])
+        >>> bool((weights.triu(1) == 0).all())
+        True
+    """
     count = len(network.frames)
     encoder = network.history_encoder
     maps: list[Tensor] = []
@@ -152,4 +180,4 @@ def outer_attention(network: HistoryNetwork, *histories: Tensor) -> Tensor:
             f"{type(encoder).__name__} has no attention over time: outer transformers, Catformer, "
             "GTrXL, CoBERL and Decision Transformer have"
         )
-    return torch.stack([weights[..., -1, :] for weights in maps], dim=-3)
+    return torch.stack(maps, dim=-4)

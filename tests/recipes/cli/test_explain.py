@@ -11,11 +11,12 @@ import pytest
 from recipes.cli import main
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
+from recipes.tools.results import paper_figures
 from tests.recipes.commands import fails
 from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt
 from tests.recipes.untrained import untrained
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, lstm, mlp
+from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, lstm, mlp, nature_cnn
 
 TIT: dict[str, Any] = {"patch_size": "auto", "embed_dim": 8, "num_blocks": 1, "features_dim": 8}
 PAGE = (432, 768, 3)
@@ -157,3 +158,88 @@ def test_maps_that_a_network_does_not_have(cartpole, tmp_path, capsys, monkeypat
     monkeypatch.setitem(sys.modules, "captum.attr", None)
     assert "need captum: pip install 'torchrl-tit[explain]'" in refused(cartpole)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+@pytest.fixture(scope="module")
+def pong(tmp_path_factory):
+    """Untrained agents of several networks, which read the last two or three frames of Pong."""
+    pytest.importorskip("ale_py")
+    folder = tmp_path_factory.mktemp("pong")
+    networks = {
+        "tit": enhanced_tit(2, **{**TIT, "patch_size": 42, "num_blocks": 2}),
+        "cnn": nature_cnn(3),
+    }
+    return {
+        name: untrained(folder / name, make_ppo("ALE/Pong-v5", network, num_envs=2)).folder
+        for name, network in networks.items()
+    }
+
+
+def test_maps_of_several_agents_on_the_same_frames(pong, tmp_path, monkeypatch):
+    drawn = []
+
+    def save(figure, out):
+        drawn.append([axes.images[0].get_array() for axes in figure.axes])
+        drawn.append([axes.get_title() for axes in figure.axes if axes.get_title()])
+
+    explain(pong["tit"], pong["cnn"], "--step", 3, 1, "--out", tmp_path / "maps.png")
+    height, width = imageio.imread(tmp_path / "maps.png").shape[:2]
+    assert width > 300 < height, "two rows of three pictures"
+    monkeypatch.setattr(paper_figures, "_save", save)
+    explain(pong["tit"], pong["cnn"], "--step", 1, 3, "--out", tmp_path / "a.png")
+    explain(pong["tit"], "--step", 1, 3, "--out", tmp_path / "b.png")
+    both, titles, alone, _ = drawn
+    assert titles == ["observation", "tit", "cnn"]
+    assert len(both) == 2 * 3
+    for first, same in zip((0, 1, 3, 4), alone, strict=True):
+        assert (both[first] == same).all(), "the first agent plays as it does alone"
+    assert (both[0] != both[3]).any(), "other steps"
+    assert any((both[i] != both[i - i % 3]).any() for i in (2, 5)), "the maps lie over the frames"
+
+
+def test_agents_of_other_tasks_see_other_frames(pong, tmp_path, capsys):
+    other = make_ppo("ALE/Breakout-v5", nature_cnn(2), num_envs=2)
+    other = untrained(tmp_path / "breakout", other).folder
+    out = tmp_path / "a.png"
+    assert "see different frames in step 1" in fails(
+        capsys, "explain", pong["tit"], other, "--step", 1, "--out", out
+    )
+    assert "are a picture (.png)" in fails(
+        capsys, "explain", pong["tit"], pong["cnn"], "--out", tmp_path / "a.gif"
+    )
+    assert "no attention weights" in fails(
+        capsys, "explain", pong["cnn"], "--map", "weights", "--out", out
+    )
+    assert "draws one step of one agent" in fails(
+        capsys, "explain", pong["cnn"], pong["tit"], "--map", "weights", "--out", out
+    )
+    assert not out.exists()
+
+
+def test_weights_of_all_blocks(pong, cartpole, tmp_path, monkeypatch):
+    explain(pong["tit"], "--map", "weights", "--step", 2, "--out", tmp_path / "a.png")
+    assert imageio.imread(tmp_path / "a.png").ndim == 3
+    panels = {}
+
+    def save(figure, out):
+        for axes in figure.axes:
+            if axes.get_title():
+                panels[axes.get_title()] = np.asarray(axes.images[0].get_array())
+
+    monkeypatch.setattr(paper_figures, "_save", save)
+    explain(pong["tit"], "--map", "weights", "--step", 2, "--out", tmp_path / "b.png")
+    inner = {f"inner block {block}, {at}" for block in (1, 2) for at in ("t-1", "t")}
+    outer = {f"outer block {block}, head 1" for block in (1, 2)}
+    assert set(panels) == inner | outer | {"observation, t-1", "observation, t"}
+    for title in outer:
+        assert panels[title].shape == (2, 2)
+        assert np.allclose(panels[title].sum(1), 1)
+        assert panels[title][0, 1] == 0, "no step reads a later one"
+    for title in inner:
+        assert panels[title].shape == (2, 2), "84 pixels in patches of 42"
+        assert (panels[title] > 0).all()
+        assert panels[title].sum() < 1
+    panels.clear()
+    explain(cartpole.folder, "--map", "weights", "--out", tmp_path / "b.png")
+    assert panels["outer block 1, head 1"].shape == (3, 3)
+    assert panels["inner block 1, t"].shape == (1, 1), "an array is one patch"
