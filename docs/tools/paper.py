@@ -172,8 +172,8 @@ def _grid(cells: Sequence[PaperCell], rows: str, columns: str, corner: str) -> s
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines) + "\n"
+    first, *lines = (f"| {' | '.join(map(str, line))} |" for line in [head, *rows])
+    return "\n".join([first, "|" + "---|" * len(head), *lines]) + "\n"
 
 
 def _in(*tables: str) -> list[PaperCell]:
@@ -267,9 +267,10 @@ def _hyperparameters() -> str:
     def show(table: str, name: str) -> str:
         (row,) = (row for row in hyperparameters(table) if row.name == name)
         here = used(table, row.fields[0])
-        if "observation size" in row.values:
-            here = "the same"
-        return f"{', '.join(row.values)} / {here}"
+        if "observation size" in row.values:  # is a number that depends on the data
+            here = "observation size"
+        values = ", ".join(row.values)
+        return values if values == here else f"{values} / {here}"
 
     def unlisted(field: str) -> list[str]:
         return [f"- / {used(table, field)}" for table in tables]
@@ -287,10 +288,14 @@ def _hyperparameters() -> str:
 
 def _scores() -> str:
     rows = []
-    for task, (random, expert) in EXPERT_SCORES.items():
+    for task, printed in EXPERT_SCORES.items():
         here = next(pair for name, pair in REFERENCE_RETURNS.items() if name.startswith(task))
-        rows.append([task, random, here[0], expert, here[1]])
-    return _table(["task", "random: paper", "here", "expert: paper", "here"], rows)
+        rows.append([task, *map(_or_same, printed, map(str, here))])
+    return _table(["task", "random", "expert"], rows)
+
+
+def _or_same(paper: str, here: str) -> str:
+    return paper if paper == here else f"{paper} / {here}"
 
 
 def _flows() -> str:
@@ -305,11 +310,10 @@ def _flows() -> str:
     ]
     rows = []
     for (name, formulas), field in zip(FLOWS.items(), fields(Flows), strict=False):
-        row: list[Any] = [name]
-        for formula, flows in zip(formulas, counted, strict=True):
-            row += [f"{formula} = {values[formula]}", getattr(flows, field.name)]
-        rows.append(row)
-    return _table(["flow", "Vanilla_TIT", "counted", "Enhanced_TIT", "counted"], rows)
+        pairs = zip(formulas, counted, strict=True)
+        numbers = [(f, str(values[f]), str(getattr(flows, field.name))) for f, flows in pairs]
+        rows.append([name, *(f"{f}: {_or_same(paper, here)}" for f, paper, here in numbers)])
+    return _table(["flow", "Vanilla_TIT", "Enhanced_TIT"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {

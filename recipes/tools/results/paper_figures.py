@@ -108,10 +108,10 @@ def draw_weights(
 ) -> None:
     """Draws the attention weights of an agent in one step: a row for each block.
 
-    On the left, for each of the last frames, the weights with which an inner block's class token
-    reads the patches, averaged over its heads and without its weight for itself; on the right the
-    K x K weights of each head of the outer block, rows (queries) and columns (keys) from the oldest
-    step to the newest.
+    On the left, unless the observation is one patch, the weights with which an inner block's class
+    token reads the patches of each of the last frames, averaged over its heads and without its
+    weight for itself. On the right, the K x K weights of each head of the outer block, rows
+    (queries) and columns (keys) from the oldest step to the newest.
 
     Args:
         agent: the agent.
@@ -151,12 +151,13 @@ def _weights(network: HistoryNetwork, histories: Sequence[Tensor]) -> list[list[
     outer: Tensor | None = None
     with suppress(ValueError):  # there is none
         inner = inner_attention(network, *histories)
+    inner = {name: blocks for name, blocks in inner.items() if blocks[0].shape[-1] > 2}  # patches
     with suppress(ValueError):
         outer = outer_weights(network, *histories)[0]
     if not inner and outer is None:
         raise ValueError(
-            "this network has no attention weights: inner and outer transformers, Catformer, "
-            "GTrXL, CoBERL and Decision Transformer have"
+            "this network has no attention over several patches or steps: inner and outer "
+            "transformers, Catformer, GTrXL, CoBERL and Decision Transformer have"
         )
     rows: list[list[Panel]] = []
     frames = dict(zip(network.observations, histories, strict=False))

@@ -207,7 +207,7 @@ def test_agents_of_other_tasks_see_other_frames(pong, tmp_path, capsys):
     assert "are a picture (.png)" in fails(
         capsys, "explain", pong["tit"], pong["cnn"], "--out", tmp_path / "a.gif"
     )
-    assert "no attention weights" in fails(
+    assert "no attention over several patches" in fails(
         capsys, "explain", pong["cnn"], "--map", "weights", "--out", out
     )
     assert "draws one step of one agent" in fails(
@@ -242,4 +242,4 @@ def test_weights_of_all_blocks(pong, cartpole, tmp_path, monkeypatch):
     panels.clear()
     explain(cartpole.folder, "--map", "weights", "--out", tmp_path / "b.png")
     assert panels["outer block 1, head 1"].shape == (3, 3)
-    assert panels["inner block 1, t"].shape == (1, 1), "an array is one patch"
+    assert len(panels) == 1, "an array is one patch"
