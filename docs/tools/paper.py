@@ -39,8 +39,12 @@ from torchrl_tit.scores import REFERENCE_RETURNS
 RESULTS = Path(__file__).parents[1] / "results"
 NOT_RUN = "*not run*"
 
-_PAGES = {"cartpole": "classic_control", "hopper": "classic_control"}
-"""The pages of tables of runs that have none of their own name."""
+_PAGES = {
+    "cartpole": "results/classic_control.md",
+    "hopper": "results/classic_control.md",
+    "pong": "results/pong/records.csv",
+}
+"""What shows the tables of runs that have no page of their own name."""
 
 EXPERT_SCORES = {
     "halfcheetah": ("-280.178953", "12135.0"),
@@ -67,7 +71,7 @@ class Measured:
     match: Match
     recipe: Recipe
     page: str
-    """The page of docs/results that has them."""
+    """The page that has them, below docs."""
     values: tuple[float, ...]
     """The mean return of each run, or its best score."""
     steps: int
@@ -90,7 +94,7 @@ class Measured:
         digits = self.match.cell.digits
         spread = f"±{pstdev(self.values):.{digits}f}" * (len(self.values) > 1)
         number = f"{fmean(self.values):.{digits}f}{spread}"
-        return f"[{number}](results/{self.page}.md) ({len(self.values)}x{_steps(self.steps)})"
+        return f"[{number}]({self.page}) ({len(self.values)}x{_steps(self.steps)})"
 
 
 def _steps(count: int) -> str:
@@ -116,7 +120,7 @@ def measured() -> dict[PaperCell, list[Measured]]:
         ]
         steps = min(evaluation["steps"] for _, evaluation in runs)
         cells[found.cell].append(
-            Measured(found, recipe, _PAGES.get(page, page), tuple(values), steps)
+            Measured(found, recipe, _PAGES.get(page, f"results/{page}.md"), tuple(values), steps)
         )
     return {cell: sorted(found, key=lambda one: one.rank) for cell, found in cells.items()}
 
@@ -124,7 +128,9 @@ def measured() -> dict[PaperCell, list[Measured]]:
 def ours(cell: PaperCell) -> list[str]:
     """What was run for a cell: with its settings, or not, and the runs that are nearest to it."""
     found = measured().get(cell, [])
-    lines = []
+    lines: list[str] = []
+    if not cell.recipes:  # the head of its row or column says it
+        return lines
     for name in cell.recipes:
         own = [one for one in found if not one.is_near and one.recipe.name == name]
         label = ("paper: " if name.endswith("-paper") else "code: ") * (len(cell.recipes) > 1)
@@ -162,7 +168,7 @@ def _grid(cells: Sequence[PaperCell], rows: str, columns: str, corner: str) -> s
 
     def head(name: str) -> str:
         if name in quoted:
-            return f"{name}: quoted"
+            return f"{name}: quoted, not run"
         return f"{name} `{names[name]}`" if name in names else name
 
     return _table(
