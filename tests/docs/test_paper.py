@@ -10,7 +10,7 @@ from recipes.core.registry import RECIPES
 from recipes.tools.results.paper import hyperparameters, paper_cells
 
 PAGE = (Path(__file__).parents[2] / "docs" / "paper.md").read_text()
-RESULT = r"\[-?[\d.]+(±[\d.]+)?\]\(results/\w+\.md\) \(\d+x\d+[kM]\)"
+RESULT = r"\[-?[\d.]+(±[\d.]+)?\]\(results/[\w/.]+\) \(\d+x\d+[kM]\)"
 WHERE = {"1": "1", "2": "2", "3": "3", "10": "3", "4": "4", "11": "4"}
 """The table of the page that has a table of the paper."""
 
@@ -37,12 +37,14 @@ def test_every_cell_has_the_papers_number_and_a_result_or_not_run(table):
     assert len(expected) == counts[table]
     for cell in expected:
         axes = (cell.task, cell.network) if WHERE[table] == "3" else (cell.network, cell.task)
-        [text] = [
-            text for (row, column), text in cells.items() if (plain(row), plain(column)) == axes
+        [(heads, text)] = [
+            (heads, text) for heads, text in cells.items() if tuple(map(plain, heads)) == axes
         ]
         number, *ours = text.split("<br>")
         assert number.partition(" (curves")[0] == str(cell).replace(" ", "")
         own = [line for line in ours if not line.startswith("near ")]
+        own += re.findall("not run", " ".join(heads))
+        assert bool(cell.recipes) == bool(ours)
         assert own, f"{cell} has neither a result nor {paper.NOT_RUN}"
         assert all(re.fullmatch(rf"((code|paper|near):? )?({RESULT}|\*not run\*)", x) for x in ours)
 
@@ -103,13 +105,15 @@ def test_a_new_run_fills_its_cell(monkeypatch):
     cell = next(c for c in paper_cells() if "ppo/mountaincar/enhanced-tit-paper" in c.recipes)
     recipe = paper.get_recipe("ppo/mountaincar/enhanced-tit-paper")
     found = paper.Measured(
-        paper.Match(cell, ""), recipe, "classic_control", (-90.0, -100.0), 100_352
+        paper.Match(cell, ""), recipe, "results/classic_control.md", (-90.0, -100.0), 100_352
     )
     monkeypatch.setattr(paper, "measured", lambda: {cell: [found]})
     assert paper.ours(cell) == [
         "code: *not run*",
         "paper: [-95±5](results/classic_control.md) (2x100k)",
     ]
-    near = paper.Measured(paper.Match(cell, "epochs 4"), recipe, "pong", (-90.0,), 2_000_000)
+    near = paper.Measured(
+        paper.Match(cell, "epochs 4"), recipe, "results/pong/records.csv", (-90.0,), 2_000_000
+    )
     monkeypatch.setattr(paper, "measured", lambda: {cell: [near]})
-    assert paper.ours(cell) == ["*not run*", "near [-90](results/pong.md) (1x2M)"]
+    assert paper.ours(cell) == ["*not run*", "near [-90](results/pong/records.csv) (1x2M)"]
