@@ -49,6 +49,7 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
 
     clips_actions = True
     columns = ("loss_bc",)
+    measures = ("action_error", "log_likelihood")
 
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with the policy."""
@@ -70,3 +71,10 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
         terms = self.loss(batch)
         descend(terms, self.optimizer)
         return self.numbers(terms)
+
+    def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
+        """Adds the mean log-likelihood of the data's actions, in nats."""
+        return {
+            **super().measure_batch(samples),
+            "log_likelihood": -self.model(samples)["loss_bc"],
+        }

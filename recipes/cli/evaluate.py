@@ -63,14 +63,28 @@ def _file_name(own: Recipe, recipe: Recipe, best: bool) -> str:
 
 
 def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
-    """Returns an evaluation in one line."""
+    """Returns an evaluation in one line, and what was measured on held-out episodes in another."""
     best = evaluation["weights"] == "best"
+    if "returns" not in evaluation:
+        chosen = ", which these episodes chose" if best else ""
+        return (
+            f"{recipe.name}: after {evaluation['steps']} {recipe.unit} ({evaluation['weights']} "
+            f"weights{chosen}), {_measured(evaluation)}"
+        )
     new = f", on new episodes from seed {evaluation['seed']}" if best else ""
+    held_out = f"\n{_measured(evaluation)}" if "held_out" in evaluation else ""
     return (
         f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
         f"{evaluation['episodes']} episodes after {evaluation['steps']} {recipe.unit} "
-        f"({evaluation['weights']} weights{new})"
+        f"({evaluation['weights']} weights{new}){held_out}"
     )
+
+
+def _measured(evaluation: dict[str, Any]) -> str:
+    """What was measured on episodes of data, in words."""
+    words = [f"{name} {value:.4g}" for name, value in evaluation["held_out"].items()]
+    episodes = evaluation["held_out_episodes"]
+    return f"on {episodes} episodes of {evaluation['dataset']}: {', '.join(words)}"
 
 
 def render(arguments: list[str]) -> None:

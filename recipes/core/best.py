@@ -17,8 +17,9 @@ class Best:
     """Keeps a copy of the weights with the highest return so far.
 
     That is the mean return of an evaluation during training. Where there is none, it is that of the
-    last 20 training episodes, and the weights are those that collected the last of them. If returns
-    are equal, the later weights are kept. The copy is part of each checkpoint.
+    last 20 training episodes, and the weights are those that collected the last of them. Of runs
+    without an environment, it is minus the error on held-out episodes. If returns are equal, the
+    later weights are kept. The copy is part of each checkpoint.
 
     The maximum of many noisy means is biased upwards: only new episodes say what the weights reach.
 

@@ -7,7 +7,7 @@ import random
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Annotated, Any
 
 import msgspec
@@ -28,7 +28,7 @@ from .algorithm import (
 )
 from .best import EPISODES, Best
 from .callback import Callback
-from .evaluation import Outcome, summarize
+from .evaluation import HeldOut, Outcome, summarize
 from .free_memory import return_free_memory
 from .interrupt import Interrupt
 from .optional import tqdm
@@ -59,6 +59,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     np.random.seed(recipe.seed)
     torch.manual_seed(recipe.seed)
     algorithm = make_algorithm(recipe)
+    recipe = algorithm.recipe  # with what only its data say
     step = saved_step = max(checkpoint_steps(run.checkpoints), default=0)
     if step == 0 and (weights := run.load_initial_weights()):
         with run.restoring(step):
@@ -114,20 +115,24 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             enough = any([callback.updated(step, algorithm.policy) for callback in callbacks])
             if evaluation_due:
                 with _naming(f"in {recipe.env}, in the evaluation at step {step}", saved_step):
-                    outcomes = algorithm.play(step)
-                if not record.outcomes:
+                    outcomes, held_out = algorithm.play(step), algorithm.measure(step)
+                if not record.outcomes and outcomes:
                     best.forget()  # training episodes do not count where there are evaluations
                 record.outcomes += outcomes
-                best.offer(step, max(outcome.mean for outcome in outcomes))
-                for callback in callbacks:
+                record.held_out += [] if held_out is None else [held_out]
+                if outcomes:
+                    best.offer(step, max(outcome.mean for outcome in outcomes))
+                elif held_out is not None:
+                    best.offer(step, -held_out.error)
+                for callback in callbacks if outcomes else ():
                     callback.evaluated(step, outcomes)
             if log_due or evaluation_due:
                 row = record.take_row(step, means=log_due)
                 written = metrics.log(step, **row)
                 for callback in callbacks:
                     callback.logged(step, written)
-                if not math.isnan(row["return_mean"]):
-                    progress.set_postfix_str(f"return {row['return_mean']:.1f}")
+                if shown := _shown(row, algorithm):
+                    progress.set_postfix_str(shown)
 
             interval = recipe.checkpoint_interval
             due = step // interval > before // interval or step >= recipe.final_step
@@ -147,6 +152,15 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
                 break
 
 
+def _shown(row: Mapping[str, float], algorithm: Algorithm[Any]) -> str:
+    """What the progress line shows of a row of metrics; nothing if it has no evaluation."""
+    if not math.isnan(row["return_mean"]):
+        return f"return {row['return_mean']:.1f}"
+    known = {x: row[x] for x in algorithm.held_out_columns if not math.isnan(row[x])}
+    words = [f"{name.removeprefix('held_out_')} {value:.3g}" for name, value in known.items()]
+    return f"held out: {', '.join(words)}" if words else ""
+
+
 class Record:
     """The measurements since the last row of metrics, and all evaluations so far.
 
@@ -158,8 +172,11 @@ class Record:
     def __init__(self, recipe: Recipe, algorithm: Algorithm[Any]) -> None:
         self.outcomes: list[Outcome] = []
         """The results of all evaluations so far."""
+        self.held_out: list[HeldOut] = []
+        """What was measured on held-out episodes so far."""
         self._recipe = recipe
         self._names = list(algorithm.columns)
+        self._measured = list(algorithm.held_out_columns)
         self._required = [name not in algorithm.optional_columns for name in self._names]
         self._sums: Tensor | None = None
         self._count = 0
@@ -170,7 +187,7 @@ class Record:
         """Names of the numbers in a row of metrics, besides step and time."""
         targets = self._recipe.target_columns.values()
         episodes = [] if self._recipe.offline else ["episodes"]
-        return ["return_mean", *targets, *episodes, *self._names]
+        return ["return_mean", *targets, *self._measured, *episodes, *self._names]
 
     def add(self, returns: Tensor | None, values: Mapping[str, Tensor | float]) -> None:
         """Adds the returns of a batch and the numbers of its update, without waiting for a GPU."""
@@ -207,6 +224,8 @@ class Record:
             row[column] = next((o.mean for o in now if o.target_return == target), math.nan)
         if self._recipe.offline:
             row["return_mean"] = max((outcome.mean for outcome in now), default=math.nan)
+        if self.held_out and self.held_out[-1].step == step:
+            row |= {f"held_out_{name}": x for name, x in self.held_out[-1].values.items()}
         if not means:
             return row
         assert self._sums is not None
@@ -222,6 +241,7 @@ class Record:
         """Returns the state that the next row and the next evaluation need."""
         return {
             "outcomes": [asdict(outcome) for outcome in self.outcomes],
+            "held_out": [asdict(held_out) for held_out in self.held_out],
             "evaluation_seed": self._recipe.evaluation_seed,
             "num_frames": self._recipe.backbone.num_frames,
             "sums": [] if self._sums is None else self._sums.tolist(),
@@ -234,7 +254,7 @@ class Record:
         state = _record_state(state_dict, self._recipe)
         if len(state.sums) != (len(self._names) if state.count else 0):
             raise ValueError(f"the record has {len(state.sums)} sums of {state.count} updates")
-        self.outcomes = state.outcomes
+        self.outcomes, self.held_out = state.outcomes, state.held_out
         self._sums = torch.tensor(state.sums, dtype=torch.float64) if state.sums else None
         self._count = state.count
         self._returns = state.returns
@@ -250,6 +270,7 @@ class _RecordState:
     count: Annotated[int, msgspec.Meta(ge=0)]
     returns: list[float]
     num_frames: int | None = None  # which the weights do not always determine
+    held_out: list[HeldOut] = field(default_factory=list)
 
 
 def _record_state(state: Mapping[str, Any], recipe: Recipe) -> _RecordState:
@@ -319,7 +340,8 @@ def evaluate(
 
     Episodes already played with these weights and seeds are not played again. But the best weights
     are those whose evaluation in training was luckiest, so they play new episodes, whose seeds come
-    after those of these evaluations.
+    after those of these evaluations. Without an environment, the weights are measured on the
+    held-out episodes, by which the best ones were chosen.
 
     Args:
         run: a run folder with a checkpoint.
@@ -345,6 +367,7 @@ def evaluate(
         recipe = replace(recipe, evaluation_seed=_fresh_seed(recipe, record))
         outcomes = []  # by which the weights were chosen
     step, algorithm = _load_networks(run, recipe, step, state, best=best)
+    recipe = algorithm.recipe
     same_seed = record.evaluation_seed == recipe.evaluation_seed
     targets: list[float | None] = [*recipe.target_columns] or [None]
     now = [
@@ -355,7 +378,7 @@ def evaluate(
         and len(outcome.returns) == recipe.evaluation_episodes
         and outcome.target_return in targets
     ]
-    if len(now) < len(targets):
+    if recipe.env and len(now) < len(targets):
         episodes = len(targets) * recipe.evaluation_episodes
         with (
             tqdm.tqdm(total=episodes, unit=" episodes", desc="evaluation", delay=1) as progress,
@@ -363,10 +386,12 @@ def evaluate(
             naming(f"in {recipe.env}"),
         ):
             now = algorithm.play(step)
-    for callback in callbacks:
+    known = (held_out for held_out in record.held_out if held_out.step == step)
+    held_out = next(known, None) or algorithm.measure(step)
+    for callback in callbacks if now else ():
         callback.evaluated(step, now)
     return {
-        **summarize(now, outcomes, recipe),
+        **summarize(now, outcomes, recipe, held_out),
         "seed": recipe.evaluation_seed,
         "weights": "best" if best else "last",
     }
