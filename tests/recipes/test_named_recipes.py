@@ -130,7 +130,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "ppo/tmaze-250/*": {"advantage_floor": 25 / 250},
     "ppo/tmaze-500/*": {"advantage_floor": 25 / 500},
     # arXiv 2212.14538, appendix, with d3rlpy 1.1.1.
-    "cql/*": {
+    "cql/*/*": {
         "actor_learning_rate": 1e-4, "critic_learning_rate": 3e-4,
         "temperature_learning_rate": 1e-4, "action_samples": 10, "batch_size": 256, "gamma": 0.99,
         "tau": 0.005, "critic": "mlp", "critic_hidden": (256, 256, 256), "over_critics": "mean",
@@ -141,7 +141,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "cql/*-replay-v0/*": {"conservative_weight": 5.0},
     "cql/*/mlp": {"backbone": mlp(hidden_dim=256, num_layers=3, activation="relu")},
     # docs/results/discrete_cql.md.
-    "discrete-cql/*": {"conservative_weight": 1.0, "gamma": 0.99, "tau": 0.005},
+    "discrete-cql/*/*": {"conservative_weight": 1.0, "gamma": 0.99, "tau": 0.005},
     "discrete-cql/cartpole-*": {
         "env": "CartPole-v1", "batch_size": 64, "learning_rate": 3e-4, "final_step": 10_000,
         "evaluation_interval": 1000, "evaluation_episodes": 20,
@@ -151,20 +151,20 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "final_step": 20_000, "evaluation_interval": 4000, "evaluation_episodes": 5,
     },
     # The papers of IQL and TD3+BC, for MuJoCo.
-    "iql/*": {
+    "iql/*/*": {
         "expectile": 0.7, "temperature": 3.0, "learning_rate": 3e-4, "decay_learning_rate": True,
         "normalize_rewards": True,
     },
-    "td3bc/*": {
+    "td3bc/*/*": {
         "alpha": 2.5, "policy_delay": 2, "policy_noise": 0.2, "noise_clip": 0.5,
         "actor_learning_rate": 3e-4, "critic_learning_rate": 3e-4, "normalize_observations": True,
     },
-    "[it][qd][l3]*": {
+    "[it][qd][l3]*/*/*": {
         "tau": 0.005, "gamma": 0.99, "critic_hidden": (256, 256), "batch_size": 256,
         "final_step": 1_000_000, "evaluation_interval": 5000, "evaluation_episodes": 10,
     },
     # arXiv 2106.01345, appendix.
-    "dt/*": {
+    "dt/*/*": {
         "final_step": 100_000, "batch_size": 64, "learning_rate": 1e-4, "warmup_updates": 10_000,
         "weight_decay": 1e-4, "max_grad_norm": 0.25, "evaluation_episodes": 100,
         "return_scale": 1000,
@@ -220,6 +220,9 @@ def test_recipes_of_data_sets() -> None:
     expected = named("cql", both, 0, "mlp enhanced-tit") | named("dt", both, 2, "dt dt-tit")
     for algorithm in ("bc", "iql", "td3bc"):
         expected |= named(algorithm, all_three, 2, "mlp enhanced-tit vanilla-tit")
+    for algorithm in ("bc", "iql", "td3bc", "cql"):  # for any data
+        expected |= {f"{algorithm}/mlp", f"{algorithm}/enhanced-tit"}
+    expected |= {"dt/dt", "dt/dt-tit"}
     algorithms = ("cql/", "dt/", "bc/", "iql/", "td3bc/")
     assert {name for name in RECIPES if name.startswith(algorithms)} == expected
 

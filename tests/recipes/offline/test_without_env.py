@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,10 @@ import torch
 from recipes.cli import main
 from recipes.core import runner
 from recipes.core.metrics import read_metrics
+from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 from recipes.offline import read_data, with_spaces
+from recipes.presets.any_data import ANY_DATA_RECIPES
 from tests.datasets.rollouts import write
 from tests.recipes.commands import fails
 from tests.recipes.small import (
@@ -173,7 +176,7 @@ def test_spaces_of_images_and_discrete_actions(tmp_path):
 
 def test_bad_settings_in_one_line(tmp_path, capsys):
     data = log_machine(tmp_path / "log.hdf5")
-    words = ["train", "bc/hopper-medium-v2/mlp", "--env", "", "--dataset"]
+    words = ["train", "bc/mlp", "--dataset"]
     for further, message in {
         ("",): "is a recipe for any data: name them with --dataset FILE",
         (data, "--validation-fraction", 0): "hold at least one episode out",
@@ -206,12 +209,31 @@ def test_one_episode_is_cut_in_two(tmp_path):
     assert torch.equal(whole.rows["action"][180], held_out.rows["action"][0])
 
 
+def test_every_recipe_for_any_data_builds_what_it_needs(tmp_path):
+    data = {
+        True: log_machine(tmp_path / "log.hdf5"),
+        False: log_machine(tmp_path / "discrete.hdf5", actions=np.arange(200) % 3),
+    }
+    for name in ANY_DATA_RECIPES:
+        data_of_kind = str(data["discrete" not in name])
+        algorithm = make_algorithm(replace(get_recipe(name), dataset=data_of_kind))
+        algorithm.check()
+
+
+def test_cloning_of_the_best_episodes(tmp_path):
+    data = log_machine(tmp_path / "log.hdf5")
+    recipe = BC(dataset=str(data), backbone=SMALL, best_fraction=0.25)
+    found = make_algorithm(recipe).load_data().returns
+    everything = make_algorithm(replace(recipe, best_fraction=1.0)).load_data().returns
+    assert found.tolist() == everything.sort(descending=True).values[:2].tolist()
+
+
 def test_the_command_line(tmp_path, capsys):
     data, out = log_machine(tmp_path / "log.hdf5"), tmp_path / "run"
-    words = ["train", "bc/hopper-medium-v2/mlp", "--env", "", "--dataset", data, "--out", out]
+    words = ["train", "bc/enhanced-tit", "--dataset", data, "--out", out]
     main([str(x) for x in [*words, "--total-updates", 4, "--evaluation-interval", 2]])
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("bc/hopper-medium-v2/mlp: after 4 updates (last weights), on 1 ep")
+    assert lines[0].startswith("bc/enhanced-tit: after 4 updates (last weights), on 1 ep")
     assert "return" not in lines[0]
     assert Run.open(out).is_complete()
     main(["evaluate", str(out), "--best"])
