@@ -82,7 +82,7 @@ class GivenTask(EnvBase):
 
     def _given(self, begins: bool) -> TensorDict:
         given, zeros = dict(self.feed(begins)), torch.zeros(*self.batch_size, 1)
-        truncated = given.get("truncated", zeros.bool())
+        truncated = zeros.bool() if begins else given.get("truncated", zeros.bool())
         flags = {"truncated": truncated, "terminated": zeros.bool(), "done": truncated.clone()}
         entries = given | flags | ({} if begins else {"reward": given.get("reward", zeros)})
         return TensorDict(entries, self.batch_size, device=self.device)
