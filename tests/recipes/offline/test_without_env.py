@@ -237,5 +237,5 @@ def test_the_command_line(tmp_path, capsys):
     assert "return" not in lines[0]
     assert Run.open(out).is_complete()
     main(["evaluate", str(out), "--best"])
-    assert "(best weights, which these episodes chose)" in capsys.readouterr().out
+    assert "(best weights, chosen on held-out episodes)" in capsys.readouterr().out
     assert "is left out: it has no environment" in fails(capsys, "table", out)
