@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Composite
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs import EnvBase, Transform, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_tit.analysis.targets import evaluating
-from torchrl_tit.envs.given import GivenTask
+from torchrl_tit.envs.given import Feed, GivenTask
 
 _READ = ("observation", "action_mask")
 
@@ -104,11 +104,8 @@ class Actor:
 
     def _start(self, observation: Any) -> None:
         """Builds the environment for as many copies as there are observations."""
-        with closing(self._make_env(1)) as made:
-            base, transforms = made.base_env, made.transform
-            transforms.reset_parent()
-        specs = base.observation_spec_unbatched
-        self._specs = {key: spec for key, spec in specs.items() if key in _READ}
+        base, transforms = _parts(self._make_env)
+        self._specs = _specs(base)
         spec = self._specs["observation"]
         several = isinstance(spec, Composite)
         name = next(iter(spec.keys())) if several else None
@@ -121,14 +118,7 @@ class Actor:
         copies = len(first) if self._batched else 1
         writer = getattr(base, "action_writer", None)
         self._to_task: Callable[[NDArray], NDArray] = writer or (lambda action: action)
-        task = GivenTask(
-            self._specs,
-            base.action_spec_unbatched,
-            lambda begins: self._given,
-            copies,
-            device=base.device,
-        )
-        self._env = TransformedEnv(task, transforms)
+        self._env = _given(base, transforms, lambda begins: self._given, copies)
         self._begins = torch.zeros(copies, 1, dtype=torch.bool)
         self._last: dict[str, Tensor] = {}
 
@@ -167,3 +157,39 @@ class Actor:
             frame = torch.where(missing, last, frame)
         self._last[name] = frame
         return frame
+
+
+def make_given_env(make_env: Callable[[int], EnvBase], feed: Feed, num_envs: int = 1) -> EnvBase:
+    """Makes an environment whose observations a function gives, with all that a policy reads.
+
+    Args:
+        make_env: makes the policy's own environment, given the number of copies.
+        feed: gives the observations; see :class:`~torchrl_tit.envs.given.GivenTask`.
+        num_envs: number of copies.
+
+    Example:
+        >>> from torchrl_tit import load_agent
+        >>> agent = load_agent("cartpole")
+        >>> env = make_given_env(agent.make_env, lambda begins: {"observation": torch.ones(1, 4)})
+        >>> agent.policy(env.reset())["action"].shape
+        torch.Size([1])
+    """
+    return _given(*_parts(make_env), feed, num_envs)
+
+
+def _parts(make_env: Callable[[int], EnvBase]) -> tuple[EnvBase, Transform]:
+    """An environment that is closed, and its transforms, which can join another."""
+    with closing(make_env(1)) as made:
+        base, transforms = made.base_env, made.transform
+        transforms.reset_parent()
+    return base, transforms
+
+
+def _specs(base: EnvBase) -> dict[str, TensorSpec]:
+    """The specs of what is observed, by their keys."""
+    return {key: x for key, x in base.observation_spec_unbatched.items() if key in _READ}
+
+
+def _given(base: EnvBase, transforms: Transform, feed: Feed, num_envs: int) -> EnvBase:
+    task = GivenTask(_specs(base), base.action_spec_unbatched, feed, num_envs, device=base.device)
+    return TransformedEnv(task, transforms)

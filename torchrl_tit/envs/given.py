@@ -87,6 +87,16 @@ class GivenTask(EnvBase):
         entries = given | flags | ({} if begins else {"reward": given.get("reward", zeros)})
         return TensorDict(entries, self.batch_size, device=self.device)
 
+    def render(self) -> np.ndarray:
+        """Renders the newest observations as ``feed.render()`` does; uint8 [N, height, width, 3].
+
+        Raises:
+            ValueError: if the feed has no such method.
+        """
+        if not hasattr(self.feed, "render"):
+            raise ValueError("there is no environment that could be rendered")
+        return self.feed.render()
+
     def _set_seed(self, seed: int | None) -> None:
         if callable(reseed := getattr(self.feed, "seed", None)):
             reseed(seed)
