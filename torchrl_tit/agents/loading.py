@@ -127,7 +127,7 @@ class TrainedAgent:
             The undiscounted return of each episode; float64 [episodes].
 
         Raises:
-            ValueError: if ``episodes`` is less than 1.
+            ValueError: if ``episodes`` is less than 1, or it was trained without an environment.
 
         Example:
             >>> from torchrl_tit import load_agent

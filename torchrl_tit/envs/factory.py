@@ -138,6 +138,7 @@ def make_env(
                 "a task without a name has one observation and nothing to wrap: it takes no "
                 "gymnasium.Wrapper, observation_keys or mask_actions"
             )
+        kwargs.pop("render_mode", None)  # its render() says that there is nothing to see
         try:
             env = make_unknown_task(num_envs, clip_actions=clip_actions, device=device, **kwargs)
         except TypeError as error:  # it has none of the settings of an environment

@@ -15,9 +15,11 @@ import torch
 
 from recipes.cli import main
 from recipes.core import runner
+from recipes.core.evaluation import score_of
 from recipes.core.metrics import read_metrics
+from recipes.core.records import Records
 from recipes.core.registry import get_recipe
-from recipes.core.run import Run
+from recipes.core.run import RecordedRun, Run
 from recipes.offline import read_data, with_spaces
 from recipes.presets.any_data import ANY_DATA_RECIPES
 from tests.datasets.rollouts import write
@@ -38,6 +40,7 @@ from tests.recipes.small import (
     tit,
     train,
 )
+from torchrl_tit import load_agent
 from torchrl_tit.datasets import DatasetError
 from torchrl_tit.evaluation_file import check_evaluation
 
@@ -239,3 +242,26 @@ def test_the_command_line(tmp_path, capsys):
     main(["evaluate", str(out), "--best"])
     assert "(best weights, chosen on held-out episodes)" in capsys.readouterr().out
     assert "is left out: it has no environment" in fails(capsys, "table", out)
+
+
+def test_what_reads_evaluations_knows_those_without_returns(tmp_path, capsys):
+    recipe = with_spaces(BC(dataset=str(log_machine(tmp_path / "log.hdf5")), backbone=SMALL))
+    run = train(replace(recipe, total_updates=2, name="bc/mine"), tmp_path / "run")
+    with run:
+        run.save_evaluation(runner.evaluate(run))
+    evaluation = run.read_evaluation()
+    assert score_of(evaluation) == -evaluation["held_out"]["action_error"]
+    main(["report", str(run.folder), "--out", str(tmp_path / "report.html")])
+    assert "no environment that could be rendered" in (tmp_path / "report.html").read_text()
+    main(["record", str(run.folder), "--out", str(tmp_path / "table")])
+    table = Records(tmp_path / "table")
+    assert RecordedRun(table, table.below(".")[0]).read_evaluation() == evaluation
+    pytest.importorskip("huggingface_hub")
+    main(["share", str(run.folder), "--out", str(tmp_path / "agent")])
+    card = (tmp_path / "agent" / "README.md").read_text()
+    assert f"action_error {evaluation['held_out']['action_error']:.4g}" in card
+    assert "agent.act(observation)" in card
+    assert "mean_reward" not in card
+    agent = load_agent(tmp_path / "agent")
+    assert agent.act(np.zeros(5)).shape == (2,)
+    assert "there is no environment" in fails(capsys, "play", tmp_path / "agent")
