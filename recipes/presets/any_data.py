@@ -21,6 +21,12 @@ _SETTINGS: dict[str, Any] = {
     "total_updates": 50_000,
     "evaluation_interval": 1000,
 }
+# With these, an update of CQL takes a fifth of the time, and the temperature soon falls.
+_CQL: dict[str, Any] = {
+    "action_samples": 4,
+    "critic_hidden": (256, 256),
+    "temperature_learning_rate": 1e-3,
+}
 _ALGORITHMS = {"bc": BC, "iql": IQL, "td3bc": TD3BC, "cql": CQL, "discrete-cql": DiscreteCQL}
 _DT: dict[str, Any] = {
     "dataset": "",
@@ -34,7 +40,12 @@ ANY_DATA_RECIPES: dict[str, Preset] = {
     recipe.name: recipe
     for recipe in [
         *(
-            make(name=f"{algorithm}/{network}", backbone=backbone, **_SETTINGS)
+            make(
+                name=f"{algorithm}/{network}",
+                backbone=backbone,
+                **_SETTINGS,
+                **(_CQL if algorithm == "cql" else {}),
+            )
             for algorithm, make in _ALGORITHMS.items()
             for network, backbone in _NETWORKS.items()
         ),
