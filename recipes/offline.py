@@ -32,7 +32,7 @@ from torchrl_tit.datasets import (
     split_episodes,
 )
 from torchrl_tit.datasets.checks import check_actions
-from torchrl_tit.envs import observation_specs
+from torchrl_tit.envs import make_env, observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.modules import Backbone
@@ -80,7 +80,7 @@ def read_data(recipe: DatasetRecipe) -> Episodes:
     settings, spaces = recipe.reading(), recipe.task_settings
     if not recipe.env and "observation_shape" in spaces:
         shape = tuple(spaces["observation_shape"])
-        action: Space = Box(-np.inf, np.inf, (len(spaces.get("low", ())),))
+        action: Space = Box(-np.inf, np.inf, (np.size(spaces.get("low", ())),))
         if "num_actions" in spaces:
             action = Discrete(spaces["num_actions"])
         settings["task"] = TaskSpaces(Box(-np.inf, np.inf, shape), action, "the recipe")
@@ -108,7 +108,10 @@ def with_spaces(recipe: DatasetRecipeT) -> DatasetRecipeT:
         problem = f"is {observation.dtype}: store arrays as floats, and images as uint8."
         raise DatasetError(episodes.source, problem, "observations")
     kind = "uint8" if observation.dtype == torch.uint8 else "float32"
-    found = {"observation_shape": list(observation.shape[1:]), "observation_dtype": kind}
+    found: dict[str, Any] = {
+        "observation_shape": list(observation.shape[1:]),
+        "observation_dtype": kind,
+    }
     steps = action[episodes.step_rows]
     if not action.is_floating_point():
         found["num_actions"] = int(steps.max()) + 1
@@ -118,8 +121,9 @@ def with_spaces(recipe: DatasetRecipeT) -> DatasetRecipeT:
             low, high = -torch.ones_like(low), torch.ones_like(high)
         constant = low == high
         found |= {"low": (low - 1.0 * constant).tolist(), "high": (high + 1.0 * constant).tolist()}
-        bounds = [np.array(known.get(name, found[name]), np.float32) for name in ("low", "high")]
-        check_actions(episodes.source, steps.numpy(), Box(*bounds))
+        make_env("", **{**found, **known}).close()  # checks what the recipe has already
+        lowest, highest = (np.array({**found, **known}[x], np.float32) for x in ("low", "high"))
+        check_actions(episodes.source, steps.numpy(), Box(lowest, highest))
     settings = tuple(f"{name}={value}" for name, value in {**found, **known}.items())
     return replace(recipe, env_settings=settings)
 
@@ -182,7 +186,9 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
             return None
         if episodes is None and self._held_out is None:
             self.split(read_data(recipe))
-        episodes = (episodes or self._held_out).to(self.device)
+        episodes = episodes or self._held_out
+        assert episodes is not None
+        episodes = episodes.to(self.device)
         items, length = self.measured_items(episodes), getattr(recipe, "slice_length", 1)
         starts = torch.arange(0, len(items) - length + 1, max(1, len(items) // _MOST_MEASURED))
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts

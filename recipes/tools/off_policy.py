@@ -23,6 +23,7 @@ from torchrl_tit.envs import observation_specs
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.settings.networks import mlp
 
+from ..core.dataset_recipe import DatasetRecipe
 from ..core.networks import is_discrete, make_critic
 from ..core.optional import tqdm
 from ..core.recipe import Recipe
@@ -61,8 +62,8 @@ def evaluate_on_data(
     step, algorithm, _ = load_trained(run, recipe, best=best)
     if not isinstance(algorithm, DatasetAlgorithm):
         raise ValueError(f"{run.folder} is a run of {recipe.algorithm}, which reads no data sets")
-    recipe = algorithm.recipe
-    episodes = read_data(replace(recipe, dataset=dataset))
+    own: DatasetRecipe = algorithm.recipe
+    episodes = read_data(replace(own, dataset=dataset))
     found = algorithm.measure(step, episodes)
     assert found is not None
     evaluation = {

@@ -42,7 +42,9 @@ class Actor:
 
     def __init__(self, policy: TensorDictModuleBase, make_env: Callable[[int], EnvBase]) -> None:
         self._policy, self._make_env = policy, make_env
-        self.reset()
+        self._env: EnvBase | None = None
+        self._steps: TensorDictBase | None = None
+        self._begins = torch.zeros(1, 1, dtype=torch.bool)
 
     def reset(self, which: Any = None) -> None:
         """Begins an episode with the next observation.
@@ -52,8 +54,7 @@ class Actor:
                 be another number.
         """
         if which is None or self._env is None:
-            self._env: EnvBase | None = None
-            self._steps: TensorDictBase | None = None
+            self._env = self._steps = None
         else:
             self._begins |= torch.as_tensor(np.asarray(which, bool)).reshape(self._begins.shape)
 

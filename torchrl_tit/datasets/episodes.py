@@ -212,10 +212,9 @@ def split_episodes(episodes: Episodes, fraction: float, seed: int) -> tuple[Epis
     generator = torch.Generator().manual_seed(seed)
     order = finished[torch.randperm(len(finished), generator=generator)]
     count = min(max(1, round(fraction * len(finished))), len(finished) - 1)
-    held_out = torch.zeros_like(episodes.finished)
-    held_out[order[:count]] = True
-    chosen = (held_out.logical_not(), held_out)
-    rest, held_out = (select_episodes(episodes, x.nonzero().squeeze(-1)) for x in chosen)
+    chosen = torch.zeros_like(episodes.finished)
+    chosen[order[:count]] = True
+    rest, held_out = (select_episodes(episodes, x.nonzero().squeeze(-1)) for x in (~chosen, chosen))
     return rest, held_out
 
 

@@ -166,17 +166,17 @@ def make_unknown_task(
     if num_actions is not None:
         action_space = Discrete(num_actions)
     else:
-        bounds = [np.atleast_1d(np.array(x, np.float32)) for x in (low, high)]
+        lowest, highest = (np.atleast_1d(np.array(x, np.float32)) for x in (low, high))
         if (
-            bounds[0].shape != bounds[1].shape
-            or bounds[0].ndim != 1
-            or not (np.isfinite(bounds).all() and (bounds[0] < bounds[1]).all())
+            lowest.shape != highest.shape
+            or lowest.ndim != 1
+            or not (np.isfinite([lowest, highest]).all() and (lowest < highest).all())
         ):
             raise ValueError(
                 f"actions need num_actions, or low below high for each entry, not low={low} and "
                 f"high={high}"
             )
-        action_space = Box(*bounds)
+        action_space = Box(lowest, highest)
     writer = ActionWriter(action_space, clip=clip_actions)
     dtype = getattr(torch, observation_dtype)
     spec, _ = array_spec("observation", tuple(observation_shape), dtype, "CHW")

@@ -75,12 +75,16 @@ def test_value_of_a_continuous_policy():
         episodes_from_arrays(states, actions, actions[:, 0], ends & False, ends, states)
     )
 
-    class Critic(nn.Linear):
+    class Critic(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.layer = nn.Linear(2, 1)
+
         def forward(self, observation, action):
-            return super().forward(torch.cat([observation, action], -1))
+            return self.layer(torch.cat([observation, action], -1))
 
     policy = TensorDictModule(lambda x: 0.5 * torch.ones_like(x), ["observation"], ["action"])
-    critic = TensorDictModule(Critic(2, 1), ["observation", "action"], ["state_action_value"])
+    critic = TensorDictModule(Critic(), ["observation", "action"], ["state_action_value"])
     value = fit_q(policy, critic, items, gamma=GAMMA, updates=2500, learning_rate=0.02)
     assert value(torch.tensor([0])).item() == pytest.approx(0.5 / (1 - GAMMA), rel=0.03)
 

@@ -184,6 +184,9 @@ def test_bad_settings_in_one_line(tmp_path, capsys):
         ("",): "is a recipe for any data: name them with --dataset FILE",
         (data, "--validation-fraction", 0): "hold at least one episode out",
         (data, "--env-settings", "low=[-1,-1]", "high=[1,0.5]"): "'actions', row ",
+        (data, "--env-settings", "low=[-1]", "high=[1,2]"): "low below high for each entry",
+        (data, "--env-settings", "low=[-1]", "high=[1]"): r"one row has the shape \[2\], but in",
+        (data, "--env-settings", "observation_shape=5", "low=1", "high=2"): "its spaces: .*'int'",
         (data, "--env-settings", "speed=3"): "consists of its spaces: .*'speed'",
         (data, "--wrappers", "gymnasium.wrappers:ClipAction"): "nothing to wrap",
     }.items():
@@ -219,7 +222,8 @@ def test_every_recipe_for_any_data_builds_what_it_needs(tmp_path):
     }
     for name in ANY_DATA_RECIPES:
         data_of_kind = str(data["discrete" not in name])
-        algorithm = make_algorithm(replace(get_recipe(name), dataset=data_of_kind))
+        recipe: Any = get_recipe(name)
+        algorithm = make_algorithm(replace(recipe, dataset=data_of_kind))
         algorithm.check()
 
 
@@ -250,6 +254,7 @@ def test_what_reads_evaluations_knows_those_without_returns(tmp_path, capsys):
     with run:
         run.save_evaluation(runner.evaluate(run))
     evaluation = run.read_evaluation()
+    assert evaluation is not None
     assert score_of(evaluation) == -evaluation["held_out"]["action_error"]
     main(["report", str(run.folder), "--out", str(tmp_path / "report.html")])
     assert "no environment that could be rendered" in (tmp_path / "report.html").read_text()
