@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
@@ -19,7 +18,6 @@ from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Size
 
 Feed = Callable[[bool], Mapping[str, Any]]
-_EPISODE = 25  # steps of an episode of random observations
 
 
 class GivenTask(EnvBase):
@@ -73,8 +71,6 @@ class GivenTask(EnvBase):
         return spec if self.device is None else spec.to(self.device)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if kwargs.get("seed") is not None:
-            self._set_seed(kwargs["seed"])
         return self._given(True)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -98,34 +94,7 @@ class GivenTask(EnvBase):
         return self.feed.render()
 
     def _set_seed(self, seed: int | None) -> None:
-        if callable(reseed := getattr(self.feed, "seed", None)):
-            reseed(seed)
-
-
-class RandomFrames:
-    """Gives random observations, in episodes of 25 steps, where nothing else is known of a task.
-
-    Args:
-        spec: spec of the observation, without batch dimensions.
-        num_envs: number of copies.
-    """
-
-    def __init__(self, spec: TensorSpec, num_envs: int) -> None:
-        self._spec, self._num_envs, self._step = spec, num_envs, 0
-        self._generator = torch.Generator()
-
-    def seed(self, seed: int | None) -> None:
-        """Seeds the observations."""
-        self._generator.manual_seed(seed or 0)
-
-    def __call__(self, begins: bool) -> dict[str, Tensor]:
-        """Returns observations [N, *obs], and where an episode ends."""
-        self._step = 0 if begins else self._step + 1
-        frames = torch.randn(self._num_envs, *self._spec.shape, generator=self._generator)
-        if not self._spec.dtype.is_floating_point:
-            frames = (frames * 64 + 128).clamp(0, 255)
-        ends = torch.full((self._num_envs, 1), self._step >= _EPISODE)
-        return {"observation": frames.to(self._spec.dtype), "truncated": ends}
+        pass
 
 
 @checked_arguments
@@ -142,7 +111,8 @@ def make_unknown_task(
 ) -> GivenTask:
     """Makes copies of a task of which only the observations and actions are known.
 
-    :func:`~torchrl_tit.envs.make_env` calls it for a task without a name. Observations are random.
+    :func:`~torchrl_tit.envs.make_env` calls it for a task without a name. Observations are random,
+    and episodes do not end.
 
     Args:
         num_envs: number of copies.
@@ -183,7 +153,7 @@ def make_unknown_task(
     return GivenTask(
         {"observation": spec},
         writer.spec,
-        RandomFrames(spec, num_envs),
+        lambda begins: {"observation": spec.rand(torch.Size([num_envs]))},
         num_envs,
         action_writer=writer,
         device=device,
