@@ -49,8 +49,6 @@ Positive = Annotated[float, Meta(gt=0, le=1e9)]
 """Factors that cannot be 0."""
 Real = Annotated[float, Meta(ge=-1e9, le=1e9)]
 """Returns and other numbers of any sign."""
-Reals = Annotated[tuple[Real, ...], Meta(min_length=1, description="at least one finite number")]
-"""Several of these."""
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 """Fractions, discounts, and update rates of target networks."""
 Share = Annotated[float, Meta(gt=0, le=1)]
