@@ -11,8 +11,9 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from torchrl_tit.datasets import Episodes, select_episodes
 from torchrl_tit.objectives import LikelihoodBCLoss
-from torchrl_tit.settings.numbers import Rate, Steps
+from torchrl_tit.settings.numbers import Rate, Share, Steps
 
 from .core.algorithm import descend
 from .core.networks import make_cloning_policy
@@ -25,6 +26,9 @@ class BC(TransitionRecipe, algorithm="bc"):
 
     learning_rate: Rate = 3e-4
     """Learning rate of Adam."""
+    best_fraction: Share = 1.0
+    """Share of the finished episodes that are learned from: those with the highest returns
+    (filtered behaviour cloning, as in arXiv 2106.01345)."""
     time_limits: Literal["keep", "drop"] = "keep"
     """Whether to keep the last transition of an episode that a time limit truncated."""
     unfinished: Literal["keep", "drop"] = "keep"
@@ -49,6 +53,7 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
 
     clips_actions = True
     columns = ("loss_bc",)
+    measures = ("action_error", "log_likelihood")
 
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with the policy."""
@@ -61,6 +66,15 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
         self.optimizer = self.make_adam({"": self.recipe.learning_rate})
         self.buffer = self.make_buffer()
 
+    def load_data(self) -> Episodes:
+        """As :meth:`TransitionAlgorithm.load_data`, the best of the episodes only."""
+        episodes, fraction = super().load_data(), self.recipe.best_fraction
+        if fraction == 1:
+            return episodes
+        finished = episodes.finished.nonzero().squeeze(-1)
+        order = finished[episodes.returns[finished].argsort(descending=True, stable=True)]
+        return select_episodes(episodes, order[: max(1, round(fraction * len(order)))])
+
     def loss(self, samples: TensorDictBase) -> TensorDictBase:
         """Returns the terms of the loss; see :meth:`TransitionAlgorithm.loss`."""
         return self.model(samples)
@@ -70,3 +84,10 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
         terms = self.loss(batch)
         descend(terms, self.optimizer)
         return self.numbers(terms)
+
+    def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
+        """Adds the mean log-likelihood of the data's actions, in nats."""
+        return {
+            **super().measure_batch(samples),
+            "log_likelihood": -self.model(samples)["loss_bc"],
+        }

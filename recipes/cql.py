@@ -128,6 +128,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
 
     # The losses are in the order of the steps: the first that is not finite is the cause.
     columns = ("loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy")
+    measures = ("action_error", "q", "advantage", "loss_cql")
     model: ContinuousCQLLoss
 
     def networks(self, env: EnvBase) -> nn.Module:
@@ -135,7 +136,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         recipe, spec = self.recipe, self.action_spec
         if not has_bounds(spec):
             raise ValueError(
-                f"cql needs continuous actions within bounds, but those of {recipe.env} are "
+                f"cql needs continuous actions within bounds, but those of {recipe.task_name} are "
                 f"{describe(spec)}: use a discrete-cql recipe if they are discrete"
             )
         backbone = self.make_backbone(env)
@@ -211,6 +212,11 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         self.target.step()
         return self.numbers({**terms, **actor_terms})
 
+    def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
+        """Adds the conservative term, the gap between the critics' values."""
+        loss_cql = self.loss(self.model.sample_policy(samples))["loss_cql"]
+        return {**super().measure_batch(samples), "loss_cql": loss_cql}
+
 
 @dataclass(frozen=True, kw_only=True)
 class DiscreteCQL(ConservativeRecipe, algorithm="discrete-cql"):
@@ -240,13 +246,14 @@ class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
     """
 
     columns = ("loss_qvalue", "loss_cql", "value")
+    measures = ("action_error", "loss_cql", "value")
 
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with the network of the values, the policy, and its target."""
         recipe, spec = self.recipe, self.action_spec
         if not is_discrete(spec):
             raise ValueError(
-                f"discrete-cql needs a few discrete actions, but those of {recipe.env} are "
+                f"discrete-cql needs a few discrete actions, but those of {recipe.task_name} are "
                 f"{describe(spec)}: use a cql recipe if they are continuous"
             )
         self._policy = make_value_policy(self.make_backbone(env), spec).to(self.device)
@@ -276,3 +283,9 @@ class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
         descend(terms, self.optimizer)
         self.target.step()
         return self.numbers(terms)
+
+    def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
+        """Compares actions, and adds the conservative term and the value of the data's actions."""
+        terms = self.loss(samples.copy())
+        error = super().measure_batch(samples)
+        return {**error, "loss_cql": terms["loss_cql"], "value": terms["value"]}

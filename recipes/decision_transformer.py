@@ -10,7 +10,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar
@@ -23,7 +23,7 @@ from torchrl.data import Bounded, Categorical, MultiCategorical, ReplayBuffer, T
 from torchrl.envs import Compose, EnvBase, TargetReturn
 
 from torchrl_tit import settings
-from torchrl_tit.datasets import Episodes, SequenceStorage, load_episodes, make_replay_buffer
+from torchrl_tit.datasets import Episodes, SequenceStorage, make_replay_buffer
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
@@ -37,7 +37,7 @@ from torchrl_tit.settings.numbers import (
     Frames,
     Positive,
     Rate,
-    Reals,
+    Real,
     Steps,
     StepsOrNone,
     Weight,
@@ -50,7 +50,7 @@ from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import Outcome
 from .core.networks import normalize_frames
 from .core.task import make_task, task_limit
-from .offline import DatasetAlgorithm
+from .offline import DatasetAlgorithm, action_error, read_data
 
 ActionSpace = Literal["continuous", "gaussian", "discrete"]
 
@@ -71,8 +71,8 @@ class SequenceRecipe(DatasetRecipe):
     """How actions are predicted: "continuous" predicts actions within -1..1 with a tanh; "gaussian"
     predicts the mean and standard deviation of a tanh-squashed Gaussian; "discrete" predicts
     logits."""
-    target_returns: Reals
-    """Target returns of the evaluations."""
+    target_returns: tuple[Real, ...] = ()
+    """Target returns of the evaluations; by default the highest return in the data."""
     return_scale: Positive = 1000.0
     """Divisor of the returns-to-go."""
     acting_num_frames: Frames | None = None
@@ -158,6 +158,12 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
+        recipe = self.recipe
+        if not recipe.target_returns:
+            episodes = read_data(recipe)
+            check_data(recipe, episodes)
+            best = episodes.returns[episodes.finished].max().item()
+            self.recipe = recipe = replace(recipe, target_returns=(best,))
         with closing(make_task(recipe, num_frames=1, clip_actions=False)) as task:
             self.model = self.networks(task).to(self.device).eval()
         self._policy = make_dt_actor(self.model.network, self.model.head)
@@ -217,7 +223,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             **settings: further settings of the task.
         """
         recipe = self.recipe
-        if task_limit(recipe) is None:
+        if recipe.env and task_limit(recipe) is None:
             settings = {"max_episode_steps": recipe.history.max_ep_len, **settings}
         env = make_task(recipe, num_envs, seed, num_frames=1, clip_actions=False, **settings)
         if target_return is None:
@@ -237,9 +243,10 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             FileNotFoundError: if there are no such data.
         """
         recipe = self.recipe
-        episodes = load_episodes(recipe.dataset, **recipe.reading())
+        episodes = read_data(recipe)
         check_data(recipe, episodes)
         warn_of_targets(recipe.target_returns, episodes)
+        episodes = self.split(episodes)
         for encoder in self.model.network.frames:
             if isinstance(encoder, NormalizedFrames):
                 encoder.set_statistics(*episodes.observation_statistics())
@@ -255,9 +262,21 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             action_padding=self.action_padding,
         )
 
+    def measured_items(self, episodes: Episodes) -> SequenceStorage:
+        """Cuts windows out of episodes, as in training."""
+        return self.make_storage(episodes)
+
+    def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
+        """Compares the predicted actions with the data's, at all steps of the windows."""
+        actor = make_dt_actor(self.model.network, self.model.head, group=None, every_frame=True)
+        chosen, mask = actor(samples.copy())["action"], samples["mask"]
+        return {"action_error": action_error(chosen[mask], samples["action"][mask])}
+
     def play(self, step: int) -> list[Outcome]:
         """Plays the evaluation's episodes for each target return, side by side."""
         recipe = self.recipe
+        if not recipe.env:
+            return []
         return [
             Outcome(
                 step,
@@ -412,7 +431,7 @@ def _check_observation(
     if several or isinstance(spec, MultiCategorical):
         found = f"several observations ({', '.join(spec)})" if several else "categories"
         raise ValueError(
-            f"{recipe.env} has {found}, but a Decision Transformer reads one array or image: "
+            f"{recipe.task_name} has {found}, but a Decision Transformer reads one array or image: "
             "choose one with observation_keys, or flatten them with the wrapper "
             "gymnasium.wrappers:FlattenObservation"
         )
@@ -425,7 +444,7 @@ def _check_task(recipe: SequenceRecipe, action_spec: Any) -> int:
     Raises:
         ValueError: if the network cannot act in the task.
     """
-    env, settings = recipe.env, recipe.history
+    env, settings = recipe.task_name, recipe.history
     limit = task_limit(recipe)
     if settings.timestep_embedding and limit is not None and limit > settings.max_ep_len:
         raise ValueError(

@@ -64,6 +64,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
 
     clips_actions = True
     columns = ("loss_value", "loss_qvalue", "loss_actor", "nll")
+    measures = ("action_error", "q", "advantage", "nll")
 
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with policy, critics, their targets and the state value."""
@@ -71,7 +72,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         if not (is_continuous(spec) or is_discrete(spec)):
             raise ValueError(
                 f"iql needs arrays of continuous actions or a few discrete ones, but those of "
-                f"{recipe.env} are {describe(spec)}: use a bc recipe"
+                f"{recipe.task_name} are {describe(spec)}: use a bc recipe"
             )
         # TorchRL's loss hides keys from the critics that the actor does not declare: "observation".
         backbone = self.make_backbone(env, slices=True)
@@ -141,3 +142,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         descend(terms, self.optimizer)
         self.target.step()
         return self.numbers(terms)
+
+    def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
+        """Adds the negative log-likelihood of the data's actions, in nats."""
+        return {**super().measure_batch(samples), "nll": self.loss(samples.copy())["nll"]}

@@ -5,20 +5,34 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
+import numpy as np
 import torch
+from gymnasium.spaces import Box, Discrete, Space
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_tit.datasets import Episodes, HistoryStorage, load_episodes, make_replay_buffer
-from torchrl_tit.envs import observation_specs
+from torchrl_tit.analysis.targets import evaluating
+from torchrl_tit.datasets import (
+    DatasetError,
+    Episodes,
+    EpisodeStorage,
+    HistoryStorage,
+    TaskSpaces,
+    load_episodes,
+    make_replay_buffer,
+    split_episodes,
+)
+from torchrl_tit.datasets.checks import check_actions
+from torchrl_tit.envs import make_env, observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.modules import Backbone
@@ -35,7 +49,7 @@ from .core.algorithm import (
     numbers,
 )
 from .core.dataset_recipe import DatasetRecipe
-from .core.evaluation import Outcome
+from .core.evaluation import HeldOut, Outcome
 from .core.networks import make_backbone, make_critic
 from .core.task import make_task
 
@@ -50,11 +64,149 @@ class Buffer(Stateful, Protocol):
 DatasetRecipeT = TypeVar("DatasetRecipeT", bound=DatasetRecipe)
 
 
+def read_data(recipe: DatasetRecipe) -> Episodes:
+    """Reads the data set of a recipe.
+
+    Raises:
+        FileNotFoundError: if there are no such data.
+        DatasetError: if they cannot be used, or belong to another task.
+        ValueError: if the recipe names none.
+    """
+    if not recipe.dataset:
+        raise ValueError(
+            f"{recipe.name or recipe.algorithm} is a recipe for any data: name them with "
+            "--dataset FILE"
+        )
+    settings, spaces = recipe.reading(), recipe.task_settings
+    if not recipe.env and "observation_shape" in spaces:
+        shape = tuple(spaces["observation_shape"])
+        action: Space = Box(-np.inf, np.inf, (np.size(spaces.get("low", ())),))
+        if "num_actions" in spaces:
+            action = Discrete(spaces["num_actions"])
+        settings["task"] = TaskSpaces(Box(-np.inf, np.inf, shape), action, "the recipe")
+    return load_episodes(recipe.dataset, **settings)
+
+
+def with_spaces(recipe: DatasetRecipeT) -> DatasetRecipeT:
+    """Adds what the data say about observations and actions to a recipe without an environment.
+
+    They become its ``env_settings``, so that its policy can act without the data. Continuous
+    actions range from -1 to 1 if all are within, otherwise from the lowest to the highest of each
+    entry, and from 1 below to 1 above an entry that is constant. Settings that the recipe has
+    already are kept.
+
+    Raises:
+        DatasetError: if the observations are of another kind, or actions exceed the bounds that the
+            recipe has already.
+    """
+    known = recipe.task_settings
+    if recipe.env or "observation_shape" in known:
+        return recipe
+    episodes = read_data(recipe)
+    observation, action = episodes.rows["observation"], episodes.rows["action"]
+    if not (observation.is_floating_point() or observation.dtype == torch.uint8):
+        problem = f"is {observation.dtype}: store arrays as floats, and images as uint8."
+        raise DatasetError(episodes.source, problem, "observations")
+    kind = "uint8" if observation.dtype == torch.uint8 else "float32"
+    found: dict[str, Any] = {
+        "observation_shape": list(observation.shape[1:]),
+        "observation_dtype": kind,
+    }
+    steps = action[episodes.step_rows]
+    if not action.is_floating_point():
+        found["num_actions"] = int(steps.max()) + 1
+    else:
+        low, high = steps.amin(0), steps.amax(0)
+        if low.min() >= -1 and high.max() <= 1:
+            low, high = -torch.ones_like(low), torch.ones_like(high)
+        constant = low == high
+        found |= {"low": (low - 1.0 * constant).tolist(), "high": (high + 1.0 * constant).tolist()}
+        make_env("", **{**found, **known}).close()  # checks what the recipe has already
+        lowest, highest = (np.array({**found, **known}[x], np.float32) for x in ("low", "high"))
+        check_actions(episodes.source, steps.numpy(), Box(lowest, highest))
+    settings = tuple(f"{name}={value}" for name, value in {**found, **known}.items())
+    return replace(recipe, env_settings=settings)
+
+
+_MOST_MEASURED = 10_000
+"""Items of held-out episodes that are measured at a time, evenly spaced if there are more."""
+_MEASURED_AT_ONCE = 500
+
+
 class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
-    """An algorithm that samples its batches from a replay buffer of a data set."""
+    """An algorithm that samples its batches from a replay buffer of a data set.
+
+    Args:
+        recipe: the settings.
+    """
 
     buffer: Buffer
     """The replay buffer, once :meth:`prepare` has made it."""
+    measures: ClassVar[tuple[str, ...]] = ("action_error",)
+    """Names of what :meth:`measure_batch` measures, the error by which weights are chosen first."""
+
+    def __init__(self, recipe: DatasetRecipeT) -> None:
+        super().__init__(with_spaces(recipe))
+        self._held_out: Episodes | None = None
+        if self.recipe.held_out_fraction:
+            self.held_out_columns = [f"held_out_{name}" for name in self.measures]
+
+    @abstractmethod
+    def measured_items(self, episodes: Episodes) -> EpisodeStorage:
+        """Cuts episodes into the items that are measured."""
+
+    @abstractmethod
+    def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
+        """Measures the networks on items of held-out episodes.
+
+        Args:
+            samples: transitions [B], slices [N, T], or windows [B].
+
+        Returns:
+            The mean of each of ``measures``, float [].
+        """
+
+    def split(self, episodes: Episodes) -> Episodes:
+        """Holds some episodes out, and returns the others."""
+        fraction = self.recipe.held_out_fraction
+        if not fraction:
+            return episodes
+        rest, self._held_out = split_episodes(episodes, fraction, self.recipe.seed)
+        return rest
+
+    def measure(self, step: int, episodes: Episodes | None = None) -> HeldOut | None:
+        """Measures the current weights, without dropout and with the most likely actions.
+
+        Args:
+            step: number of steps done so far.
+            episodes: the episodes to measure them on; those that are held out if None.
+        """
+        recipe = self.recipe
+        if episodes is None and not recipe.held_out_fraction:
+            return None
+        if episodes is None and self._held_out is None:
+            self.split(read_data(recipe))
+        episodes = episodes or self._held_out
+        assert episodes is not None
+        episodes = episodes.to(self.device)
+        items, length = self.measured_items(episodes), getattr(recipe, "slice_length", 1)
+        starts = torch.arange(0, len(items) - length + 1, max(1, len(items) // _MOST_MEASURED))
+        index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
+        sums = dict.fromkeys(self.measures, 0.0)
+        with (
+            torch.random.fork_rng(range(torch.cuda.device_count())),
+            torch.no_grad(),
+            evaluating(self.model),
+            evaluating(self.policy),
+            set_exploration_type(ExplorationType.DETERMINISTIC),
+        ):
+            torch.manual_seed(recipe.evaluation_seed)
+            for part in index.to(self.device).split(max(1, _MEASURED_AT_ONCE // length)):
+                means = self.measure_batch(items.get(part))
+                for name in sums:
+                    sums[name] += means[name].item() * len(part)
+        values = {name: total / len(index) for name, total in sums.items()}
+        return HeldOut(step, len(episodes.lengths), values)
 
     @abstractmethod
     def make_buffer(self) -> Buffer:
@@ -141,6 +293,18 @@ class ActorCriticRecipe(TransitionRecipe):
     """Gradient steps between evaluations."""
 
 
+def action_error(chosen: Tensor, action: Tensor) -> Tensor:
+    """Mean squared error of continuous actions, or share of discrete ones that differ; float [].
+
+    Example:
+        >>> action_error(torch.tensor([0, 1]), torch.tensor([0, 2]))
+        tensor(0.5000)
+    """
+    if action.is_floating_point():
+        return (chosen - action).square().mean()
+    return (chosen != action).float().mean()
+
+
 RecipeT = TypeVar("RecipeT", bound=TransitionRecipe)
 
 
@@ -155,6 +319,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             are not floats.
     """
 
+    measures: ClassVar[tuple[str, ...]] = ("action_error", "q", "advantage")
     clips_actions: ClassVar[bool] = False
     """Whether the task clips actions, because the policy may exceed the bounds."""
     terminal_observations: ClassVar[Literal["keep", "zero"]] = "keep"
@@ -165,6 +330,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
+        recipe = self.recipe
         with closing(make_task(recipe, clip_actions=False)) as task:  # its spec has the bounds
             self.action_spec = task.action_spec_unbatched.to(self.device)
             observation = observation_specs(task)
@@ -233,21 +399,21 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         return {"optimizer": self.optimizer, "buffer": self.buffer}
 
     def load_data(self) -> Episodes:
-        """Loads the data set.
+        """Loads the episodes to learn from; the others are held out.
 
         Raises:
-            ValueError: if its actions are of another kind than those of the task.
+            ValueError: if the data set's actions are of another kind than those of the task.
             FileNotFoundError: if there are no such data.
         """
         recipe, continuous = self.recipe, self.action_spec.dtype.is_floating_point
-        episodes = load_episodes(recipe.dataset, **recipe.reading())
+        episodes = read_data(recipe)
         if episodes.rows["action"].is_floating_point() != continuous:
             found, expected = ("integers", "floats") if continuous else ("floats", "integers")
             raise ValueError(
-                f"the actions in {recipe.dataset} are {found}, but those of {recipe.env} are "
+                f"the actions in {recipe.dataset} are {found}, but those of {recipe.task_name} are "
                 f"{expected}: use other data"
             )
-        return episodes
+        return self.split(episodes)
 
     def make_buffer(self) -> ReplayBuffer:
         """Reads the data set into a replay buffer of transitions with histories.
@@ -257,8 +423,15 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         recipe, episodes = self.recipe, self.load_data()
         if recipe.normalize_observations:
             self._set_statistics(*episodes.observation_statistics())
-        storage = HistoryStorage(
-            episodes.to(self.device),
+        storage = self.measured_items(episodes.to(self.device))
+        length = recipe.slice_length
+        return make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed, slice_length=length)
+
+    def measured_items(self, episodes: Episodes) -> HistoryStorage:
+        """Cuts episodes into transitions with histories, as in training."""
+        recipe = self.recipe
+        return HistoryStorage(
+            episodes,
             recipe.backbone.num_frames,
             padding=recipe.padding,
             time_limits=recipe.time_limits,
@@ -266,8 +439,33 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             terminal_observations=self.terminal_observations,
             is_init=recipe.slice_length > 1,
         )
-        length = recipe.slice_length
-        return make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed, slice_length=length)
+
+    def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
+        """Compares the policy's actions with the data's, and what the critics say of both.
+
+        ``q`` is the lower of the critics' values of the data's actions, ``advantage`` how much
+        higher they value the policy's.
+        """
+        chosen, action = self.policy(samples.copy())["action"], samples["action"]
+        found = {"action_error": action_error(chosen, action)}
+        if "q" in self.measures:
+            q = self.q_values(samples)
+            found |= {"q": q.mean(), "advantage": (self.q_values(samples, chosen) - q).mean()}
+        return found
+
+    def q_values(self, samples: TensorDictBase, action: Tensor | None = None) -> Tensor:
+        """The lower value of the critics, float [*B]; of the data's actions if None are given."""
+        loss: Any = self.model
+        network, values = loss.qvalue_network, []
+        for weights in loss.qvalue_network_params.unbind(0):
+            with weights.to_module(network, preserve_module_state=False):
+                given = samples if action is None else samples.copy().set("action", action)
+                values.append(network(given.copy())["state_action_value"])
+        lower = torch.stack(values).amin(0)  # [*B, 1], or of each discrete action [*B, n]
+        if lower.shape[-1] > 1:
+            index = (samples["action"] if action is None else action).unsqueeze(-1)
+            lower = lower.gather(-1, index)
+        return lower.squeeze(-1)
 
     def numbers(self, terms: Terms) -> Mapping[str, Tensor]:
         """Selects and checks the numbers that an update returns.
@@ -282,6 +480,8 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
 
     def play(self, step: int) -> list[Outcome]:
         """Plays full episodes side by side, each with its own seed, without dropout."""
+        if not self.recipe.env:
+            return []
         seed, episodes = self.recipe.evaluation_seed, self.recipe.evaluation_episodes
         returns = evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=True)
         return [Outcome(step, returns.tolist())]

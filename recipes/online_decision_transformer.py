@@ -127,6 +127,8 @@ class ODT(SequenceRecipe, algorithm="odt"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.env:
+            raise ValueError("odt plays new episodes, so it needs an environment: name one as env")
         if self.action_space != "gaussian":
             raise ValueError(
                 f"action_space is {self.action_space!r}, but exploration needs a distribution of "

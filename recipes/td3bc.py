@@ -64,8 +64,8 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
         recipe, spec = self.recipe, self.action_spec
         if not has_bounds(spec):
             raise ValueError(
-                f"td3bc needs continuous actions within bounds, but those of {recipe.env} are "
-                f"{describe(spec)}: use a bc or iql recipe"
+                "td3bc needs continuous actions within bounds, but those of "
+                f"{recipe.task_name} are {describe(spec)}: use a bc or iql recipe"
             )
         # TorchRL's loss hides keys from the critics that the actor does not declare: "observation".
         backbone = self.make_backbone(env, slices=True)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from statistics import fmean, pstdev
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
@@ -45,12 +45,23 @@ class _Evaluation(msgspec.Struct):
     score_std: _Spread | UnsetType = UNSET
 
 
+class _OfData(msgspec.Struct):
+    """The entries of an evaluation without an environment."""
+
+    env: Literal[""]
+    dataset: str
+    steps: Steps
+    held_out: Annotated[dict[str, _Number], Meta(min_length=1)]
+    held_out_episodes: Annotated[int, Meta(ge=1)]
+
+
 def check_evaluation(evaluation: Mapping[str, Any]) -> None:
     """Raises ValueError if an evaluation lacks an entry that others rely on, or one is invalid.
 
-    The entries are the task ``env``, the number of ``episodes``, the ``seed`` of the first, their
-    ``returns``, the ``mean`` and population ``std`` of these, and the ``steps`` of training before.
-    The command ``evaluate`` writes them.
+    Without an environment they are ``steps``, the ``dataset``, and what was measured on
+    ``held_out_episodes`` of it, ``held_out``. Otherwise they are the task ``env``, the number of
+    ``episodes``, the ``seed`` of the first, their ``returns``, the ``mean`` and population ``std``
+    of these, and the ``steps`` of training before. The command ``evaluate`` writes them.
 
     Example:
         >>> numbers = {"episodes": 1, "seed": 0, "mean": 9.0, "std": 0.0, "steps": 100}
@@ -61,6 +72,9 @@ def check_evaluation(evaluation: Mapping[str, Any]) -> None:
         ValueError: evaluation.json is not that of a run: Expected `array`, got `str` - at ...
     """
     try:
+        if "returns" not in evaluation and "held_out" in evaluation:
+            msgspec.convert(evaluation, _OfData)
+            return
         msgspec.convert(evaluation, _Evaluation)
     except msgspec.ValidationError as error:
         raise ValueError(f"{EVALUATION} is not that of a run: {error}") from error

@@ -1,28 +1,67 @@
-"""Acts in Gymnasium from a policy of `export AGENT --step-by-step --out FILE.onnx`: no torch."""
+"""Acts with a policy of `export AGENT --step-by-step --out FILE.onnx`, without torch.
+
+As a program it plays an episode in Gymnasium; copy the class to act on what a machine sends.
+"""
 
 import json
 import sys
 
-import gymnasium
 import numpy as np
 import onnxruntime
 
-policy = onnxruntime.InferenceSession(sys.argv[1])
-facts = json.loads(policy.get_modelmeta().custom_metadata_map["torchrl_tit"])
-kinds = {name: (entry["shape"], entry["dtype"]) for name, entry in facts["inputs"].items()}
-env, draw = gymnasium.make(**facts["task"]), np.random.default_rng(0)
-observation, info = env.reset(seed=0)
-state = {name: np.zeros((1, *kinds[name][0]), kinds[name][1]) for name in facts["state"]}
-first, reward, total, done = True, 0.0, 0.0, False
-while not done:
-    given = {"observation": observation, "is_init": first, "reward": reward, **info}
-    given["target_return"] = facts.get("target_return")
-    given["noise"] = facts["noise"] and getattr(draw, facts["noise"])(size=kinds["noise"][0])
-    inputs = {x: np.asarray((given | state)[x], kinds[x][1]) for x in kinds}
-    inputs = {x: inputs[x].reshape(1, *kinds[x][0]) for x in kinds}
-    outputs = dict(zip(facts["outputs"], policy.run(None, inputs), strict=True))
-    action = outputs["action"][0]
-    state = {name: outputs[f"next_{name}"] for name in state}
-    observation, reward, terminated, truncated, info = env.step(action)
-    first, total, done = False, total + reward, terminated or truncated
-print(f"return {total:g}")
+
+class Agent:
+    """Keeps histories, states and missing values inside, as `torchrl_tit.load_agent` does."""
+
+    def __init__(self, file: str, seed: int = 0) -> None:
+        self.policy = onnxruntime.InferenceSession(file)
+        metadata = self.policy.get_modelmeta().custom_metadata_map
+        self.facts = json.loads(metadata["torchrl_tit"])
+        self.draw = np.random.default_rng(seed)
+        self.reset()
+
+    def reset(self, which=None):
+        """Begins an episode with the next observation: in all copies, or where bool [N] says so."""
+        if which is None:
+            self.first, self.state, self.last = True, {}, None
+        else:
+            self.first = np.logical_or(self.first, which)
+
+    def act(self, observation, *, reward=0.0, action_mask=True):
+        """Maps an observation, or those of N copies, [N, ...], to actions; holds values for NaN."""
+        shape = self.facts["inputs"]["observation"]["shape"]
+        frames = np.asarray(np.full(shape, np.nan) if observation is None else observation)
+        several, frames = frames.ndim > len(shape), frames.reshape(-1, *shape)
+        if (missing := np.isnan(frames)).any():
+            if self.last is None:
+                raise ValueError("the first observation is missing or has NaN")
+            frames = np.where(missing, self.last, frames)
+        self.last = frames
+        given = {"observation": frames, "is_init": self.first, "reward": reward, **self.state}
+        given |= {"action_mask": action_mask, "target_return": self.facts.get("target_return")}
+        inputs = {}
+        for name, entry in self.facts["inputs"].items():
+            size = (len(frames), *entry["shape"])
+            if name == "noise":
+                given[name] = getattr(self.draw, self.facts["noise"])(size=size)
+            value = np.asarray(given.get(name, 0), entry["dtype"])
+            inputs[name] = np.ascontiguousarray(np.broadcast_to(value, size))
+        outputs = dict(zip(self.facts["outputs"], self.policy.run(None, inputs), strict=True))
+        self.state = {name: outputs[f"next_{name}"] for name in self.facts["state"]}
+        self.first = False
+        return outputs["action"] if several else outputs["action"][0]
+
+
+if __name__ == "__main__":
+    import gymnasium
+
+    agent = Agent(sys.argv[1])
+    env = gymnasium.make(**agent.facts["task"])
+    observation, info = env.reset(seed=0)
+    reward, total, done = 0.0, 0.0, False
+    while not done:
+        mask = info.get("action_mask", True)
+        action = agent.act(observation, reward=reward, action_mask=mask)
+        observation, reward, terminated, truncated, info = env.step(action)
+        total, done = total + reward, terminated or truncated
+    print(f"return {total:g}")

@@ -90,14 +90,16 @@ def explain(arguments: list[str]) -> None:
     """Films what a trained agent looks at, or draws steps of one or several agents."""
     parser = Parser(
         "explain",
-        "Film what a trained agent looks at, or draw steps of it. Several agents, which read images, "
-        "are drawn side by side while the first one plays.",
+        "Film what a trained agent looks at, or draw steps of it. Several agents, which read "
+        "images, are drawn side by side while the first one plays.",
     )
     add_agent(parser, nargs="+")
     parser.add_argument(
         "--out", type=Path, required=True, help="new file: a film (.gif, .mp4) or a picture (.png)"
     )
     parser.add_argument("--seed", type=int, help="seed of the episode; default: the evaluation's")
+    parser.add_argument("--dataset", help="data set whose recorded episode is shown to the agent")
+    parser.add_argument("--episode", type=int, help="of the data: which one; default: 0, the first")
     parser.add_argument(
         "--step",
         type=int,
@@ -122,11 +124,18 @@ def explain(arguments: list[str]) -> None:
     )
     options = parser.parse_args(arguments)
     check_seed(options.seed)
+    if options.dataset is None and options.episode is not None:
+        fail("--episode is one of a data set: name it with --dataset FILE")
+    if options.dataset is not None and options.seed is not None:
+        fail("--seed is that of an episode that is played: leave it out with --dataset")
     import torch  # not at the top: help needs no PyTorch
 
     from torchrl_tit import load_agent
+    from torchrl_tit.agents.acting import make_given_env
+    from torchrl_tit.datasets import load_episodes
 
     from ..tools.results.explanation import check_explanation, explain_policy
+    from ..tools.results.recorded import Recording
 
     steps = options.step or [None]
     check_explanation(options.out, steps[0], options.max_steps)
@@ -135,10 +144,23 @@ def explain(arguments: list[str]) -> None:
     torch.set_num_threads(agent.recipe["threads"])
     seed = agent.first_seed if options.seed is None else options.seed
     if options.map == "weights" or len(agents) > 1 or len(steps) > 1:
+        if options.dataset is not None:
+            fail("--dataset shows its episode to one agent, in one step or a film: leave it out")
         _draw_figure(agents, steps if options.step else [0], seed, options)
         return
+    make_env: Any = agent.make_env
+    actions, which = None, f"the episode of seed {seed}"
+    if options.dataset is not None:
+        own = {k: agent.recipe[k] for k in ("max_episode_steps", "gaps") if k in agent.recipe}
+        episodes = load_episodes(options.dataset, **own)
+        recording = Recording(episodes, options.episode or 0)
+        actions, which = recording.actions, f"episode {options.episode or 0} of {options.dataset}"
+
+        def make_env(copies: int, **settings: Any) -> Any:
+            return make_given_env(agent.make_env, recording, copies)
+
     shown = explain_policy(
-        agent.make_env,
+        make_env,
         agent.policy,
         agent.name,
         options.out,
@@ -149,9 +171,10 @@ def explain(arguments: list[str]) -> None:
         target=options.target,
         kind=options.map,
         layer=options.layer,
+        actions=actions,
     )
     count = f"{shown} steps" if shown > 1 else "1 step"
-    say(f"{count} of the episode of seed {seed}\nwritten to {options.out}")
+    say(f"{count} of {which}\nwritten to {options.out}")
 
 
 def _draw_figure(agents: list[Any], steps: list[int], seed: int, options: Namespace) -> None:

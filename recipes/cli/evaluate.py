@@ -23,15 +23,25 @@ def evaluate(arguments: list[str]) -> None:
         "episodes, with other seeds than those by which they were chosen",
     )
     parser.add_argument(
+        "--dataset",
+        help="data to measure the policy on instead: action errors, likelihoods, values",
+    )
+    parser.add_argument(
+        "--ope",
+        choices=["fqe"],
+        help="also estimate the policy's return from the data, by fitted Q evaluation",
+    )
+    parser.add_argument(
         "--out",
         type=Path,
-        help="file to write; default: RUN/evaluation.json, with _best and other --episodes or "
-        "--seed in its name, so that it never replaces the run's own evaluation",
+        help="file to write; default: RUN/evaluation.json, with _best and other --episodes, --seed "
+        "or --dataset in its name, so that it never replaces the run's own evaluation",
     )
     add_machine_options(parser)
     options = parser.parse_args(arguments)
     from ..core import runner  # not at the top: help needs no PyTorch
     from ..core.run import Run
+    from ..tools.off_policy import evaluate_on_data
 
     run = Run.open(options.run)
     recipe = override(
@@ -43,34 +53,65 @@ def evaluate(arguments: list[str]) -> None:
     )
     if options.out is not None and not options.out.absolute().parent.is_dir():
         fail(f"--out {options.out} cannot be written: there is no folder {options.out.parent}")
+    if options.ope is not None and options.dataset is None:
+        fail("--ope estimates returns from data: name them with --dataset FILE")
     # Only one process at a time may write to the run folder.
     lock: AbstractContextManager[Any] = run if options.out is None else nullcontext()
     with lock:
-        evaluation = runner.evaluate(run, recipe, best=options.best)
-        out = options.out or run.folder / _file_name(run.recipe, recipe, options.best)
+        if options.dataset is None:
+            evaluation = runner.evaluate(run, recipe, best=options.best)
+        else:
+            settings = {"best": options.best, "ope": options.ope}
+            evaluation = evaluate_on_data(run, recipe, options.dataset, **settings)
+        name = _file_name(run.recipe, recipe, options.best, options.dataset)
+        out = options.out or run.folder / name
         run.save_evaluation(evaluation, out)
     say(f"{one_line(recipe, evaluation)}\nwritten to {out}")
 
 
-def _file_name(own: Recipe, recipe: Recipe, best: bool) -> str:
+def _file_name(own: Recipe, recipe: Recipe, best: bool, dataset: str | None) -> str:
     """Builds a file name from the settings that differ from the run's own evaluation."""
     parts = ["evaluation", *(["best"] if best else [])]
     for field in ("episodes", "seed"):
         value = getattr(recipe, f"evaluation_{field}")
         if value != getattr(own, f"evaluation_{field}"):
             parts.append(f"{field}-{value}")
+    if dataset is not None:
+        parts.append(f"dataset-{Path(dataset).stem}")
     return f"{'_'.join(parts)}.json"
 
 
 def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
-    """Returns an evaluation in one line."""
+    """Returns an evaluation in one line, and what was measured on held-out episodes in another."""
     best = evaluation["weights"] == "best"
+    if "returns" not in evaluation:
+        chosen = ", chosen on held-out episodes" if best else ""
+        return (
+            f"{recipe.name}: after {evaluation['steps']} {recipe.unit} ({evaluation['weights']} "
+            f"weights{chosen}), {_measured(evaluation)}"
+        )
     new = f", on new episodes from seed {evaluation['seed']}" if best else ""
+    held_out = f"\n{_measured(evaluation)}" if "held_out" in evaluation else ""
     return (
         f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
         f"{evaluation['episodes']} episodes after {evaluation['steps']} {recipe.unit} "
-        f"({evaluation['weights']} weights{new})"
+        f"({evaluation['weights']} weights{new}){held_out}"
     )
+
+
+def _measured(evaluation: dict[str, Any]) -> str:
+    """What was measured on episodes of data, in words."""
+    words = [f"{name} {value:.4g}" for name, value in evaluation["held_out"].items()]
+    episodes = evaluation["held_out_episodes"]
+    text = f"on {episodes} episodes of {evaluation['dataset']}: {', '.join(words)}"
+    if "ope" in evaluation:
+        low, high = f"{evaluation['low']:.4g}", f"{evaluation['high']:.4g}"
+        text += (
+            f"\ndiscounted return ({evaluation['gamma']}) by {evaluation['ope']}: "
+            f"{evaluation['value']:.4g} ({low} to {high} over episodes); of the data: "
+            f"{evaluation['data_value']:.4g}"
+        )
+    return text
 
 
 def render(arguments: list[str]) -> None:

@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from .evaluation import Outcome
+from .evaluation import HeldOut, Outcome
 from .recipe import Recipe
 
 RecipeT = TypeVar("RecipeT", bound=Recipe)
@@ -57,6 +57,8 @@ class Algorithm(ABC, Generic[RecipeT]):
     """Names of the numbers that an update returns: columns of the metrics."""
     optional_columns: Sequence[str] = ()
     """The columns that may be NaN, because there is nothing to measure yet."""
+    held_out_columns: Sequence[str] = ()
+    """Names of what :meth:`measure` measures: columns of the metrics."""
 
     def __init__(self, recipe: RecipeT) -> None:
         self.recipe = recipe
@@ -131,9 +133,19 @@ class Algorithm(ABC, Generic[RecipeT]):
     def play(self, step: int) -> list[Outcome]:
         """Evaluates the current weights, for each target return if there are any.
 
+        Without an environment, there is nothing to play, and no outcome.
+
         Args:
             step: number of steps done so far.
         """
+
+    def measure(self, step: int) -> HeldOut | None:
+        """Measures the current weights on held-out episodes; None if there are none.
+
+        Args:
+            step: number of steps done so far.
+        """
+        return None
 
     def check(self) -> None:
         """Lets the policy act once, and makes other cheap checks before a run starts.

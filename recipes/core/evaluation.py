@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -30,26 +30,56 @@ class Outcome:
         return sum(self.returns) / len(self.returns)
 
 
+@dataclass(frozen=True)
+class HeldOut:
+    """What was measured on held-out episodes at one step of training."""
+
+    step: int
+    episodes: Annotated[int, msgspec.Meta(ge=1)]
+    """Number of these episodes."""
+    values: dict[str, float]
+    """The measures by name; the first is an error, which decides which weights are the best where
+    there is no environment."""
+
+    @property
+    def error(self) -> float:
+        """The first measure."""
+        return next(iter(self.values.values()))
+
+
 def summarize(
-    outcomes: Sequence[Outcome], earlier: Sequence[Outcome], recipe: Recipe
+    outcomes: Sequence[Outcome],
+    earlier: Sequence[Outcome],
+    recipe: Recipe,
+    held_out: HeldOut | None = None,
 ) -> dict[str, Any]:
     """Returns the contents of ``evaluation.json``.
 
     Args:
-        outcomes: outcomes of the newest step, one for each target return.
+        outcomes: outcomes of the newest step, one for each target return; none without an
+            environment.
         earlier: those of earlier steps; may be empty.
         recipe: the settings.
+        held_out: what was measured on held-out episodes at that step, if any are.
 
     Returns:
-        ``mean``, ``std`` (population), ``episodes`` and ``returns`` of the better target return,
-        ``env``, and the ``steps`` that the networks were trained for. For a run on a data set also
+        ``held_out``, the measures, and ``held_out_episodes``, if there are such. Without an
+        environment, otherwise only ``env``, ``dataset`` and ``steps``. With one, also ``mean``,
+        ``std`` (population), ``episodes`` and ``returns`` of the better target return, ``env``, and
+        the ``steps`` that the networks were trained for. For a run on a data set also
         the ``dataset`` and the ``score``, normalised as D4RL does: ``last``, of the better target,
         and ``best``, over all steps and targets (raw returns if there is no reference).
         With target returns, ``target_return`` is the better one, and ``targets`` holds the
         same for each.
     """
+    env, measured = recipe.env, {}
+    if held_out is not None:
+        measured = {"held_out": held_out.values, "held_out_episodes": held_out.episodes}
+    if not outcomes:
+        assert isinstance(recipe, DatasetRecipe)
+        assert held_out is not None
+        return {"env": env, "dataset": recipe.dataset, "steps": held_out.step, **measured}
     best = max(outcomes, key=lambda outcome: outcome.mean)
-    env = recipe.env
     summary: dict[str, Any] = {"mean": best.mean, "std": _std(best), "episodes": len(best.returns)}
     if isinstance(recipe, DatasetRecipe):
         highest = max(outcome.mean for outcome in [*outcomes, *earlier])
@@ -58,7 +88,7 @@ def summarize(
             "score_std": _score_std(best, env),
             "dataset": recipe.dataset,
         }
-    summary |= {"env": env, "steps": best.step, "returns": best.returns}
+    summary |= {"env": env, "steps": best.step, "returns": best.returns, **measured}
     if best.target_return is None:
         return summary
     targets = {
@@ -73,6 +103,13 @@ def summarize(
         for outcome in outcomes
     }
     return {**summary, "target_return": best.target_return, "targets": targets}
+
+
+def score_of(evaluation: Mapping[str, Any]) -> float:
+    """Returns what an evaluation is judged by: its mean return, or minus its held-out error."""
+    if "mean" in evaluation:
+        return float(evaluation["mean"])
+    return -float(next(iter(evaluation["held_out"].values())))
 
 
 def _std(outcome: Outcome) -> float:

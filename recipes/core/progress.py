@@ -6,7 +6,7 @@ import copy
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any
 
 import msgspec
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from .algorithm import Algorithm, Stateful, check_finite
-from .evaluation import Outcome
+from .evaluation import HeldOut, Outcome
 from .recipe import Recipe
 
 EPISODES = 20
@@ -32,8 +32,11 @@ class Record:
     def __init__(self, recipe: Recipe, algorithm: Algorithm[Any]) -> None:
         self.outcomes: list[Outcome] = []
         """The results of all evaluations so far."""
+        self.held_out: list[HeldOut] = []
+        """What was measured on held-out episodes so far."""
         self._recipe = recipe
         self._names = list(algorithm.columns)
+        self._measured = list(algorithm.held_out_columns)
         self._required = [name not in algorithm.optional_columns for name in self._names]
         self._sums: Tensor | None = None
         self._count = 0
@@ -44,7 +47,7 @@ class Record:
         """Names of the numbers in a row of metrics, besides step and time."""
         targets = self._recipe.target_columns.values()
         episodes = [] if self._recipe.offline else ["episodes"]
-        return ["return_mean", *targets, *episodes, *self._names]
+        return ["return_mean", *targets, *self._measured, *episodes, *self._names]
 
     def add(self, returns: Tensor | None, values: Mapping[str, Tensor | float]) -> None:
         """Adds the returns of a batch and the numbers of its update, without waiting for a GPU."""
@@ -81,6 +84,8 @@ class Record:
             row[column] = next((o.mean for o in now if o.target_return == target), math.nan)
         if self._recipe.offline:
             row["return_mean"] = max((outcome.mean for outcome in now), default=math.nan)
+        if self.held_out and self.held_out[-1].step == step:
+            row |= {f"held_out_{name}": x for name, x in self.held_out[-1].values.items()}
         if not means:
             return row
         assert self._sums is not None
@@ -96,6 +101,7 @@ class Record:
         """Returns the state that the next row and the next evaluation need."""
         return {
             "outcomes": [asdict(outcome) for outcome in self.outcomes],
+            "held_out": [asdict(held_out) for held_out in self.held_out],
             "evaluation_seed": self._recipe.evaluation_seed,
             "num_frames": self._recipe.backbone.num_frames,
             "sums": [] if self._sums is None else self._sums.tolist(),
@@ -108,7 +114,7 @@ class Record:
         state = read_state(state_dict, self._recipe)
         if len(state.sums) != (len(self._names) if state.count else 0):
             raise ValueError(f"the record has {len(state.sums)} sums of {state.count} updates")
-        self.outcomes = state.outcomes
+        self.outcomes, self.held_out = state.outcomes, state.held_out
         self._sums = torch.tensor(state.sums, dtype=torch.float64) if state.sums else None
         self._count = state.count
         self._returns = state.returns
@@ -124,6 +130,7 @@ class RecordState:
     count: Annotated[int, msgspec.Meta(ge=0)]
     returns: list[float]
     num_frames: int | None = None  # which the weights do not always determine
+    held_out: list[HeldOut] = field(default_factory=list)
 
 
 def read_state(state: Mapping[str, Any], recipe: Recipe) -> RecordState:
@@ -142,8 +149,9 @@ class Best:
     """Keeps a copy of the weights with the highest return so far.
 
     That is the mean return of an evaluation during training. Where there is none, it is that of the
-    last 20 training episodes, and the weights are those that collected the last of them. If returns
-    are equal, the later weights are kept. The copy is part of each checkpoint.
+    last 20 training episodes, and the weights are those that collected the last of them. Of runs
+    without an environment, it is minus the error on held-out episodes. If returns are equal, the
+    later weights are kept. The copy is part of each checkpoint.
 
     The maximum of many noisy means is biased upwards: only new episodes say what the weights reach.
 

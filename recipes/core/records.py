@@ -227,9 +227,9 @@ def find_records(path: Path) -> tuple[Records, str] | None:
 
 
 def _evaluation(row: dict[str, str]) -> str:
-    if not row["returns"]:
+    if not row["steps"]:
         return ""
-    known = {name: json.loads(row[name]) for name in OF_EVALUATION}
+    known = {name: json.loads(row[name]) for name in OF_EVALUATION if row[name]}
     others = json.loads(row["evaluation"]) if row["evaluation"] else {}
     return json.dumps({**known, **others})
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from torchrl_tit.settings.parts import Names
 
+from ..presets.any_data import ANY_DATA_RECIPES
 from ..presets.cql import CQL_RECIPES
 from ..presets.decision_transformer import DT_RECIPES
 from ..presets.dqn import DQN_RECIPES
@@ -88,6 +89,7 @@ def register_recipes(*recipes: Recipe) -> None:
 
 for _named in (
     ANY_TASK_RECIPES,
+    ANY_DATA_RECIPES,
     ARRAY_RECIPES,
     NO_VELOCITY_RECIPES,
     MEMORY_RECIPES,

@@ -52,6 +52,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     np.random.seed(recipe.seed)
     torch.manual_seed(recipe.seed)
     algorithm = make_algorithm(recipe)
+    recipe = algorithm.recipe  # with what only its data say
     step = saved_step = max(checkpoint_steps(run.checkpoints), default=0)
     if step == 0 and (weights := run.load_initial_weights()):
         with run.restoring(step):
@@ -107,20 +108,24 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             enough = any([callback.updated(step, algorithm.policy) for callback in callbacks])
             if evaluation_due:
                 with _naming(f"in {recipe.env}, in the evaluation at step {step}", saved_step):
-                    outcomes = algorithm.play(step)
-                if not record.outcomes:
+                    outcomes, held_out = algorithm.play(step), algorithm.measure(step)
+                if not record.outcomes and outcomes:
                     best.forget()  # training episodes do not count where there are evaluations
                 record.outcomes += outcomes
-                best.offer(step, max(outcome.mean for outcome in outcomes))
-                for callback in callbacks:
+                record.held_out += [] if held_out is None else [held_out]
+                if outcomes:
+                    best.offer(step, max(outcome.mean for outcome in outcomes))
+                elif held_out is not None:
+                    best.offer(step, -held_out.error)
+                for callback in callbacks if outcomes else ():
                     callback.evaluated(step, outcomes)
             if log_due or evaluation_due:
                 row = record.take_row(step, means=log_due)
                 written = metrics.log(step, **row)
                 for callback in callbacks:
                     callback.logged(step, written)
-                if not math.isnan(row["return_mean"]):
-                    progress.set_postfix_str(f"return {row['return_mean']:.1f}")
+                if shown := _shown(row, algorithm):
+                    progress.set_postfix_str(shown)
 
             interval = recipe.checkpoint_interval
             due = step // interval > before // interval or step >= recipe.final_step
@@ -138,6 +143,15 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
                 raise KeyboardInterrupt
             if enough:
                 break
+
+
+def _shown(row: Mapping[str, float], algorithm: Algorithm[Any]) -> str:
+    """What the progress line shows of a row of metrics; nothing if it has no evaluation."""
+    if not math.isnan(row["return_mean"]):
+        return f"return {row['return_mean']:.1f}"
+    known = {x: row[x] for x in algorithm.held_out_columns if not math.isnan(row[x])}
+    words = [f"{name.removeprefix('held_out_')} {value:.3g}" for name, value in known.items()]
+    return f"held out: {', '.join(words)}" if words else ""
 
 
 def load_trained(
@@ -195,7 +209,8 @@ def evaluate(
 
     Episodes already played with these weights and seeds are not played again. But the best weights
     are those whose evaluation in training was luckiest, so they play new episodes, whose seeds come
-    after those of these evaluations.
+    after those of these evaluations. Without an environment, the weights are measured on the
+    held-out episodes, by which the best ones were chosen.
 
     Args:
         run: a run folder with a checkpoint.
@@ -221,6 +236,7 @@ def evaluate(
         recipe = replace(recipe, evaluation_seed=_fresh_seed(recipe, record))
         outcomes = []  # by which the weights were chosen
     step, algorithm = _load_networks(run, recipe, step, state, best=best)
+    recipe = algorithm.recipe
     same_seed = record.evaluation_seed == recipe.evaluation_seed
     targets: list[float | None] = [*recipe.target_columns] or [None]
     now = [
@@ -231,7 +247,7 @@ def evaluate(
         and len(outcome.returns) == recipe.evaluation_episodes
         and outcome.target_return in targets
     ]
-    if len(now) < len(targets):
+    if recipe.env and len(now) < len(targets):
         episodes = len(targets) * recipe.evaluation_episodes
         with (
             tqdm.tqdm(total=episodes, unit=" episodes", desc="evaluation", delay=1) as progress,
@@ -239,10 +255,12 @@ def evaluate(
             naming(f"in {recipe.env}"),
         ):
             now = algorithm.play(step)
-    for callback in callbacks:
+    known = (held_out for held_out in record.held_out if held_out.step == step)
+    held_out = next(known, None) or algorithm.measure(step)
+    for callback in callbacks if now else ():
         callback.evaluated(step, now)
     return {
-        **summarize(now, outcomes, recipe),
+        **summarize(now, outcomes, recipe, held_out),
         "seed": recipe.evaluation_seed,
         "weights": "best" if best else "last",
     }

@@ -140,8 +140,9 @@ def test_without_timeouts(arrays: Transitions) -> None:
 
 
 def test_without_next_observations_those_of_time_limits_are_never_drawn(
-    arrays: Transitions,
+    arrays: Transitions, tmp_path: Path
 ) -> None:
+    whole = episodes_from_arrays(**arrays)
     following = arrays.pop("next_observations")
 
     data = episodes_from_arrays(**arrays)
@@ -154,8 +155,29 @@ def test_without_next_observations_those_of_time_limits_are_never_drawn(
     # Their rewards still count.
     returns = [arrays["rewards"][a:b].sum(dtype=np.float64) for a, b in spans(arrays)]
     np.testing.assert_allclose(data.returns.numpy(), returns)
+    # They are written without any, and come back the same.
+    write_hdf5(data, tmp_path / "a.hdf5")
+    again = read_hdf5(tmp_path / "a.hdf5")
+    assert (again.rows == data.rows).all()
+    assert not again.final_known.any()
     with pytest.raises(DatasetError, match=r"episode \d+ was truncated and its final observation"):
-        write_hdf5(data, "never-written.hdf5")
+        write_hdf5(join_episodes([data, whole]), tmp_path / "never-written.hdf5")
+
+
+def test_timestamps_are_checked_within_episodes(arrays: Transitions, tmp_path: Path) -> None:
+    start, stop = max(spans(arrays), key=lambda span: span[1] - span[0])
+    times = np.arange(len(arrays["rewards"])) * 0.01
+    times[stop:] -= times[stop]  # the clock starts again
+    data = read_hdf5(write(tmp_path / "a.hdf5", {**arrays, "timestamps": times}))
+    assert (data.rows == episodes_from_arrays(**arrays).rows).all()
+    assert data.left_out == ("timestamps",)
+    for bad in (times[start] - 1, np.nan):
+        times[start + 1] = bad
+        message = f"'timestamps', row {start + 1}: is {bad} after {times[start]}, within an episode"
+        with pytest.raises(DatasetError, match=re.escape(message)):
+            episodes_from_arrays(**arrays, timestamps=times)
+    with pytest.raises(DatasetError, match=r"'timestamps': must be \d+ numbers"):
+        episodes_from_arrays(**arrays, timestamps=times[1:])
 
 
 def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:

@@ -5,8 +5,13 @@ What is shortened stands in a comment before the code, which readers do not see:
     <!-- test: 30000 -> 1024; --step 40 -> --step 3 -->
 """
 
+import hashlib
+import os
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -40,6 +45,9 @@ def blocks(page: Path) -> Iterator[tuple[str, str, str]]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_page_runs(page, own_modules, monkeypatch):
+    if page.stem == "deploying":
+        for package in ("onnxruntime", "onnxscript", "captum"):
+            pytest.importorskip(package)
     monkeypatch.syspath_prepend(str(own_modules))
     namespace: dict[str, object] = {"__name__": "__main__"}
     for language, title, code in blocks(page):
@@ -52,6 +60,27 @@ def test_page_runs(page, own_modules, monkeypatch):
                 words = shlex.split(command)
                 assert words[:3] == ["python", "-m", "recipes"], command
                 main(words[3:])
+    if page.stem == "deploying":
+        act_without_torch(own_modules)
+
+
+def act_without_torch(folder: Path) -> None:
+    """Runs the loop of the page on deploying where only ONNX Runtime and NumPy can be imported."""
+    shutil.copy(ROOT / "docs" / "examples" / "act_from_onnx.py", folder)
+    code = (
+        "import runpy, sys\n"
+        "missing = ('torch', 'torchrl', 'tensordict', 'torchrl_tit', 'recipes', 'gymnasium')\n"
+        "sys.modules.update(dict.fromkeys(missing))\n"  # importing them fails
+        "runpy.run_path('loop.py')\n"
+    )
+    command = [sys.executable, "-c", code]
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder, env=environment)
+    assert done.returncode == 0, done.stderr
+    checksum, facts, latency = done.stdout.splitlines()
+    assert checksum == hashlib.sha256((folder / "machine.onnx").read_bytes()).hexdigest()
+    assert facts.startswith("bc/enhanced-tit 2 ")
+    assert re.fullmatch(r"p50 \d+\.\d\d ms, p99 \d+\.\d\d ms", latency)
 
 
 def test_k_of_the_script_stands_in_one_place():

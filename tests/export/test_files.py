@@ -28,7 +28,7 @@ def act(example: str, file: Path, without: tuple[str, ...]) -> str:
         "import runpy, sys\n"
         f"sys.modules.update(dict.fromkeys({without!r}))\n"  # importing them fails
         f"sys.argv = [{example!r}, {str(file)!r}]\n"
-        f"runpy.run_path({str(EXAMPLES / example)!r})\n"
+        f"runpy.run_path({str(EXAMPLES / example)!r}, run_name='__main__')\n"
     )
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, capture_output=True, text=True, cwd=file.parent)
@@ -46,7 +46,7 @@ OURS = ("torchrl_tit", "recipes", "torchrl", "tensordict")
         ("act_from_onnx.py", (*OURS, "torch")),
     ],
 )
-def test_twenty_lines_play_the_episode_that_the_policy_plays(example, without, tmp_path):
+def test_the_examples_play_the_episode_that_the_policy_plays(example, without, tmp_path):
     if "onnx" in example:
         pytest.importorskip("onnxruntime")
         pytest.importorskip("onnxscript")

@@ -22,6 +22,7 @@ from torchrl_tit.settings.networks import (
     catformer,
     coberl,
     d2rl,
+    dt_tit,
     enhanced_tit,
     mlp,
     ofenet,
@@ -174,6 +175,9 @@ def test_recipes_of_data_sets() -> None:
     expected |= named("dt", both, 2, "dt dt-tit dt-tit-paper")
     for algorithm in ("bc", "iql", "td3bc"):
         expected |= named(algorithm, all_three, 2, "mlp enhanced-tit vanilla-tit")
+    for algorithm in ("bc", "iql", "td3bc", "cql"):  # for any data
+        expected |= {f"{algorithm}/mlp", f"{algorithm}/enhanced-tit"}
+    expected |= {"dt/dt", "dt/dt-tit"}
     algorithms = ("cql/", "dt/", "bc/", "iql/", "td3bc/")
     assert {name for name in RECIPES if name.startswith(algorithms)} == expected
     # Those of an algorithm and a network differ in what test_settings says, and CQL's TITs, alone.

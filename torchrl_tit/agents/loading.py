@@ -8,14 +8,17 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
+from torchrl_tit.agents.acting import Actor
 from torchrl_tit.agents.folder import AgentError, is_agent, read_agent
 from torchrl_tit.agents.hub import PREFIX, download
 from torchrl_tit.settings import resolve
@@ -57,6 +60,35 @@ class TrainedAgent:
     versions: Mapping[str, Any]
     plays: Callable[[int, int], Sequence[float]] = field(repr=False)
 
+    @cached_property
+    def _actor(self) -> Actor:
+        return Actor(self.policy, self.make_env)
+
+    def reset(self, which: Any = None) -> None:
+        """Begins an episode with the next observation of :meth:`act`.
+
+        Args:
+            which: in which of several copies, bool [N]; all by default.
+        """
+        self._actor.reset(which)
+
+    def act(self, observation: Any, *, reward: Any = 0.0, action_mask: Any = None) -> NDArray:
+        """Returns the most likely action for an observation of a machine, as NumPy arrays.
+
+        Histories, recurrent states and missing frames are kept inside; call :meth:`reset` where an
+        episode begins. See :meth:`torchrl_tit.agents.acting.Actor.act` for the arguments.
+
+        Example:
+            >>> import gymnasium
+            >>> from torchrl_tit import load_agent
+            >>> agent, env = load_agent("cartpole"), gymnasium.make("CartPole-v1")
+            >>> observation, info = env.reset(seed=0)
+            >>> agent.reset()
+            >>> agent.act(observation) in env.action_space
+            True
+        """
+        return self._actor.act(observation, reward=reward, action_mask=action_mask)
+
     @property
     def first_seed(self) -> int:
         """Seed of the first episode of its evaluation; episode i is seeded with this seed + i."""
@@ -95,7 +127,7 @@ class TrainedAgent:
             The undiscounted return of each episode; float64 [episodes].
 
         Raises:
-            ValueError: if ``episodes`` is less than 1.
+            ValueError: if ``episodes`` is less than 1, or it was trained without an environment.
 
         Example:
             >>> from torchrl_tit import load_agent

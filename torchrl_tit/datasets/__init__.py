@@ -1,7 +1,12 @@
 """Data sets for offline RL: from D4RL, Minari, HDF5 files and arrays to TorchRL replay buffers."""
 
 from torchrl_tit.datasets.checks import DatasetError, TaskSpaces, task_spaces
-from torchrl_tit.datasets.episodes import Episodes, join_episodes, select_episodes
+from torchrl_tit.datasets.episodes import (
+    Episodes,
+    join_episodes,
+    select_episodes,
+    split_episodes,
+)
 from torchrl_tit.datasets.hdf5 import read_hdf5, write_hdf5
 from torchrl_tit.datasets.minari import read_minari, write_minari
 from torchrl_tit.datasets.online import OnlineHistoryStorage
@@ -40,6 +45,7 @@ __all__ = [
     "read_hdf5",
     "read_minari",
     "select_episodes",
+    "split_episodes",
     "task_spaces",
     "write_hdf5",
     "write_minari",

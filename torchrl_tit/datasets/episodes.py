@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import prod
@@ -123,12 +124,16 @@ class Episodes:
 
         Returns:
             Mean and population standard deviation, float32 [*obs] each, for
-            :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`.
+            :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`. The deviation of a constant
+            entry of an array is 1, so that it is not amplified if it changes later.
         """
         count = self.lengths[self.finished].sum()
         mean = sum(chunk.double().sum(0) for chunk in self._observations()) / count
         squares = sum(chunk.double().sub_(mean).square_().sum(0) for chunk in self._observations())
-        return mean.float(), (squares / count).sqrt().float()
+        std = (squares / count).sqrt().float()
+        if mean.ndim == 1:  # pixels of an image have the statistics of their channel
+            std = std.where(std > 1e-7 * mean.abs(), 1.0)  # less is rounding
+        return mean.float(), std
 
     def _observations(self) -> Iterator[Tensor]:
         """The observations at the steps of finished episodes, in chunks."""
@@ -174,6 +179,74 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
         lengths=episodes.lengths[index],
         final_known=episodes.final_known[index],
     )
+
+
+def split_episodes(episodes: Episodes, fraction: float, seed: int) -> tuple[Episodes, Episodes]:
+    """Holds some of the finished episodes out.
+
+    If a single one is finished, its last part is held out, with a warning.
+
+    Args:
+        episodes: The data.
+        fraction: Share of the finished episodes to hold out, above 0 and below 1; at least one
+            episode is held out, and at least one is not.
+        seed: Seed of the choice.
+
+    Returns:
+        The episodes to learn from, unfinished ones among them, and those that are held out.
+
+    Raises:
+        DatasetError: If the only finished episode has a single step.
+
+    Example:
+        >>> from torchrl_tit.datasets import episodes_from_arrays
+        >>> states, ends = torch.arange(40.0).view(40, 1), torch.arange(40) % 4 == 3
+        >>> episodes = episodes_from_arrays(states, states, torch.ones(40), ends)
+        >>> rest, held_out = split_episodes(episodes, 0.2, seed=0)
+        >>> len(rest.lengths), len(held_out.lengths)
+        (8, 2)
+    """
+    finished = episodes.finished.nonzero().squeeze(-1)
+    if len(finished) < 2:
+        return _split_single(episodes, fraction)
+    generator = torch.Generator().manual_seed(seed)
+    order = finished[torch.randperm(len(finished), generator=generator)]
+    count = min(max(1, round(fraction * len(finished))), len(finished) - 1)
+    chosen = torch.zeros_like(episodes.finished)
+    chosen[order[:count]] = True
+    rest, held_out = (select_episodes(episodes, x.nonzero().squeeze(-1)) for x in (~chosen, chosen))
+    return rest, held_out
+
+
+def _split_single(episodes: Episodes, fraction: float) -> tuple[Episodes, Episodes]:
+    """Cuts the first finished episode, or the first one, in two; the others are before it."""
+    number = int(episodes.finished.int().argmax())
+    others = [i for i in range(len(episodes.lengths)) if i != number]
+    single = select_episodes(episodes, torch.tensor([number]))
+    length = int(single.lengths)
+    place = length - max(1, round(fraction * length))
+    if place < 1:
+        raise DatasetError(
+            episodes.source,
+            "has a single finished episode of one step, of which nothing can be held out: set "
+            "validation_fraction to 0.",
+        )
+    warnings.warn(
+        f"{episodes.source} has a single finished episode: its last {length - place} of {length} "
+        "steps are held out",
+        stacklevel=3,
+    )
+    before, after = single.rows[: place + 1].clone(), single.rows[place:]
+    for name, values in before.items():
+        if name != "observation":  # the last row is the final observation
+            values[-1] = 0
+    before["truncated"][-2] = True
+    first = replace(
+        single, rows=before, lengths=torch.tensor([place]), final_known=torch.tensor([True])
+    )
+    last = replace(single, rows=after, lengths=torch.tensor([length - place]))
+    rest = [select_episodes(episodes, torch.tensor(others))] if others else []
+    return join_episodes([*rest, first]), last
 
 
 def join_episodes(parts: Sequence[Episodes]) -> Episodes:

@@ -18,7 +18,7 @@ from torchrl_tit.datasets.hdf5_files import (
     new_hdf5,
     open_hdf5,
 )
-from torchrl_tit.datasets.transitions import FIELDS, episodes_from_transitions
+from torchrl_tit.datasets.transitions import FIELDS, TIMESTAMPS, episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
 
 _LIKE_TASK = ("observations", "actions", "next_observations")  # others are one number a row
@@ -32,7 +32,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
 
     Args:
         path: The file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
-            "terminals" [N], and optionally "timeouts" [N] and "next_observations" [N, *obs].
+            "terminals" [N], and optionally "timeouts" [N], "next_observations" [N, *obs], and
+            "timestamps" [N], whose order is checked.
             Other fields, and attributes that are neither text nor a few numbers, are not read.
         **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
             which describes how missing fields are replaced.
@@ -66,7 +67,7 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
             # The arrays of the layout, and the names of others, which are not opened.
             fields: dict[str, Any] = dict.fromkeys(set(array_names(file)) - set(FIELDS))
             attributes = _attributes(file)
-        for name in FIELDS:
+        for name in (*FIELDS, TIMESTAMPS):
             if isinstance(field := find(source, file, name), h5py.Dataset):
                 fields[name] = field
         return episodes_from_transitions(fields, source=source, attributes=attributes, **settings)
@@ -75,7 +76,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
 def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     """Writes episodes with one row per transition, in chunks.
 
-    Fields keep their dtypes. Every next observation must be known.
+    Fields keep their dtypes. Next observations are written if all are known, and left out if none
+    is, because the data came without them.
 
     Args:
         episodes: The episodes. Only the last one may be unfinished.
@@ -83,8 +85,8 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
 
     Raises:
         FileExistsError: If the file exists already.
-        ValueError: If an episode before the last is unfinished, or the final observation of a
-            truncated one is unknown; the layout cannot represent either.
+        ValueError: If an episode before the last is unfinished, or the final observations of only
+            some truncated ones are known; the layout cannot represent either.
         OSError: If the file cannot be written.
 
     Example:
@@ -103,11 +105,13 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
             f"{episodes.source}: episode {number} is neither terminated nor truncated, which the "
             f"layout of D4RL's files cannot represent for any episode but the last."
         )
-    check_final_observations(episodes)
+    if episodes.final_known.any():
+        check_final_observations(episodes)
     steps = episodes.step_rows
     kept = zip(FIELDS, ("observation", "action", "reward", "terminated", "truncated"), strict=False)
     fields = {name: (episodes.rows[field], steps) for name, field in kept}
-    fields["next_observations"] = (episodes.rows["observation"], steps + 1)
+    if episodes.final_known.any() or episodes.terminated.all():
+        fields["next_observations"] = (episodes.rows["observation"], steps + 1)
     with whole_or_not_at_all(path) as hidden, new_hdf5(hidden, path) as (file, check):
         file.attrs.update(episodes.attributes)
         for name, (values, rows) in fields.items():

@@ -31,6 +31,8 @@ from torchrl_tit.settings.choices import Gaps
 from torchrl_tit.settings.numbers import Steps
 
 FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
+TIMESTAMPS = "timestamps"
+"""A further field, which is checked and not kept."""
 _REQUIRED = FIELDS[:4]
 _NUMBERS = (*FLAGS, "rewards")  # fields with one number a row
 
@@ -42,6 +44,7 @@ def episodes_from_arrays(
     terminals: ArrayLike,
     timeouts: ArrayLike | None = None,
     next_observations: ArrayLike | None = None,
+    timestamps: ArrayLike | None = None,
     **settings: Any,
 ) -> Episodes:
     """Builds episodes from arrays of transitions in chronological order.
@@ -53,6 +56,7 @@ def episodes_from_arrays(
         terminals: Whether the transition led to a terminal state; bool [N].
         timeouts: Whether the episode was truncated after it; bool [N].
         next_observations: [N, *obs].
+        timestamps: Times of the steps in any unit, [N], to check their order.
         **settings: As for :func:`episodes_from_transitions`, which describes how missing arrays are
             replaced.
 
@@ -68,9 +72,9 @@ def episodes_from_arrays(
         >>> episodes_from_arrays(frames, np.zeros(6, int), np.ones(6), ends).lengths
         tensor([3, 3])
     """
-    given = (observations, actions, rewards, terminals, timeouts, next_observations)
+    given = (observations, actions, rewards, terminals, timeouts, next_observations, timestamps)
     fields = {}
-    for name, array in zip(FIELDS, given, strict=True):
+    for name, array in zip((*FIELDS, TIMESTAMPS), given, strict=True):
         if array is not None:
             try:
                 fields[name] = np.asarray(array)
@@ -123,8 +127,9 @@ def episodes_from_transitions(
         ValueError: If ``max_episode_steps`` is less than 1, ``gaps`` is not one of the above, or
             ``dtype`` is not a floating-point dtype.
         DatasetError: If a field is missing or empty, has the wrong length, shape or dtype, or
-            contains NaN, infinity, or actions out of bounds; if no episode ends; or if
-            ``next_observations`` is not the observation of the next row within an episode.
+            contains NaN, infinity, or actions out of bounds; if no episode ends; or if, within an
+            episode, ``next_observations`` is not the observation of the next row, or ``timestamps``
+            go backwards.
 
     Example:
         >>> fields = {"observations": np.zeros((2, 3)), "rewards": np.zeros(2)}
@@ -155,6 +160,8 @@ def episodes_from_transitions(
             problem = "ends the episode, but more steps follow."
             raise DatasetError(source, problem, "terminals", int(inside.argmax()))
 
+    if fields.get(TIMESTAMPS) is not None:
+        _check_times(reader, ends)
     last_steps = np.flatnonzero(ends)
     rows = memory_mapped_rows(reader.num_rows + len(last_steps), reader.row_fields(), directory)
     # The final observation of an episode is an additional row, so all later rows move by one.
@@ -308,6 +315,23 @@ def _truncations(
             truncated[before + max_episode_steps : last + 1 : max_episode_steps] = True
         truncated &= ~terminated
     return truncated
+
+
+def _check_times(reader: _Reader, ends: NDArray) -> None:
+    """Checks that the steps of an episode are in chronological order; ends bool [N]."""
+    with damage_named(reader.source, "cannot be read", TIMESTAMPS):
+        times = np.asarray(reader.fields[TIMESTAMPS]).reshape(-1)
+    if len(times) != reader.num_rows or times.dtype.kind not in "iuf":
+        problem = f"must be {reader.num_rows} numbers, one for each row."
+        raise DatasetError(reader.source, problem, TIMESTAMPS)
+    backwards = ~(times[1:] >= times[:-1]) & ~ends[:-1]  # also where it is NaN
+    if backwards.any():
+        row = int(backwards.argmax()) + 1
+        problem = (
+            f"is {times[row]} after {times[row - 1]}, within an episode: sort the rows by time, or "
+            "mark where episodes end."
+        )
+        raise DatasetError(reader.source, problem, TIMESTAMPS, row)
 
 
 def _gaps(reader: _Reader) -> NDArray:

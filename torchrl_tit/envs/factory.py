@@ -12,6 +12,7 @@ from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.atari import FRAME_SKIP, MAX_NUM_FRAMES, AtariEnv, AtariGames
+from torchrl_tit.envs.given import make_unknown_task
 from torchrl_tit.envs.gymnasium_tasks import make_gymnasium_tasks
 from torchrl_tit.envs.names import find_task, load_wrappers, task_spec, unknown
 from torchrl_tit.envs.spaces import observation_keys as keys_of
@@ -68,7 +69,9 @@ def make_env(
     ======================  ==================  ===================================================
 
     Args:
-        name: a name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". In
+        name: a name that Gymnasium has registered, such as "CartPole-v1" or "Hopper-v5". An empty
+            name is a task of which only the spaces are known: see
+            :func:`~torchrl_tit.envs.given.make_unknown_task`. In
             "module:Name-v0", the module registers the name. In "module:Name", the name is that of a
             class or function in the module that makes a TorchRL `EnvBase`: see
             :class:`~torchrl_tit.envs.torchrl_tasks.TorchRLTask`. The module is imported, so pass no
@@ -129,7 +132,18 @@ def make_env(
         "device": device,
     }
     env: EnvBase
-    if is_atari(name):
+    if not name:
+        if wraps or observation_keys or mask_actions:
+            raise ValueError(
+                "a task without a name has one observation and nothing to wrap: it takes no "
+                "gymnasium.Wrapper, observation_keys or mask_actions"
+            )
+        kwargs.pop("render_mode", None)  # its render() says that there is nothing to see
+        try:
+            env = make_unknown_task(num_envs, clip_actions=clip_actions, device=device, **kwargs)
+        except TypeError as error:  # it has none of the settings of an environment
+            raise ValueError(f"a task without a name consists of its spaces: {error}") from error
+    elif is_atari(name):
         if vectorization_mode == "async":
             raise ValueError(
                 f"{name} runs in threads, side by side; leave vectorization_mode at 'sync'."
@@ -283,6 +297,8 @@ def time_limit(name: str) -> int | None:
         >>> time_limit("Hopper-v5"), time_limit("ALE/Pong-v5")
         (1000, 27000)
     """
+    if not name:
+        return None
     if is_atari(name):
         return MAX_NUM_FRAMES // FRAME_SKIP
     task = find_task(name)

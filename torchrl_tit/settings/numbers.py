@@ -49,10 +49,10 @@ Positive = Annotated[float, Meta(gt=0, le=1e9)]
 """Factors that cannot be 0."""
 Real = Annotated[float, Meta(ge=-1e9, le=1e9)]
 """Returns and other numbers of any sign."""
-Reals = Annotated[tuple[Real, ...], Meta(min_length=1, description="at least one finite number")]
-"""Several of these."""
 Fraction = Annotated[float, Meta(ge=0, le=1)]
 """Fractions, discounts, and update rates of target networks."""
+Share = Annotated[float, Meta(gt=0, le=1)]
+"""Shares of something that cannot be empty."""
 Probability = Annotated[float, Meta(ge=0, lt=1, description="a probability in [0, 1)")]
 """Probabilities below 1, such as dropout."""
 Inside = Annotated[float, Meta(gt=0, lt=1, description="a probability in (0, 1)")]

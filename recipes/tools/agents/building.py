@@ -131,6 +131,8 @@ def _plays(algorithm: Algorithm[Any], steps: int) -> Callable[[int, int], list[f
     recipe = algorithm.recipe
 
     def plays(episodes: int, seed: int) -> list[float]:
+        if not recipe.env:
+            raise ValueError("there is no environment to play in: act on observations with act()")
         algorithm.recipe = replace(recipe, evaluation_episodes=episodes, evaluation_seed=seed)
         return algorithm.play(steps)[0].returns
 

@@ -131,21 +131,45 @@ def _card(recipe: Recipe, evaluation: Mapping[str, Any], **facts: Any) -> str:
     """Writes the card of an agent in Markdown."""
     settings = [f"`{setting}`" for setting in [*recipe.env_settings, *recipe.wrappers]]
     hidden = " without velocities" if getattr(recipe, "hide_velocities", False) else ""
-    target = ""
-    if "target_return" in evaluation:
-        target = f" The policy was told to aim for a return of {evaluation['target_return']:g}."
     versions = "\n".join(f"| {name} | {version} |" for name, version in facts["versions"].items())
     template = resources.files(__package__).joinpath("card.md").read_text(encoding="utf-8")
     return template.format(
         **{**facts, "versions": versions},
         recipe=recipe,
         evaluation=evaluation,
-        task=f"`{recipe.env}`{hidden}" + (f" with {', '.join(settings)}" if settings else ""),
+        task=f"`{recipe.env or 'recorded data'}`{hidden}"
+        + (f" with {', '.join(settings)}" if settings else ""),
         unit="gradient steps" if recipe.offline else "environment steps",
         data=f", on the data set `{evaluation['dataset']}`" if "dataset" in evaluation else "",
         recipe_name=f"`{recipe.name}`, " if recipe.name else "",
-        last=evaluation["seed"] + evaluation["episodes"] - 1,
-        target=target,
+        results=_results(evaluation),
+        use=_PLAY if recipe.env else _ACT,
+    )
+
+
+_PLAY = """env = agent.make_env(8, seed=0)  # with everything that the policy reads
+steps = env.rollout(100, agent.policy, break_when_any_done=False)
+print(agent.evaluate(10))  # the returns of 10 episodes"""
+_ACT = """agent.reset()
+action = agent.act(observation)  # for each observation of an episode"""
+
+
+def _results(evaluation: Mapping[str, Any]) -> str:
+    """Says what an evaluation found."""
+    if "mean" not in evaluation:
+        measures = ", ".join(f"{name} {x:.4g}" for name, x in evaluation["held_out"].items())
+        return (
+            f"There is no environment. On {evaluation['held_out_episodes']} episodes that were "
+            f"held out of training: **{measures}**."
+        )
+    target, first, episodes = "", evaluation["seed"], evaluation["episodes"]
+    if "target_return" in evaluation:
+        target = f" The policy was told to aim for a return of {evaluation['target_return']:g}."
+    return (
+        f"Mean return **{evaluation['mean']:.1f} ± {evaluation['std']:.1f}** (standard deviation) "
+        f"over\n{episodes} whole episodes, each with its own seed ({first} to "
+        f"{first + episodes - 1}), always the most\nlikely action, in the task's own "
+        f"rewards.{target} The return of each episode is in\n`evaluation.json`."
     )
 
 
@@ -153,21 +177,25 @@ def _metadata(name: str, license: str | None, recipe: Recipe, evaluation: Mappin
     """The metadata in YAML, written by the Hub's own library."""
     hub = import_hub()
     task = "reinforcement-learning"
-    result = hub.EvalResult(
-        task_type=task,
-        task_name=task,
-        dataset_type=recipe.env,
-        dataset_name=recipe.env,
-        metric_type="mean_reward",
-        metric_name="mean_reward",
-        metric_value=f"{evaluation['mean']:.2f} +/- {evaluation['std']:.2f}",
-    )
+    results = []
+    if "mean" in evaluation:
+        result = hub.EvalResult(
+            task_type=task,
+            task_name=task,
+            dataset_type=recipe.env,
+            dataset_name=recipe.env,
+            metric_type="mean_reward",
+            metric_name="mean_reward",
+            metric_value=f"{evaluation['mean']:.2f} +/- {evaluation['std']:.2f}",
+        )
+        results.append(result)
+    tags = [task, "deep-reinforcement-learning", "torchrl", recipe.env, recipe.algorithm]
     data = hub.ModelCardData(
         library_name="torchrl-tit",
         license=license,
         pipeline_tag=task,
-        tags=[task, "deep-reinforcement-learning", "torchrl", recipe.env, recipe.algorithm],
+        tags=[tag for tag in tags if tag],
         model_name=name,
-        eval_results=[result],
+        eval_results=results or None,
     )
     return str(data.to_yaml()).strip()

@@ -173,6 +173,7 @@ def explain_episode(
     title: str,
     seed: int = 0,
     dpi: int = 80,
+    actions: Tensor | None = None,
 ) -> int:
     """Plays an episode with the most likely actions, and explains some of its steps.
 
@@ -187,6 +188,8 @@ def explain_episode(
         title: title of the pages.
         seed: seed of the episode.
         dpi: dots per inch of the pages.
+        actions: the actions that were taken, [T, ...], if they are recorded; by default those of
+            the policy.
 
     Returns:
         The number of steps that were played.
@@ -208,6 +211,8 @@ def explain_episode(
             show(number, step, page.draw(step, [*recent], values, number))
         if number == steps[-1]:
             raise _Enough
+        if actions is not None:
+            acted["action"] = actions[number].expand_as(acted["action"])
         return acted
 
     with suppress(_Enough):
@@ -229,6 +234,7 @@ def explain_policy(
     step: int | None = None,
     max_steps: int | None = None,
     title: str | None = None,
+    actions: Tensor | None = None,
     **explanation: Any,
 ) -> int:
     """Shows what a policy looks at while it plays an episode with its most likely actions.
@@ -243,6 +249,7 @@ def explain_policy(
         step: for a picture, the step to show, counted from 0, which is the default.
         max_steps: for a film, the maximum number of steps to show; by default the whole episode.
         title: name of the policy on the page; by default ``name``.
+        actions: as in :func:`explain_episode`.
         **explanation: arguments of :class:`Explainer`.
 
     Returns:
@@ -269,11 +276,19 @@ def explain_policy(
             shown += 1
 
         count = explain_episode(
-            env, explainer, name, steps, show, title=title or str(name), seed=seed
+            env,
+            explainer,
+            name,
+            steps,
+            show,
+            title=title or str(name),
+            seed=seed,
+            actions=actions,
         )
         if not shown:
+            played = f"of seed {seed}" if actions is None else "of the data"
             raise ValueError(
-                f"the episode of seed {seed} has {count} steps, so there is no step {first}: "
+                f"the episode {played} has {count} steps, so there is no step {first}: "
                 f"choose one below {count}"
             )
     return shown

@@ -72,9 +72,9 @@ def _record(name: str, run: Run, commit: str) -> Record:
         "versions": _dumps(_read(run, "versions.json")),
         "earlier_lengths": _dumps(run.earlier_lengths()),
     }
-    if found:
+    if "returns" in found:
         found["returns"] = [float(f"{value:.6g}") for value in found["returns"]]
-        row |= {entry: _dumps(found.pop(entry)) for entry in OF_EVALUATION}
+    row |= {entry: _dumps(found.pop(entry)) for entry in OF_EVALUATION if entry in found}
     row["evaluation"] = _dumps(found)
     columns = [column for column in metrics[0] if column not in LEFT_OUT and column != "step"]
     lines = [[f"{one['step']:.0f}", *(f"{one[x]:.4g}" for x in columns)] for one in metrics]

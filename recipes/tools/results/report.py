@@ -222,7 +222,10 @@ def _read(run: Run) -> RunData:
         versions = dict(json.loads(run.read("versions.json") or b"{}"))
     except (OSError, RecursionError, TypeError, ValueError):  # the report says so
         versions = {}
-    return RunData(run, rows, run.read_evaluation(), versions)
+    evaluation = run.read_evaluation()
+    if evaluation is not None and "returns" not in evaluation:  # nothing was played
+        evaluation = None
+    return RunData(run, rows, evaluation, versions)
 
 
 def _make_media(groups: Sequence[Group], say: Callable[[str], None]) -> Media:

@@ -124,6 +124,9 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         if evaluation is None:
             notes.append(f"{run.folder} is left out: it has no evaluation yet")
             continue
+        if "returns" not in evaluation:
+            notes.append(f"{run.folder} is left out: it has no environment, and so no returns")
+            continue
         if evaluation["steps"] < run.recipe.final_step:
             notes.append(
                 f"{run.folder} is left out: evaluated after {evaluation['steps']} of "

@@ -25,6 +25,7 @@ from torchrl_tit.evaluation_file import read_evaluation
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 
 from ...core.algorithm import make_algorithm
+from ...core.evaluation import score_of
 from ...core.interrupt import raise_on_signals
 from ...core.metrics import read_metrics
 from ...core.networks import name_chosen_encoders
@@ -315,7 +316,7 @@ class _Trial:
         if job is None:
             self._report()
             evaluations = [read_evaluation(job.folder) or {} for job in self.jobs]
-            return self._end(TrialState.COMPLETE, fmean(x["mean"] for x in evaluations))
+            return self._end(TrialState.COMPLETE, fmean(map(score_of, evaluations)))
         if not job.is_in_use():  # by a process that a killed search left behind
             self.process, self.started = start(job), job
         return False

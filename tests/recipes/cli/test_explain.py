@@ -3,18 +3,26 @@
 import sys
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import imageio.v3 as imageio
 import numpy as np
 import pytest
 
+from recipes.bc import BC
 from recipes.cli import main
 from recipes.core.runner import load_trained
+from recipes.offline import with_spaces
 from recipes.ppo import PPO
-from recipes.tools.results import paper_figures
+from recipes.tools.results import explanation, paper_figures
+from recipes.tools.results.recorded import Recording
 from tests.recipes.commands import fails
-from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt
+from tests.recipes.offline.test_without_env import log_machine
+from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt, train
 from tests.recipes.untrained import untrained
+from torchrl_tit import load_agent
+from torchrl_tit.agents.acting import make_given_env
+from torchrl_tit.datasets import load_episodes
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, lstm, mlp, nature_cnn
 
@@ -243,3 +251,51 @@ def test_weights_of_all_blocks(pong, cartpole, tmp_path, monkeypatch):
     explain(cartpole.folder, "--map", "weights", "--out", tmp_path / "b.png")
     assert panels["outer block 1, head 1"].shape == (3, 3)
     assert len(panels) == 1, "an array is one patch"
+
+
+def test_a_recorded_episode(tmp_path, capsys, monkeypatch):
+    """Each frame of it is explained as where the policy plays, with the actions of the data."""
+    pytest.importorskip("captum")
+    data, out = log_machine(tmp_path / "log.hdf5"), tmp_path / "step.png"
+    recipe = with_spaces(BC(dataset=str(data), backbone=enhanced_tit(3, **TIT), total_updates=1))
+    run = train(recipe, tmp_path / "run")
+    seen = []
+
+    class Watching(explanation.Explainer):
+        def explain(self, tensordict):
+            seen.append(tensordict.clone())
+            return super().explain(tensordict)
+
+    monkeypatch.setattr(explanation, "Explainer", Watching)
+    explain(run.folder, "--dataset", data, "--episode", 3, "--step", 7, "--out", out)
+    line = capsys.readouterr().out.splitlines()[0]
+    assert line == f"1 step of episode 3 of {data}"
+    assert imageio.imread(out).shape == PAGE
+    recorded = load_episodes(data).rows[3 * 21 : 4 * 21]
+    assert seen[0]["history"][0].tolist() == recorded["observation"][5:8].tolist()
+    for words, message in {
+        ("--episode", "10"): "has 10 episodes, so there is no episode 10",
+        ("--step", "20"): "the episode of the data has 20 steps, so there is no step 20",
+        ("--seed", "1"): "leave it out with --dataset",
+    }.items():
+        more = ["--dataset", data, "--out", tmp_path / "no.png", *words]
+        assert message in fails(capsys, "explain", run.folder, *more)
+
+
+def test_a_recorded_episode_of_a_decision_transformer(tmp_path, monkeypatch):
+    """It reads the actions that were taken."""
+    pytest.importorskip("captum")
+    recipe = make_dt(tmp_path, backbone=decision_transformer(**SMALL_DT))
+    run = untrained(tmp_path / "run", recipe)
+    agent, recording = load_agent(run.folder), Recording(load_episodes(recipe.dataset), 2)
+    seen, steps = [], range(4, 5)
+    explainer = explanation.Explainer(agent.policy)
+    monkeypatch.setattr(explainer, "explain", lambda td: seen.append(td["sequence"][0].clone()))
+    monkeypatch.setattr(explanation, "Page", lambda *args: Mock())
+    env = make_given_env(agent.make_env, recording)
+    show: Any = lambda *args: None  # noqa: E731
+    explanation.explain_episode(
+        env, explainer, "dt", steps, show, title="", actions=recording.actions
+    )
+    assert seen[0]["action"][1:5].tolist() == recording.actions[:4].tolist()
+    assert seen[0]["timestep"].tolist() == [0, 0, 1, 2, 3, 4]

@@ -47,7 +47,8 @@ ALGORITHMS = sorted(
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_column_is_described(algorithm):
     recipe = next(r for r in registry.RECIPES.values() if r.algorithm == algorithm)
-    columns = [*make_algorithm(recipe).columns]
+    made = make_algorithm(recipe)
+    columns = [*made.columns, *(f"held_out_{name}" for name in getattr(made, "measures", ()))]
     if algorithm == "ppo":  # which depend on the recipe
         columns.append("loss_contrastive")
     for column in ("steps_per_second", "return_mean", *columns):

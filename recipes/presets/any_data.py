@@ -1,0 +1,56 @@
+"""The named recipes for data of your own, which ``--dataset`` names, with or without ``--env``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl_tit.settings import Network
+from torchrl_tit.settings.networks import decision_transformer, dt_tit, mlp
+
+from .ppo_settings import reliable_tit
+from .preset import BC, CQL, DT, IQL, TD3BC, DiscreteCQL, Preset
+
+_NETWORKS: dict[str, Network] = {
+    "mlp": mlp(hidden_dim=256, activation="relu"),
+    "enhanced-tit": reliable_tit("enhanced-tit", 4),
+}
+# Sensors have any scale, and data of one machine are few.
+_SETTINGS: dict[str, Any] = {
+    "dataset": "",
+    "normalize_observations": True,
+    "total_updates": 50_000,
+    "evaluation_interval": 1000,
+}
+# With these, an update of CQL takes a fifth of the time, and the temperature soon falls.
+_CQL: dict[str, Any] = {
+    "action_samples": 4,
+    "critic_hidden": (256, 256),
+    "temperature_learning_rate": 1e-3,
+}
+_ALGORITHMS = {"bc": BC, "iql": IQL, "td3bc": TD3BC, "cql": CQL, "discrete-cql": DiscreteCQL}
+_DT: dict[str, Any] = {
+    "dataset": "",
+    "iterations": 20,
+    "updates_per_iteration": 500,
+    "learning_rate": 3e-4,
+    "warmup_updates": 1000,
+}
+
+ANY_DATA_RECIPES: dict[str, Preset] = {
+    recipe.name: recipe
+    for recipe in [
+        *(
+            make(
+                name=f"{algorithm}/{network}",
+                backbone=backbone,
+                **_SETTINGS,
+                **(_CQL if algorithm == "cql" else {}),
+            )
+            for algorithm, make in _ALGORITHMS.items()
+            for network, backbone in _NETWORKS.items()
+        ),
+        DT(name="dt/dt", backbone=decision_transformer(), **_DT),
+        DT(name="dt/dt-tit", backbone=dt_tit(), **_DT),
+    ]
+}
+"""``ALGORITHM/mlp`` and ``ALGORITHM/enhanced-tit``, ``dt/dt`` and ``dt/dt-tit``."""

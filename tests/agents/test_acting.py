@@ -1,0 +1,161 @@
+"""Agents that act on NumPy arrays: as in an evaluation, one or many, with missing frames."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from recipes.bc import BC
+from recipes.cli import main
+from recipes.iql import IQL
+from recipes.offline import with_spaces
+from recipes.ppo import PPO
+from tests.agents.runs import make_run
+from tests.recipes.offline.test_without_env import log_machine
+from tests.recipes.small import make_dt, tit, train
+from torchrl_tit import load_agent
+from torchrl_tit.agents import agent_names
+from torchrl_tit.export import export_policy
+from torchrl_tit.settings.literals import parse_assignments
+from torchrl_tit.settings.networks import lstm
+
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "act_from_onnx.py"
+STEPS = 12
+
+
+def made(name, folder):
+    if name in agent_names():
+        return load_agent(name)
+    if name == "dt":
+        return load_agent(train(make_dt(folder), folder / "run").folder)
+    backbone = {"lstm": lstm(1), "blackjack": tit(3)}[name]
+    env = "Blackjack-v1" if name == "blackjack" else "Pendulum-v1"
+    return load_agent(make_run(folder / "run", PPO(env=env, backbone=backbone)))
+
+
+def tasks(agent, count):
+    settings = parse_assignments(agent.recipe["env_settings"])
+    return [gymnasium.make(agent.recipe["env"], **settings) for _ in range(count)]
+
+
+@pytest.mark.parametrize("name", [*agent_names(), "dt", "lstm"])
+def test_one_by_one_as_in_an_evaluation(tmp_path, name):
+    agent = made(name, tmp_path)
+    env = agent.make_env(1)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        first = env.reset(seed=4)
+        steps = env.rollout(STEPS, agent.policy, auto_reset=False, tensordict=first)[0]
+    [env] = tasks(agent, 1)
+    observation, reward = env.reset(seed=4)[0], 0.0
+    for expected, expected_reward in zip(steps["action"], steps["next", "reward"], strict=True):
+        action = agent.act(observation.tolist(), reward=reward)
+        bounds = getattr(env.action_space, "low", None), getattr(env.action_space, "high", None)
+        expected = expected.numpy() if bounds[0] is None else expected.numpy().clip(*bounds)
+        np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-5)
+        observation, reward, *_ = env.step(action)
+        assert reward == pytest.approx(expected_reward.item(), rel=1e-4, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ["cartpole-no-velocity", "dt", "lstm"])
+def test_many_at_a_time_each_as_if_alone(tmp_path, name):
+    """Episodes begin at different times, in some copies only."""
+    agent = made(name, tmp_path)
+    draw = np.random.default_rng(0)
+    [env] = tasks(agent, 1)
+    frames = draw.normal(size=(STEPS, 3, *env.observation_space.shape))
+    begins = draw.random((STEPS, 3)) < 0.3
+    together = []
+    for now, which in zip(frames, begins, strict=True):
+        agent.reset(which)
+        together.append(agent.act(now, reward=np.ones(3)))
+    for copy in range(3):
+        agent.reset()
+        for step in range(STEPS):
+            if begins[step, copy]:
+                agent.reset()
+            action = agent.act(frames[step, copy], reward=1.0)
+            np.testing.assert_allclose(action, together[step][copy], rtol=1e-4, atol=1e-5)
+
+
+def test_missing_values_are_held(tmp_path):
+    agent = made("dt", tmp_path)
+    draw = np.random.default_rng(0)
+    frames = draw.normal(size=(5, 11))
+    held, whole = frames.copy(), frames.copy()
+    held[2], held[3, 4] = np.nan, np.nan
+    whole[2], whole[3, 4] = frames[1], frames[1, 4]
+    expected = [agent.act(frame) for frame in whole]
+    agent.reset()
+    for step, frame in enumerate(held):
+        np.testing.assert_array_equal(agent.act(None if step == 2 else frame), expected[step])
+    agent.reset()
+    with pytest.raises(ValueError, match="the first observation of an episode is missing or has N"):
+        agent.act(held[2])
+    with pytest.raises(ValueError, match=r"has the shape \[4\], but must have \[11\]"):
+        agent.act(np.zeros(4))
+
+
+def test_several_observations(tmp_path):
+    agent = made("blackjack", tmp_path)
+    action = agent.act({"0": [12], "1": [3], "2": [0]})
+    assert action in (0, 1)
+    agent.act(None)
+
+
+def test_an_agent_without_an_environment(tmp_path):
+    recipe = IQL(
+        dataset=str(log_machine(tmp_path / "log.hdf5", actions=np.full((200, 2), [0.0, 70.0]))),
+        backbone=tit(3),
+        total_updates=2,
+        normalize_observations=True,
+    )
+    run = train(with_spaces(recipe), tmp_path / "run")
+    (tmp_path / "log.hdf5").rename(tmp_path / "elsewhere.hdf5")
+    agent = load_agent(run.folder)
+    actions = np.stack([agent.act(frame) for frame in np.random.default_rng(0).normal(size=(5, 5))])
+    assert ((actions >= [-1, 69]) & (actions <= [1, 71])).all()
+    assert len({*actions[:, 1].tolist()}) == 5
+    assert torch.is_grad_enabled()
+
+
+@pytest.mark.parametrize("name", ["cartpole-no-velocity", "dt", "lstm"])
+def test_a_file_acts_as_its_agent(tmp_path, name):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    agent, file = made(name, tmp_path), tmp_path / "agent.onnx"
+    export_policy(agent.policy, agent.make_env, file, step_by_step=True)
+    exported = runpy.run_path(str(EXAMPLE))["Agent"](str(file))
+    draw = np.random.default_rng(0)
+    [env] = tasks(agent, 1)
+    for size in ((), (3,)):
+        agent.reset()
+        exported.reset()
+        for step in range(STEPS):
+            frames = draw.normal(size=(*size, *env.observation_space.shape))
+            if step:
+                frames[..., 0][draw.random(size) < 0.5] = np.nan
+            if size and step == 5:
+                agent.reset([True, False, False])
+                exported.reset([True, False, False])
+                frames[0] = 0
+            expected = agent.act(frames, reward=1.0)
+            found = exported.act(frames, reward=1.0)
+            assert found.dtype == expected.dtype
+            np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_a_file_of_an_agent_without_an_environment(tmp_path):
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    recipe = BC(dataset=str(log_machine(tmp_path / "log.hdf5")), backbone=tit(3), total_updates=2)
+    run, file = train(with_spaces(recipe), tmp_path / "run"), tmp_path / "agent.onnx"
+    main(["export", str(run.folder), "--out", str(file), "--step-by-step"])
+    agent, exported = load_agent(run.folder), runpy.run_path(str(EXAMPLE))["Agent"](str(file))
+    for frame in np.random.default_rng(0).normal(size=(6, 5)):
+        np.testing.assert_allclose(exported.act(frame), agent.act(frame), rtol=1e-3, atol=1e-5)

@@ -1,0 +1,272 @@
+"""Learning from logged data alone: spaces, held-out episodes, and the best weights by them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from recipes.cli import main
+from recipes.core import runner
+from recipes.core.evaluation import score_of
+from recipes.core.metrics import read_metrics
+from recipes.core.records import Records
+from recipes.core.registry import get_recipe
+from recipes.core.run import RecordedRun, Run
+from recipes.offline import read_data, with_spaces
+from recipes.presets.any_data import ANY_DATA_RECIPES
+from tests.datasets.rollouts import write
+from tests.recipes.commands import fails
+from tests.recipes.small import (
+    BC,
+    CQL,
+    IQL,
+    SMALL,
+    TD3BC,
+    assert_resumes_bit_for_bit,
+    make,
+    make_algorithm,
+    make_cartpole_dt,
+    make_discrete_cql,
+    make_dt,
+    make_odt,
+    tit,
+    train,
+)
+from torchrl_tit import load_agent
+from torchrl_tit.datasets import DatasetError
+from torchrl_tit.evaluation_file import check_evaluation
+
+RECIPES = {
+    "bc": partial(make, BC, env="", normalize_observations=True),
+    "bc, slices": partial(make, BC, env="", backbone=tit(3), slice_length=2),
+    "iql": partial(make, IQL, env=""),
+    "td3bc": partial(make, TD3BC, env=""),
+    "cql": partial(make, CQL, env=""),
+    "cql, slices": partial(make, CQL, env="", backbone=tit(3), slice_length=2),
+    "discrete-cql": partial(make_discrete_cql, env=""),
+    "dt": partial(make_dt, env="", target_returns=()),
+    "dt, discrete": partial(make_cartpole_dt, env="", target_returns=()),
+}
+
+
+def log_machine(path: Path, steps: int = 200, length: int = 20, **arrays: Any) -> Path:
+    """Logs of a machine with 5 sensors, whose 2 actions follow from the newest reading."""
+    draw = np.random.default_rng(0)
+    observations = draw.normal(size=(steps, 5))
+    fields = {
+        "observations": observations,
+        "actions": np.tanh(observations[:, :2]),
+        "rewards": draw.normal(size=steps),
+        "terminals": np.zeros(steps, bool),
+        "timeouts": np.arange(steps) % length == length - 1,
+        **arrays,
+    }
+    return write(path, fields)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_trains_and_resumes_bit_for_bit(tmp_path, name):
+    algorithm = make_algorithm(RECIPES[name](tmp_path))
+    algorithm.check()
+    run = train(algorithm.recipe, tmp_path / "whole")
+    assert_resumes_bit_for_bit(run, tmp_path / "resumed")
+    rows = read_metrics(run.folder / "metrics.csv")
+    measured = {row["step"]: row for row in rows if row["step"] in (9, 18)}
+    for column in algorithm.held_out_columns:
+        assert np.isfinite([row[column] for row in measured.values()]).all()
+    assert np.isnan([row["return_mean"] for row in rows]).all()
+    errors = {step: row["held_out_action_error"] for step, row in measured.items()}
+    last, best = runner.evaluate(run), runner.evaluate(run, best=True)
+    for evaluation in (last, best):
+        check_evaluation(evaluation)
+        assert "mean" not in evaluation
+        assert list(evaluation["held_out"]) == list(algorithm.measures)
+        assert evaluation["held_out"]["action_error"] == errors[evaluation["steps"]]
+    assert last["steps"] == 18
+    assert errors[best["steps"]] == min(errors.values())
+
+
+def test_the_measures_of_held_out_episodes(tmp_path):
+    recipe = BC(dataset=str(log_machine(tmp_path / "log.hdf5")), backbone=SMALL, seed=1)
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    assert algorithm.buffer.storage.shape[0] == 9 * 19  # the final observations are unknown
+    found = algorithm.measure(0)
+    items = algorithm.measured_items(algorithm._held_out).get(slice(None))
+    assert (found.episodes, len(items)) == (1, 19)
+    rest = algorithm.buffer.storage.get(slice(None))["observation"]
+    assert not (items["observation"].unsqueeze(1) == rest).all(-1).any()
+    with torch.no_grad():
+        dist = algorithm.policy.get_dist(items.clone())
+    expected = {
+        "action_error": (dist.mode - items["action"]).square().mean(),
+        "log_likelihood": dist.log_prob(items["action"]).mean(),
+    }
+    assert found.values == pytest.approx({k: v.item() for k, v in expected.items()}, rel=1e-5)
+    state = torch.get_rng_state()
+    assert algorithm.measure(0) == found
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_the_best_weights_are_those_before_the_data_are_learnt_by_heart(tmp_path):
+    noise = np.random.default_rng(1).uniform(-1, 1, (60, 2))
+    data = log_machine(tmp_path / "log.hdf5", steps=60, actions=noise)
+    recipe = BC(
+        dataset=str(data),
+        backbone=SMALL,
+        learning_rate=0.03,
+        total_updates=200,
+        evaluation_interval=10,
+        batch_size=32,
+        name="bc/mine",
+    )
+    run = train(recipe, tmp_path / "run")
+    last, best = runner.evaluate(run), runner.evaluate(run, best=True)
+    assert best["steps"] < last["steps"]
+    assert best["held_out"]["action_error"] < 0.9 * last["held_out"]["action_error"]
+
+
+def test_an_environment_and_held_out_episodes(tmp_path):
+    run = train(make(BC, tmp_path, validation_fraction=0.2), tmp_path / "run")
+    evaluation = runner.evaluate(run)
+    check_evaluation(evaluation)
+    assert evaluation["held_out"]["action_error"] > 0
+    assert len(evaluation["returns"]) == 3
+    returns = {row["step"]: row["return_mean"] for row in read_metrics(run.folder / "metrics.csv")}
+    best = runner.evaluate(run, best=True)["steps"]
+    assert returns[best] == max(returns[9], returns[18])  # not by the error
+
+
+@pytest.mark.parametrize(
+    ("actions", "low", "high"),
+    [
+        (np.linspace(-0.5, 0.9, 400).reshape(200, 2), [-1, -1], [1, 1]),
+        (np.stack([np.linspace(0, 90, 200), np.full(200, 40)], 1), [0, 39], [90, 41]),
+    ],
+    ids=["within -1 to 1", "others, one of them constant"],
+)
+def test_spaces_of_the_data(tmp_path, actions, low, high):
+    data = log_machine(tmp_path / "log.hdf5", actions=actions)
+    recipe = with_spaces(BC(dataset=str(data), backbone=SMALL))
+    assert recipe.task_settings == {
+        "observation_shape": [5],
+        "observation_dtype": "float32",
+        "low": low,
+        "high": high,
+    }
+    assert with_spaces(recipe) is recipe
+    read_data(recipe)
+    log_machine(data.with_name("other.hdf5"), observations=np.zeros((200, 4)))
+    with pytest.raises(DatasetError, match=r"'observations': one row has the shape \[4\]"):
+        read_data(BC(**{**vars(recipe), "dataset": str(data.with_name("other.hdf5"))}))
+
+
+def test_spaces_of_images_and_discrete_actions(tmp_path):
+    images = np.zeros((200, 20, 20), np.uint8)
+    data = log_machine(tmp_path / "log.hdf5", observations=images, actions=np.arange(200) % 3)
+    recipe = with_spaces(BC(dataset=str(data), backbone=SMALL))
+    shape, dtype, count = recipe.task_settings.values()
+    assert (shape, dtype, count) == ([20, 20], "uint8", 3)
+
+
+def test_bad_settings_in_one_line(tmp_path, capsys):
+    data = log_machine(tmp_path / "log.hdf5")
+    words = ["train", "bc/mlp", "--dataset"]
+    for further, message in {
+        ("",): "is a recipe for any data: name them with --dataset FILE",
+        (data, "--validation-fraction", 0): "hold at least one episode out",
+        (data, "--env-settings", "low=[-1,-1]", "high=[1,0.5]"): "'actions', row ",
+        (data, "--env-settings", "low=[-1]", "high=[1,2]"): "low below high for each entry",
+        (data, "--env-settings", "low=[-1]", "high=[1]"): r"one row has the shape \[2\], but in",
+        (data, "--env-settings", "observation_shape=5", "low=1", "high=2"): "its spaces: .*'int'",
+        (data, "--env-settings", "speed=3"): "consists of its spaces: .*'speed'",
+        (data, "--wrappers", "gymnasium.wrappers:ClipAction"): "nothing to wrap",
+    }.items():
+        assert re.search(message, fails(capsys, *words, *further))
+    with pytest.raises(ValueError, match="needs an environment"):
+        make_odt(tmp_path, env="")
+    with h5py.File(data, "a") as file:
+        integers = np.zeros((200, 5), int)
+        del file["observations"]
+        file["observations"] = integers
+    assert "store arrays as floats" in fails(capsys, *words, data)
+
+
+def test_one_episode_is_cut_in_two(tmp_path):
+    data = log_machine(tmp_path / "log.hdf5", length=200)
+    algorithm = make_algorithm(BC(dataset=str(data), backbone=SMALL))
+    with pytest.warns(UserWarning, match="its last 20 of 200 steps are held out"):
+        episodes = algorithm.load_data()
+    whole, held_out = read_data(algorithm.recipe), algorithm._held_out
+    assert (episodes.lengths.tolist(), held_out.lengths.tolist()) == ([180], [20])
+    observations = whole.rows["observation"]
+    assert torch.equal(episodes.rows["observation"], observations[:181])
+    assert torch.equal(held_out.rows["observation"], observations[180:])
+    assert episodes.rows["truncated"].nonzero()[:, 0].tolist() == [179]
+    assert episodes.rows["action"][-1].tolist() == [0, 0]
+    assert torch.equal(whole.rows["action"][180], held_out.rows["action"][0])
+
+
+def test_every_recipe_for_any_data_builds_what_it_needs(tmp_path):
+    data = {
+        True: log_machine(tmp_path / "log.hdf5"),
+        False: log_machine(tmp_path / "discrete.hdf5", actions=np.arange(200) % 3),
+    }
+    for name in ANY_DATA_RECIPES:
+        data_of_kind = str(data["discrete" not in name])
+        recipe: Any = get_recipe(name)
+        algorithm = make_algorithm(replace(recipe, dataset=data_of_kind))
+        algorithm.check()
+
+
+def test_cloning_of_the_best_episodes(tmp_path):
+    data = log_machine(tmp_path / "log.hdf5")
+    recipe = BC(dataset=str(data), backbone=SMALL, best_fraction=0.25)
+    found = make_algorithm(recipe).load_data().returns
+    everything = make_algorithm(replace(recipe, best_fraction=1.0)).load_data().returns
+    assert found.tolist() == everything.sort(descending=True).values[:2].tolist()
+
+
+def test_the_command_line(tmp_path, capsys):
+    data, out = log_machine(tmp_path / "log.hdf5"), tmp_path / "run"
+    words = ["train", "bc/enhanced-tit", "--dataset", data, "--out", out]
+    main([str(x) for x in [*words, "--total-updates", 4, "--evaluation-interval", 2]])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("bc/enhanced-tit: after 4 updates (last weights), on 1 ep")
+    assert "return" not in lines[0]
+    assert Run.open(out).is_complete()
+    main(["evaluate", str(out), "--best"])
+    assert "(best weights, chosen on held-out episodes)" in capsys.readouterr().out
+    assert "is left out: it has no environment" in fails(capsys, "table", out)
+
+
+def test_what_reads_evaluations_knows_those_without_returns(tmp_path, capsys):
+    recipe = with_spaces(BC(dataset=str(log_machine(tmp_path / "log.hdf5")), backbone=SMALL))
+    run = train(replace(recipe, total_updates=2, name="bc/mine"), tmp_path / "run")
+    with run:
+        run.save_evaluation(runner.evaluate(run))
+    evaluation = run.read_evaluation()
+    assert evaluation is not None
+    assert score_of(evaluation) == -evaluation["held_out"]["action_error"]
+    main(["report", str(run.folder), "--out", str(tmp_path / "report.html")])
+    assert "no environment that could be rendered" in (tmp_path / "report.html").read_text()
+    main(["record", str(run.folder), "--out", str(tmp_path / "table")])
+    table = Records(tmp_path / "table")
+    assert RecordedRun(table, table.below(".")[0]).read_evaluation() == evaluation
+    pytest.importorskip("huggingface_hub")
+    main(["share", str(run.folder), "--out", str(tmp_path / "agent")])
+    card = (tmp_path / "agent" / "README.md").read_text()
+    assert f"action_error {evaluation['held_out']['action_error']:.4g}" in card
+    assert "agent.act(observation)" in card
+    assert "mean_reward" not in card
+    agent = load_agent(tmp_path / "agent")
+    assert agent.act(np.zeros(5)).shape == (2,)
+    assert "there is no environment" in fails(capsys, "play", tmp_path / "agent")

@@ -1,0 +1,196 @@
+"""A policy that acts on the observations of a machine, one after another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec
+from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from torchrl_tit.analysis.targets import evaluating
+from torchrl_tit.envs.given import Feed, GivenTask
+
+_READ = ("observation", "action_mask")
+
+
+class Actor:
+    """Acts on NumPy arrays, and keeps what the policy remembers.
+
+    Histories, recurrent states and the past actions and returns-to-go of a Decision Transformer are
+    kept by the transforms of the policy's own environment, so it acts as in an evaluation.
+
+    Args:
+        policy: the policy.
+        make_env: makes its task, given the number of copies, with all entries that it reads.
+
+    Example:
+        >>> from torchrl_tit import load_agent
+        >>> agent = load_agent("cartpole")
+        >>> actor = Actor(agent.policy, agent.make_env)
+        >>> actor.act(np.zeros(4)).shape, actor.act([0.1, np.nan, 0.0, 0.0]).shape
+        ((), ())
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, make_env: Callable[[int], EnvBase]) -> None:
+        self._policy, self._make_env = policy, make_env
+        self._env: EnvBase | None = None
+        self._steps: TensorDictBase | None = None
+        self._begins = torch.zeros(1, 1, dtype=torch.bool)
+
+    def reset(self, which: Any = None) -> None:
+        """Begins an episode with the next observation.
+
+        Args:
+            which: in which of several copies, bool [N]; by default in all, of which there may then
+                be another number.
+        """
+        if which is None or self._env is None:
+            self._env = self._steps = None
+        else:
+            self._begins |= torch.as_tensor(np.asarray(which, bool)).reshape(self._begins.shape)
+
+    def act(self, observation: Any, *, reward: Any = 0.0, action_mask: Any = None) -> NDArray:
+        """Returns the most likely action.
+
+        Args:
+            observation: one observation, or those of N copies, [N, ...], as the agent's environment
+                writes them, of any dtype; for a task with several, each by its name. Where it is
+                NaN, or None for all of it, the last value is held.
+            reward: the reward since the last action, a number or [N], which only a Decision
+                Transformer reads.
+            action_mask: which actions are allowed, for an agent that reads it.
+
+        Returns:
+            The action in the task's own form, clipped to its bounds; [N, ...] for several copies.
+
+        Raises:
+            ValueError: if the observation has another shape, the number of copies changes without
+                :meth:`reset`, or there is no last value to hold.
+        """
+        if self._env is None:
+            self._start(observation)
+        assert self._env is not None
+        given = {"observation": self._read(observation)}
+        if "action_mask" in self._specs:
+            if action_mask is None:
+                raise ValueError("the agent reads which actions are allowed: give action_mask")
+            mask = torch.as_tensor(np.asarray(action_mask, bool))
+            given["action_mask"] = mask.reshape(self._env.observation_spec["action_mask"].shape)
+        rewards = torch.as_tensor(np.asarray(reward, np.float32)).reshape(-1, 1)
+        given["reward"] = rewards.expand(len(self._begins), 1)
+        given["truncated"] = self._begins
+        self._given = given
+        with (
+            torch.no_grad(),
+            evaluating(self._policy),
+            set_exploration_type(ExplorationType.DETERMINISTIC),
+        ):
+            if self._steps is None:
+                steps = self._env.reset()
+            else:  # also resets the copies in which an episode begins
+                _, steps = self._env.step_and_maybe_reset(self._steps)
+            self._steps = self._policy(steps)
+        action = self._to_task(self._steps["action"].numpy(force=True))
+        self._begins = torch.zeros_like(self._begins)
+        return action if self._batched else action[0]
+
+    def _start(self, observation: Any) -> None:
+        """Builds the environment for as many copies as there are observations."""
+        base, transforms = _parts(self._make_env)
+        self._specs = _specs(base)
+        spec = self._specs["observation"]
+        several = isinstance(spec, Composite)
+        name = next(iter(spec.keys())) if several else None
+        if observation is None or (several and not isinstance(observation, Mapping)):
+            expected = f"a mapping with {', '.join(spec.keys())}" if several else "an array"
+            raise ValueError(f"the first observation must be {expected}, not {observation!r}")
+        first = np.asarray(observation[name] if several else observation)
+        ndim = (spec[name] if several else spec).ndim
+        self._batched = first.ndim > ndim
+        copies = len(first) if self._batched else 1
+        writer = getattr(base, "action_writer", None)
+        self._to_task: Callable[[NDArray], NDArray] = writer or (lambda action: action)
+        self._env = _given(base, transforms, lambda begins: self._given, copies)
+        self._begins = torch.zeros(copies, 1, dtype=torch.bool)
+        self._last: dict[str, Tensor] = {}
+
+    def _read(self, observation: Any) -> Any:
+        spec = self._specs["observation"]
+        if not isinstance(spec, Composite):
+            return self._hold("observation", observation, spec)
+        values = observation or {}
+        return {name: self._hold(name, values.get(name), leaf) for name, leaf in spec.items()}
+
+    def _hold(self, name: str, value: Any, spec: Any) -> Tensor:
+        """Converts an observation, [N, *obs], and fills in what is missing."""
+        last = self._last.get(name)
+        shape = (len(self._begins), *spec.shape)
+        if value is None:
+            missing = torch.ones(shape, dtype=torch.bool)
+            frame = torch.zeros(shape, dtype=spec.dtype)
+        else:
+            array = np.asarray(value)
+            if array.shape != (shape if self._batched else shape[1:]):
+                expected = list(shape) if self._batched else list(shape[1:])
+                raise ValueError(
+                    f"the {name} has the shape {list(array.shape)}, but must have {expected}: call "
+                    "reset() before another number of copies"
+                )
+            numbers = torch.as_tensor(np.ascontiguousarray(array)).reshape(shape)
+            missing, frame = numbers.isnan(), numbers.to(spec.dtype)
+        if missing.any():
+            begins = self._begins if last is not None else torch.ones_like(self._begins)
+            if (missing.flatten(1).any(1, keepdim=True) & begins).any():
+                raise ValueError(
+                    f"the first {name} of an episode is missing or has NaN, and there is no last "
+                    "one to hold: wait for a whole one"
+                )
+            assert last is not None
+            frame = torch.where(missing, last, frame)
+        self._last[name] = frame
+        return frame
+
+
+def make_given_env(make_env: Callable[[int], EnvBase], feed: Feed, num_envs: int = 1) -> EnvBase:
+    """Makes an environment whose observations a function gives, with all that a policy reads.
+
+    Args:
+        make_env: makes the policy's own environment, given the number of copies.
+        feed: gives the observations; see :class:`~torchrl_tit.envs.given.GivenTask`.
+        num_envs: number of copies.
+
+    Example:
+        >>> from torchrl_tit import load_agent
+        >>> agent = load_agent("cartpole")
+        >>> env = make_given_env(agent.make_env, lambda begins: {"observation": torch.ones(1, 4)})
+        >>> agent.policy(env.reset())["action"].shape
+        torch.Size([1])
+    """
+    return _given(*_parts(make_env), feed, num_envs)
+
+
+def _parts(make_env: Callable[[int], EnvBase]) -> tuple[EnvBase, Transform]:
+    """An environment that is closed, and its transforms, which can join another."""
+    with closing(make_env(1)) as made:
+        base, transforms = made.base_env, made.transform
+        transforms.reset_parent()
+    return base, transforms
+
+
+def _specs(base: EnvBase) -> dict[str, TensorSpec]:
+    """The specs of what is observed, by their keys."""
+    return {key: x for key, x in base.observation_spec_unbatched.items() if key in _READ}
+
+
+def _given(base: EnvBase, transforms: Transform, feed: Feed, num_envs: int) -> EnvBase:
+    task = GivenTask(_specs(base), base.action_spec_unbatched, feed, num_envs, device=base.device)
+    return TransformedEnv(task, transforms)
