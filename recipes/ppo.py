@@ -150,7 +150,8 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     of an epoch, as in Stable-Baselines3; see at_target_kl."""
     at_target_kl: Literal["stop", "adapt"] = "stop"
     """With a target_kl: "stop" ends an update after the epoch that exceeds it (as in OpenAI's
-    Spinning Up), "adapt" adjusts the learning rate to approach it (as in rl_games and skrl)."""
+    Spinning Up), "adapt" raises or lowers the learning rate of the next update where the last epoch
+    is below half or above twice the target."""
     gae_lambda: Fraction = 0.95
     """Lambda of generalized advantage estimation (arXiv 1506.02438)."""
     bootstrap_time_limit: bool = True
@@ -394,6 +395,8 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         if recipe.running_advantage_floor:
             running = self.advantage_scale.update(batch["advantage"])
             floor = max(floor, recipe.running_advantage_floor * running)
+        target, value = batch["value_target"], batch["state_value"]
+        explained_variance = 1 - (target - value).var() / target.var().clamp(min=1e-12)
         model.train()
         steps: list[Tensor] = []
         per_epoch = math.ceil(batch.numel() / recipe.minibatch_size)
@@ -410,8 +413,8 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
                 terms = torch.stack(steps[-per_epoch:]).mean(0)
                 moved = terms[self.terms.index("kl_approx")].item()
                 if recipe.at_target_kl == "adapt":
-                    self.rate.update(moved)
-                    self._set_schedules(step)
+                    if len(steps) == recipe.epochs * per_epoch:
+                        self.rate.update(moved, explained_variance.item())
                 elif moved > recipe.target_kl:
                     break
         model.eval()
@@ -421,11 +424,10 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
             self.collector.update_policy_weights_()
         # If this goes to 0, the features are the same in all states, and so is the policy.
         features = batch[model.backbone.features_keys[0]].flatten(0, -2)  # [steps, features]
-        target, value = batch["value_target"], batch["state_value"]
         return {
             "learning_rate": learning_rate,
             "feature_spread": features.std(0).mean(),
-            "explained_variance": 1 - (target - value).var() / target.var().clamp(min=1e-12),
+            "explained_variance": explained_variance,
             "epochs": len(steps) / per_epoch,
             **dict(zip([*self.terms, "gradient_norm"], torch.stack(steps).mean(0), strict=True)),
         }

@@ -119,9 +119,13 @@ def normalize_advantages(advantage: Tensor, floor: float) -> Tensor:
 class KLAdaptiveRate:
     """A factor on the learning rate that keeps the KL divergence of an update near a target.
 
-    The rule of skrl's `KLAdaptiveLR` and of rl_games: after each epoch, divide the rate by 1.5 if
-    the policy has moved twice as far as the target, multiply it by 1.5 if it has moved less than
-    half as far.
+    After each update, the rate is divided by 1.5 if the policy has moved twice as far as the
+    target, and multiplied by 1.5 if it has moved less than half as far. skrl's `KLAdaptiveLR` and
+    rl_games do so after each epoch; but the first epochs of any update move the policy little, so
+    the rate rises too far.
+
+    Where values explain nothing of the returns, as before the first reward, advantages are noise.
+    Then the rate does not rise, and a factor above 1 falls back to 1.
 
     Args:
         target: the KL divergence to keep.
@@ -130,7 +134,7 @@ class KLAdaptiveRate:
 
     Example:
         >>> rate = KLAdaptiveRate(0.01)
-        >>> rate.update(0.05)
+        >>> rate.update(0.05, explained_variance=0.9)
         >>> round(rate.factor, 3)
         0.667
     """
@@ -141,9 +145,17 @@ class KLAdaptiveRate:
         self.largest = largest
         self.factor = 1.0
 
-    def update(self, kl: float) -> None:
-        """Adapts the factor to the divergence measured in an epoch."""
-        if kl > 2 * self.target:
+    def update(self, kl: float, explained_variance: float) -> None:
+        """Adapts the factor to an update.
+
+        Args:
+            kl: the divergence in its last epoch.
+            explained_variance: the share of the variance of the value targets that the values of
+                the batch explain; 0 or less if they explain nothing.
+        """
+        if explained_variance <= 0:
+            self.factor = max(self.factor / 1.5, min(self.factor, 1.0))
+        elif kl > 2 * self.target:
             self.factor /= 1.5
         elif kl < self.target / 2:
             self.factor *= 1.5

@@ -13,15 +13,15 @@ from torchrl_tit.settings.networks import enhanced_tit, vanilla_tit
 PPO_SETTINGS: dict[str, Any] = {
     "num_envs": 8,
     "steps_per_batch": 1024,
-    "minibatch_size": 256,
     "decay_learning_rate": True,
     # Observations and rewards, and therefore values, are of scale 1 in every task.
     "normalize_observations": True,
     "normalize_rewards": True,
     # Once a task is solved, advantages are mostly noise, which must not count as much as a signal.
     "running_advantage_floor": 0.5,
-    # An update that has moved the policy this far ends early.
+    # The learning rate follows the KL divergence, so that updates are as large for every network.
     "target_kl": 0.02,
+    "at_target_kl": "adapt",
 }
 """Fields of the recipe; the others have their defaults, which are Stable-Baselines3's."""
 

@@ -55,12 +55,28 @@ def test_learning_rate_follows_the_divergence():
     rate = KLAdaptiveRate(0.01)
     factors = []
     for kl in (0.05, 0.015, 0.001, 0.001):
-        rate.update(kl)
+        rate.update(kl, 0.5)
         factors.append(rate.factor)
     assert factors == pytest.approx([1 / 1.5, 1 / 1.5, 1, 1.5])
     for _ in range(100):
-        rate.update(1.0)
+        rate.update(1.0, 0.5)
     assert rate.factor == rate.smallest
+    for _ in range(100):
+        rate.update(0.0, 0.5)
+    assert rate.factor == rate.largest
+
+
+@pytest.mark.parametrize(("start", "end"), [(3.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
+def test_noise_does_not_raise_the_learning_rate(start, end):
+    """Whatever the divergence is, values that explain nothing bring the factor down to 1."""
+    for kl in (0.0, 1.0):
+        rate = KLAdaptiveRate(0.01)
+        rate.factor = start
+        rate.update(kl, -0.1)
+        assert rate.factor == pytest.approx(max(start / 1.5, end))
+        for _ in range(5):
+            rate.update(kl, 0.0)
+        assert rate.factor == end
 
 
 def test_rewards_are_divided_by_the_deviation_of_returns(tmp_path, monkeypatch):
@@ -243,17 +259,19 @@ def test_an_update_ends_after_the_first_epoch_beyond_the_target(divergences, tmp
     assert read_metrics(run.folder / "metrics.csv")[-1]["epochs"] == 2
 
 
-def test_the_learning_rate_follows_the_target_divergence(divergences, tmp_path):
-    recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=1e-3, at_target_kl="adapt")
+@pytest.mark.parametrize("target", [1e-4, 1.0])
+def test_the_learning_rate_follows_the_target_divergence(divergences, target, tmp_path):
+    """It is adapted once an update, to the divergence in the last of its epochs."""
+    recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=target, at_target_kl="adapt")
     rows = read_metrics(train(recipe, tmp_path / "run").folder / "metrics.csv")
-    expected, factors = KLAdaptiveRate(1e-3), [1.0]
-    for kl in divergences():
-        expected.update(kl)
+    expected, factors = KLAdaptiveRate(target), [1.0]
+    for kl, row in zip(divergences()[7::8], rows, strict=True):
+        expected.update(kl, row["explained_variance"])
         factors.append(expected.factor)
-    assert len(factors) == 4 * 8 + 1
+    assert len(factors) == 4 + 1
     assert len(set(factors)) > 2
     rates = [row["learning_rate"] for row in rows]
-    assert rates == pytest.approx([0.01 * factor for factor in factors[0:32:8]])
+    assert rates == pytest.approx([0.01 * factor for factor in factors[:4]])
     assert all(row["epochs"] == 8 for row in rows)
 
 
