@@ -2,6 +2,7 @@
 # and installs again where pyproject.toml, setup.py or constraints.txt have changed since.
 #   make test PYTHON=python3.12       another interpreter
 #   make demo OUT=runs/first          another run folder
+#   make test DEVICE=cuda             on a GPU, what differs there
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -9,6 +10,7 @@ WORKERS ?= 2
 VERSIONS ?= 3.11-lowest 3.12-pinned 3.13-newest
 OUT ?= runs/demo-$(shell date +%Y%m%d-%H%M%S)
 ARGS ?=
+DEVICE ?=
 
 BIN := $(VENV)/bin
 # One thread a process: the workers of the tests would otherwise fight over the cores.
@@ -50,8 +52,10 @@ lint: $(VENV)/installed-test  ## Check style, formatting and which modules impor
 types: $(VENV)/installed-test  ## Check types
 	$(BIN)/mypy
 
+ON_DEVICE := tests/test_device.py tests/datasets/test_online.py tests/datasets/test_storages.py tests/envs/test_vector.py
+
 unit: $(VENV)/installed-test  ## Run the tests and the examples in docstrings (ARGS="-k history" for some)
-	$(PYTEST) --durations 20 -m "not slow" $(ARGS)
+	$(if $(DEVICE),DEVICE=$(DEVICE)) $(PYTEST) --durations 20 -m "not slow" $(ARGS) $(if $(DEVICE),$(ON_DEVICE))
 
 slow: numerics  ## Run the tests that take long, and those of numbers on a plain processor
 	$(PYTEST) --durations 20 -m slow $(ARGS)

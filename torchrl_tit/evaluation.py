@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from torchrl_tit.layers.standardize import widest_float
 from torchrl_tit.modules import acting
 
 _WATCHER: ContextVar[Callable[[int], Any] | None] = ContextVar("watcher", default=None)
@@ -133,7 +134,8 @@ def _play(
 ) -> Tensor:
     """Computes the return of one episode in each environment, float64 [N]."""
     tensordict = env.reset(seed=seed)
-    returns = torch.zeros(env.batch_size.numel(), dtype=torch.float64, device=env.device)
+    wide = torch.float64 if env.device is None else widest_float(env.device)
+    returns = torch.zeros(env.batch_size.numel(), dtype=wide, device=env.device)
     playing = torch.ones_like(returns, dtype=torch.bool)
     left = len(playing)
     while left:
@@ -148,7 +150,7 @@ def _play(
             returns += reward
             playing &= ~outcome["done"].flatten()
         else:
-            returns = outcome["game_return"].flatten().double().where(playing, returns)
+            returns = outcome["game_return"].flatten().to(wide).where(playing, returns)
             playing &= ~game_over.flatten()
         before, left = left, int(playing.sum())
         if left < before and (watcher := _WATCHER.get()) is not None:

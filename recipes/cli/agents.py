@@ -27,7 +27,7 @@ def play(arguments: list[str]) -> None:
     parser.add_argument("--episodes", type=int, help=f"default: {_EPISODES}, or 1 in a film")
     parser.add_argument("--seed", type=int, help="seed of the first; default: the evaluation's")
     parser.add_argument("--out", type=Path, help="film them: a new file, .gif or .mp4")
-    parser.add_argument("--device", choices=["cpu", "cuda", "auto"], default="cpu")
+    parser.add_argument("--device", default="cpu", help="such as cuda:1, or auto; default: cpu")
     parser.add_argument("--threads", type=int, default=1, help="default: 1")
     options = parser.parse_args(arguments)
     for name in ("episodes", "threads"):

@@ -99,7 +99,7 @@ def add_agent(parser: argparse.ArgumentParser, **settings: Any) -> None:
 
 def add_machine_options(parser: argparse.ArgumentParser) -> None:
     """Adds the options for device and threads, which override those of the recipe."""
-    parser.add_argument("--device", choices=["cpu", "cuda", "auto"], help="default: the recipe's")
+    parser.add_argument("--device", help="such as cuda:1, or auto; default: the recipe's")
     parser.add_argument("--threads", type=int, help="default: the recipe's")
 
 

@@ -49,7 +49,7 @@ class ReturnScale:
             returns.append(current)
             current = current.masked_fill(ended, 0.0)
         self.returns = current
-        values = torch.stack(returns).double().cpu()
+        values = torch.stack(returns).cpu().double()
         count, mean, squares = self.statistics
         total, shift = count + values.numel(), values.mean() - mean
         self.statistics = torch.stack(

@@ -210,12 +210,20 @@ def torch_device(device: str) -> torch.device:
 
     Raises:
         ValueError: if there is no such device.
+
+    Example:
+        >>> torch_device("cpu")
+        device(type='cpu')
     """
-    if device == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device is 'cuda', but PyTorch finds no GPU: use 'cpu' or 'auto'")
     if device == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(device)
+    try:
+        return torch.empty(0, device=device).device
+    except (AssertionError, RuntimeError) as error:  # unknown, or not there
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"device is {device!r}, which PyTorch does not find ({reason}): use 'cpu' or 'auto'"
+        ) from error
 
 
 def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:

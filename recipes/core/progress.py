@@ -13,6 +13,8 @@ import msgspec
 import torch
 from torch import Tensor
 
+from torchrl_tit.layers.standardize import widest_float
+
 from .algorithm import Algorithm, Stateful, check_finite
 from .evaluation import HeldOut, Outcome
 from .recipe import Recipe
@@ -53,14 +55,13 @@ class Record:
         """Adds the returns of a batch and the numbers of its update, without waiting for a GPU."""
         if returns is not None:
             self._returns += returns.flatten().tolist()
-        device = next((x.device for x in values.values() if isinstance(x, Tensor)), None)
+        cpu = torch.device("cpu")
+        device = next((x.device for x in values.values() if isinstance(x, Tensor)), cpu)
+        wide = widest_float(device)
         terms = torch.stack(
-            [
-                torch.as_tensor(values[name], dtype=torch.float64, device=device)
-                for name in self._names
-            ]
+            [torch.as_tensor(values[name], dtype=wide, device=device) for name in self._names]
         )
-        self._sums = terms if self._sums is None else self._sums.to(terms.device) + terms
+        self._sums = terms if self._sums is None else self._sums.to(terms) + terms
         self._count += 1
 
     def check(self) -> None:

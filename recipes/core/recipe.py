@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.checks import check_fields
-from torchrl_tit.settings.choices import ImageLayout
+from torchrl_tit.settings.choices import Device, ImageLayout
 from torchrl_tit.settings.literals import parse_assignments, parse_call
 from torchrl_tit.settings.numbers import Episodes, Seed, Steps, Threads
 from torchrl_tit.settings.parts import Names
@@ -62,8 +62,8 @@ class Recipe:
     """Order of an image's dimensions, for images whose sizes do not determine it."""
     seed: Seed = 0
     """Seed of the networks, the environments and the order of minibatches."""
-    device: Literal["cpu", "cuda", "auto"] = "cpu"
-    """Device of the networks; "auto" is the GPU if there is one."""
+    device: Device = "cpu"
+    """Device of the networks: cpu, cuda, cuda:1, mps, ...; "auto" is the GPU if there is one."""
     threads: Threads = 1
     """PyTorch's CPU threads; small networks are fastest with one."""
     log_interval: Steps = 1

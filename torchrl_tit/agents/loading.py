@@ -10,7 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from torchrl_tit.agents.folder import AgentError, is_agent, read_agent
 from torchrl_tit.agents.hub import PREFIX, download
 from torchrl_tit.settings import resolve
 from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.choices import Device
 
 _PACKAGED = Path(__file__).parent
 _EPISODES = 100
@@ -152,9 +153,7 @@ def agent_names() -> list[str]:
     return sorted(path.name for path in _PACKAGED.iterdir() if is_agent(path))
 
 
-def load_agent(
-    source: str | os.PathLike[str], *, device: Literal["cpu", "cuda", "auto"] = "cpu"
-) -> TrainedAgent:
+def load_agent(source: str | os.PathLike[str], *, device: Device = "cpu") -> TrainedAgent:
     """Loads a trained agent. Nothing in its files is executed.
 
     Args:

@@ -173,12 +173,12 @@ def sinusoids(positions: Tensor, dim: int) -> Tensor:
         dim: number of entries of an encoding.
 
     Returns:
-        float [P, dim], of the default type: sines, then cosines.
+        float [P, dim], of the default type, on the device of the positions: sines, then cosines.
 
     Example:
         >>> sinusoids(torch.arange(2), 4)[0].tolist()
         [0.0, 0.0, 1.0, 1.0]
     """
-    frequencies = 10_000 ** (-torch.arange(0, dim, 2) / dim)
+    frequencies = 10_000 ** (-torch.arange(0, dim, 2, device=positions.device) / dim)
     angles = positions[:, None] * frequencies
     return torch.cat([angles.sin(), angles.cos()], dim=-1)[:, :dim]

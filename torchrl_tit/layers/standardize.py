@@ -1,7 +1,8 @@
-"""Standard scores, with the small number that keeps a division by a deviation finite."""
+"""Standard scores: the small number that keeps a division finite, and the type of sums."""
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 
@@ -19,8 +20,17 @@ def standardize(x: Tensor, mean: Tensor | float, std: Tensor, eps: float) -> Ten
         eps: is added to the deviation.
 
     Example:
-        >>> import torch
         >>> standardize(torch.tensor([3.0, 0.5]), 0.0, torch.tensor([2.0, 0.0]), eps=1e-3)
         tensor([  1.4993, 500.0000])
     """
     return (x - mean) / (std + eps)
+
+
+def widest_float(device: torch.device) -> torch.dtype:
+    """The widest float type of a device: float64, or float32 on Apple's "mps", which lacks it.
+
+    Example:
+        >>> widest_float(torch.device("mps"))
+        torch.float32
+    """
+    return torch.float32 if device.type == "mps" else torch.float64

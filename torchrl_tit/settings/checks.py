@@ -167,6 +167,8 @@ def _reason(name: str, value: object, kind: Any, error: str) -> str:
             continue
         if bounds.description is not None and isinstance(value, int | float | list | tuple):
             return f"{name} must be {bounds.description}, not {value}"
+        if bounds.pattern is not None and isinstance(value, str):
+            return f"{name} must be {bounds.description}, not {value!r}"
         if not isinstance(value, int | float):
             continue
         if bounds.gt == 0 and not value > 0:

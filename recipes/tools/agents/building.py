@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -15,6 +15,7 @@ from torchrl_tit.agents import AgentError, TrainedAgent
 from torchrl_tit.agents.folder import RECIPE, AgentFiles
 from torchrl_tit.checkpoint import latest_step
 from torchrl_tit.evaluation_file import read_evaluation
+from torchrl_tit.settings.choices import Device
 
 from ...core.algorithm import Algorithm, load_weights, make_algorithm
 from ...core.recipe import Recipe
@@ -22,8 +23,6 @@ from ...core.recipe_json import recipe_from_json, recipe_to_json
 from ...core.run import Run
 from ...core.runner import load_trained
 from ...decision_transformer import SequenceRecipe
-
-Device = Literal["cpu", "cuda", "auto"]
 
 
 def agent_from_files(files: AgentFiles, name: str, device: Device) -> TrainedAgent:

@@ -38,8 +38,8 @@ def find_unmet_needs(jobs: Iterable[Job]) -> list[str]:
 class RayWorker:
     """A run on a machine of the cluster; it waits in Ray's queue until one has room for it.
 
-    It takes as many CPUs as the recipe has threads, and a GPU if the recipe's device is "cuda",
-    or "auto" and the cluster has GPUs.
+    It takes as many CPUs as the recipe has threads, and a GPU if the recipe's device is "cuda" or
+    one of its GPUs, or "auto" and the cluster has GPUs.
 
     Args:
         job: the run.
@@ -96,7 +96,8 @@ def _needs(job: Job) -> dict[str, int]:
     import ray
 
     device = job.recipe.device
-    gpu = device == "cuda" or (device == "auto" and ray.cluster_resources().get("GPU", 0) > 0)
+    some = device == "auto" and ray.cluster_resources().get("GPU", 0) > 0
+    gpu = some or device.startswith("cuda")
     return {"CPU": job.recipe.threads, "GPU": int(gpu)}
 
 

@@ -165,7 +165,10 @@ def test_wrong_types_and_unknown_options(option, capsys, tmp_path, monkeypatch):
         ),
         ({"backbone": {"network": ["mlp"]}}, r"unknown field 'backbone\.network'"),
         ({"epochs": 1e30}, r"epochs must be at most 1000000000000, not 1e\+30"),
-        ({"device": "tpu"}, r"field 'device' is 'tpu', not one of \('cpu', 'cuda', 'auto'\)"),
+        (
+            {"device": "GPU 1"},
+            r"device must be auto or a device of PyTorch, such as .* not 'GPU 1'",
+        ),
     ],
 )
 def test_json_with_wrong_fields_is_refused(change, message):
