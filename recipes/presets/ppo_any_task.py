@@ -6,7 +6,7 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import lstm, mlp
 
 from .ppo_settings import PPO_SETTINGS, reliable_tit
-from .preset import PPO, Preset
+from .preset import PPO, NovelPPO, Preset
 
 # The task determines the patches, and the encoders of several observations.
 _NETWORKS: dict[str, Network] = {
@@ -17,9 +17,11 @@ _NETWORKS: dict[str, Network] = {
 }
 
 ANY_TASK_RECIPES: dict[str, Preset] = {
-    f"ppo/{network}": PPO(
-        name=f"ppo/{network}", env="CartPole-v1", backbone=backbone, **PPO_SETTINGS
+    f"ppo/{network}{ending}": make(
+        name=f"ppo/{network}{ending}", env="CartPole-v1", backbone=backbone, **PPO_SETTINGS
     )
+    for ending, make in (("", PPO), ("-noveld", NovelPPO))
     for network, backbone in _NETWORKS.items()
 }
-"""The recipes by name; without ``--env`` they train on CartPole."""
+"""The recipes by name; without ``--env`` they train on CartPole. Those whose names end in "-noveld"
+have a bonus for what is new, for tasks that give a reward seldom."""
