@@ -24,6 +24,7 @@ from recipes.core.run import Run
 from recipes.core.runner import evaluate
 from recipes.core.task import make_task, seed_copies
 from recipes.dqn import DQN
+from recipes.novelty import NovelPPO
 from recipes.ppo import PPO
 from recipes.sac import SAC
 from tests.envs import tasks
@@ -72,6 +73,7 @@ DQN_RECIPE = DQN(env="CartPole-v1", backbone=TIT, buffer_size=64, slice_length=4
 IMAGES = ("minigrid.wrappers:ImgObsWrapper",)
 RECIPES: dict[str, Recipe] = {
     "CartPole": PPO_RECIPE,
+    "novelty": NovelPPO(**vars(PPO_RECIPE)),
     "recurrent": replace(PPO_RECIPE, backbone=lstm(embed_dim=8, hidden_dim=8, features_dim=8)),
     "MuJoCo": replace(PPO_RECIPE, env="Hopper-v5", backbone=mlp()),
     "ale_py": replace(PPO_RECIPE, env="ALE/Breakout-v5", backbone=nature_cnn()),

@@ -90,3 +90,29 @@ ACTIONS = {
 }
 for name, space in ACTIONS.items():
     gymnasium.register(f"{name}Actions-v0", f"{__name__}:Mixed", kwargs={"action_space": space})
+
+
+class Corridor(gymnasium.Env):
+    """One step to the left or to the right at a time; a reward at the far end alone."""
+
+    action_space = Discrete(2)
+    observation_space = Box(0, 1, (1,), np.float32)
+
+    def __init__(self, length: int = 24) -> None:
+        self.length = length
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed, options=options)
+        self.place = 0
+        return self._observed(), {}
+
+    def step(self, action):
+        self.place = max(0, self.place + (1 if action else -1))
+        arrived = self.place == self.length
+        return self._observed(), float(arrived), arrived, False, {}
+
+    def _observed(self):
+        return np.array([self.place / self.length], np.float32)
+
+
+gymnasium.register("Corridor-v0", f"{__name__}:Corridor", max_episode_steps=40)
