@@ -196,6 +196,7 @@ _MODULES = {
     "iql": "iql",
     "odt": "online_decision_transformer",
     "ppo": "ppo",
+    "ppo-gsde": "gsde",
     "ppo-noveld": "novelty",
     "sac": "sac",
     "td3bc": "td3bc",

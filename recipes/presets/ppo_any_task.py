@@ -6,7 +6,7 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import lstm, mlp
 
 from .ppo_settings import PPO_SETTINGS, reliable_tit
-from .preset import PPO, NovelPPO, Preset
+from .preset import PPO, NovelPPO, Preset, SmoothPPO
 
 # The task determines the patches, and the encoders of several observations.
 _NETWORKS: dict[str, Network] = {
@@ -16,12 +16,18 @@ _NETWORKS: dict[str, Network] = {
     "lstm": lstm(),
 }
 
+# The ending of the name, the algorithm, and the task without --env.
+_ALGORITHMS = {
+    "": (PPO, "CartPole-v1"),
+    "-noveld": (NovelPPO, "CartPole-v1"),  # a bonus for what is new, where rewards are rare
+    "-gsde": (SmoothPPO, "Pendulum-v1"),  # smooth noise, for continuous actions
+}
+
 ANY_TASK_RECIPES: dict[str, Preset] = {
     f"ppo/{network}{ending}": make(
-        name=f"ppo/{network}{ending}", env="CartPole-v1", backbone=backbone, **PPO_SETTINGS
+        name=f"ppo/{network}{ending}", env=env, backbone=backbone, **PPO_SETTINGS
     )
-    for ending, make in (("", PPO), ("-noveld", NovelPPO))
+    for ending, (make, env) in _ALGORITHMS.items()
     for network, backbone in _NETWORKS.items()
 }
-"""The recipes by name; without ``--env`` they train on CartPole. Those whose names end in "-noveld"
-have a bonus for what is new, for tasks that give a reward seldom."""
+"""The recipes by name."""
