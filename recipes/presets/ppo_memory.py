@@ -1,9 +1,9 @@
-"""The named recipes of tasks that require memory, for four kinds of memory.
+"""The named recipes of tasks that require memory, for seven kinds of memory.
 
 All networks have the same frame encoder and about the same number of weights, and train with the
 same PPO settings on all tasks, but for a few fields in T-Mazes. They differ in how they remember:
-the last four observations side by side, a recurrent state, a gated transformer over the last K
-observations, and TIT's outer blocks.
+the last four observations side by side, a recurrent state (four kinds), a gated transformer over
+the last K observations, and TIT's outer blocks.
 docs/results/memory.md describes how the settings were found, and the results.
 """
 
@@ -12,7 +12,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from torchrl_tit.settings import LSTM, MLP, GTrXL, Inner, Network
+from torchrl_tit.settings import (
+    LSTM,
+    MLP,
+    GatedDeltaNet,
+    GTrXL,
+    HistorySettings,
+    Inner,
+    Mamba2,
+    MinGRU,
+    Network,
+)
 
 from .ppo_settings import PPO_SETTINGS, reliable_tit
 from .preset import PPO, Preset
@@ -51,6 +61,15 @@ VIEW = (
 """The wrappers of MiniGrid: a picture of tiles of 8 pixels, and three actions."""
 
 
+_RECURRENT: dict[str, HistorySettings] = {
+    "lstm": LSTM(hidden_dim=64),
+    "mingru": MinGRU(num_blocks=2),
+    "gated-deltanet": GatedDeltaNet(num_blocks=2),
+    "mamba2": Mamba2(num_blocks=2),
+}
+"""The history encoders that carry a state."""
+
+
 def _t_maze_settings(length: int) -> dict[str, Any]:
     """Sequences as long as an episode, so that an LSTM's gradient reaches the cue.
 
@@ -69,10 +88,10 @@ def _t_maze_settings(length: int) -> dict[str, Any]:
 
 
 def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[str, Network]:
-    """Returns the four memories by name.
+    """Returns the memories by name.
 
     Args:
-        num_frames: number K of observations; ``frames-4`` and ``lstm`` do not use it.
+        num_frames: number K of observations; it counts for attention only.
         patch_size: pixels along a side of an image's patch; an array is one patch.
     """
     patch: dict[str, Any] = {"patch_size": patch_size or "auto", "patch_weights": "own"}
@@ -82,7 +101,10 @@ def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[s
     last = Inner(every_block=False, **patch)
     return {
         "frames-4": replace(tit, frame=last, history=MLP(hidden_dim=96), num_frames=4),
-        "lstm": replace(tit, frame=last, history=LSTM(hidden_dim=64), num_frames=1),
+        **{
+            name: replace(tit, frame=last, history=history, num_frames=1)
+            for name, history in _RECURRENT.items()
+        },
         "gtrxl": replace(tit, frame=last, history=GTrXL(num_blocks=1, num_heads=1)),
         "enhanced-tit": tit,
     }

@@ -155,7 +155,8 @@ class RecurrentEncoder(HistoryEncoder):
             is_init: bool [*B, 1], True where an episode begins.
 
         Returns:
-            float [*B, E], and the state after each step.
+            float [*B, E], and the state after each step; in a sequence, only that of its last step
+            need be right.
         """
         raise NotImplementedError
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from torchrl_tit.settings.numbers import Count, Probability, Real, Steps, Width
+from torchrl_tit.settings.numbers import Count, CountOrNone, Probability, Real, Steps, Width
 from torchrl_tit.settings.parts import Part
 
 __all__ = [
@@ -25,9 +25,14 @@ __all__ = [
     "Flat",
     "FrameSettings",
     "GTrXL",
+    "GatedDeltaNet",
     "HistorySettings",
     "Inner",
     "Linear",
+    "LinearRecurrentSettings",
+    "Mamba2",
+    "MatrixMemorySettings",
+    "MinGRU",
     "NatureCNNFrames",
     "OFENet",
     "Outer",
@@ -343,6 +348,67 @@ class LSTM(RecurrentSettings, name="lstm", builds="torchrl_tit.histories.recurre
 @dataclass(frozen=True, kw_only=True)
 class GRU(RecurrentSettings, name="gru", builds="torchrl_tit.histories.recurrent:GRU"):
     """A GRU. It carries its state through the episode if it reads one frame, else starts at 0."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearRecurrentSettings(HistorySettings):
+    """Settings of recurrent blocks that read whole sequences at once.
+
+    If they read one frame, they carry their state through the episode; otherwise it starts at 0.
+    """
+
+    is_recurrent = True
+
+    num_blocks: Count = 2
+    """Number of blocks."""
+    ffn_expansion: CountOrNone = 2
+    """Hidden width of a block's gated FFN as a multiple of the width; 0 for blocks without one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MinGRU(
+    LinearRecurrentSettings,
+    name="mingru",
+    builds="torchrl_tit.histories.linear_recurrent:MinGRU",
+):
+    """minGRU (arXiv 2410.01201): a GRU whose gate does not read the state."""
+
+    expansion: Count = 2
+    """Size of a block's state as a multiple of the width."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatrixMemorySettings(LinearRecurrentSettings):
+    """Settings of recurrent blocks whose state is a matrix for each head."""
+
+    num_heads: Count = 2
+    """Heads of a block."""
+    key_dim: Width = 16
+    """Size of a head's keys and queries, by which its state is written and read."""
+    value_dim: Width = 32
+    """Size of a head's values. A state has num_heads x key_dim x value_dim entries in a block."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GatedDeltaNet(
+    MatrixMemorySettings,
+    name="gated-deltanet",
+    builds="torchrl_tit.histories.linear_recurrent:GatedDeltaNet",
+):
+    """Gated DeltaNet (arXiv 2412.06464): it replaces the value that is stored under a key."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mamba2(
+    MatrixMemorySettings,
+    name="mamba2",
+    builds="torchrl_tit.histories.linear_recurrent:Mamba2",
+):
+    """Mamba-2 (arXiv 2405.21060): a state space whose decay depends on the step."""
+
+    ffn_expansion: CountOrNone = 0
+    """Hidden width of a block's gated FFN as a multiple of the width; 0, as in the paper, for
+    blocks without one."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,10 +18,13 @@ from torchrl_tit.settings.encoders import (
     DecisionTransformer,
     Flat,
     FrameSettings,
+    GatedDeltaNet,
     GTrXL,
     HistorySettings,
     Inner,
     Linear,
+    Mamba2,
+    MinGRU,
     OFENet,
     Outer,
     PairedOuter,
@@ -373,6 +376,39 @@ def gru(
     )
 
 
+def mingru(num_frames: int = 1, *, embed_dim: int = 64, **hyperparameters: Any) -> Network:
+    """MinGRU: like :func:`lstm`, with minGRU, which trains on whole sequences at once.
+
+    Args:
+        num_frames: if 1, the state is carried through the episode; if more, it starts at 0.
+        embed_dim: width of a token and of the blocks.
+        **hyperparameters: fields of :class:`MinGRU`.
+    """
+    return replace(lstm(num_frames, embed_dim=embed_dim), history=MinGRU(**hyperparameters))
+
+
+def gated_deltanet(num_frames: int = 1, *, embed_dim: int = 64, **hyperparameters: Any) -> Network:
+    """Gated DeltaNet: like :func:`mingru`, with an associative memory as its state.
+
+    Args:
+        num_frames: if 1, the state is carried through the episode; if more, it starts at 0.
+        embed_dim: width of a token and of the blocks.
+        **hyperparameters: fields of :class:`GatedDeltaNet`.
+    """
+    return replace(lstm(num_frames, embed_dim=embed_dim), history=GatedDeltaNet(**hyperparameters))
+
+
+def mamba2(num_frames: int = 1, *, embed_dim: int = 64, **hyperparameters: Any) -> Network:
+    """Mamba-2: like :func:`mingru`, with a state space as its state.
+
+    Args:
+        num_frames: if 1, the state is carried through the episode; if more, it starts at 0.
+        embed_dim: width of a token and of the blocks.
+        **hyperparameters: fields of :class:`Mamba2`.
+    """
+    return replace(lstm(num_frames, embed_dim=embed_dim), history=Mamba2(**hyperparameters))
+
+
 def decision_transformer(
     num_frames: int = 20, *, embed_dim: int = 128, **hyperparameters: Any
 ) -> Network:
@@ -449,10 +485,13 @@ NETWORKS: dict[str, Callable[..., Network]] = {
     "d2rl": d2rl,
     "lstm": lstm,
     "gru": gru,
+    "mingru": mingru,
+    "gated-deltanet": gated_deltanet,
+    "mamba2": mamba2,
     "decision-transformer": decision_transformer,
     "dt-tit": dt_tit,
 }
-"""The systems of the paper, GTrXL, LSTM and GRU by name: each is a pair of encoders."""
+"""The systems of the paper, GTrXL and recurrent networks by name: each is a pair of encoders."""
 
 
 def _on_images(

@@ -24,6 +24,8 @@ Widths = Annotated[
 """Widths of the layers of a network."""
 Count = Annotated[int, Meta(ge=1, le=1000)]
 """Blocks, layers, heads or multiples of a width."""
+CountOrNone = Annotated[int, Meta(ge=0, le=1000)]
+"""Multiples of a width, where 0 leaves a part out."""
 Frames = Annotated[int, Meta(ge=1, le=10_000)]
 """Observations of a history."""
 Steps = Annotated[int, Meta(ge=1, le=10**12)]
