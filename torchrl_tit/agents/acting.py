@@ -99,7 +99,7 @@ class Actor:
             else:  # also resets the copies in which an episode begins
                 _, steps = self._env.step_and_maybe_reset(self._steps)
             self._steps = self._policy(steps)
-        action = self._to_task(self._steps["action"].numpy(force=True))
+        action = self._to_task(self._steps["action"].cpu()).numpy()
         self._begins = torch.zeros_like(self._begins)
         return action if self._batched else action[0]
 
@@ -118,7 +118,7 @@ class Actor:
         self._batched = first.ndim > ndim
         copies = len(first) if self._batched else 1
         writer = getattr(base, "action_writer", None)
-        self._to_task: Callable[[NDArray], NDArray] = writer or (lambda action: action)
+        self._to_task: Callable[[Tensor], Tensor] = writer or (lambda action: action)
         self._env = _given(base, transforms, lambda begins: self._given, copies)
         self._begins = torch.zeros(copies, 1, dtype=torch.bool)
         self._last: dict[str, Tensor] = {}
