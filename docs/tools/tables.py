@@ -321,7 +321,7 @@ def measure(text: str, path: str) -> str:
     Raises:
         ValueError: if it is no measure, or there is no such run.
     """
-    words, _, of = text.partition(" @ ")
+    words, _, of = (part.strip() for part in text.partition("@"))
     name, _, rest = words.partition(" ")
     name, _, digits = name.partition(".")
     if name in ("median", "ratio", "spread"):
