@@ -22,9 +22,12 @@ from torchrl_tit.settings import (
     ChainedOuter,
     CoBERL,
     Flat,
+    GatedDeltaNet,
     GTrXL,
     Inner,
     Linear,
+    Mamba2,
+    MinGRU,
     Outer,
     PairedOuter,
 )
@@ -70,7 +73,9 @@ def test_what_precedes_an_episode_and_what_is_hidden(padding, step_by_step):
     assert difference(policy, task, step_by_step=step_by_step) < 1e-5
 
 
-@pytest.mark.parametrize("history", [LSTM(hidden_dim=4), GRU(hidden_dim=4)])
+@pytest.mark.parametrize(
+    "history", [LSTM(hidden_dim=4), GRU(hidden_dim=4), MinGRU(), GatedDeltaNet(), Mamba2()]
+)
 def test_recurrent_states(history):
     policy, task = make_policy(history=history, num_frames=1)
     assert program_of(policy, task).state[0] == "recurrent_state_h"

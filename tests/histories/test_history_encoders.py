@@ -22,6 +22,9 @@ ONE_TOKEN: list[HistorySettings] = [
     settings.Catformer(num_heads=2),
     settings.CoBERL(num_heads=2, hidden_dim=5),
     settings.LSTM(hidden_dim=5),
+    settings.MinGRU(),
+    settings.GatedDeltaNet(),
+    settings.Mamba2(),
     settings.GTrXL(num_heads=2),
 ]
 

@@ -19,10 +19,11 @@ N, T, H = 3, 12, 6
 TRUNKS = ["shared", "separate"]
 
 
-def make_backbone(trunks="shared", shape=(2,), num_frames=1):
-    network = settings.NETWORKS["lstm"](num_frames, embed_dim=8, hidden_dim=H, features_dim=5)
+def make_backbone(trunks="shared", name="lstm"):
+    sizes = {"hidden_dim": H, "features_dim": 5} if name == "lstm" else {}
+    network = settings.NETWORKS[name](embed_dim=8, **sizes)
     out_keys = ["features"] if trunks == "shared" else ["policy", "value"]
-    return Backbone(build_network(network, shape, trunks=trunks), out_keys=out_keys)
+    return Backbone(build_network(network, (2,), trunks=trunks), out_keys=out_keys)
 
 
 def sequences(backbone):
@@ -31,16 +32,19 @@ def sequences(backbone):
     is_init[0, 0], is_init[1, 5] = False, True
     states = {key: torch.randn(N, T, *shape) for key, shape in backbone.state_shapes.items()}
     td = TensorDict({"history": torch.randn(N, T, 1, 2), "is_init": is_init, **states}, [N, T])
-    for key in states:
-        td[key] *= ~is_init.unsqueeze(-1)
+    for state in states.values():
+        state[is_init.squeeze(-1)] = 0
     return td
 
 
 @pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize("trunks", TRUNKS)
+@pytest.mark.parametrize(
+    ("trunks", "name"),
+    [("shared", "lstm"), ("separate", "lstm"), ("separate", "mingru"), ("shared", "mamba2")],
+)
 @torch.no_grad()
-def test_sequences_equal_single_steps(trunks):
-    backbone = make_backbone(trunks)
+def test_sequences_equal_single_steps(trunks, name):
+    backbone = make_backbone(trunks, name)
     td = sequences(backbone)
     with set_recurrent_mode(True):
         whole = backbone(td.clone())
@@ -55,10 +59,8 @@ def test_sequences_equal_single_steps(trunks):
             torch.testing.assert_close(step[key], whole[key][:, t], rtol=0, atol=1e-9)
         for key in states:
             states[key] = step["next", key]
-            last = t == T - 1 or td["is_init"][:, t + 1].squeeze(-1)
-            ends = torch.as_tensor(last).expand(N)
-            computed = whole["next", key][:, t][ends]  # the states that sequences end with
-            torch.testing.assert_close(states[key][ends], computed, rtol=0, atol=1e-9)
+    for key, state in states.items():  # the states that sequences end with
+        torch.testing.assert_close(state, whole["next", key][:, -1], rtol=0, atol=1e-9)
     assert set(backbone.out_keys) == {*backbone.features_keys, *(("next", key) for key in states)}
 
 
@@ -68,6 +70,9 @@ def test_sequences_equal_single_steps(trunks):
         ("lstm", "shared", 1),
         ("lstm", "separate", 1),
         ("gru", "separate", 1),
+        ("mingru", "shared", 1),
+        ("gated-deltanet", "separate", 1),
+        ("mamba2", "shared", 1),
         ("lstm", "shared", 4),
         ("enhanced-tit", "shared", 4),
     ],

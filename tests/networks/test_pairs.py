@@ -62,6 +62,9 @@ HISTORIES: dict[str, HistorySettings] = {
     "gtrxl": settings.GTrXL(**BLOCKS, num_blocks=1),
     "lstm": settings.LSTM(hidden_dim=WIDTH),
     "gru": settings.GRU(hidden_dim=WIDTH),
+    "mingru": settings.MinGRU(),
+    "gated-deltanet": settings.GatedDeltaNet(key_dim=4, value_dim=4),
+    "mamba2": settings.Mamba2(key_dim=4, value_dim=4),
     "decision-transformer": settings.DecisionTransformer(
         num_blocks=2, num_heads=2, ffn_dim=WIDTH, max_ep_len=10
     ),

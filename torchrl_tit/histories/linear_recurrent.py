@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import normalize, silu, softplus
+from torch.nn.functional import silu, softplus
 from torchrl.modules import recurrent_mode
 
 from torchrl_tit import settings
@@ -51,7 +51,9 @@ class LinearRecurrentEncoder(RecurrentEncoder):
         """Tokens of K frames, float [..., K, L, D] -> those after the last, float [..., D]."""
         x = self.one_token(tokens)  # [..., K, D]
         sequences = x.reshape(-1, *x.shape[-2:])
-        state = {key: x.new_zeros(len(sequences), *size) for key, size in self.state_shapes.items()}
+        state = {
+            key: x.new_zeros(sequences.shape[0], *size) for key, size in self.state_shapes.items()
+        }
         is_init = torch.zeros(sequences.shape[:2], dtype=torch.bool, device=x.device)
         outputs, _ = self.read(sequences, state, is_init)
         return outputs[:, -1].reshape(*x.shape[:-2], self.out_features)
@@ -199,8 +201,9 @@ class _MatrixMixer(_Mixer):
             "recurrent_state_h": (heads, settings.key_dim, settings.value_dim),
             "recurrent_state_inputs": self.convolution.state_shape,
         }
-        self.log_a = nn.Parameter(torch.zeros(heads))
-        self.rate_bias = nn.Parameter(_rates(heads).expm1().log())
+        # The rates start at 0.5, also those of slow heads, which would otherwise hardly be written.
+        self.rate_bias = nn.Parameter(torch.full((heads,), 0.5).expm1().log())
+        self.log_a = nn.Parameter((_rates(heads) / 0.5).log())
         self.output = nn.Linear(values, width, bias=False)
 
     def rates(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -232,7 +235,7 @@ class _GatedDeltaMixer(_MatrixMixer):
         keys = self.num_heads * self.key_dim
         query, key, value = map(self.heads, x.split([keys, keys, x.shape[-1] - 2 * keys], dim=-1))
         _, log_decay = self.rates(rate)
-        query, key = normalize(query, dim=-1) * self.key_dim**-0.5, normalize(key, dim=-1)
+        query, key = _unit(query) * self.key_dim**-0.5, _unit(key)
         output, memory = scan_matrices(query, key, value, log_decay, is_init, memory, beta)
         output = self.norm(output).transpose(1, 2).flatten(-2) * silu(gate)
         return self.output(output), [memory, before]
@@ -247,8 +250,9 @@ class GatedDeltaNet(LinearRecurrentEncoder):
 
     q, k and v are projections of x through a convolution over four steps and SiLU; q and k have
     length 1 (q then 1 / sqrt(K)). Yang et al., "Gated Delta Networks: Improving Mamba2 with Delta
-    Rule", arXiv 2412.06464, section 3 and figure 1. The heads start to forget after 2 to 1,000
-    steps, evenly spaced (drawn at random in the paper, which has many heads).
+    Rule", arXiv 2412.06464, section 3 and figure 1. The softplus starts at 0.5, and A so that the
+    heads forget over 2 to 1,000 steps, evenly spaced (in the paper, which has many heads, both are
+    drawn at random).
 
     Args:
         settings: blocks, heads, and sizes of keys and values.
@@ -302,8 +306,8 @@ class Mamba2(LinearRecurrentEncoder):
 
     x, B and C are projections of the input u through a convolution over four steps and SiLU; B and
     C are shared by all heads. Dao and Gu, "Transformers are SSMs", arXiv 2405.21060, sections 6 and
-    7. ``key_dim`` and ``value_dim`` are the paper's N and P. The heads start with rates r of 0.001
-    to 0.5, evenly spaced, and A = 1 (drawn at random in the paper, which has many heads).
+    7. ``key_dim`` and ``value_dim`` are the paper's N and P. Rates and A start as in
+    :class:`GatedDeltaNet`.
 
     Args:
         settings: blocks, heads, and sizes of keys and values.
@@ -316,6 +320,11 @@ class Mamba2(LinearRecurrentEncoder):
     """
 
     mixer = _Mamba2Mixer
+
+
+def _unit(x: Tensor) -> Tensor:
+    """Scales vectors to length 1, or less if they are shorter than about 0.001."""
+    return x * (x.square().sum(-1, keepdim=True) + 1e-6).rsqrt()
 
 
 def _rates(count: int) -> Tensor:

@@ -12,6 +12,7 @@ from recipes.ppo import PPO, PPOAlgorithm
 from tests.numerics import assert_near
 from tests.recipes.small import train
 from torchrl_tit.rollout import FrameCollector, Rollout
+from torchrl_tit.settings import HistorySettings
 from torchrl_tit.settings.networks import lstm
 
 RECIPE = PPO(
@@ -30,11 +31,14 @@ RECIPE = PPO(
 )
 
 
-@pytest.fixture
-def batch():
+@pytest.fixture(params=["lstm", "mingru", "gated-deltanet", "mamba2"])
+def batch(request):
     """A batch of 200 steps of 2 environments, and the algorithm whose policy took them."""
     torch.manual_seed(0)
-    algorithm = PPOAlgorithm(replace(RECIPE, steps_per_batch=400))
+    backbone = RECIPE.backbone
+    if request.param != "lstm":
+        backbone = replace(backbone, history=HistorySettings.get(request.param)())
+    algorithm = PPOAlgorithm(replace(RECIPE, backbone=backbone, steps_per_batch=400))
     algorithm.gae = GAE(gamma=0.99, lmbda=0.95, value_network=None)
     algorithm.model.eval()
     env = algorithm.make_env(2, seed=0, keep_histories=False)
@@ -61,9 +65,9 @@ def test_the_next_values_know_the_state_before_them(batch):
     following = model.critic(model.backbone(states.clone()))
     algorithm.advantages(batch, Rollout(batch, 1, "same"))
     terminated, next_value = batch["next", "terminated"], batch["next", "state_value"]
-    torch.testing.assert_close(next_value, following["state_value"].masked_fill(terminated, 0))
+    assert_near(next_value, following["state_value"].masked_fill(terminated, 0))
     forgetful = states
-    for key in ("recurrent_state_h", "recurrent_state_c"):
+    for key in model.backbone.state_shapes:
         forgetful[key] = torch.zeros_like(forgetful[key])
     forgetful = model.critic(model.backbone(forgetful))["state_value"]
     assert (next_value - forgetful)[~terminated].abs().max() > 1e-3
