@@ -67,7 +67,8 @@ def floats(batch: TensorDict) -> TensorDict:
 PADDINGS: list[Any] = ["same", "constant"]
 READS = ["steps", *PADDINGS, "observations", *(["histories"] if COMPUTES else [])]
 # TorchRL's GRUModule looks whether an episode begins.
-CARRIED = [case for case in pairs.CASES if case[1] in ("lstm", *(["gru"] if COMPUTES else []))]
+MEMORIES = ("lstm", "mingru", "gated-deltanet", "mamba2", *(["gru"] if COMPUTES else []))
+CARRIED = [case for case in pairs.CASES if case[1] in MEMORIES]
 
 
 @pairs.every_case
@@ -104,7 +105,7 @@ ACTING = [*((case, 3) for case in pairs.CASES), *((case, 1) for case in CARRIED)
 
 @pytest.mark.parametrize(("case", "frames"), ACTING, ids=str)
 def test_policies_act(case: pairs.Pair, frames: int) -> None:
-    """With kept tokens; with one frame, an LSTM's and a GRU's state is carried."""
+    """With kept tokens; with one frame, a recurrent network's state is carried."""
     network = pairs.build(case, num_frames=frames).to(DEVICE)
     context = network.history_encoder.context
     backbone = Backbone(network, [*history_keys(pairs.CASES[case]), *context])

@@ -63,9 +63,9 @@ VIEW = (
 
 _RECURRENT: dict[str, HistorySettings] = {
     "lstm": LSTM(hidden_dim=64),
-    "mingru": MinGRU(num_blocks=2),
-    "gated-deltanet": GatedDeltaNet(num_blocks=2),
-    "mamba2": Mamba2(num_blocks=2),
+    "mingru": MinGRU(),
+    "gated-deltanet": GatedDeltaNet(value_dim=24),
+    "mamba2": Mamba2(num_heads=4, value_dim=28),
 }
 """The history encoders that carry a state."""
 

@@ -71,7 +71,8 @@ def test_the_documented_table() -> None:
     none = {name for name, network in named.items() if zeros in flow_table({name: network})}
     assert none == {"nature-cnn", "resnet", "mlp", "ofenet", "d2rl"}
     named = {name: network for name, network in named.items() if name not in none}
-    for name in ("lstm", "gru", "coberl", "gtrxl", "decision-transformer"):
+    recurrent = ("lstm", "gru", "mingru", "gated-deltanet", "mamba2")
+    for name in (*recurrent, "coberl", "gtrxl", "decision-transformer"):
         del named[name]  # are not on the page
     named |= {
         "enhanced-tit, chained": replace(enhanced_tit(4), history=ChainedOuter()),

@@ -145,7 +145,10 @@ def _read_chunk(
     if beta is not None:
         rest = beta * (value - carried * (key @ state))
         overlap = beta * decay * (key @ key.mT)  # below the diagonal; the rest is not read
-        value = torch.linalg.solve_triangular(overlap, rest, upper=False, unitriangular=True)
+        full = torch.promote_types(rest.dtype, torch.float32)  # it solves in no smaller type
+        value = torch.linalg.solve_triangular(
+            overlap.to(full), rest.to(full), upper=False, unitriangular=True
+        ).to(rest.dtype)
     output = carried * (query @ state) + (decay * (query @ key.mT)) @ value
     state = carried[:, :, -1:] * state + (key * decay[:, :, -1].unsqueeze(-1)).mT @ value
     return output, state
