@@ -13,6 +13,7 @@ BENCHMARKS = [
     "acting",
     "segments",
     "window_tables",
+    "memories",
     "cql",
     "decision_transformer",
     "history_windows",

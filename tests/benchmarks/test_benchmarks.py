@@ -11,7 +11,15 @@ import pytest
 import torch
 from torchrl.modules import set_recurrent_mode
 
-from benchmarks import acting, export, history_windows, measuring, segments, window_tables
+from benchmarks import (
+    acting,
+    export,
+    history_windows,
+    measuring,
+    memories,
+    segments,
+    window_tables,
+)
 from benchmarks.__main__ import BENCHMARKS, main
 from benchmarks.straightforward import Case
 from tests.numerics import assert_near
@@ -78,6 +86,23 @@ def test_window_tables_agree_with_copies(monkeypatch):
     monkeypatch.setattr(window_tables, "read", lambda n, table, x: read(n, table, x) + table)
     with pytest.raises(AssertionError, match="not close"):
         window_tables.main(num_frames=[8], seconds=0)
+
+
+def test_memories_forget_where_an_episode_begins(monkeypatch):
+    names = ["lstm", "mingru", "enhanced-tit"]
+    for name in names:
+        backbone = memories.make_backbone(name, 6).eval()
+        steps = memories.make_sequences(backbone, 6, samples=12)
+        other = steps.clone()
+        other["observation"][:, :2] = other["history"][:, :2] = 1
+        with set_recurrent_mode(True):
+            features = [backbone(x)["features"] for x in (steps, other)]
+        assert_near(features[0][:, 2:], features[1][:, 2:])
+        assert (features[0] - features[1])[:, :2].abs().max() > 1e-3
+    monkeypatch.setattr(memories, "SAMPLES", 12)
+    for row in memories.main([3, 6], names, seconds=0).values():
+        assert len(row) == 4
+        assert all(time > 0 for times in row.values() for time in times)
 
 
 @pytest.mark.slow
