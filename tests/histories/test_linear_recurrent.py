@@ -36,6 +36,11 @@ def build(name: str, tokens: int = 1, frames: int = 1) -> LinearRecurrentEncoder
     return encoder
 
 
+def mixer_of(encoder: LinearRecurrentEncoder) -> Any:
+    """The layer of its first block that reads the past."""
+    return encoder.blocks[0].mixer
+
+
 def draw(encoder: LinearRecurrentEncoder) -> tuple[Tensor, State, Tensor]:
     """Tokens, states before the first step, and where episodes begin: first, last, in a row."""
     is_init = torch.rand(N, T, 1) < 0.2
@@ -152,8 +157,8 @@ def test_long_sequences_neither_overflow_nor_lose_what_is_kept() -> None:
 
 
 def test_mingru_is_the_papers() -> None:
-    encoder = build("mingru")
-    x, (mixer, state) = torch.randn(N, T, D), (encoder.blocks[0].mixer, torch.randn(N, 2 * D))
+    mixer = mixer_of(build("mingru"))
+    x, state = torch.randn(N, T, D), torch.randn(N, 2 * D)
     h, expected = state, []
     for t in range(T):
         z = torch.sigmoid(mixer.gate(x[:, t]) + mixer.gate_bias)
@@ -162,7 +167,7 @@ def test_mingru_is_the_papers() -> None:
     near(mixer(x, [state], torch.zeros(N, T).bool())[0], torch.stack(expected, 1))
 
 
-def of_transformers(name: str) -> tuple[nn.Module, dict[str, str]]:
+def of_transformers(name: str) -> tuple[Any, dict[str, str]]:
     """That library's layer of the same sizes, and the names of its weights here."""
     # Not at the top: it takes seconds to import.
     if name == "mamba2":
@@ -171,11 +176,14 @@ def of_transformers(name: str) -> tuple[nn.Module, dict[str, str]]:
         config = Mamba2Config(
             hidden_size=D, num_heads=2, head_dim=3, expand=1, state_size=4, n_groups=1, chunk_size=8
         )
-        layer = Mamba2Mixer(config, layer_idx=0)
-        return layer, {"skip": "D", "inputs.weight": "in_proj.weight", "norm.weight": "norm.weight"}
+        return Mamba2Mixer(config, layer_idx=0), {
+            "skip": "D",
+            "inputs.weight": "in_proj.weight",
+            "norm.weight": "norm.weight",
+        }
     from transformers.models.olmo_hybrid import modeling_olmo_hybrid as olmo
 
-    config = olmo.OlmoHybridConfig(
+    sizes = olmo.OlmoHybridConfig(
         hidden_size=D,
         linear_num_value_heads=2,
         linear_num_key_heads=2,
@@ -184,8 +192,7 @@ def of_transformers(name: str) -> tuple[nn.Module, dict[str, str]]:
         linear_allow_neg_eigval=False,
     )
     parts = [f"{part}_proj.weight" for part in ("g", "q", "k", "v", "a")]
-    layer = olmo.OlmoHybridGatedDeltaNet(config, layer_idx=0)
-    return layer, {
+    return olmo.OlmoHybridGatedDeltaNet(sizes, layer_idx=0), {
         "beta.weight": "b_proj.weight",
         "inputs.weight": " ".join(parts),
         "norm.weight": "o_norm.weight",
@@ -200,7 +207,7 @@ def test_layers_are_those_of_transformers(name: str) -> None:
     names |= {"output.weight": "out_proj.weight" if name == "mamba2" else "o_proj.weight"}
     if name == "mamba2":
         names["convolution.bias"] = "conv1d.bias"
-    theirs, mixer = layer.state_dict(), build(name).blocks[0].mixer
+    theirs, mixer = layer.state_dict(), mixer_of(build(name))
     weights = {ours: torch.cat([theirs[x] for x in of.split()]) for ours, of in names.items()}
     weights["convolution.weight"] = weights["convolution.weight"].squeeze(1)
     mixer.load_state_dict(weights)
@@ -213,7 +220,7 @@ def test_layers_are_those_of_transformers(name: str) -> None:
 
 @every_memory
 def test_a_new_memory_forgets_over_short_and_long_spans(name: str) -> None:
-    mixer = MEMORIES[name].build(HistoryShape(num_frames=1, num_tokens=1, width=D)).blocks[0].mixer
+    mixer = mixer_of(MEMORIES[name].build(HistoryShape(num_frames=1, num_tokens=1, width=D)))
     if name == "mingru":
         rates = mixer.gate_bias.sigmoid()
     else:

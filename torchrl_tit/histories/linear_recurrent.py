@@ -38,13 +38,13 @@ class LinearRecurrentEncoder(RecurrentEncoder):
     def __init__(self, settings: settings.LinearRecurrentSettings, shape: HistoryShape) -> None:
         super().__init__(shape, out_features=shape.width)
         self.one_token = OneToken(shape)
+        mixers = [self.mixer(shape.width, settings) for _ in range(settings.num_blocks)]
         self.blocks = nn.ModuleList(
-            _Block(self.mixer(shape.width, settings), shape.width, settings.ffn_expansion)
-            for _ in range(settings.num_blocks)
+            _Block(mixer, shape.width, settings.ffn_expansion) for mixer in mixers
         )
         self.state_shapes = {
             key: torch.Size([settings.num_blocks, *size])
-            for key, size in self.blocks[0].mixer.state_shapes.items()
+            for key, size in mixers[0].state_shapes.items()
         }
 
     def forward(self, tokens: Tensor) -> Tensor:

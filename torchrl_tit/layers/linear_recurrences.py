@@ -96,15 +96,22 @@ def scan_matrices(
         >>> output.shape, state.shape
         (torch.Size([2, 3, 100, 4]), torch.Size([2, 3, 8, 4]))
     """
-    steps = (query, key, value, log_decay.unsqueeze(-1))
-    betas = None if beta is None else beta.unsqueeze(-1)
+    log_decay = log_decay.unsqueeze(-1)
+    beta = None if beta is None else beta.unsqueeze(-1)
     if value.shape[2] == 1:
-        return _read_step(*steps, betas, is_init, state)
+        return _read_step(query, key, value, log_decay, beta, is_init, state)
     outputs = []
     for start in range(0, value.shape[2], chunk):
         part = slice(start, start + chunk)
-        *parts, rate = (None if x is None else x[:, :, part] for x in (*steps, betas))
-        output, state = _read_chunk(*parts, rate, is_init[:, part], state)
+        output, state = _read_chunk(
+            query[:, :, part],
+            key[:, :, part],
+            value[:, :, part],
+            log_decay[:, :, part],
+            None if beta is None else beta[:, :, part],
+            is_init[:, part],
+            state,
+        )
         outputs.append(output)
     return torch.cat(outputs, dim=2), state
 
