@@ -99,7 +99,8 @@ def test_runs_of_the_same_second_get_folders_of_their_own(tmp_path, monkeypatch,
     monkeypatch.setattr(time, "strftime", lambda _: "20260101-000000")
     monkeypatch.setattr(runner, "train", lambda *_: None)
     monkeypatch.setattr("recipes.cli.training.plot_run", lambda run: None)
-    evaluation = {"mean": 0, "std": 0, "episodes": 1, "steps": 0, "weights": "last"}
+    evaluation = {"mean": 0, "std": 0, "episodes": 1, "steps": 0, "returns": [0]}
+    evaluation["weights"] = "last"
     monkeypatch.setattr(runner, "evaluate", lambda *_, **__: evaluation)
     for _ in range(3):
         main(["train", "ppo/cartpole/enhanced-tit"])
