@@ -19,6 +19,7 @@ from torchrl_tit.envs import observation_specs
 from torchrl_tit.frames.normalized import NormalizedFrames
 from torchrl_tit.frames.observation import Observations
 from torchrl_tit.layers import init_orthogonal_
+from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.networks import build_network
 from torchrl_tit.settings import MLP, Head, Network
 from torchrl_tit.settings.numbers import Fraction, Weight
@@ -76,7 +77,7 @@ class Novelty(nn.Module):
         layers = MLP(hidden_dim=128, num_layers=2, activation="relu")
         one_frame = replace(network, history=layers, head=Head(features_dim=None), num_frames=1)
         self.target, self.predictor = (
-            build_network(one_frame, observation, trunks="shared") for _ in range(2)
+            trunks_of(build_network(one_frame, observation, trunks="shared"))[""] for _ in range(2)
         )
         for part in (self.target, self.predictor):
             init_orthogonal_(part)
@@ -212,8 +213,9 @@ class NovelPPOAlgorithm(PPOAlgorithm):
         this, after = self._observations(batch), self._observations(following)
         novelty.update(after)
         risen = (novelty(after) - recipe.novelty_alpha * novelty(this)).clamp(min=0)
-        cells = [novelty.cells(observations, recipe.novelty_cell) for observations in (this, after)]
-        bonus = risen.unsqueeze(-1) * self.visits.add(*cells, done)
+        width = recipe.novelty_cell
+        first = self.visits.add(novelty.cells(this, width), novelty.cells(after, width), done)
+        bonus = risen.unsqueeze(-1) * first
         bonus = bonus / (self.bonus_scale.update(bonus, done) + 1e-8)
         batch["bonus"] = recipe.novelty_coeff * bonus
         batch["next", "reward"] = batch["next", "reward"] + batch["bonus"]

@@ -20,6 +20,7 @@ from recipes.core.run import Run
 from recipes.cql import CQL, DiscreteCQL
 from recipes.decision_transformer import DT
 from recipes.dqn import DQN
+from recipes.gsde import SmoothPPO
 from recipes.iql import IQL
 from recipes.online_decision_transformer import ODT
 from recipes.ppo import PPO
@@ -186,6 +187,7 @@ TINY = PPO(
 RECIPES: dict[str, Callable[[Path], Recipe]] = {
     "ppo": lambda folder: PPO(env="CartPole-v1", **_ROLLOUTS),
     "ppo, continuous": lambda folder: PPO(env="Pendulum-v1", **_ROLLOUTS),
+    "ppo, smooth": lambda folder: SmoothPPO(env="Pendulum-v1", **_ROLLOUTS),
     "sac": lambda folder: SAC(env="Pendulum-v1", **_REPLAY),
     "dqn": lambda folder: DQN(env="CartPole-v1", **_REPLAY),
     "bc": partial(make, BC, **_NORMALIZED),

@@ -29,7 +29,16 @@ from torchrl_tit.export.program import make_program
 from torchrl_tit.frames import NormalizedFrames
 
 NOISE = {
-    "standard_normal": ("ppo, continuous", "sac", "bc", "iql", "cql", "odt", "odt, offline"),
+    "standard_normal": (
+        "ppo, continuous",
+        "ppo, smooth",
+        "sac",
+        "bc",
+        "iql",
+        "cql",
+        "odt",
+        "odt, offline",
+    ),
     "gumbel": ("ppo", "bc, discrete", "iql, discrete", "dt, discrete"),
 }
 """With which the actions of policies are drawn that draw them."""

@@ -86,8 +86,8 @@ def test_noise_and_log_probabilities_are_those_by_hand(backbone, float64, monkey
 
 def test_it_trains_and_is_evaluated_without_noise(tmp_path, monkeypatch):
     run = train(RECIPE, tmp_path / "run")
-    _, algorithm, _ = load_trained(run)
-    noise = algorithm.model.actor[0][1].module
+    trained: Any = load_trained(run)[1]
+    noise = trained.model.actor[0][1].module
     assert (noise.gsde.log_sigma.diff(dim=-1) != 0).all()  # they were all the same
     monkeypatch.delattr(StateDependentNoise, "_draw")
     assert evaluate(run)["episodes"] == 2

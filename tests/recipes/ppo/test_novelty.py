@@ -40,7 +40,7 @@ RECIPE = NovelPPO(
 )
 
 
-def bonuses_by_hand(novelty: Novelty, batch: Any, recipe: NovelPPO) -> torch.Tensor:
+def bonuses_by_hand(novelty: Any, batch: Any, recipe: NovelPPO) -> torch.Tensor:
     """The undivided bonuses of a first batch, step by step, [envs, time]."""
     following = batch["next", "observation"].flatten(0, 1)
     mean, deviation = following.mean(0), following.var(0, unbiased=False).add(1e-8).sqrt()
