@@ -33,7 +33,7 @@ from torchrl.modules import TanhModule, set_recurrent_mode
 
 from recipes.core import networks, task
 from recipes.core.recipe import Recipe
-from recipes.ppo import Minibatch
+from recipes.ppo import PPO, Minibatch
 from recipes.replay import _STORED as STORED
 from recipes.replay import ReplayAlgorithm
 from tests.networks import test_pairs as pairs
@@ -202,7 +202,7 @@ def test_updates_of_each_algorithm(
         algorithm.make_collector = lambda *_, **__: None
         algorithm.make_buffer = lambda: SimpleNamespace(newest_return=0.0)
         algorithm.prepare(0, tmp_path)
-        if recipe.algorithm == "ppo":
+        if isinstance(recipe, PPO):
             terms = algorithm._step(batch)
         elif isinstance(algorithm, ReplayAlgorithm):
             terms = algorithm.learn(batch, 0)
@@ -230,7 +230,9 @@ def batch_of(recipe: Recipe, folder: Path) -> Any:
     if isinstance(algorithm, ReplayAlgorithm):
         algorithm.buffer.extend(algorithm.collected(batch).select(*STORED, strict=False))
         batch = algorithm.buffer.sample()
-    if recipe.algorithm == "ppo":
+    if isinstance(recipe, PPO):
+        with torch.no_grad():
+            batch = algorithm.collected(batch)
         rollout = algorithm.rollout(batch)
         algorithm.advantages(batch, rollout)
         steps, frames, windows = next(algorithm.minibatches(batch, rollout))

@@ -22,6 +22,7 @@ from recipes.decision_transformer import DT
 from recipes.dqn import DQN
 from recipes.gsde import SmoothPPO
 from recipes.iql import IQL
+from recipes.novelty import NovelPPO
 from recipes.online_decision_transformer import ODT
 from recipes.ppo import PPO
 from recipes.sac import SAC
@@ -187,6 +188,7 @@ TINY = PPO(
 RECIPES: dict[str, Callable[[Path], Recipe]] = {
     "ppo": lambda folder: PPO(env="CartPole-v1", **_ROLLOUTS),
     "ppo, continuous": lambda folder: PPO(env="Pendulum-v1", **_ROLLOUTS),
+    "ppo, novelty": lambda folder: NovelPPO(env="CartPole-v1", **_ROLLOUTS),
     "ppo, smooth": lambda folder: SmoothPPO(env="Pendulum-v1", **_ROLLOUTS),
     "sac": lambda folder: SAC(env="Pendulum-v1", **_REPLAY),
     "dqn": lambda folder: DQN(env="CartPole-v1", **_REPLAY),
