@@ -7,6 +7,7 @@ new an observation is, is measured by random network distillation (RND, arXiv 18
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -34,8 +35,8 @@ from .ppo import PPO, ActorCritic, Minibatch, PPOAlgorithm
 class NovelPPO(PPO, algorithm="ppo-noveld"):
     """PPO whose rewards include NovelD's exploration bonus; reported returns do not.
 
-    Besides the networks of PPO, there are two small ones for each run: a fixed random one, and one
-    that learns to predict its output. Both have the frame encoder of the recipe's network.
+    Besides the networks of PPO, there is a fixed random one, with a frame encoder like the policy's,
+    and one that learns to predict its output from the same tokens.
     """
 
     novelty_coeff: Weight = 0.5
@@ -55,11 +56,12 @@ class NovelPPO(PPO, algorithm="ppo-noveld"):
 
 
 class Novelty(nn.Module):
-    """A fixed random network, and one that predicts its output where observations are known.
+    """A fixed random network, and layers that predict its output where observations are known.
 
-    Both map an observation to features by the recipe's frame encoder and two layers on its tokens.
-    They read observations normalized to a running mean of 0 and standard deviation of 1 and clipped
-    to +-5 (arXiv 1810.12894, section 2.4), whatever the policy reads.
+    The random network is a frame encoder with the settings of the policy's, and two layers. The
+    predictor is two other layers on the same tokens, as in NovelD, whose encoder is fixed too. Both
+    read observations normalized to a running mean of 0 and standard deviation of 1 and clipped to
+    +-5 (arXiv 1810.12894, section 2.4), whatever the policy reads.
 
     Args:
         network: settings of the policy's network, whose frame encoder is used.
@@ -74,14 +76,14 @@ class Novelty(nn.Module):
 
     def __init__(self, network: Network, observation: Observations) -> None:
         super().__init__()
-        layers = MLP(hidden_dim=128, num_layers=2, activation="relu")
+        # Units that are 0 wherever the agent has been, as of relu, would never learn the target, and
+        # nothing would ever be known.
+        layers = MLP(hidden_dim=128, num_layers=2, activation="tanh")
         one_frame = replace(network, history=layers, head=Head(features_dim=None), num_frames=1)
-        self.target, self.predictor = (
-            trunks_of(build_network(one_frame, observation, trunks="shared"))[""] for _ in range(2)
-        )
-        for part in (self.target, self.predictor):
-            init_orthogonal_(part)
-            normalize_frames(part, limit=5.0)
+        self.target = trunks_of(build_network(one_frame, observation, trunks="shared"))[""]
+        self.predictor = copy.deepcopy(self.target.history_encoder)
+        init_orthogonal_(self)
+        normalize_frames(self.target, limit=5.0)
         self.target.requires_grad_(False)
 
     def train(self, mode: bool = True) -> Novelty:
@@ -90,19 +92,17 @@ class Novelty(nn.Module):
 
     def update(self, observations: Sequence[Tensor]) -> None:
         """Adds observations to the statistics, [..., *observation_shape] each."""
-        for part in (self.target, self.predictor):
-            for frames, seen in zip(part.frames, observations, strict=True):
-                if isinstance(frames, NormalizedFrames):
-                    frames.update(seen.reshape(-1, *frames.observation_shape))
+        for frames, seen in zip(self.target.frames, observations, strict=True):
+            if isinstance(frames, NormalizedFrames):
+                frames.update(seen.reshape(-1, *frames.observation_shape))
 
     def errors(self, observations: Sequence[Tensor]) -> Tensor:
         """Squared errors of the prediction, [..., *observation_shape] each -> float [..., F]."""
-        frames = self.target.frames
-        histories = [
-            seen.unsqueeze(-1 - len(encoder.observation_shape))
-            for seen, encoder in zip(observations, frames, strict=True)
-        ]
-        return (self.predictor(*histories) - self.target(*histories)).square()
+        target, histories = self.target, []
+        for encoder, seen in zip(target.frames, observations, strict=True):
+            histories.append(seen.unsqueeze(-1 - len(encoder.observation_shape)))
+        tokens = target.as_floats(target.encode_frames(*histories))
+        return (self.predictor(tokens) - target.encode_history(tokens)).square()
 
     def forward(self, observations: Sequence[Tensor]) -> Tensor:
         """How new observations are, [..., *observation_shape] each -> float [...]."""

@@ -49,12 +49,10 @@ def bonuses_by_hand(novelty: Any, batch: Any, recipe: NovelPPO) -> torch.Tensor:
         return ((observation - mean) / deviation).clamp(-5, 5)
 
     def how_new(observation: torch.Tensor) -> float:
-        features = []
-        for network in (novelty.target, novelty.predictor):
-            (frames,) = network.frames
-            tokens = frames.encoder(normal(observation))
-            features.append(network.history_encoder(tokens.unsqueeze(0)).tolist())
-        return math.dist(*features)
+        (frames,) = novelty.target.frames
+        tokens = frames.encoder(normal(observation)).unsqueeze(0)
+        target, predicted = novelty.target.history_encoder(tokens), novelty.predictor(tokens)
+        return math.dist(target.tolist(), predicted.tolist())
 
     def cell(observation: torch.Tensor) -> tuple[int, ...]:
         return tuple(math.floor(x / recipe.novelty_cell) for x in normal(observation).tolist())
@@ -134,6 +132,22 @@ def test_cells_are_coarse_for_floats_and_exact_for_bytes_and_without_width():
         assert cells.shape == (5, 66)
         pairs = combinations(range(5), 2)
         assert {(i, j) for i, j in pairs if cells[i].equal(cells[j])} == expected
+
+
+@pytest.mark.parametrize("backbone", [TIT, mlp(), lstm()])
+def test_what_is_known_is_no_longer_new(backbone):
+    """Whatever the frame encoder: the error falls to almost nothing there, but not elsewhere."""
+    novelty = Novelty(backbone, (2,))
+    known, far = torch.rand(256, 2) * 2 - 1, torch.tensor([[4.0, 4], [-4, 4], [4, -4], [-4, -4]])
+    novelty.update([torch.randn(1024, 2)])
+    before = novelty([known]).mean()
+    optimizer = torch.optim.Adam(novelty.predictor.parameters(), lr=1e-3)
+    for part in known.repeat(100, 1).split(64):
+        optimizer.zero_grad()
+        novelty.errors([part]).mean().backward()
+        optimizer.step()
+    assert novelty([known]).mean() < before / 10
+    assert novelty([far]).mean() > 3 * novelty([known]).mean()
 
 
 @pytest.mark.parametrize("env", ["MultiDiscreteActions-v0", "BoxActions-v0"])
