@@ -35,8 +35,8 @@ from .ppo import PPO, ActorCritic, Minibatch, PPOAlgorithm
 class NovelPPO(PPO, algorithm="ppo-noveld"):
     """PPO whose rewards include NovelD's exploration bonus; reported returns do not.
 
-    Besides the networks of PPO, there is a fixed random one, with a frame encoder like the policy's,
-    and one that learns to predict its output from the same tokens.
+    Besides the networks of PPO, there is a fixed random one, with a frame encoder like that of the
+    policy, and one that learns to predict its output from the same tokens.
     """
 
     novelty_coeff: Weight = 0.5
@@ -76,8 +76,8 @@ class Novelty(nn.Module):
 
     def __init__(self, network: Network, observation: Observations) -> None:
         super().__init__()
-        # Units that are 0 wherever the agent has been, as of relu, would never learn the target, and
-        # nothing would ever be known.
+        # With relu, units that are 0 wherever the agent has been never learn: on the tokens of TIT, a
+        # sixth of the error remained forever, and with it the bonus.
         layers = MLP(hidden_dim=128, num_layers=2, activation="tanh")
         one_frame = replace(network, history=layers, head=Head(features_dim=None), num_frames=1)
         self.target = trunks_of(build_network(one_frame, observation, trunks="shared"))[""]
