@@ -76,8 +76,8 @@ class Novelty(nn.Module):
 
     def __init__(self, network: Network, observation: Observations) -> None:
         super().__init__()
-        # With relu, units that are 0 wherever the agent has been never learn: on the tokens of TIT, a
-        # sixth of the error remained forever, and with it the bonus.
+        # Units of relu that are 0 wherever the agent has been never learn: on TIT's tokens, a sixth
+        # of the squared error remained forever, and with it the bonus.
         layers = MLP(hidden_dim=128, num_layers=2, activation="tanh")
         one_frame = replace(network, history=layers, head=Head(features_dim=None), num_frames=1)
         self.target = trunks_of(build_network(one_frame, observation, trunks="shared"))[""]

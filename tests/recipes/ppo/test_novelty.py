@@ -134,7 +134,7 @@ def test_cells_are_coarse_for_floats_and_exact_for_bytes_and_without_width():
         assert {(i, j) for i, j in pairs if cells[i].equal(cells[j])} == expected
 
 
-@pytest.mark.parametrize("backbone", [TIT, mlp(), lstm()])
+@pytest.mark.parametrize("backbone", [enhanced_tit(3, patch_size="auto"), mlp(), lstm()])
 def test_what_is_known_is_no_longer_new(backbone):
     """Whatever the frame encoder: the error falls there, but not elsewhere."""
     novelty = Novelty(backbone, (2,))
