@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import torch
@@ -136,9 +137,14 @@ class _MinGRUMixer(_Mixer):
         hidden = settings.expansion * width
         self.state_shapes = {"recurrent_state_h": (hidden,)}
         self.gate = nn.Linear(width, hidden, bias=False)
-        self.gate_bias = nn.Parameter(_rates(hidden).logit())
+        self.gate_bias = nn.Parameter(torch.empty(hidden))
         self.candidate = nn.Linear(width, hidden)
         self.output = nn.Linear(hidden, width, bias=False)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        with torch.no_grad():
+            self.gate_bias.copy_(_rates(len(self.gate_bias)).logit())
 
     def forward(
         self, x: Tensor, state: list[Tensor], is_init: Tensor
@@ -201,10 +207,15 @@ class _MatrixMixer(_Mixer):
             "recurrent_state_h": (heads, settings.key_dim, settings.value_dim),
             "recurrent_state_inputs": self.convolution.state_shape,
         }
-        # The rates start at 0.5, also those of slow heads, which would otherwise hardly be written.
-        self.rate_bias = nn.Parameter(torch.full((heads,), 0.5).expm1().log())
-        self.log_a = nn.Parameter((_rates(heads) / 0.5).log())
+        self.rate_bias = nn.Parameter(torch.empty(heads))
+        self.log_a = nn.Parameter(torch.empty(heads))
         self.output = nn.Linear(values, width, bias=False)
+
+    def reset_parameters(self) -> None:
+        # The rates start at 0.5, also those of slow heads, which would otherwise hardly be written.
+        nn.init.constant_(self.rate_bias, math.log(math.expm1(0.5)))
+        with torch.no_grad():
+            self.log_a.copy_((_rates(self.num_heads) / 0.5).log())
 
     def rates(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """[N, T, H] -> softplus(x + bias), and minus the decay's logarithm, [N, H, T] each."""
@@ -224,6 +235,7 @@ class _GatedDeltaMixer(_MatrixMixer):
         super().__init__(width, settings, keys=2 * heads)
         self.beta = nn.Linear(width, heads, bias=False)
         self.norm = nn.RMSNorm(settings.value_dim, eps=_EPS)
+        self.reset_parameters()
 
     def forward(
         self, x: Tensor, state: list[Tensor], is_init: Tensor
@@ -272,8 +284,13 @@ class _Mamba2Mixer(_MatrixMixer):
 
     def __init__(self, width: int, settings: settings.Mamba2) -> None:
         super().__init__(width, settings, keys=2, bias=True)
-        self.skip = nn.Parameter(torch.ones(settings.num_heads))
+        self.skip = nn.Parameter(torch.empty(settings.num_heads))
         self.norm = nn.RMSNorm(settings.num_heads * settings.value_dim, eps=_EPS)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        super().reset_parameters()
+        nn.init.ones_(self.skip)
 
     def forward(
         self, x: Tensor, state: list[Tensor], is_init: Tensor

@@ -178,10 +178,16 @@ class ShortConvolution(nn.Module):
 
     def __init__(self, channels: int, *, bias: bool = False) -> None:
         super().__init__()
-        bound = _KERNEL**-0.5  # as in nn.Conv1d
-        self.weight = nn.Parameter(torch.empty(channels, _KERNEL).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.zeros(channels)) if bias else None
+        self.weight = nn.Parameter(torch.empty(channels, _KERNEL))
+        self.bias = nn.Parameter(torch.empty(channels)) if bias else None
         self.state_shape = (_KERNEL - 1, channels)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initializes the weights as in `nn.Conv1d`, and the bias with 0."""
+        nn.init.uniform_(self.weight, -(_KERNEL**-0.5), _KERNEL**-0.5)
+        if self.bias is not None:
+            nn.init.zeros_(self.bias)
 
     def forward(self, x: Tensor, before: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """Convolves sequences.
