@@ -305,6 +305,17 @@ def action_error(chosen: Tensor, action: Tensor) -> Tensor:
     return (chosen != action).float().mean()
 
 
+def action_values(critic: TensorDictModuleBase, states: TensorDictBase, action: Tensor) -> Tensor:
+    """A critic's values of actions in states [*B], which are left as they are; float [*B].
+
+    The critic writes "state_action_value", one value or one for each discrete action.
+    """
+    values = critic(states.copy().set("action", action))["state_action_value"]
+    if not action.is_floating_point():
+        values = values.gather(-1, action.unsqueeze(-1))
+    return values.squeeze(-1)
+
+
 RecipeT = TypeVar("RecipeT", bound=TransitionRecipe)
 
 
@@ -456,16 +467,12 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
     def q_values(self, samples: TensorDictBase, action: Tensor | None = None) -> Tensor:
         """The lower value of the critics, float [*B]; of the data's actions if None are given."""
         loss: Any = self.model
+        action = samples["action"] if action is None else action
         network, values = loss.qvalue_network, []
         for weights in loss.qvalue_network_params.unbind(0):
             with weights.to_module(network, preserve_module_state=False):
-                given = samples if action is None else samples.copy().set("action", action)
-                values.append(network(given.copy())["state_action_value"])
-        lower = torch.stack(values).amin(0)  # [*B, 1], or of each discrete action [*B, n]
-        if lower.shape[-1] > 1:
-            index = (samples["action"] if action is None else action).unsqueeze(-1)
-            lower = lower.gather(-1, index)
-        return lower.squeeze(-1)
+                values.append(action_values(network, samples, action))
+        return torch.stack(values).amin(0)
 
     def numbers(self, terms: Terms) -> Mapping[str, Tensor]:
         """Selects and checks the numbers that an update returns.

@@ -131,11 +131,8 @@ def explain(arguments: list[str]) -> None:
     import torch  # not at the top: help needs no PyTorch
 
     from torchrl_tit import load_agent
-    from torchrl_tit.agents.acting import make_given_env
-    from torchrl_tit.datasets import load_episodes
 
     from ..tools.results.explanation import check_explanation, explain_policy
-    from ..tools.results.recorded import Recording
 
     steps = options.step or [None]
     check_explanation(options.out, steps[0], options.max_steps)
@@ -151,6 +148,11 @@ def explain(arguments: list[str]) -> None:
     make_env: Any = agent.make_env
     actions, which = None, f"the episode of seed {seed}"
     if options.dataset is not None:
+        from torchrl_tit.agents.acting import make_given_env
+        from torchrl_tit.datasets import load_episodes
+
+        from ..tools.results.recorded import Recording
+
         own = {k: agent.recipe[k] for k in ("max_episode_steps", "gaps") if k in agent.recipe}
         episodes = load_episodes(options.dataset, **own)
         recording = Recording(episodes, options.episode or 0)

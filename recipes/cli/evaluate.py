@@ -41,7 +41,6 @@ def evaluate(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     from ..core import runner  # not at the top: help needs no PyTorch
     from ..core.run import Run
-    from ..tools.off_policy import evaluate_on_data
 
     run = Run.open(options.run)
     recipe = override(
@@ -61,6 +60,8 @@ def evaluate(arguments: list[str]) -> None:
         if options.dataset is None:
             evaluation = runner.evaluate(run, recipe, best=options.best)
         else:
+            from ..tools.off_policy import evaluate_on_data
+
             settings = {"best": options.best, "ope": options.ope}
             evaluation = evaluate_on_data(run, recipe, options.dataset, **settings)
         name = _file_name(run.recipe, recipe, options.best, options.dataset)

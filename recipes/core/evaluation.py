@@ -46,6 +46,14 @@ class HeldOut:
         """The first measure."""
         return next(iter(self.values.values()))
 
+    def entries(self) -> dict[str, Any]:
+        """What ``evaluation.json`` says of them."""
+        return {
+            "steps": self.step,
+            "held_out": self.values,
+            "held_out_episodes": self.episodes,
+        }
+
 
 def summarize(
     outcomes: Sequence[Outcome],
@@ -72,13 +80,10 @@ def summarize(
         With target returns, ``target_return`` is the better one, and ``targets`` holds the
         same for each.
     """
-    env, measured = recipe.env, {}
-    if held_out is not None:
-        measured = {"held_out": held_out.values, "held_out_episodes": held_out.episodes}
+    env, measured = recipe.env, {} if held_out is None else held_out.entries()
     if not outcomes:
         assert isinstance(recipe, DatasetRecipe)
-        assert held_out is not None
-        return {"env": env, "dataset": recipe.dataset, "steps": held_out.step, **measured}
+        return {"env": env, "dataset": recipe.dataset, **measured}
     best = max(outcomes, key=lambda outcome: outcome.mean)
     summary: dict[str, Any] = {"mean": best.mean, "std": _std(best), "episodes": len(best.returns)}
     if isinstance(recipe, DatasetRecipe):

@@ -8,7 +8,7 @@ import os
 import platform
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -205,13 +205,14 @@ class Run:
             ) from error
 
     def __enter__(self) -> Run:
-        self._lock = locked(self.folder)
-        self._lock.__enter__()
-        remove_leftovers(self.folder, _WRITTEN_WHOLE)
+        with ExitStack() as stack:
+            stack.enter_context(locked(self.folder))
+            remove_leftovers(self.folder, _WRITTEN_WHOLE)
+            self._held = stack.pop_all()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._lock.__exit__(None, None, None)
+        self._held.close()
 
     @property
     def checkpoints(self) -> Path:

@@ -29,7 +29,7 @@ from ..core.optional import tqdm
 from ..core.recipe import Recipe
 from ..core.run import Run
 from ..core.runner import load_trained
-from ..offline import DatasetAlgorithm, TransitionAlgorithm, read_data
+from ..offline import DatasetAlgorithm, TransitionAlgorithm, action_values, read_data
 
 UPDATES = 20_000
 """Gradient steps of fitted Q evaluation."""
@@ -66,14 +66,8 @@ def evaluate_on_data(
     episodes = read_data(replace(own, dataset=dataset))
     found = algorithm.measure(step, episodes)
     assert found is not None
-    evaluation = {
-        "env": "",
-        "dataset": dataset,
-        "steps": step,
-        "held_out": found.values,
-        "held_out_episodes": found.episodes,
-        "weights": "best" if best else "last",
-    }
+    weights = "best" if best else "last"
+    evaluation = {"env": "", "dataset": dataset, **found.entries(), "weights": weights}
     if ope is not None:
         if not isinstance(algorithm, TransitionAlgorithm):
             raise ValueError(
@@ -177,11 +171,11 @@ def fit_q(
         outcome = batch["next"]
         goal = td0_return_estimate(
             gamma,
-            _values(target, outcome, following[index]).unsqueeze(-1),
+            action_values(target, outcome, following[index]).unsqueeze(-1),
             scale * outcome["reward"],
             outcome["terminated"],
         ).squeeze(-1)
-        loss = F.mse_loss(_values(critic, batch, batch["action"]), goal)
+        loss = F.mse_loss(action_values(critic, batch, batch["action"]), goal)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -191,7 +185,7 @@ def fit_q(
     @torch.no_grad()
     def value(index: Tensor) -> Tensor:
         found = items.get(index)
-        return _values(critic, found, _act(policy, found)).double() / scale
+        return action_values(critic, found, _act(policy, found)).double() / scale
 
     return value
 
@@ -219,11 +213,3 @@ def _act(policy: TensorDictModuleBase, states: TensorDictBase) -> Tensor:
     """The most likely actions in states [B]."""
     with evaluating(policy), set_exploration_type(ExplorationType.DETERMINISTIC):
         return policy(states.copy())["action"]
-
-
-def _values(critic: TensorDictModuleBase, states: TensorDictBase, action: Tensor) -> Tensor:
-    """The critic's values of actions in states, float [B]."""
-    values = critic(states.copy().set("action", action))["state_action_value"]
-    if not action.is_floating_point():
-        values = values.gather(-1, action.unsqueeze(-1))
-    return values.squeeze(-1)

@@ -77,7 +77,7 @@ class AgentFiles:
     Args:
         folder: the agent's folder.
         steps: the steps that the agent was trained for.
-            recipe: the recipe, as JSON.
+        recipe: the recipe, as JSON.
         weights: tensors by name, on the CPU.
         evaluation: the returns of its episodes; see :func:`check_evaluation`.
         versions: versions of packages, by name.

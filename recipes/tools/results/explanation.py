@@ -198,10 +198,8 @@ def explain_episode(
     values: list[Any] = []
     recent: deque[np.ndarray] = deque(maxlen=explainer.network.num_frames)
 
-    def explained(tensordict: TensorDictBase) -> TensorDictBase:
+    def look(number: int, acted: TensorDictBase) -> None:
         nonlocal page
-        number = len(values)
-        acted = explainer.policy(tensordict)
         values.append(read_value(acted))
         if number > steps[0] - explainer.network.num_frames:
             recent.append(np.asarray(take_picture(env, name)))
@@ -209,19 +207,52 @@ def explain_episode(
             step = explainer.explain(acted)
             page = page or Page(step, title, dpi)
             show(number, step, page.draw(step, [*recent], values, number))
-        if number == steps[-1]:
-            raise _Enough
+
+    return len(play_steps(env, explainer.policy, steps[-1], look, seed=seed, actions=actions))
+
+
+def play_steps(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    last: int,
+    look: Callable[[int, TensorDictBase], None],
+    *,
+    seed: int,
+    actions: Sequence[Tensor] | Tensor | None = None,
+) -> list[Tensor]:
+    """Plays an episode with the most likely actions, up to one of its steps.
+
+    Args:
+        env: the task, of one copy.
+        policy: the policy.
+        last: the last step to play, counted from 0.
+        look: called at each step with its number and what the policy wrote.
+        seed: seed of the episode.
+        actions: the actions to take instead of the policy's.
+
+    Returns:
+        The actions that were taken; fewer than ``last + 1`` if the episode ended before.
+    """
+    taken: list[Tensor] = []
+
+    def act(tensordict: TensorDictBase) -> TensorDictBase:
+        number = len(taken)
+        acted = policy(tensordict)
+        look(number, acted)
         if actions is not None:
-            acted["action"] = actions[number].expand_as(acted["action"])
+            acted["action"] = actions[number].expand_as(acted["action"]).clone()
+        taken.append(acted["action"].clone())
+        if number == last:
+            raise _Enough
         return acted
 
     with suppress(_Enough):
-        evaluate(env, explained, 1, seed=seed)
-    return len(values)
+        evaluate(env, act, 1, seed=seed)
+    return taken
 
 
 class _Enough(Exception):
-    """Everything that was requested is shown."""
+    """The last step was played."""
 
 
 def explain_policy(

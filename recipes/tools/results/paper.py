@@ -129,7 +129,7 @@ def paper_cells() -> tuple[PaperCell, ...]:
             note=row["note"],
             digits=len(row["mean"].partition(".")[2]),
         )
-        for row in _rows("paper_results.csv")
+        for row in read_rows("paper_results.csv")
     )
 
 
@@ -148,7 +148,7 @@ def hyperparameters(table: str) -> tuple[Hyperparameter, ...]:
             (row["values"],) if " size" in row["values"] else tuple(row["values"].split()),
             tuple(row["fields"].split()),
         )
-        for row in _rows("paper_hyperparameters.csv")
+        for row in read_rows("paper_hyperparameters.csv")
         if row["table"] == table
     )
 
@@ -260,6 +260,7 @@ def _differences(recipe: Recipe, measured: Recipe, cell: PaperCell) -> dict[str,
     return changes
 
 
-def _rows(file: str) -> Iterator[dict[str, str]]:
+def read_rows(file: str) -> Iterator[dict[str, str]]:
+    """Reads a table of reported numbers that lies beside this module."""
     text = resources.files(__package__).joinpath(file).read_text(encoding="utf-8")
     yield from csv.DictReader(io.StringIO(text))

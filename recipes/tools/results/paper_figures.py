@@ -21,12 +21,11 @@ from torchrl_tit.agents import TrainedAgent
 from torchrl_tit.analysis import Target, inner_attention, outer_weights
 from torchrl_tit.analysis.layers import patch_grid
 from torchrl_tit.analysis.targets import evaluating, find_network, histories_of
-from torchrl_tit.evaluation import evaluate
 from torchrl_tit.files import whole_or_not_at_all
 from torchrl_tit.networks import HistoryNetwork
 
 from .explained_page import Seen, as_picture, lay_over
-from .explanation import Explainer, MapKind
+from .explanation import Explainer, MapKind, play_steps
 
 Panel: TypeAlias = tuple[str, np.ndarray] | None
 """A title and what is drawn below it; None stays empty."""
@@ -209,31 +208,21 @@ def _play(
     """
     if min(steps) < 0:
         raise ValueError(f"steps are counted from 0, so there is no step {min(steps)}")
-    taken: list[Tensor] = []
 
-    def act(tensordict: TensorDictBase) -> TensorDictBase:
-        number = len(taken)
-        acted = agent.policy(tensordict)
+    def at_steps(number: int, acted: TensorDictBase) -> None:
         if number in steps:
             look(number, acted)
-        if actions:
-            acted["action"] = actions[number].clone()
-        taken.append(acted["action"].clone())
-        if number == max(steps):
-            raise _Enough
-        return acted
 
-    with suppress(_Enough), closing(agent.make_env(1)) as env:
-        evaluate(env, act, 1, seed=seed)
+    with closing(agent.make_env(1)) as env:
+        taken = play_steps(
+            env, agent.policy, max(steps), at_steps, seed=seed, actions=actions or None
+        )
+    if len(taken) <= max(steps):
         raise ValueError(
             f"the episode of seed {seed} has {len(taken)} steps, so there is no step {max(steps)}: "
             f"choose one below {len(taken)}"
         )
     return taken
-
-
-class _Enough(Exception):
-    """All steps were looked at."""
 
 
 def _grid(rows: int, columns: int) -> tuple[Figure, Any]:

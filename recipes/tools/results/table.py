@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,7 @@ from ...core.registry import RECIPES
 from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import interval_of
-from .paper import HEADINGS, Match, has_its_data, match, paper_cells, plain_name
+from .paper import HEADINGS, Match, has_its_data, match, paper_cells, plain_name, read_rows
 
 OTHER = "not in the paper"
 HEADER = (
@@ -218,7 +217,7 @@ def published_results() -> dict[str, tuple[Published, ...]]:
         ['CleanRL', 'RL Zoo']
     """
     results: dict[str, tuple[Published, ...]] = {}
-    for row in _rows("published_results.csv"):
+    for row in read_rows("published_results.csv"):
         name = row["recipe"]
         mean, std = float(row["mean"]), float(row["std"])
         result = Published(row["source"], row["url"], mean, std, row["note"])
@@ -295,8 +294,3 @@ def _line(columns: Sequence[str]) -> str:
 def _number(value: float) -> str:
     """Formats a number: whole from 100 on, with one decimal below."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
-
-
-def _rows(file: str) -> Iterator[dict[str, str]]:
-    text = resources.files(__package__).joinpath(file).read_text(encoding="utf-8")
-    yield from csv.DictReader(io.StringIO(text))
