@@ -270,3 +270,25 @@ def test_what_reads_evaluations_knows_those_without_returns(tmp_path, capsys):
     agent = load_agent(tmp_path / "agent")
     assert agent.act(np.zeros(5)).shape == (2,)
     assert "there is no environment" in fails(capsys, "play", tmp_path / "agent")
+
+
+@pytest.mark.parametrize("name", ["iql", "td3bc", "cql"])
+def test_values_are_the_lower_ones_of_two_critics(name, tmp_path):
+    algorithm = make_algorithm(RECIPES[name](tmp_path))
+    network, (one, two) = (
+        algorithm.model.qvalue_network,
+        algorithm.model.qvalue_network_params.unbind(0),
+    )
+    samples = algorithm.make_buffer().sample()
+    others = samples["action"].flip(0)
+    with torch.no_grad():
+        for action in (samples["action"], others):
+            states = samples.copy().set("action", action)
+            both = []
+            for weights in (one, two):
+                with weights.to_module(network):
+                    both.append(network(states.copy())["state_action_value"].squeeze(-1))
+            assert (both[0] != both[1]).any(), "critics that differ"
+            assert torch.equal(algorithm.q_values(samples, action), torch.minimum(*both))
+        found = algorithm.measure_batch(samples)
+        assert torch.equal(found["q"], algorithm.q_values(samples).mean())
