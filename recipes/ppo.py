@@ -47,7 +47,7 @@ from torchrl_tit.settings.numbers import (
 )
 from torchrl_tit.windows import Windows
 
-from .core.adaptive import AdvantageScale, KLAdaptiveRate, ReturnScale, normalize_advantages
+from .core.adaptive import AdvantageScale, ReturnScale, normalize_advantages
 from .core.algorithm import Stateful, check_finite
 from .core.compilation import (
     STATIC_SHAPES,
@@ -62,8 +62,9 @@ from .core.recipe import Compile, Precision
 from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
 
-# Longer sequences are faster, but their steps are more correlated.
-_LONGEST = 16
+# Longer sequences are faster, but their steps are correlated: a minibatch of windows consists of
+# this many sequences at least. Through a state, gradients reach as far as a sequence is long.
+_LONGEST = _SEQUENCES = 16
 
 # The share of the steps that CoBERL's contrastive loss masks (arXiv 2107.05431).
 _MASKED = 0.15
@@ -78,6 +79,7 @@ class PPO(OnlineRecipe, algorithm="ppo"):
 
     removed: ClassVar[dict[str, Any]] = {
         "async_collection": False,
+        "at_target_kl": "stop",
         "masked_fraction": 0.15,
         "next_frame_coeff": 0.0,
         "normalize_values": False,
@@ -98,7 +100,8 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     """Length of the sequences of consecutive steps that make up a minibatch, for networks that read
     several frames or carry a state; others train on single steps. Within a sequence, each frame is
     encoded once for all steps that read it. Must divide minibatch_size and an environment's steps
-    in a batch; by default the largest divisor of both and of 16."""
+    in a batch; by default it divides 16, too, and without a state a 16th of minibatch_size, so that
+    a minibatch holds 16 sequences or more."""
     epochs: Steps = 10
     """Passes over each batch."""
     learning_rate: Rate = 3e-4
@@ -147,11 +150,8 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     update, so the first batch is read as it is."""
     target_kl: Positive | None = None
     """Target KL divergence of an update, estimated by the mean of (r - 1) - log r over the ratios r
-    of an epoch, as in Stable-Baselines3; see at_target_kl."""
-    at_target_kl: Literal["stop", "adapt"] = "stop"
-    """With a target_kl: "stop" ends an update after the epoch that exceeds it (as in OpenAI's
-    Spinning Up), "adapt" raises or lowers the learning rate of the next update where the last epoch
-    is below half or above twice the target."""
+    of an epoch, as in Stable-Baselines3. An update ends after the epoch that exceeds it, as in
+    OpenAI's Spinning Up."""
     gae_lambda: Fraction = 0.95
     """Lambda of generalized advantage estimation (arXiv 1506.02438)."""
     bootstrap_time_limit: bool = True
@@ -202,7 +202,11 @@ class PPO(OnlineRecipe, algorithm="ppo"):
         if not self.reads_sequences:
             return 1
         steps = self.steps_per_batch // self.num_envs
-        return self.sequence_length or math.gcd(_LONGEST, self.minibatch_size, steps)
+        if self.sequence_length:
+            return self.sequence_length
+        size = self.minibatch_size
+        share = size if self.backbone.carries_state else max(1, size // _SEQUENCES)
+        return math.gcd(_LONGEST, share, size, steps)
 
     @property
     def gradient_steps(self) -> int:
@@ -288,7 +292,6 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         self.columns = ["learning_rate", *means]
         self.return_scale = ReturnScale(recipe.gamma)
         self.advantage_scale = AdvantageScale()
-        self.rate = KLAdaptiveRate(recipe.target_kl or math.inf)
 
     def networks(self, env: EnvBase) -> ActorCritic:
         """Builds the networks: backbone, actor and critic, and what a subclass adds to them.
@@ -369,12 +372,11 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         )
 
     def state(self) -> Mapping[str, Stateful]:
-        """Optimizer, running scales and the learning rate's factor."""
+        """Optimizer and running scales."""
         return {
             "optimizer": self.optimizer,
             "return_scale": self.return_scale,
             "advantage_scale": self.advantage_scale,
-            "rate": self.rate,
         }
 
     def batches(self) -> Iterator[TensorDictBase]:
@@ -412,10 +414,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
             if recipe.target_kl is not None and len(steps) % per_epoch == 0:
                 terms = torch.stack(steps[-per_epoch:]).mean(0)
                 moved = terms[self.terms.index("kl_approx")].item()
-                if recipe.at_target_kl == "adapt":
-                    if len(steps) == recipe.epochs * per_epoch:
-                        self.rate.update(moved, explained_variance.item())
-                elif moved > recipe.target_kl:
+                if moved > recipe.target_kl:
                     break
         model.eval()
         self._check_update(steps)
@@ -571,7 +570,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
     def _set_schedules(self, step: int) -> float:
         """Sets what changes over the run, and returns the learning rate."""
         recipe, left = self.recipe, 1 - step / self.recipe.final_step
-        learning_rate = recipe.learning_rate_at(step) * self.rate.factor
+        learning_rate = recipe.learning_rate_at(step)
         self.optimizer.param_groups[0]["lr"] = learning_rate
         if recipe.decay_clip_epsilon:
             self.ppo_loss.clip_epsilon.fill_(recipe.clip_epsilon * left)

@@ -1,4 +1,4 @@
-"""What adapts to a task: the scales of rewards and advantages, and the learning rate."""
+"""What adapts to a task: the scales of rewards and of advantages."""
 
 from __future__ import annotations
 
@@ -114,57 +114,3 @@ def normalize_advantages(advantage: Tensor, floor: float) -> Tensor:
     if advantage.numel() == 1:
         return advantage
     return standardize(advantage, advantage.mean(), advantage.std().clamp(min=floor), eps=1e-8)
-
-
-class KLAdaptiveRate:
-    """A factor on the learning rate that keeps the KL divergence of an update near a target.
-
-    After each update, the rate is divided by 1.5 if the policy has moved twice as far as the
-    target, and multiplied by 1.5 if it has moved less than half as far. skrl's `KLAdaptiveLR` and
-    rl_games do so after each epoch; but the first epochs of any update move the policy little, so
-    the rate rises too far.
-
-    Where values explain nothing of the returns, as before the first reward, advantages are noise.
-    Then the rate does not rise, and a factor above 1 falls back to 1.
-
-    Args:
-        target: the KL divergence to keep.
-        smallest: the smallest factor.
-        largest: the largest factor.
-
-    Example:
-        >>> rate = KLAdaptiveRate(0.01)
-        >>> rate.update(0.05, explained_variance=0.9)
-        >>> round(rate.factor, 3)
-        0.667
-    """
-
-    def __init__(self, target: float, smallest: float = 0.01, largest: float = 10.0) -> None:
-        self.target = target
-        self.smallest = smallest
-        self.largest = largest
-        self.factor = 1.0
-
-    def update(self, kl: float, explained_variance: float) -> None:
-        """Adapts the factor to an update.
-
-        Args:
-            kl: the divergence in its last epoch.
-            explained_variance: the share of the variance of the value targets that the values of
-                the batch explain; 0 or less if they explain nothing.
-        """
-        if explained_variance <= 0:
-            self.factor = max(self.factor / 1.5, min(self.factor, 1.0))
-        elif kl > 2 * self.target:
-            self.factor /= 1.5
-        elif kl < self.target / 2:
-            self.factor *= 1.5
-        self.factor = min(max(self.factor, self.smallest), self.largest)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Returns the factor."""
-        return {"factor": self.factor}
-
-    def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
-        """Restores a state."""
-        self.factor = state_dict["factor"]

@@ -31,8 +31,7 @@ MEMORY_SETTINGS: dict[str, Any] = PPO_SETTINGS | {
     "num_envs": 16,
     "steps_per_batch": 2048,
     "minibatch_size": 256,
-    # An update that has moved the policy as far as target_kl ends early.
-    "at_target_kl": "stop",
+    "target_kl": 0.02,
     "sequence_length": 64,  # by default 16; K - 1 frames more are encoded for each sequence
     "epochs": 8,
     # Less noise in the advantage of the one step where memory decides.

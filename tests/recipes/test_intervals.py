@@ -51,7 +51,6 @@ PPO_RECIPE = PPO(
     normalize_observations=True,
     running_advantage_floor=0.5,
     target_kl=1e-3,
-    at_target_kl="adapt",
     log_interval=64,
     checkpoint_interval=10**6,
     evaluation_episodes=2,

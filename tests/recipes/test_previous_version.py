@@ -45,8 +45,7 @@ def test_a_recipe_of_each_algorithm_and_network_loads(which):
     assert recipe.final_step == now.final_step
     if isinstance(recipe, PPO) and isinstance(now, PPO):
         # The size of an update is set by other settings now; a run keeps those that it had.
-        assert recipe.at_target_kl == "stop"
-        recipe = replace(recipe, minibatch_size=now.minibatch_size, at_target_kl=now.at_target_kl)
+        recipe = replace(recipe, minibatch_size=now.minibatch_size, target_kl=now.target_kl)
     assert recipe == now or which.startswith("recipes-0.1.0"), "another setting than before"
 
 

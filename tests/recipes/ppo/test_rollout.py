@@ -338,8 +338,9 @@ def test_the_compiled_objective_is_one_graph_and_the_eager_one(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "length"),
     [
-        ({}, 16),
-        ({"minibatch_size": 24}, 8),
+        ({"minibatch_size": 512}, 16),
+        ({"minibatch_size": 64}, 4),
+        ({"minibatch_size": 48}, 1),
         ({"steps_per_batch": 81}, 1),
         ({"sequence_length": 32}, 32),
         ({"backbone": enhanced_tit(1, **SMALL), "sequence_length": 32}, 1),

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from recipes import ppo
-from recipes.core.adaptive import KLAdaptiveRate, ReturnScale, normalize_advantages
+from recipes.core.adaptive import ReturnScale, normalize_advantages
 from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
 from recipes.core.runner import evaluate
@@ -49,34 +49,6 @@ def test_return_scale_is_the_deviation_of_discounted_returns():
         found = scale.update(rewards[:, start:stop], done[:, start:stop])
         seen = torch.tensor([value for t, value in expected if t < stop], dtype=torch.float64)
         assert found.item() == pytest.approx(seen.std(unbiased=False).item(), rel=1e-5)
-
-
-def test_learning_rate_follows_the_divergence():
-    rate = KLAdaptiveRate(0.01)
-    factors = []
-    for kl in (0.05, 0.015, 0.001, 0.001):
-        rate.update(kl, 0.5)
-        factors.append(rate.factor)
-    assert factors == pytest.approx([1 / 1.5, 1 / 1.5, 1, 1.5])
-    for _ in range(100):
-        rate.update(1.0, 0.5)
-    assert rate.factor == rate.smallest
-    for _ in range(100):
-        rate.update(0.0, 0.5)
-    assert rate.factor == rate.largest
-
-
-@pytest.mark.parametrize(("start", "end"), [(3.0, 1.0), (1.0, 1.0), (0.5, 0.5)])
-def test_noise_does_not_raise_the_learning_rate(start, end):
-    """Whatever the divergence is, values that explain nothing bring the factor down to 1."""
-    for kl in (0.0, 1.0):
-        rate = KLAdaptiveRate(0.01)
-        rate.factor = start
-        rate.update(kl, -0.1)
-        assert rate.factor == pytest.approx(max(start / 1.5, end))
-        for _ in range(5):
-            rate.update(kl, 0.0)
-        assert rate.factor == end
 
 
 def test_rewards_are_divided_by_the_deviation_of_returns(tmp_path, monkeypatch):
@@ -257,22 +229,6 @@ def test_an_update_ends_after_the_first_epoch_beyond_the_target(divergences, tmp
     run = train(replace(recipe, target_kl=target), tmp_path / "ended")
     assert divergences()[8:] == pytest.approx(free[:2])
     assert read_metrics(run.folder / "metrics.csv")[-1]["epochs"] == 2
-
-
-@pytest.mark.parametrize("target", [1e-4, 1.0])
-def test_the_learning_rate_follows_the_target_divergence(divergences, target, tmp_path):
-    """It is adapted once an update, to the divergence in the last of its epochs."""
-    recipe = replace(RECIPE, learning_rate=0.01, epochs=8, target_kl=target, at_target_kl="adapt")
-    rows = read_metrics(train(recipe, tmp_path / "run").folder / "metrics.csv")
-    expected, factors = KLAdaptiveRate(target), [1.0]
-    for kl, row in zip(divergences()[7::8], rows, strict=True):
-        expected.update(kl, row["explained_variance"])
-        factors.append(expected.factor)
-    assert len(factors) == 4 + 1
-    assert len(set(factors)) > 2
-    rates = [row["learning_rate"] for row in rows]
-    assert rates == pytest.approx([0.01 * factor for factor in factors[:4]])
-    assert all(row["epochs"] == 8 for row in rows)
 
 
 @pytest.mark.parametrize("floor", [0.0, 1e-6, 1e6])
