@@ -170,6 +170,6 @@ def test_steps_that_are_no_slices_are_refused():
 @pytest.mark.parametrize("wrap", [lambda history: history, lambda history: Compose(history)])
 def test_wrong_environment(wrap):
     with pytest.raises(ValueError, match=r"shape \[2, 4, 5\], so observation_ndim must be 3"):
-        TransformedEnv(StreamEnv([3], shape=(2, 4, 5)), wrap(History(2)))
+        TransformedEnv(StreamEnv([3], shape=(2, 4, 5)), wrap(History(2, observation_ndim=1)))
     with pytest.raises(KeyError, match=r"'pixels' in the environment, which has \['observation'\]"):
         TransformedEnv(StreamEnv([3]), wrap(History(2, in_keys=["pixels"])))

@@ -23,6 +23,7 @@ from torchrl.envs import EnvBase
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
+from torchrl_tit.transforms.history import keys_of_histories, observation_ndim
 
 _MAX_CHANNELS = 4
 _MAX_ORDER = 3  # of an observation: channels, height, width
@@ -138,27 +139,48 @@ def observation_specs(env: EnvBase) -> TensorSpec | dict[str, TensorSpec]:
     ===========  ==================================================================================
 
     Args:
-        env: an environment of :func:`~torchrl_tit.envs.make_env`, or any whose observations are
-            under "observation".
+        env: an environment of :func:`~torchrl_tit.envs.make_env`; any with a
+            :class:`~torchrl_tit.transforms.History` of each observation that is read; or any whose
+            observations are under "observation".
 
     Returns:
         The spec of the only observation; or, if there are several, the spec of each by its name:
-        the keys of NAME are ``("observation", NAME)`` and ``("history", NAME)``. The specs have no
-        batch dimensions.
+        the key of its history is ``("history", NAME)``. The specs have no batch dimensions, and no
+        dimension of agents.
+
+    Raises:
+        ValueError: if the environment has no such observations.
 
     Example:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from torchrl_tit import History
         >>> from torchrl_tit.envs import make_env
-        >>> observation_specs(make_env("CartPole-v1")).shape
+        >>> observation_specs(TransformedEnv(GymEnv("CartPole-v1"), History(4))).shape
         torch.Size([4])
         >>> list(observation_specs(make_env("Blackjack-v1")))
         ['0', '1', '2']
     """
-    spec = env.observation_spec_unbatched["observation"]
-    return dict(spec.items()) if isinstance(spec, Composite) else spec
+    specs, keys = env.observation_spec_unbatched, _keys_of_histories(env)
+    found = {history: _without_group(key, specs) for history, key in keys.items()}
+    named = [key for key in found if isinstance(key, tuple) and key[0] == "history"]
+    if named and len(named) == len(found):
+        return {"/".join(history[1:]): spec for history, spec in found.items()}
+    if len(set(keys.values())) > 1:
+        raise ValueError(
+            f"the histories {list(keys)} have no names: call them ('history', NAME), as History "
+            "does by default, or build each network from the spec of its own observation"
+        )
+    return next(iter(found.values()))
 
 
 def observation_keys(env: EnvBase) -> list[NestedKey]:
-    """Returns the keys of an environment's observations.
+    """Returns the keys of an environment's observations, in the order of their specs.
+
+    Args:
+        env: see :func:`observation_specs`.
+
+    Raises:
+        ValueError: if the environment has no such observations.
 
     Example:
         >>> from torchrl_tit.envs import make_env
@@ -167,10 +189,32 @@ def observation_keys(env: EnvBase) -> list[NestedKey]:
         >>> observation_keys(make_env("Blackjack-v1"))
         [('observation', '0'), ('observation', '1'), ('observation', '2')]
     """
-    specs = observation_specs(env)
-    if isinstance(specs, Mapping):
-        return [("observation", name) for name in specs]
-    return ["observation"]
+    return list(dict.fromkeys(_keys_of_histories(env).values()))
+
+
+def _keys_of_histories(env: EnvBase) -> dict[NestedKey, NestedKey]:
+    """The key of each history's observation; without any `History`, those of "observation"."""
+    if keys := keys_of_histories(env):
+        return keys
+    specs = env.observation_spec_unbatched
+    if "observation" not in specs.keys():  # noqa: SIM118 (a Composite)
+        raise ValueError(
+            "the environment has no 'observation' and no History of another one, only "
+            f"{', '.join(sorted(map(str, specs.keys(True, True))))}: add "
+            "History(num_frames, in_keys=[...]) around the environment, with those that are read"
+        )
+    spec = specs["observation"]
+    if not isinstance(spec, Composite):
+        return {"history": "observation"}
+    return {("history", name): ("observation", name) for name in spec.keys()}  # noqa: SIM118
+
+
+def _without_group(key: NestedKey, specs: Composite) -> TensorSpec:
+    """The spec of an observation without the dimensions of its group, such as those of agents."""
+    spec = specs[key]
+    for _ in range(spec.ndim - observation_ndim(key, specs)):
+        spec = spec[0]
+    return spec
 
 
 def group(specs: dict[str, TensorSpec]) -> TensorSpec:

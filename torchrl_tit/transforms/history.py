@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -42,8 +42,12 @@ class History(CatFrames):
             stored data, the histories of the next observations are made in any case; they can be
             named as `CatFrames` requires, ``["observation", ("next", "observation")]``.
         out_keys: keys of the histories, one for each of ``in_keys`` and different from all of them.
-        observation_ndim: number of dimensions of one observation: 1 for arrays [D], 2 for grey
-            images [H, W], 3 for images [C, H, W].
+            By default the only observation has "history", in its group if it has one: ``("agents",
+            "history")``. Of several, "pixels" has ``("history", "pixels")``; in nested keys,
+            "history" replaces "observation".
+        observation_ndim: number of dimensions of one observation, for a check: 1 for arrays [D], 2
+            for grey images [H, W], 3 for images [C, H, W]. By default each observation has those
+            that the batch of its group, such as [*B, agents], does not have.
         padding: how to pad before an episode's first step: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
 
@@ -51,7 +55,7 @@ class History(CatFrames):
         TypeError: if ``in_keys`` or ``out_keys`` are no keys.
         ValueError: if a number or the padding is invalid, the keys do not pair up, a key under
             "next" is not that of an observation in ``in_keys``, or, when the transform is added to
-            an environment, its observation does not have ``observation_ndim`` dimensions.
+            an environment, its observation does not have ``observation_ndim`` dimensions, if given.
         KeyError: if the environment has no such observation.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
@@ -69,22 +73,28 @@ class History(CatFrames):
         self,
         num_frames: Size,
         in_keys: Sequence[NestedKey] | str = ("observation",),
-        out_keys: Sequence[NestedKey] | str = ("history",),
+        out_keys: Sequence[NestedKey] | str | None = None,
         *,
-        observation_ndim: Annotated[int, Meta(ge=0)] = 1,
+        observation_ndim: Annotated[int, Meta(ge=0)] | None = None,
         padding: Padding = "same",
     ) -> None:
-        observations, histories = _key_list("in_keys", in_keys), _key_list("out_keys", out_keys)
+        observations = _key_list("in_keys", in_keys)
+        if out_keys is None:
+            observations = [key for key in observations if key[0] != "next"]
+            histories = default_history_keys(observations)
+        else:
+            histories = _key_list("out_keys", out_keys)
         _check_keys(observations, histories)
         observations, histories = _without_next(observations, histories)
         super().__init__(
             num_frames,
-            dim=-(observation_ndim + 1),
+            dim=-1,  # that of each observation is in _dims
             in_keys=observations,
             out_keys=histories,
             padding=padding,
         )
         self._observation_ndim = observation_ndim
+        self._dims: dict[NestedKey, int] = {}  # of K in each history, in an environment
         for key in observations:  # made from the specs instead of in the first step
             delattr(self, _buffer_name(key))
 
@@ -96,7 +106,7 @@ class History(CatFrames):
 
         Raises:
             KeyError: if the environment has no such observation.
-            ValueError: if an observation does not have ``observation_ndim`` dimensions.
+            ValueError: if an observation does not have ``observation_ndim`` dimensions, if given.
         """
         super().set_container(container)
         if self.parent is None:  # a composition without an environment yet
@@ -104,8 +114,9 @@ class History(CatFrames):
         specs = self.parent.full_observation_spec  # before this transform
         for key in self.in_keys:
             self._check_observation(key, specs)
+            self._dims[key] = self._dim(key, specs)
             if self.N > 1:
-                self._make_buffer(_buffer_name(key), self._history_spec(specs[key]).zero())
+                self._make_buffer(_buffer_name(key), self._history_spec(key, specs).zero())
 
     def _make_buffer(self, name: str, zeros: Tensor) -> None:
         present = getattr(self, name, None)
@@ -117,17 +128,18 @@ class History(CatFrames):
         self, next_tensordict: TensorDictBase, _reset: Tensor | None = None
     ) -> TensorDictBase:
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            history = next_tensordict.get(in_key).unsqueeze(self.dim)  # [..., 1, *obs]
+            dim = self._dims.get(in_key) or self._dim(in_key, next_tensordict)
+            history = next_tensordict.get(in_key).unsqueeze(dim)  # [..., 1, *obs]
             if self.N > 1:
                 name = _buffer_name(in_key)
                 if not hasattr(self, name):  # no environment has made it
-                    zeros = torch.zeros_like(history).repeat_interleave(self.N, self.dim)
+                    zeros = torch.zeros_like(history).repeat_interleave(self.N, dim)
                     self._make_buffer(name, zeros)
-                history = self._push(getattr(self, name), history, _reset)
+                history = self._push(getattr(self, name), history, _reset, dim)
             next_tensordict.set(out_key, history)
         return next_tensordict
 
-    def _push(self, buffer: Tensor, newest: Tensor, reset: Tensor | None) -> Tensor:
+    def _push(self, buffer: Tensor, newest: Tensor, reset: Tensor | None, dim: int) -> Tensor:
         """Adds the newest observation to the last histories.
 
         Args:
@@ -135,15 +147,16 @@ class History(CatFrames):
             newest: [..., 1, *obs].
             reset: true where an episode begins, bool [...]; the other histories stay unchanged.
                 None in a step.
+            dim: that of K.
 
         Returns:
             The histories, [..., K, *obs].
         """
         if reset is None:
-            history = torch.cat([buffer.narrow(self.dim, 1, self.N - 1), newest], self.dim)
+            history = torch.cat([buffer.narrow(dim, 1, self.N - 1), newest], dim)
         else:
             padding = newest if self.padding == "same" else torch.zeros_like(newest)
-            first = torch.cat([*[padding] * (self.N - 1), newest], self.dim)
+            first = torch.cat([*[padding] * (self.N - 1), newest], dim)
             history = torch.where(expand_right(reset, first.shape), first, buffer)
         buffer.copy_(history)
         return history
@@ -161,7 +174,7 @@ class History(CatFrames):
         if not frames:
             return {}
         buffers = {key: getattr(self, _buffer_name(key)) for key in self.in_keys}
-        return {key: x.narrow(self.dim, 0, frames).clone() for key, x in buffers.items()}
+        return {key: x.narrow(self._dims[key], 0, frames).clone() for key, x in buffers.items()}
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -179,14 +192,20 @@ class History(CatFrames):
             The same specs with those of the histories.
         """
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
-            observation_spec[out_key] = self._history_spec(observation_spec[in_key])
+            observation_spec[out_key] = self._history_spec(in_key, observation_spec)
         return observation_spec
 
-    def _history_spec(self, spec: TensorSpec) -> TensorSpec:
-        spec = spec.unsqueeze(self.dim)
+    def _history_spec(self, key: NestedKey, specs: Composite) -> TensorSpec:
+        dim = self._dim(key, specs)
+        spec = specs[key].unsqueeze(dim)
         shape = list(spec.shape)
-        shape[self.dim] = self.N
+        shape[dim] = self.N
         return spec.expand(shape).clone()
+
+    def _dim(self, key: NestedKey, entries: Composite | TensorDictBase) -> int:
+        """The dimension of K in the history of an observation, counted from the last."""
+        ndim = self._observation_ndim
+        return -1 - (observation_ndim(key, entries) if ndim is None else ndim)
 
     def unfolding(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Makes the histories of stored steps, and of the next steps if these are stored.
@@ -212,12 +231,13 @@ class History(CatFrames):
         windows = find_histories(tensordict, self.in_keys, self.N, self.padding)
         for in_key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             frames = tensordict.get(in_key).flatten(0, time)
-            history = windows.gather(frames).movedim(time + 1, self.dim)
+            dim = self._dim(in_key, tensordict)
+            history = windows.gather(frames).movedim(time + 1, dim)
             tensordict.set(out_key, history)
             following = tensordict.get(unravel_key(("next", in_key)), None)
             if following is not None:
-                kept = history.narrow(self.dim, 1, self.N - 1)
-                moved = torch.cat([kept, following.unsqueeze(self.dim)], self.dim)
+                kept = history.narrow(dim, 1, self.N - 1)
+                moved = torch.cat([kept, following.unsqueeze(dim)], dim)
                 tensordict.set(unravel_key(("next", out_key)), moved)
         return tensordict
 
@@ -285,15 +305,46 @@ class History(CatFrames):
                 f"History found no observation {key!r} in the environment, which has "
                 f"{sorted(map(str, specs.keys(True, True)))}; name one of these in in_keys."
             )
-        # The dimensions of the observation's group are batch dimensions; the rest are the
-        # observation's.
-        group = specs if isinstance(key, str) else specs[key[:-1]]
-        shape = specs[key].shape[group.ndim :]
-        if len(shape) != self._observation_ndim:
+        ndim = observation_ndim(key, specs)
+        if self._observation_ndim not in (None, ndim):
+            shape = list(specs[key].shape[specs[key].ndim - ndim :])
             raise ValueError(
-                f"One observation {key!r} has the shape {list(shape)}, so observation_ndim "
-                f"must be {len(shape)}, not {self._observation_ndim}"
+                f"One observation {key!r} has the shape {shape}, so observation_ndim "
+                f"must be {ndim}, not {self._observation_ndim}"
             )
+
+
+def observation_ndim(key: NestedKey, entries: Composite | TensorDictBase) -> int:
+    """Number of an observation's own dimensions; those of its group are batch dimensions.
+
+    Example:
+        >>> from torchrl.data import Unbounded
+        >>> agents = Composite(observation=Unbounded((2, 3, 84, 84)), shape=(2,))
+        >>> observation_ndim(("agents", "observation"), Composite(agents=agents))
+        3
+    """
+    group = entries if isinstance(key, str) else entries[key[:-1]]
+    return entries[key].ndim - group.ndim
+
+
+def default_history_keys(observations: Sequence[NestedKey]) -> list[NestedKey]:
+    """Names the histories of observations: see ``out_keys`` of :class:`History`.
+
+    Example:
+        >>> default_history_keys(["pixels"]), default_history_keys([("agents", "observation")])
+        (['history'], [('agents', 'history')])
+        >>> default_history_keys(["pixels", ("arm", "left"), ("observation", "state")])
+        [('history', 'pixels'), ('history', 'arm/left'), ('history', 'state')]
+    """
+    histories: list[NestedKey] = []
+    for key in observations:
+        parts, alone = (key,) if isinstance(key, str) else key, len(observations) == 1
+        if (alone or len(parts) > 1) and any("observation" in part for part in parts):
+            parts = tuple(part.replace("observation", "history") for part in parts)
+        else:
+            parts = (*parts[:-1], "history") if alone else ("history", "/".join(parts))
+        histories.append(unravel_key(parts))
+    return histories
 
 
 def frames_before(env: EnvBase) -> dict[NestedKey, Tensor]:
@@ -313,13 +364,31 @@ def frames_before(env: EnvBase) -> dict[NestedKey, Tensor]:
         True
     """
     frames: dict[NestedKey, Tensor] = {}
+    for history in _histories_of(env):
+        frames |= history.frames_before()
+    return frames
+
+
+def keys_of_histories(env: EnvBase) -> dict[NestedKey, NestedKey]:
+    """Returns the key of the observation of each history that a `History` of an environment writes.
+
+    Example:
+        >>> from torchrl.envs import GymEnv
+        >>> keys_of_histories(TransformedEnv(GymEnv("CartPole-v1"), History(num_frames=4)))
+        {'history': 'observation'}
+    """
+    return {
+        out_key: in_key
+        for history in _histories_of(env)
+        for in_key, out_key in zip(history.in_keys, history.out_keys, strict=True)
+    }
+
+
+def _histories_of(env: EnvBase) -> Iterator[History]:
     while isinstance(env, TransformedEnv):
         transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
-        for transform in transforms:
-            if isinstance(transform, History):
-                frames |= transform.frames_before()
+        yield from (transform for transform in transforms if isinstance(transform, History))
         env = env.base_env
-    return frames
 
 
 def _buffer_name(key: NestedKey) -> str:
