@@ -178,8 +178,7 @@ def make_env(
     if hide_velocities:
         env.append_transform(HideVelocities(name))
     env.append_transform(RewardSum())
-    for history in _histories(env, num_frames, padding):
-        env.append_transform(history)
+    env.append_transform(History(num_frames, keys_of(env), padding=padding))
     return env
 
 
@@ -249,23 +248,6 @@ class TransformedVectorEnv(TransformedEnv):
         spec = self.action_spec.clone()
         spec.update_mask(tensordict[MASK])
         return tensordict.set(self.action_key, spec.rand())
-
-
-def _histories(env: EnvBase, num_frames: int, padding: Padding) -> list[History]:
-    """The transforms that write histories: one for all observations with as many dimensions."""
-    keys: dict[int, list[NestedKey]] = {}
-    for key in keys_of(env):
-        keys.setdefault(env.observation_spec[key].ndim - env.ndim, []).append(key)
-    return [
-        History(
-            num_frames,
-            in_keys,
-            ["history" if key == "observation" else ("history", key[1]) for key in in_keys],
-            observation_ndim=ndim,
-            padding=padding,
-        )
-        for ndim, in_keys in keys.items()
-    ]
 
 
 def is_atari(name: str) -> bool:

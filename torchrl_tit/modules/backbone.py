@@ -28,7 +28,7 @@ from torchrl.envs import Compose, InitTracker, TensorDictPrimer, Transform
 
 from torchrl_tit.histories.encoder import RecurrentEncoder
 from torchrl_tit.modules.acting import ActingModule, trunks_of
-from torchrl_tit.modules.sequences import SequenceKeys, default_observation_keys
+from torchrl_tit.modules.sequences import SequenceKeys, beside, default_observation_keys
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
@@ -60,6 +60,11 @@ class Backbone(ActingModule):
 
     The transforms of :meth:`make_transforms` supply the state and ``is_init``. With two trunks, the
     keys of the states begin with ``policy_`` and ``value_``.
+
+    **Several agents.** Dimensions between those of the batch and those of a history stay as they
+    are: histories [*B, agents, K, *obs] under ``("agents", "history")`` become features [*B,
+    agents, F], and sequences [*B, T, agents, *obs] features [*B, T, agents, F]. All agents share
+    the weights. ``is_init`` [*B, T, 1] is that of the environment.
 
     **Sequences.** By default a backbone reads single steps. Within TorchRL's recurrent mode
     (``torchrl.modules.set_recurrent_mode(True)``, which TorchRL's losses switch on) it reads
@@ -97,7 +102,8 @@ class Backbone(ActingModule):
             the history encoder's further inputs. A single key can be given as a string. For several
             observations, :func:`~torchrl_tit.modules.history_keys` lists the keys.
         out_keys: keys of the features: one, or one for the policy and one for the value. A single
-            key can be given as a string.
+            key can be given as a string. By default "features", in the group of the histories:
+            ``("agents", "features")``.
         autocast: dtype of matrix products, such as ``torch.bfloat16``; weights and features keep
             their dtype. None disables autocast.
         every_frame: write the features of all K frames, [..., K, F], for losses on whole windows,
@@ -132,15 +138,16 @@ class Backbone(ActingModule):
         self,
         network: nn.Module,
         in_keys: Sequence[NestedKey] | str = ("history",),
-        out_keys: Sequence[NestedKey] | str = ("features",),
+        out_keys: Sequence[NestedKey] | str | None = None,
         autocast: torch.dtype | None = None,
         every_frame: bool = False,
         padding: Padding | None = None,
         observation_keys: Sequence[NestedKey] | str | None = None,
     ) -> None:
-        in_keys, out_keys = (
-            [keys] if isinstance(keys, str) else list(keys) for keys in (in_keys, out_keys)
-        )
+        in_keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
+        if out_keys is None:
+            out_keys = [beside(in_keys[0], "features")] if in_keys else ["features"]
+        out_keys = [out_keys] if isinstance(out_keys, str) else list(out_keys)
         if not isinstance(network, nn.Module):
             raise ValueError(f"network must be one, such as EnhancedTIT((4,)), not {network!r}")
         trunks = trunks_of(network)
@@ -152,6 +159,11 @@ class Backbone(ActingModule):
             for prefix, trunk in trunks.items()
             for key, shape in _state_shapes(trunk).items()
         }
+        if state_shapes and beside(in_keys[0], "is_init") != "is_init":
+            raise ValueError(
+                f"{type(network.history_encoder).__name__} of one frame carries a state for one "
+                f"agent, not for those of {in_keys[0]!r}: give it num_frames of 2 or more"
+            )
         sequence_keys = _sequence_keys(trunks, in_keys, observation_keys, padding)
         step_keys = [*in_keys, *state_shapes, *(["is_init"] if state_shapes else [])]
         declared = [*sequence_keys.observations, "is_init"] if padding or observation_keys else []
@@ -232,13 +244,20 @@ class Backbone(ActingModule):
         trunks = list(trunks_of(self.module).values())
         table, context = self.sequence_keys.lay_out(tensordict, trunks)
         outputs = self.encode_windows(table.frames, table.windows, *context)
-        shape = self.sequence_keys.shape_of(tensordict)
+        *batch, steps = self.sequence_keys.shape_of(tensordict)
+        group = self.sequence_keys.group_of(tensordict, trunks)
+
+        def unflatten(output: Tensor) -> Tensor:  # [N, T, ...] -> [*B, T, *group, ...]
+            output = output.reshape(*batch, *group, steps, *output.shape[2:])
+            return output.movedim(len(batch) + len(group), len(batch))
+
         written: dict[NestedKey, Tensor] = {
-            key: output.reshape(*shape, *output.shape[2:])
+            key: unflatten(output)
             for key, output in zip(self.features_keys, outputs, strict=True)
         }
         if table.valid is not None:
-            written["features_valid"] = table.valid.reshape(*shape, 1)
+            valid = beside(self.features_keys[0], "features_valid")
+            written[valid] = unflatten(table.valid.unsqueeze(-1))
         return written
 
     def encode_windows(

@@ -32,6 +32,7 @@ from torchrl_tit.modules.distributions import (
     IndependentCategorical,
     IndependentOneHotCategorical,
 )
+from torchrl_tit.modules.sequences import beside
 from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
 from torchrl_tit.modules.torch_internals import is_transformed
 from torchrl_tit.settings.checks import checked_arguments
@@ -44,7 +45,7 @@ def make_actor(
     action_spec: TensorSpec,
     *,
     in_key: NestedKey = "features",
-    action_key: NestedKey = "action",
+    action_key: NestedKey | None = None,
     mask_key: NestedKey | None = None,
     batch_dims: int | None = None,
     gain: Weight = 0.01,
@@ -71,8 +72,9 @@ def make_actor(
     Args:
         features_dim: size of the features.
         action_spec: spec of the action, such as ``env.action_spec_unbatched``.
-        in_key: key of the features [..., F].
-        action_key: key of the action.
+        in_key: key of the features [..., F]. All that is written is in their group: with
+            ``("agents", "features")``, there is an ``("agents", "action")``.
+        action_key: key of the action; by default "action", in the group of the features.
         mask_key: key of the action mask, bool, True where an action is allowed; the masks of an
             action's components are concatenated. Masked actions have probability 0. None allows
             all.
@@ -118,14 +120,15 @@ def make_actor(
     else:
         parts = _gaussian(features_dim, action_spec, shape, gain)
     in_keys = [in_key] if mask_key is None else [in_key, mask_key]
+    parameters = {name: beside(in_key, key) for name, key in parts.parameters.items()}
     return ProbabilisticActor(
-        TensorModule(parts.network, in_keys=in_keys, out_keys=list(parts.parameters.values())),
-        in_keys=parts.parameters,
-        out_keys=[action_key],
+        TensorModule(parts.network, in_keys=in_keys, out_keys=list(parameters.values())),
+        in_keys=parameters,
+        out_keys=[beside(in_key, "action") if action_key is None else action_key],
         distribution_class=parts.distribution,
         distribution_kwargs=parts.settings,
         return_log_prob=True,
-        log_prob_key="action_log_prob",
+        log_prob_key=beside(in_key, "action_log_prob"),
     )
 
 
@@ -135,7 +138,7 @@ def make_squashed_actor(
     action_spec: TensorSpec,
     *,
     in_key: NestedKey = "features",
-    action_key: NestedKey = "action",
+    action_key: NestedKey | None = None,
 ) -> ProbabilisticActor:
     """Builds a tanh-squashed Gaussian policy head on features.
 
@@ -154,7 +157,8 @@ def make_squashed_actor(
         features_dim: size of the features.
         action_spec: a ``Bounded`` spec of one action, without batch dimensions.
         in_key: key of the features [..., F].
-        action_key: key of the action, float [..., A].
+        action_key: key of the action, float [..., A]; by default "action", in the group of the
+            features.
 
     Returns:
         A :class:`~torchrl.modules.ProbabilisticActor` that follows TorchRL's exploration type.
@@ -177,10 +181,11 @@ def make_squashed_actor(
         )
     check_bounds(action_spec, "no squashed policy")
     head = ClampedGaussianHead(features_dim, action_spec.shape[0])
+    parameters = {name: beside(in_key, name) for name in ("loc", "scale")}
     return ProbabilisticActor(
-        TensorModule(head, in_keys=[in_key], out_keys=["loc", "scale"]),
-        in_keys=["loc", "scale"],
-        out_keys=[action_key],
+        TensorModule(head, in_keys=[in_key], out_keys=list(parameters.values())),
+        in_keys=parameters,
+        out_keys=[beside(in_key, "action") if action_key is None else action_key],
         distribution_class=TanhNormal,
         distribution_kwargs={
             "low": action_spec.space.low,
@@ -199,7 +204,8 @@ def make_value(features_dim: Size, *, in_key: NestedKey = "features") -> ValueOp
         in_key: key of the features [..., F].
 
     Returns:
-        A :class:`~torchrl.modules.ValueOperator` that writes ``"state_value"``, float [..., 1].
+        A :class:`~torchrl.modules.ValueOperator` that writes ``"state_value"``, float [..., 1], in
+        the group of the features.
 
     Example:
         >>> import torch
@@ -207,7 +213,8 @@ def make_value(features_dim: Size, *, in_key: NestedKey = "features") -> ValueOp
         >>> make_value(64)(TensorDict({"features": torch.randn(5, 64)}, [5]))["state_value"].shape
         torch.Size([5, 1])
     """
-    return TensorValue(_Linear(features_dim, 1, gain=1.0), in_keys=[in_key])
+    value = _Linear(features_dim, 1, gain=1.0)
+    return TensorValue(value, in_keys=[in_key], out_keys=[beside(in_key, "state_value")])
 
 
 class _Parts(NamedTuple):

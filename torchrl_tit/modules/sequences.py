@@ -61,6 +61,13 @@ class SequenceKeys:
         """
         return tensordict.batch_size or tensordict.get("is_init").shape[:-1]
 
+    def group_of(self, tensordict: TensorDictBase, trunks: Sequence[HistoryNetwork]) -> torch.Size:
+        """The shape between [*B, T] and an observation's own, such as [agents]; mostly empty."""
+        if not trunks or (entry := tensordict.get(self.observations[0], None)) is None:
+            return torch.Size()
+        own = len(next(iter(trunks[0].observations.values())).shape)
+        return entry.shape[len(self.shape_of(tensordict)) : entry.ndim - own]
+
     def lay_out(
         self, tensordict: TensorDictBase, trunks: Sequence[HistoryNetwork]
     ) -> tuple[FrameTable, list[Tensor]]:
@@ -71,7 +78,8 @@ class SequenceKeys:
             trunks: the networks that read them; empty for other modules.
 
         Returns:
-            The table, with windows [N, T, K], and the further inputs, [N, T, K, *entry] each.
+            The table, with windows [N, T, K], and the further inputs, [N, T, K, *entry] each. N
+            counts B, and the agents of each, if there are several.
 
         Raises:
             KeyError: if an entry is missing.
@@ -80,13 +88,16 @@ class SequenceKeys:
         """
         self._check(tensordict, trunks)
         *batch, steps = self.shape_of(tensordict)
-        count, time = math.prod(batch), len(batch)
+        group = self.group_of(tensordict, trunks)
+        count, time = math.prod([*batch, *group]), len(batch)
 
         def flat(entry: Tensor) -> Tensor:
-            return entry.reshape(count, steps, *entry.shape[time + 1 :])
+            entry = entry.movedim(time, time + len(group))  # [*B, *group, T, ...]
+            return entry.reshape(count, steps, *entry.shape[time + len(group) + 1 :])
 
         def flags(entry: Tensor) -> Tensor:
-            return entry.reshape(count, steps, -1).any(-1)
+            flags = entry.reshape(math.prod(batch), steps, -1).any(-1)
+            return flags.repeat_interleave(math.prod(group), 0) if group else flags
 
         observations = [flat(tensordict.get(key)) for key in self.observations]
         context = [flat(tensordict.get(key)) for key in self.context]
@@ -100,7 +111,8 @@ class SequenceKeys:
         stored = [tensordict.get(key, None) for key in self.histories]
         histories = [history for history in stored if history is not None]
         if histories and self.padding is not None:
-            first = [x.select(time, 0).reshape(count, *x.shape[time + 1 :]) for x in histories]
+            own = time + len(group) + 1
+            first = [x.select(time, 0).reshape(count, *x.shape[own:]) for x in histories]
             return table_of_first(first, observations, is_init, self.padding), context
         if histories:
             return table_of_stored([flat(x) for x in histories], observations, starts), context
@@ -130,7 +142,8 @@ class SequenceKeys:
             )
         for trunk in trunks:
             observations = (tensordict.get(key) for key in self.observations)
-            trunk.check_frames(*(x.flatten(0, len(shape) - 1) for x in observations))
+            leading = len(shape) + len(self.group_of(tensordict, trunks))
+            trunk.check_frames(*(x.flatten(0, leading - 1) for x in observations))
             if present:
                 trunk.check(*(tensordict.get(key) for key in present))
 
@@ -164,3 +177,17 @@ def default_observation_keys(histories: Sequence[NestedKey]) -> list[NestedKey]:
         else (*key[:-1], key[-1].replace("history", "observation"))
         for key in histories
     ]
+
+
+def beside(key: NestedKey, name: str) -> NestedKey:
+    """Names another entry of the same group; that of several histories is the one they are in.
+
+    Example:
+        >>> beside("history", "features"), beside(("history", "image"), "features")
+        ('features', 'features')
+        >>> beside(("agents", "history"), "features")
+        ('agents', 'features')
+    """
+    parts = (key,) if isinstance(key, str) else key
+    group = parts[: parts.index("history") if "history" in parts else -1]
+    return unravel_key((*group, name))

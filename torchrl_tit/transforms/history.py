@@ -98,6 +98,14 @@ class History(CatFrames):
         for key in observations:  # made from the specs instead of in the first step
             delattr(self, _buffer_name(key))
 
+    @CatFrames.reset_key.getter
+    def reset_key(self) -> NestedKey:
+        """Key of the mask of a reset: that of the environment, if its agents have others."""
+        given = getattr(self, "_reset_key", None)
+        if given is None and "_reset" in self.parent.reset_keys:
+            return "_reset"
+        return super().reset_key
+
     def set_container(self, container: Transform | EnvBase) -> None:
         """Joins an environment or a composition of transforms, and makes the buffers.
 
@@ -338,11 +346,14 @@ def default_history_keys(observations: Sequence[NestedKey]) -> list[NestedKey]:
     """
     histories: list[NestedKey] = []
     for key in observations:
-        parts, alone = (key,) if isinstance(key, str) else key, len(observations) == 1
-        if (alone or len(parts) > 1) and any("observation" in part for part in parts):
-            parts = tuple(part.replace("observation", "history") for part in parts)
+        *groups, name = parts = (key,) if isinstance(key, str) else key
+        alone = len(observations) == 1
+        if groups[:1] == ["observation"]:
+            parts = ("history", *parts[1:])
+        elif "observation" in name and (alone or groups):
+            parts = (*groups, name.replace("observation", "history"))
         else:
-            parts = (*parts[:-1], "history") if alone else ("history", "/".join(parts))
+            parts = (*groups, "history") if alone else ("history", "/".join(parts))
         histories.append(unravel_key(parts))
     return histories
 
