@@ -230,7 +230,8 @@ def test_a_row_without_any_action_is_refused():
 
 def test_value_and_keys():
     td = TensorDict({"agent": {"value_features": torch.randn(5, 16)}}, [5])
-    assert make_value(16, in_key=("agent", "value_features"))(td)["state_value"].shape == (5, 1)
+    make_value(16, in_key=("agent", "value_features"))(td)
+    assert td["agent", "state_value"].shape == (5, 1)
     td = TensorDict({"policy": torch.randn(5, 16)}, [5])
     assert make_actor(16, Categorical(2), in_key="policy", action_key="move")(td)["move"].shape == (
         5,

@@ -252,8 +252,7 @@ class Backbone(ActingModule):
             return output.movedim(len(batch) + len(group), len(batch))
 
         written: dict[NestedKey, Tensor] = {
-            key: unflatten(output)
-            for key, output in zip(self.features_keys, outputs, strict=True)
+            key: unflatten(output) for key, output in zip(self.features_keys, outputs, strict=True)
         }
         if table.valid is not None:
             valid = beside(self.features_keys[0], "features_valid")
