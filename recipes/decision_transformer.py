@@ -249,7 +249,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         episodes = self.split(episodes)
         for encoder in self.model.network.frames:
             if isinstance(encoder, NormalizedFrames):
-                encoder.set_statistics(*episodes.observation_statistics())
+                encoder.set_statistics(*episodes.observation_statistics(encoder.samples))
         return episodes.to(self.device)
 
     def make_storage(self, episodes: Episodes) -> SequenceStorage:

@@ -117,6 +117,7 @@ class Novelty(nn.Module):
         """
         entries = []
         for frames, seen in zip(self.target.frames, observations, strict=True):
+            seen = frames.clean(seen)
             if width and seen.is_floating_point() and isinstance(frames, NormalizedFrames):
                 seen = (frames.normalize(seen) / width).floor()
             entries.append(seen.flatten(-len(frames.observation_shape)))

@@ -433,7 +433,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         """
         recipe, episodes = self.recipe, self.load_data()
         if recipe.normalize_observations:
-            self._set_statistics(*episodes.observation_statistics())
+            self._set_statistics(episodes)
         storage = self.measured_items(episodes.to(self.device))
         length = recipe.slice_length
         return make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed, slice_length=length)
@@ -502,10 +502,10 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         return 1e-3 if self.recipe.normalize_observations else None
 
     @torch.no_grad()
-    def _set_statistics(self, mean: Tensor, std: Tensor) -> None:
+    def _set_statistics(self, episodes: Episodes) -> None:
         """Sets the statistics of all networks: the policy's, the critics' and the targets'."""
         (frames,) = (m for m in self.policy.modules() if isinstance(m, NormalizedFrames))
-        frames.set_statistics(mean, std)
+        frames.set_statistics(*episodes.observation_statistics(frames.samples))
         statistics = dict(frames.named_buffers(recurse=False))
         buffers = dict(self.model.named_buffers())  # the loss stacks those of the critics
         for name, buffer in buffers.items():

@@ -112,7 +112,7 @@ def fitted_q(
     )
     for module in critic.modules():
         if isinstance(module, NormalizedFrames):
-            module.set_statistics(*episodes.observation_statistics())
+            module.set_statistics(*episodes.observation_statistics(module.samples))
     episodes = episodes.to(algorithm.device)
     items = HistoryStorage(episodes, num_frames, padding=recipe.padding, unfinished="keep")
     critic = critic.to(algorithm.device)

@@ -45,6 +45,7 @@ FRAMES: dict[str, FrameSettings] = {
     "flat": settings.Flat(),
     "linear": settings.Linear(embed_dim=WIDTH, bias=True, activation="tanh"),
     "inner": settings.Inner(patch_size=4, embed_dim=WIDTH, **BLOCKS),
+    "entities": settings.Entities(embed_dim=WIDTH, **BLOCKS),
     "resnet": settings.ResNetFrames(embed_dim=WIDTH),
     "nature-cnn": settings.NatureCNNFrames(embed_dim=WIDTH),
 }
@@ -81,8 +82,10 @@ Pair = tuple[str, ...]
 
 
 def shape_of(pair: Pair) -> tuple[int, ...]:
-    """An image for convolutions, as small as they allow, else an array."""
+    """An image for convolutions, as small as they allow; a set of entities; else an array."""
     frame, history = pair
+    if frame == "entities":
+        return (5, 4)
     return (36, 36) if history == "stacked-cnn" or frame in ("resnet", "nature-cnn") else (6,)
 
 

@@ -273,15 +273,17 @@ def _draw_inputs(network: HistoryNetwork) -> list[Tensor]:
     """A random history of each observation, [1, K, *observation], and the further inputs."""
     inputs = []
     frames = network.num_frames
-    for seen in network.observations.values():
+    for encoder, seen in zip(network.frames, network.observations.values(), strict=True):
         if seen.categories is not None:
             columns = [torch.randint(n, (1, frames, 1)) for n in seen.categories]
             inputs.append(torch.cat(columns, -1))
         else:
             inputs.append(torch.randn(1, frames, *seen.shape, dtype=torch.float64))
-    encoder = network.history_encoder
-    if isinstance(encoder, DecisionTransformer):
-        inputs.append(torch.randn(1, frames, encoder.action_dim, dtype=torch.float64))
+            if encoder.reads_entities:
+                inputs[-1][..., -1] = 1  # none is padding
+    history = network.history_encoder
+    if isinstance(history, DecisionTransformer):
+        inputs.append(torch.randn(1, frames, history.action_dim, dtype=torch.float64))
         inputs.append(torch.randn(1, frames, 1, dtype=torch.float64))
         inputs.append(torch.arange(frames).unsqueeze(0))
     return inputs

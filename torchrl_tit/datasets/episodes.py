@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
@@ -119,17 +119,25 @@ class Episodes:
             final_known=self.final_known.to(device),
         )
 
-    def observation_statistics(self) -> tuple[Tensor, Tensor]:
+    def observation_statistics(
+        self, samples: Callable[[Tensor], Tensor] = lambda observations: observations
+    ) -> tuple[Tensor, Tensor]:
         """Computes the mean and standard deviation of the observations of finished episodes.
 
+        Args:
+            samples: what is counted of observations [N, *obs], [M, *sample]: see
+                :meth:`torchrl_tit.frames.FrameEncoder.samples`.
+
         Returns:
-            Mean and population standard deviation, float32 [*obs] each, for
+            Mean and population standard deviation, float32 [*sample] each, for
             :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`. The deviation of a constant
             entry of an array is 1, so that it is not amplified if it changes later.
         """
-        count = self.lengths[self.finished].sum()
-        mean = sum(chunk.double().sum(0) for chunk in self._observations()) / count
-        squares = sum(chunk.double().sub_(mean).square_().sum(0) for chunk in self._observations())
+        count = sum(len(samples(chunk)) for chunk in self._observations())
+        mean = sum(samples(x).double().sum(0) for x in self._observations()) / count
+        squares = sum(
+            samples(x).double().sub_(mean).square_().sum(0) for x in self._observations()
+        )
         std = (squares / count).sqrt().float()
         if mean.ndim == 1:  # pixels of an image have the statistics of their channel
             std = std.where(std > 1e-7 * mean.abs(), 1.0)  # less is rounding

@@ -47,6 +47,9 @@ class FrameEncoder(nn.Module):
 
     kinds: ClassVar[tuple[Kind, ...]] = ("array", "image")
     """Kinds of observations that it reads: any of "array", "image" and "categories"."""
+    reads_entities: bool = False
+    """Whether an observation is a set: rows of entities, and of padding, as their last entry says
+    (:class:`~torchrl_tit.frames.entities.EntityTransformer`)."""
     num_tokens: int
     """Number L of tokens per observation."""
     width: int
@@ -71,6 +74,28 @@ class FrameEncoder(nn.Module):
         raise NotImplementedError(
             "there is no forward, which maps [..., *observation_shape] to tokens [..., L, D]"
         )
+
+    def clean(self, observation: Tensor) -> Tensor:
+        """Replaces what is never read, such as the numbers in padding, by zeros.
+
+        Args:
+            observation: as in ``forward``.
+
+        Returns:
+            Observations of the same shape.
+        """
+        return observation
+
+    def samples(self, observations: Tensor) -> Tensor:
+        """Returns what statistics are computed of: by default the observations themselves.
+
+        Args:
+            observations: [N, *observation_shape].
+
+        Returns:
+            [M, *sample]; for sets, the rows of all entities.
+        """
+        return observations
 
     def attention_maps(self, observation: Tensor) -> list[Tensor]:
         """Returns the attention weights of each attention layer of this library in it.

@@ -88,13 +88,14 @@ class InnerTransformer(FrameEncoder):
         if self.positions is not None:
             nn.init.normal_(self.positions, std=0.02)
 
-    def forward(self, observation: Tensor) -> Tensor:
+    def forward(self, observation: Tensor, mask: Tensor | None = None) -> Tensor:
         """Encodes observations.
 
         Args:
             observation: [..., *observation_shape], or [..., num_frames, *observation_shape] if
                 frames are stacked as channels; float, or uint8, which is divided by 255; integers
                 for categories.
+            mask: bool [..., patches], True where a patch is read; None reads all.
 
         Returns:
             Class tokens, float [..., L, D], or [..., 1, D] of the last block only.
@@ -108,10 +109,13 @@ class InnerTransformer(FrameEncoder):
         patches = self.patch_embedding(x)  # [N, patches, D]
         x = torch.cat([self.class_token.expand(patches.shape[0], -1, -1), patches], dim=1)
         x = x if self.positions is None else x + self.positions
+        if mask is not None:  # the class token is always read
+            mask = mask.reshape(x.shape[0], 1, 1, mask.shape[-1])
+            mask = nn.functional.pad(mask, (1, 0), value=True)
         class_tokens = []
         for index in range(self.num_blocks):
             last = index == self.num_blocks - 1
-            x = self._block(index)(x, read="first" if last else "all")
+            x = self._block(index)(x, read="first" if last else "all", mask=mask)
             if last or self.every_block:
                 class_tokens.append(x[:, 0])
         return torch.stack(class_tokens, dim=1).reshape(*leading, self.num_tokens, self.width)

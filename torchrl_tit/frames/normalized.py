@@ -20,7 +20,8 @@ class NormalizedFrames(FrameEncoder):
     (:meth:`set_statistics`). Until then, observations are read as they are. Each entry of an array
     has its own mean and standard deviation, as in `VecNormalize` of Stable-Baselines3. So has each
     channel of an image, whose bytes are first scaled to 0..1: if all pixels are positive, a network
-    first sees what all images have in common. Results beyond +-``limit`` are clipped.
+    first sees what all images have in common. The entities of a set share their statistics, in which
+    padding does not count; their mask is not normalized. Results beyond +-``limit`` are clipped.
 
     The statistics are buffers of the network, so checkpoints, evaluation, copies and exports have
     them, and a frame's tokens stay the same while a batch is collected. TorchRL's `VecNormV2` is a
@@ -56,15 +57,16 @@ class NormalizedFrames(FrameEncoder):
         self.limit = limit
         self.eps = eps
         shape = encoder.observation_shape
-        self.is_image = len(shape) > 1
-        shape = (*shape[:-2], 1, 1) if self.is_image else shape
+        self.reads_entities = encoder.reads_entities
+        self.is_image = len(shape) > 1 and not self.reads_entities
+        shape = (*shape[:-2], 1, 1) if self.is_image else shape[-1:]
         self.register_buffer("count", torch.zeros(()))
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("variance", torch.ones(shape))
 
     @torch.no_grad()
     def set_statistics(self, mean: Tensor, std: Tensor) -> None:
-        """Replaces the statistics by those of a data set, float [*observation_shape] each."""
+        """Replaces the statistics by those of a data set's samples, float [*sample] each."""
         variance = std.square()
         if self.is_image:  # of a channel: the mean of its variances, and the variance of its means
             over = (-2, -1)
@@ -72,16 +74,19 @@ class NormalizedFrames(FrameEncoder):
             mean = mean.mean(over, keepdim=True)
         self.mean.copy_(mean)
         self.variance.copy_(variance)
+        self._keep_mask()
 
     @torch.no_grad()
     def update(self, observations: Tensor) -> None:
         """Adds observations to the statistics, float or uint8 [N, *observation_shape]."""
         for part in observations.split(_IMAGES) if self.is_image else [observations]:
-            self._add(bytes_to_floats(part, self.mean.dtype))
+            self._add(bytes_to_floats(self.samples(part), self.mean.dtype))
+        self._keep_mask()
 
     def _add(self, observations: Tensor) -> None:
         over = (0, -2, -1) if self.is_image else (0,)
-        size = observations.shape[0]
+        if not (size := observations.shape[0]):  # sets without entities
+            return
         total = self.count + size
         shift = observations.mean(over, keepdim=True)[0] - self.mean
         variance = observations.var(over, unbiased=False, keepdim=True)[0]
@@ -90,9 +95,22 @@ class NormalizedFrames(FrameEncoder):
         self.mean.add_(shift * size / total)
         self.count.copy_(total)
 
+    def _keep_mask(self) -> None:
+        """Leaves the masks of entities as they are: 0, or 1 up to ``eps``."""
+        if self.reads_entities:
+            self.mean[-1], self.variance[-1] = 0, 1
+
+    def clean(self, observation: Tensor) -> Tensor:
+        """See :meth:`FrameEncoder.clean`."""
+        return self.encoder.clean(observation)
+
+    def samples(self, observations: Tensor) -> Tensor:
+        """See :meth:`FrameEncoder.samples`."""
+        return self.encoder.samples(observations)
+
     def normalize(self, observation: Tensor) -> Tensor:
         """Normalizes observations, float or uint8 [..., *observation_shape] -> float."""
-        floats = bytes_to_floats(observation, self.mean.dtype)
+        floats = bytes_to_floats(self.clean(observation), self.mean.dtype)
         root, eps = (1e-8, 0.0) if self.eps is None else (0.0, self.eps)
         normal = standardize(floats, self.mean, (self.variance + root).sqrt(), eps)
         return normal.clamp(-self.limit, self.limit)

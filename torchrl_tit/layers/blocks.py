@@ -61,17 +61,18 @@ class TransformerBlock(nn.Module):
         self.norm2 = nn.LayerNorm(embed_dim)
         self.ffn = _ffn(embed_dim, ffn_expansion * embed_dim, activation, ffn_dropout)
 
-    def forward(self, x: Tensor, read: Read = "all") -> Tensor:
+    def forward(self, x: Tensor, read: Read = "all", mask: Tensor | None = None) -> Tensor:
         """Transforms a sequence.
 
         Args:
             x: tokens, float [..., S, D].
             read: which positions to compute and return: all, the first or the last.
+            mask: which positions see which others: see :meth:`SelfAttention.forward`.
 
         Returns:
             float [..., S or 1, D].
         """
-        x = x[..., READ_SLICES[read], :] + self.attention(self.norm1(x), read)
+        x = x[..., READ_SLICES[read], :] + self.attention(self.norm1(x), read, mask)
         return x + self.ffn(self.norm2(x))
 
     def read_windows(self, x: Tensor, windows: Windows) -> Tensor:

@@ -22,6 +22,7 @@ __all__ = [
     "ChainedOuter",
     "CoBERL",
     "DecisionTransformer",
+    "Entities",
     "Flat",
     "FrameSettings",
     "GTrXL",
@@ -97,25 +98,31 @@ class TransformerSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatchTransformerSettings(TransformerSettings):
+class ClassTokenSettings(TransformerSettings):
+    """Settings of a transformer on the parts of an observation, which outputs class tokens."""
+
+    embed_dim: Width = 32
+    """Width D of a token."""
+    num_blocks: Count = 2
+    """Number of blocks."""
+    every_block: bool = True
+    """Whether to output the class token of every block, or of the last one only."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PatchTransformerSettings(ClassTokenSettings):
     """Settings of a transformer on the patches of observations."""
 
     patch_size: Width | Literal["auto"] | None = 1
     """Entries per patch of an array, or pixels per side of an image patch. If not given, the patch
     is the whole observation (images must then be square). "auto" uses one patch for an array, at
     most 16 patches for categories, and about 49 for an image."""
-    embed_dim: Width = 32
-    """Width D of a token."""
     patch_weights: Literal["shared", "own"] = "shared"
     """Whether all patches of an array share one embedding, which has no bias, or each patch has its
     own weights and bias, all of the same size (the feature tokenizer of arXiv 2106.11959). With
     shared weights and patches of one entry, attention sees little more than each entry's sign."""
-    num_blocks: Count = 2
-    """Number of blocks."""
     position_encoding: bool = True
     """Whether patches and class token get a learned position encoding."""
-    every_block: bool = True
-    """Whether to output the class token of every block, or of the last one only."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +133,16 @@ class Inner(
     builds="torchrl_tit.frames.inner:InnerTransformer",
 ):
     """The inner transformer of TIT (arXiv 2212.14538), which outputs its class tokens."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Entities(
+    ClassTokenSettings,
+    FrameSettings,
+    name="entities",
+    builds="torchrl_tit.frames.entities:EntityTransformer",
+):
+    """An inner transformer on a set of entities: rows whose last entry says which are padding."""
 
 
 @dataclass(frozen=True, kw_only=True)
