@@ -100,7 +100,7 @@ def map_attention(network: HistoryNetwork, *histories: Tensor) -> dict[str, Tens
     Returns:
         Maps by the name of the observation, float [..., K, h, w] over the patches, summing to 1;
         for networks that stack the frames as channels, [..., 1, h, w]. The patches of arrays and
-        categories form one row.
+        categories form one row, the entities of a set one column.
 
     Raises:
         ValueError: if the network has no inner blocks.
@@ -114,7 +114,8 @@ def map_attention(network: HistoryNetwork, *histories: Tensor) -> dict[str, Tens
     maps = {}
     for name, blocks in inner_attention(network, *histories).items():
         row = roll_out(blocks)[..., 0, 1:]  # of the class token, without its attention to itself
-        row = row / row.sum(-1, keepdim=True)
+        # Nothing is read of a set without entities.
+        row = row / row.sum(-1, keepdim=True).clamp(min=torch.finfo(row.dtype).tiny)
         maps[name] = row.unflatten(-1, patch_grid(network, name))
     return maps
 

@@ -45,7 +45,8 @@ def integrated_gradients(
             one.
         target: what is explained; see :data:`~torchrl_tit.analysis.targets.Target`.
         baselines: observations to compare with, by name, broadcast to [N, K, *observation]; zeros
-            if not given. Bytes count as 0..1, as networks read them.
+            if not given. Bytes count as 0..1, as networks read them. In sets, the same rows are
+            entities as in the observation.
         steps: number of points on the line. With more points, the sum is more exact.
 
     Returns:
@@ -93,10 +94,15 @@ def integrated_gradients(
         with evaluating(policy), torch.no_grad():
             state = state.copy().set("action", run_policy(policy, state)[0]["action"])
     inputs = {name: bytes_to_floats(state[key]) for name, key in keys.items()}
-    starts = tuple(
-        torch.zeros_like(x) if name not in baselines else baselines[name].to(x).expand_as(x)
+    starts = {
+        name: baselines[name].to(x).expand_as(x).clone()
+        if name in baselines
+        else torch.zeros_like(x)
         for name, x in inputs.items()
-    )
+    }
+    for name, encoder in zip(network.observations, network.frames, strict=True):
+        if encoder.reads_entities:
+            starts[name][..., -1] = inputs[name][..., -1]
 
     def compute(*histories: Tensor) -> Tensor:
         repeats = len(histories[0]) // len(state)
@@ -108,7 +114,9 @@ def integrated_gradients(
         return value
 
     with evaluating(policy), torch.enable_grad():
-        shares = method(compute).attribute(tuple(inputs.values()), starts, n_steps=steps)
+        shares = method(compute).attribute(
+            tuple(inputs.values()), tuple(starts.values()), n_steps=steps
+        )
     return {name: share.detach() for name, share in zip(inputs, shares, strict=True)}
 
 

@@ -109,7 +109,7 @@ def named_layer(network: HistoryNetwork, layer: str) -> tuple[str, ImageLayer]:
 
 
 def patch_grid(network: HistoryNetwork, observation: str) -> tuple[int, int]:
-    """Returns rows and columns of the patches of an observation; an array has one row.
+    """Returns rows and columns of the patches: one row of an array's, one column of a set's.
 
     Raises:
         ValueError: if no inner transformer reads it.
@@ -119,6 +119,8 @@ def patch_grid(network: HistoryNetwork, observation: str) -> tuple[int, int]:
         inner = inner_of(part)
         if inner is not None:
             patches = inner.patch_embedding
+            if network.frames[index].reads_entities:
+                return patches.num_patches, 1
             return getattr(patches, "grid", None) or (1, patches.num_patches)
     raise ValueError(
         f"no inner transformer reads {observation!r}, so there are no patches: this network has no "

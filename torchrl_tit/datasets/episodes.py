@@ -135,9 +135,7 @@ class Episodes:
         """
         count = sum(len(samples(chunk)) for chunk in self._observations())
         mean = sum(samples(x).double().sum(0) for x in self._observations()) / count
-        squares = sum(
-            samples(x).double().sub_(mean).square_().sum(0) for x in self._observations()
-        )
+        squares = sum(samples(x).double().sub_(mean).square_().sum(0) for x in self._observations())
         std = (squares / count).sqrt().float()
         if mean.ndim == 1:  # pixels of an image have the statistics of their channel
             std = std.where(std > 1e-7 * mean.abs(), 1.0)  # less is rounding

@@ -20,8 +20,8 @@ class NormalizedFrames(FrameEncoder):
     (:meth:`set_statistics`). Until then, observations are read as they are. Each entry of an array
     has its own mean and standard deviation, as in `VecNormalize` of Stable-Baselines3. So has each
     channel of an image, whose bytes are first scaled to 0..1: if all pixels are positive, a network
-    first sees what all images have in common. The entities of a set share their statistics, in which
-    padding does not count; their mask is not normalized. Results beyond +-``limit`` are clipped.
+    first sees what all images have in common. The entities of a set share their statistics: padding
+    does not count, and the mask is not normalized. Results beyond +-``limit`` are clipped.
 
     The statistics are buffers of the network, so checkpoints, evaluation, copies and exports have
     them, and a frame's tokens stay the same while a batch is collected. TorchRL's `VecNormV2` is a

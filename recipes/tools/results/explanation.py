@@ -77,7 +77,8 @@ class Explainer:
             outputs, distribution = run_policy(self.policy, state)
         histories = histories_of(self.policy, state)
         seen = {}
-        frames = dict(zip(self.network.observations, histories, strict=False))
+        encoders = zip(self.network.observations, self.network.frames, histories, strict=False)
+        frames = {name: encoder.clean(history) for name, encoder, history in encoders}
         for name, maps in self._maps(state, histories).items():
             seen[name] = Seen(_array(frames[name][0]), _array(maps[0]))
         try:
