@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from docs.examples import dqn, iql, ppo, sac
+from docs.examples import dqn, iql, ppo, sac, several_agents
 
 
 def parameters_of_backbones(loss):
@@ -71,5 +71,13 @@ def test_ppo_trains_the_backbone_before_its_heads(dropout):
     assert parameters_of_backbones(backbone)
     for name, parameter in [*backbone.named_parameters(), *heads.items()]:
         assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        assert parameter.grad.any() or "in_proj" in name, name
+
+
+def test_several_agents_share_a_backbone_that_learns():
+    backbone, rewards = several_agents.main(steps=2560)
+    assert rewards[-1] > rewards[0] + 0.1
+    for name, parameter in backbone.named_parameters():
         assert parameter.grad.isfinite().all(), name
         assert parameter.grad.any() or "in_proj" in name, name

@@ -11,14 +11,19 @@ from gymnasium.spaces import Tuple as TupleSpace
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import FilterObservation
 from torchrl.data import Binary, Categorical, MultiCategorical, Unbounded
-from torchrl.envs import GymWrapper
+from torchrl.envs import Compose, GymWrapper, InitTracker, TransformedEnv
 from torchrl.envs.utils import check_env_specs
+from torchrl.modules import set_recurrent_mode
 
 from tests.envs.tasks import Echo, Robot
 from tests.transforms.streams import assert_histories
 from torchrl_tit.envs import GymVectorEnv, make_env, observation_keys, observation_specs
 from torchrl_tit.envs.actions import box_action_spec
 from torchrl_tit.envs.spaces import ObservationReader
+from torchrl_tit.modules import Backbone, history_keys
+from torchrl_tit.networks import build_network
+from torchrl_tit.settings.networks import enhanced_tit
+from torchrl_tit.transforms import History
 
 ROBOT = "tests.envs.tasks:Robot-v0"
 NAMES = ["arm/gear", "arm/joint_angles", "camera", "contacts", "wheels"]
@@ -286,3 +291,51 @@ def test_actions_and_masks_that_are_not_supported():
         echo(Box(-1, 1), mask_actions=True)
     with pytest.raises(ValueError, match='"action_mask" has 4 entries, but there are 3 actions'):
         echo(Discrete(3), Dict(action_mask=MultiBinary(4), at=Discrete(2)), mask_actions=True)
+
+
+class Arm(gymnasium.Env):
+    """A camera, a place, and a nested entry."""
+
+    action_space = Discrete(2)
+    observation_space = Dict(
+        camera=Box(0, 255, (3, 12, 12), np.uint8),
+        arm=Dict(left=Box(-1, 1, (2,))),
+        place=Box(-1, 1, (3,)),
+    )
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        self.steps = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: Any) -> Any:
+        self.steps += 1
+        return self.observation_space.sample(), 1.0, self.steps == 7, False, {}
+
+
+def test_torchrls_own_environments_with_several_observations() -> None:
+    keys = ["camera", "place", ("arm", "left")]
+    env = TransformedEnv(GymWrapper(Arm()), Compose(InitTracker(), History(4, in_keys=keys)))
+    specs = observation_specs(env)
+    assert isinstance(specs, dict)
+    shapes = {name: tuple(spec.shape) for name, spec in specs.items()}
+    assert shapes == {"camera": (3, 12, 12), "place": (3,), "arm/left": (2,)}
+    assert observation_keys(env) == keys
+    network = build_network(enhanced_tit(4), specs)
+    backbone = Backbone(network, history_keys(specs), observation_keys=keys)
+    steps = env.rollout(12, break_when_any_done=False)
+    expected = backbone(steps.clone())["features"]
+    with set_recurrent_mode(True):
+        torch.testing.assert_close(backbone(steps)["features"], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_what_an_environment_lacks_is_said_in_one_line() -> None:
+    env = GymWrapper(Arm())
+    with pytest.raises(ValueError, match=r"no 'observation' .* only .*camera, place: add History"):
+        observation_specs(env)
+    pixels = History(2, in_keys=["camera"])
+    assert observation_specs(TransformedEnv(env, pixels)).shape == (3, 12, 12)
+    odd = History(2, in_keys=["camera", "place"], out_keys=["a", "b"])
+    with pytest.raises(ValueError, match=r"\['a', 'b'\] have no names: call them"):
+        observation_specs(TransformedEnv(env, odd))

@@ -167,6 +167,16 @@ def test_steps_that_are_no_slices_are_refused():
         History(3)(flat[0])
 
 
+def test_keys_of_histories() -> None:
+    assert History(2, in_keys=["pixels"]).out_keys == ["history"]
+    assert History(2, in_keys=[("agents", "observation_1")]).out_keys == [("agents", "history_1")]
+    several = ["observation", "pixels", ("arm", "left"), ("observation", "own_observation")]
+    names = ["observation", "pixels", "arm/left", "own_observation"]
+    assert History(2, in_keys=several).out_keys == [("history", name) for name in names]
+    stored = ["pixels", ("next", "pixels")]
+    assert History(2, in_keys=stored).out_keys == ["history"]
+
+
 @pytest.mark.parametrize("wrap", [lambda history: history, lambda history: Compose(history)])
 def test_wrong_environment(wrap):
     with pytest.raises(ValueError, match=r"shape \[2, 4, 5\], so observation_ndim must be 3"):
