@@ -133,9 +133,13 @@ class Episodes:
             :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`. The deviation of a constant
             entry of an array is 1, so that it is not amplified if it changes later.
         """
-        count = sum(len(samples(chunk)) for chunk in self._observations())
-        mean = sum(samples(x).double().sum(0) for x in self._observations()) / count
-        squares = sum(samples(x).double().sub_(mean).square_().sum(0) for x in self._observations())
+        count, total = 0, torch.zeros((), dtype=torch.float64)
+        for chunk in map(samples, self._observations()):
+            count, total = count + len(chunk), total + chunk.double().sum(0)
+        mean = total / count
+        squares = torch.zeros_like(mean)
+        for chunk in map(samples, self._observations()):
+            squares += chunk.double().sub_(mean).square_().sum(0)
         std = (squares / count).sqrt().float()
         if mean.ndim == 1:  # pixels of an image have the statistics of their channel
             std = std.where(std > 1e-7 * mean.abs(), 1.0)  # less is rounding
