@@ -102,7 +102,7 @@ class Backbone(ActingModule):
             the history encoder's further inputs. A single key can be given as a string. For several
             observations, :func:`~torchrl_tit.modules.history_keys` lists the keys.
         out_keys: keys of the features: one, or one for the policy and one for the value. A single
-            key can be given as a string. By default "features", in the group of the histories:
+            key can be given as a string. By default "features"; beside ``("agents", "history")``,
             ``("agents", "features")``.
         autocast: dtype of matrix products, such as ``torch.bfloat16``; weights and features keep
             their dtype. None disables autocast.
@@ -145,8 +145,10 @@ class Backbone(ActingModule):
         observation_keys: Sequence[NestedKey] | str | None = None,
     ) -> None:
         in_keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
+        first = in_keys[0] if in_keys else "history"
+        of_agents = isinstance(first, tuple) and "history" in first[-1]
         if out_keys is None:
-            out_keys = [beside(in_keys[0], "features")] if in_keys else ["features"]
+            out_keys = [beside(first, "features") if of_agents else "features"]
         out_keys = [out_keys] if isinstance(out_keys, str) else list(out_keys)
         if not isinstance(network, nn.Module):
             raise ValueError(f"network must be one, such as EnhancedTIT((4,)), not {network!r}")
@@ -159,10 +161,10 @@ class Backbone(ActingModule):
             for prefix, trunk in trunks.items()
             for key, shape in _state_shapes(trunk).items()
         }
-        if state_shapes and beside(in_keys[0], "is_init") != "is_init":
+        if state_shapes and of_agents:
             raise ValueError(
                 f"{type(network.history_encoder).__name__} of one frame carries a state for one "
-                f"agent, not for those of {in_keys[0]!r}: give it num_frames of 2 or more"
+                f"agent, not for those of {first!r}: give it num_frames of 2 or more"
             )
         sequence_keys = _sequence_keys(trunks, in_keys, observation_keys, padding)
         step_keys = [*in_keys, *state_shapes, *(["is_init"] if state_shapes else [])]

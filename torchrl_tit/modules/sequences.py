@@ -180,14 +180,10 @@ def default_observation_keys(histories: Sequence[NestedKey]) -> list[NestedKey]:
 
 
 def beside(key: NestedKey, name: str) -> NestedKey:
-    """Names another entry of the same group; that of several histories is the one they are in.
+    """Names another entry of the same group.
 
     Example:
-        >>> beside("history", "features"), beside(("history", "image"), "features")
-        ('features', 'features')
-        >>> beside(("agents", "history"), "features")
-        ('agents', 'features')
+        >>> beside("features", "action"), beside(("agents", "features"), "action")
+        ('action', ('agents', 'action'))
     """
-    parts = (key,) if isinstance(key, str) else key
-    group = parts[: parts.index("history") if "history" in parts else -1]
-    return unravel_key((*group, name))
+    return name if isinstance(key, str) else unravel_key((*key[:-1], name))
