@@ -10,16 +10,23 @@ from .arguments import Parser, fail, note, say
 
 
 def compare(arguments: list[str]) -> None:
-    """Plots learning curves of several runs."""
-    parser = Parser("compare", "Plot learning curves of runs, a recipe's seeds as one band.")
-    parser.add_argument("runs", type=Path, nargs="+", help="run folders, or tables of runs")
+    """Plots learning curves of several runs, and says which are better."""
+    parser = Parser(
+        "compare",
+        "Plot learning curves of runs, a recipe's seeds as one band, and print how the evaluations "
+        "of each recipe differ from those of the first: probability of improvement, permutation "
+        "test, and the number of seeds that such a difference needs.",
+    )
+    parser.add_argument("runs", type=Path, nargs="+", help="folders of runs, or tables of runs")
     parser.add_argument("--out", type=Path, default=Path("comparison.png"), help="PNG to write")
     parser.add_argument("--title", default="", help="title of the figure")
     options = parser.parse_args(arguments)
     if options.out.suffix != ".png":
         fail(f"--out {options.out} must end in .png: the figure is a PNG")
+    from ..tools.results.comparison import HEADER, WORDS, compare_with_first
     from ..tools.results.experiments import check_together, find_runs, group_runs
     from ..tools.results.plot import plot_comparison
+    from ..tools.results.table import read_evaluations, to_lines, value_of
 
     # The logs of a sweep lie next to its runs, so `sweep/*/seed-*` matches them too.
     folders = {path.resolve(): path for path in options.runs if path.suffix != ".log"}
@@ -29,6 +36,47 @@ def compare(arguments: list[str]) -> None:
     check_together(experiments)
     plot_comparison(experiments, options.out, title=options.title)
     say(f"written to {options.out}")
+    if len(experiments) < 2:
+        return
+    evaluated, notes = read_evaluations(folders.values())
+    for line in notes:
+        note(line)
+    if rows := compare_with_first([(x.label, [*map(value_of, found)]) for x, found in evaluated]):
+        say("\n".join(["", *to_lines(HEADER, rows), "", WORDS]))
+
+
+def summary(arguments: list[str]) -> None:
+    """Summarizes the runs of networks over several tasks."""
+    parser = Parser(
+        "summary",
+        "Print the interquartile mean of each network's returns over all tasks that all of them "
+        "have, normalised by a random policy and the best published PPO, and the probability that "
+        "it improves on the first (arXiv 2108.13264).",
+    )
+    parser.add_argument("folders", type=Path, nargs="+", help="folders of runs, or tables of runs")
+    parser.add_argument(
+        "--networks",
+        nargs="+",
+        default=[],
+        metavar="PATTERN",
+        help="which runs belong together, the first to compare with: patterns of the last part of "
+        "a recipe's name, such as 'enhanced-tit*'; default: those with the same last part",
+    )
+    parser.add_argument(
+        "--references",
+        type=Path,
+        metavar="FILE",
+        help="CSV file with the columns env, random and best, instead of the returns that come "
+        "with the package",
+    )
+    options = parser.parse_args(arguments)
+    from ..tools.results.comparison import SUMMARY, read_networks, summarize
+    from ..tools.results.table import to_lines
+
+    networks, notes = read_networks(options.folders, options.networks, options.references)
+    for line in notes:
+        note(line)
+    say("\n".join(to_lines(SUMMARY, summarize(networks))))
 
 
 def table(arguments: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""Interquartile means over runs, and their intervals."""
+"""Interquartile means over runs and over tasks, and their intervals."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import bootstrap, trim_mean
 
+from .numbers import number, numbers
+
+FEWEST = 5
+"""Of fewer runs, the quarters at both ends are no runs, and intervals say nothing."""
+
 
 @dataclass(frozen=True)
 class Interval:
-    """An interquartile mean over runs, and its 95% interval, which is NaN for a single run."""
+    """A number over runs, and its 95% interval, which is NaN for too few runs."""
 
-    iqm: float
+    middle: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        """As "0.310 [0.280, 0.350]"."""
-        return f"{self:.3f}"
-
-    def __format__(self, spec: str) -> str:
-        """Each number in a format, such as ".0f"."""
-        numbers = [format(value, spec or ".3f") for value in (self.iqm, self.low, self.high)]
-        return numbers[0] if np.isnan(self.low) else "{} [{}, {}]".format(*numbers)
+        """As "0.31 [0.28, 0.35]"."""
+        if np.isnan(self.low):
+            return number(self.middle)
+        return "{} [{}, {}]".format(*numbers([self.middle, self.low, self.high]))
 
 
 def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
@@ -36,16 +38,19 @@ def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
     Args:
         values: one value of each run (seed).
 
+    Returns:
+        The interquartile mean and its interval by bootstrap over runs; of fewer than five runs,
+        their mean without an interval.
+
     Example:
-        >>> interval_of([1.0, 2.0, 3.0, 10.0]).iqm
-        2.5
+        >>> interval_of([1.0, 2.0, 3.0, 4.0, 100.0]).middle, str(interval_of([1.0, 5.0]))
+        (3.0, '3')
     """
     x = np.array(values, dtype=float)
-    low = high = float("nan")
-    if len(x) > 1:
-        found = bootstrap((x,), _iqm, n_resamples=10_000, method="percentile", rng=0)
-        low, high = map(float, found.confidence_interval)
-    return Interval(float(_iqm(x)), low, high)
+    if len(x) < FEWEST:
+        return Interval(float(x.mean()), np.nan, np.nan)
+    found = bootstrap((x,), _iqm, n_resamples=10_000, method="percentile", rng=0)
+    return Interval(float(_iqm(x)), *map(float, found.confidence_interval))
 
 
 def intervals_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -55,21 +60,20 @@ def intervals_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
         values: float [runs, points].
 
     Returns:
-        Interquartile means and both ends of their 95% intervals, float [points] each. For a single
-        run, the ends are NaN.
+        Interquartile means and both ends of their 95% intervals, float [points] each. Of fewer than
+        five runs, means, and the ends are NaN.
 
     Example:
         >>> intervals_of(np.array([[1.0, 5.0], [3.0, 5.0]]))[0].tolist()
         [2.0, 5.0]
     """
-    means = _iqm(values, axis=0)
-    if len(values) == 1:
-        unknown = np.full(len(means), np.nan)
-        return means, unknown, unknown
+    if len(values) < FEWEST:
+        unknown = np.full(values.shape[1], np.nan)
+        return values.mean(0), unknown, unknown
     found = bootstrap(
         (values,), _iqm, axis=0, n_resamples=2_000, batch=200, method="percentile", rng=0
     )
-    return means, *found.confidence_interval
+    return _iqm(values, axis=0), *found.confidence_interval
 
 
 def _iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:

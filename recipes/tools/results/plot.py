@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,7 +18,7 @@ from torchrl_tit.files import write_bytes_atomic
 
 from ...core.run import Run
 from .experiments import Experiment, common_part, read_metrics
-from .interval import intervals_of
+from .interval import FEWEST, intervals_of
 from .table import Cell
 
 NEARLY = 0.9
@@ -71,8 +72,8 @@ def draw_curves(
 ) -> dict[str, Curve]:
     """Draws curves: thin lines for single runs, bold ones for interquartile means with bands.
 
-    Bands are 95% bootstrap intervals. If all runs together are more than nine, there are no thin
-    lines.
+    Bands are 95% bootstrap intervals. Of fewer than five runs, bold lines are means without a band.
+    If all runs together are more than nine, there are no thin lines.
 
     Args:
         axes: where to draw.
@@ -99,7 +100,7 @@ def draw_curves(
         label = f"{name} ({len(whole)} runs)" if len(whole) > 1 else name
         marker = "o" if len(steps) == 1 else None  # a line through one point is invisible
         axes.plot(steps, middle, c=color, ls=line, lw=2, marker=marker, label=plain(label))
-        if len(whole) > 1:
+        if len(whole) >= FEWEST:
             axes.fill_between(steps, low, high, color=color, alpha=0.2, lw=0)
         bold[name] = Curve(steps, middle)
     return bold
@@ -122,7 +123,7 @@ def plot_run(run: Run) -> None:
 
 
 def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: str) -> None:
-    """Draws learning curves of experiments: interquartile means over runs, with 95% intervals.
+    """Draws learning curves of experiments, as :func:`draw_curves` does.
 
     Args:
         experiments: the experiments; what their names have in common appears only in the title.
@@ -170,22 +171,26 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     rows = -(-len(tasks) // columns)
     figure = new_figure((4.2 * columns, height * rows + 0.6))
     panels = figure.subplots(rows, columns, squeeze=False).flatten()
+    shown: dict[str, Any] = {}  # what the legend names
     for axes, ((task, measure), group) in zip(panels, tasks.items(), strict=False):
-        places = np.arange(len(group))
-        iqm, low, high = np.array([(cell.iqm, cell.low, cell.high) for cell in group]).T
-        # A single run has no interval.
-        ends = np.nan_to_num([iqm - low, high - iqm])
-        axes.errorbar(
-            iqm, places, xerr=ends, fmt="o", c="C0", capsize=3, label="interquartile mean, 95%"
-        )
-        paper, spread = np.array([(cell.paper_mean, cell.paper_std) for cell in group]).T
-        axes.errorbar(paper, places + 0.22, xerr=spread, fmt="s", c="grey", ms=4, label="paper")
-        axes.set_yticks(places, labels[task, measure])
+        for place, cell in enumerate(group):
+            if cell.runs >= FEWEST:
+                ends = [[cell.iqm - cell.low], [cell.high - cell.iqm]]
+                label = "interquartile mean, 95%"
+                shown[label] = axes.errorbar(cell.iqm, place, xerr=ends, fmt="o", c="C0", capsize=3)
+            else:
+                label = f"mean of fewer than {FEWEST} runs"
+                (shown[label],) = axes.plot(cell.mean, place, "o", c="C0", mfc="none")
+            if cell.paper:
+                shown["paper"] = axes.errorbar(
+                    cell.paper_mean, place + 0.22, xerr=cell.paper_std, fmt="s", c="grey", ms=4
+                )
+        axes.set_yticks(range(len(group)), labels[task, measure])
         axes.set(title=task, xlabel=measure, ylim=(len(group) - 0.4, -0.6))
         axes.grid(alpha=0.3)
     for axes in panels[len(tasks) :]:
         axes.set_visible(False)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown))
     save_figure(figure, picture)
 
 

@@ -34,6 +34,7 @@ from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.registry import RECIPES
 from ...core.run import Run, package_versions
+from . import comparison
 from .experiments import (
     Experiment,
     changes_of,
@@ -47,6 +48,7 @@ from .experiments import (
 from .explanation import ExplainedStep, Explainer, explain_episode
 from .film import film_policy, make_rendered
 from .metric_words import MetricWords, known_columns, limit, words_of
+from .numbers import number, numbers
 from .plot import (
     NEARLY,
     WINDOW,
@@ -306,6 +308,9 @@ def _context(
         "notes": notes + _short_runs(groups),
         "header": HEADER,
         "cells": [(to_columns(cell), cell.published) for cell in cells],
+        "compared_header": comparison.HEADER,
+        "compared_words": comparison.WORDS,
+        "compared": comparison.compare_with_first([(x.label, x.values) for x in cells]),
         "returns": [*drawn, *([episodes] if episodes else [])],
         "numbers": _numbers(curves[0][1]) if curves else [],
         "labels": [group.label for group in groups],
@@ -531,7 +536,7 @@ def _run(group: Group, data: RunData) -> list[str]:
         group.label,
         str(data.run.recipe.seed),
         f"{data.steps:,}",
-        f"{number(evaluation['mean'])} ± {number(evaluation['std'])}" if evaluation else "-",
+        " ± ".join(numbers([evaluation["mean"], evaluation["std"]])) if evaluation else "-",
         str(evaluation["episodes"]) if evaluation else "-",
         str(timedelta(seconds=round(seconds))) if seconds else "-",
         f"{data.steps / seconds:,.0f}" if seconds else "-",
@@ -549,18 +554,6 @@ def _versions(runs: Sequence[RunData]) -> list[tuple[str, str]]:
 
 def _unit(recipe: Recipe) -> str:
     return "gradient steps" if recipe.offline else "environment steps"
-
-
-def number(value: float) -> str:
-    """Formats a number for people: "500", "-81.4", "0.0123".
-
-    Example:
-        >>> number(-81.432)
-        '-81.43'
-    """
-    if value != value:
-        return "-"
-    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 def _text(value: Any) -> str:

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-
-import numpy as np
+from statistics import fmean, stdev
+from typing import Any
 
 from torchrl_tit.scores import has_reference
 
@@ -17,12 +17,14 @@ from ...core.recipe import Recipe
 from ...core.registry import RECIPES
 from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
-from .interval import interval_of
+from .interval import FEWEST, Interval, interval_of
+from .numbers import mean_std, number, numbers
 from .paper import HEADINGS, Match, has_its_data, match, paper_cells, plain_name, read_rows
 
 OTHER = "not in the paper"
+FEW = f"Fewer than {FEWEST} runs have no interquartile mean, and say little about others."
 HEADER = (
-    *("recipe", "runs", "mean ± over runs", "± over episodes"),
+    *("recipe", "runs", "mean ± sample deviation over runs", "± over episodes"),
     *("interquartile mean [95%]", "paper"),
 )
 """The header of :func:`to_columns`."""
@@ -47,6 +49,11 @@ class Published:
     note: str
     """How it was measured: version of the task, steps, seeds."""
 
+    @property
+    def numbers(self) -> str:
+        """The mean, and the spread if there is one."""
+        return " ± ".join(numbers([self.mean, *([self.std] * (self.std == self.std))]))
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -65,14 +72,14 @@ class Cell:
     mean: float
     """Mean of the runs' values."""
     std: float
-    """Standard deviation of the runs' values (population)."""
+    """Sample standard deviation of the runs' values; NaN for a single run."""
     std_episodes: float
     """Standard deviation over the episodes of a run, as the paper's online tables seem to report
     it; the mean over the runs."""
     iqm: float
-    """Interquartile mean of the runs' values (arXiv 2108.13264)."""
+    """Interquartile mean of the runs' values (arXiv 2108.13264); NaN for fewer than five runs."""
     low: float
-    """Lower end of its 95% confidence interval, by bootstrap over runs; NaN for a single run."""
+    """Lower end of its 95% confidence interval, by bootstrap over runs; NaN as above."""
     high: float
     """Upper end."""
     paper_mean: float
@@ -91,6 +98,9 @@ class Cell:
     published: tuple[Published, ...] = ()
     """What others report for the same task and kind of network."""
 
+    values: tuple[float, ...] = ()
+    """The runs' values."""
+
     @property
     def label(self) -> str:
         """The recipe's name, and the changed fields."""
@@ -104,13 +114,43 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
         folders: run folders, or folders with run folders somewhere below.
 
     Returns:
-        The cells, in the paper's order, and a note for each run that is left out, was evaluated
-        over a different number of episodes than its recipe says, or changed its length
-        while schedules followed it.
+        The cells, in the paper's order, and the notes of :func:`read_evaluations`.
 
     Raises:
         ValueError: if there is no evaluated run, or two runs of the same settings have the same
             seed.
+    """
+    folders = list(folders)
+    experiments, notes = read_evaluations(folders)
+    if not experiments:
+        raise ValueError(
+            f"no evaluated run in {', '.join(map(str, folders))}" + "".join(f"; {n}" for n in notes)
+        )
+    cells = [_cell(experiment, evaluations) for experiment, evaluations in experiments]
+    order = {
+        plain_name(name): place for place, cell in enumerate(paper_cells()) for name in cell.recipes
+    }
+
+    def rank(cell: Cell) -> tuple[bool, int, str]:
+        place = order.get(plain_name(cell.recipe), len(order))
+        return cell.table == OTHER, place, cell.label
+
+    cells.sort(key=rank)
+    return cells, notes
+
+
+def read_evaluations(
+    folders: Iterable[Path],
+) -> tuple[list[tuple[Experiment, list[dict[str, Any]]]], list[str]]:
+    """Reads the evaluations of runs that are complete.
+
+    Args:
+        folders: as for :func:`make_table`.
+
+    Returns:
+        Experiments in the order of their first runs, with the evaluation of each run, and a note
+        for each run that is left out, was evaluated over a different number of episodes than its
+        recipe says, or changed its length while schedules followed it.
     """
     evaluations: dict[Path, dict] = {}
     runs, notes = [], []
@@ -139,24 +179,10 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
             notes.append(_earlier_lengths(run, lengths))
         evaluations[run.folder] = evaluation
         runs.append(run)
-    if not runs:
-        raise ValueError(
-            f"no evaluated run in {', '.join(map(str, folders))}" + "".join(f"; {n}" for n in notes)
-        )
-    cells = [
-        _cell(experiment, [evaluations[run.folder] for run in experiment.runs])
+    return [
+        (experiment, [evaluations[run.folder] for run in experiment.runs])
         for experiment in group_runs(runs)
-    ]
-    order = {
-        plain_name(name): place for place, cell in enumerate(paper_cells()) for name in cell.recipes
-    }
-
-    def rank(cell: Cell) -> tuple[bool, int, str]:
-        place = order.get(plain_name(cell.recipe), len(order))
-        return cell.table == OTHER, place, cell.label
-
-    cells.sort(key=rank)
-    return cells, notes
+    ], notes
 
 
 def to_markdown(cells: Sequence[Cell]) -> str:
@@ -170,24 +196,25 @@ def to_markdown(cells: Sequence[Cell]) -> str:
         rows = [cell for cell in cells if cell.table == table]
         is_published = any(cell.published for cell in rows)
         columns = [*HEADER, "published"] if is_published else HEADER
-        lines = [f"### {table[0].upper()}{table[1:]}\n", _line(columns)]
-        lines += ["|---" * len(columns) + "|"]
-        for cell in rows:
-            published = [", ".join(map(_published, cell.published))] if is_published else []
-            lines.append(_line([*to_columns(cell), *published]))
+        texts = (
+            [*to_columns(cell), *([", ".join(map(_published, cell.published))] * is_published)]
+            for cell in rows
+        )
+        lines = [f"### {table[0].upper()}{table[1:]}\n", *to_lines(columns, texts)]
+        if any(cell.runs < FEWEST for cell in rows):
+            lines += ["", FEW]
         parts.append("\n".join(lines) + "\n")
     return "\n".join(parts)
 
 
 def to_columns(cell: Cell) -> list[str]:
     """Writes the numbers of a cell as text, under :data:`HEADER`."""
-    interval = f" [{_number(cell.low)}, {_number(cell.high)}]" if cell.runs > 1 else ""
     return [
         cell.label,
         str(cell.runs),
-        f"{_number(cell.mean)} ± {_number(cell.std)}",
-        _number(cell.std_episodes),
-        f"{_number(cell.iqm)}{interval}",
+        mean_std(cell.values),
+        number(cell.std_episodes),
+        str(Interval(cell.iqm, cell.low, cell.high)),
         cell.paper,
     ]
 
@@ -200,6 +227,7 @@ def to_csv(cells: Sequence[Cell]) -> str:
     writer.writeheader()
     for cell in cells:
         values = {name: getattr(cell, name) for name in names}
+        values["values"] = "; ".join(map(str, cell.values))
         values["published"] = "; ".join(
             f"{result.source} {result.mean} ± {result.std} ({result.note}; {result.url})"
             for result in cell.published
@@ -241,11 +269,13 @@ def reported_of(recipe: Recipe) -> tuple[Match | None, tuple[Published, ...]]:
     return found, published_results().get(plain, ())
 
 
-def _value(evaluation: dict) -> float:
+def value_of(evaluation: dict[str, Any]) -> float:
+    """The number that a run counts with: the mean return, or the best normalised score."""
     return float(evaluation["score"]["best"] if "score" in evaluation else evaluation["mean"])
 
 
-def _measure(recipe: Recipe, evaluation: dict) -> str:
+def measure_of(recipe: Recipe, evaluation: dict[str, Any]) -> str:
+    """What :func:`value_of` is: "return" or "normalized score"."""
     return "normalized score" if "score" in evaluation and has_reference(recipe.env) else "return"
 
 
@@ -256,7 +286,7 @@ def _earlier_lengths(run: Run, lengths: Sequence[tuple[int, int]]) -> str:
 
 
 def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
-    values = np.array([_value(evaluation) for evaluation in evaluations])
+    values = [value_of(evaluation) for evaluation in evaluations]
     spreads = [evaluation.get("score_std", evaluation["std"]) for evaluation in evaluations]
     interval = interval_of(values)
     found, published = reported_of(experiment.settings)
@@ -266,31 +296,27 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
         recipe=experiment.name,
         runs=len(values),
         steps=min(evaluation["steps"] for evaluation in evaluations),
-        mean=float(values.mean()),
-        std=float(values.std()),
-        std_episodes=float(np.mean(spreads)),
-        iqm=interval.iqm,
+        mean=fmean(values),
+        std=stdev(values) if len(values) > 1 else float("nan"),
+        std_episodes=fmean(spreads),
+        iqm=interval.middle if len(values) >= FEWEST else float("nan"),
         low=interval.low,
         high=interval.high,
         paper_mean=paper.mean if paper else float("nan"),
         paper_std=paper.std if paper else float("nan"),
         paper=str(found or ""),
         changes=experiment.changes,
-        measure=_measure(experiment.settings, evaluations[0]),
+        measure=measure_of(experiment.settings, evaluations[0]),
         published=published,
+        values=tuple(values),
     )
 
 
 def _published(result: Published) -> str:
-    spread = "" if result.std != result.std else f" ± {_number(result.std)}"
-    numbers = f"{_number(result.mean)}{spread}"
-    return f"[{result.source}]({result.url}) {numbers} ({result.note})"
+    return f"[{result.source}]({result.url}) {result.numbers} ({result.note})"
 
 
-def _line(columns: Sequence[str]) -> str:
-    return f"| {' | '.join(columns)} |"
-
-
-def _number(value: float) -> str:
-    """Formats a number: whole from 100 on, with one decimal below."""
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
+def to_lines(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Writes a Markdown table."""
+    first, *lines = (f"| {' | '.join(columns)} |" for columns in (header, *rows))
+    return [first, "|---" * len(header) + "|", *lines]

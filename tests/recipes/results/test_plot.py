@@ -66,16 +66,20 @@ def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, figures):
 
 def test_bold_lines_are_interquartile_means_of_runs_that_are_as_far():
     steps = np.arange(1.0, 11)
-    runs = [Curve(steps, steps * factor) for factor in (1.0, 2.0, 3.0, 30.0)]
+    runs = [Curve(steps, steps * factor) for factor in (1.0, 2.0, 3.0, 4.0, 30.0)]
     _, axes = new_chart("", offline=False)
     bold = draw_curves(axes, {"a": [*runs, Curve(steps[:8], steps[:8])], "none": []})
     assert bold.keys() == {"a"}
-    assert np.allclose(bold["a"].values, 2.5 * steps)
+    assert np.allclose(bold["a"].values, 3 * steps)
     labels = [line.get_label() for line in axes.lines]
-    assert len(labels) == 6  # of single runs, and the bold one
-    assert labels[-1] == "a (4 runs)"
+    assert len(labels) == 7  # of single runs, and the bold one
+    assert labels[-1] == "a (5 runs)"
     band = np.asarray(axes.collections[0].get_paths()[0].vertices)
     assert band[:, 1].max() <= 300
+    _, axes = new_chart("", offline=False)
+    bold = draw_curves(axes, {"a": runs[:4]})
+    assert np.allclose(bold["a"].values, 2.5 * steps)
+    assert not axes.collections  # too few for a band
 
 
 def test_runs_with_other_steps_are_interpolated_and_returns_averaged():
@@ -104,6 +108,16 @@ def test_a_run_of_one_batch_is_seen(values, tmp_path, figures):
     point = values == [2.0]
     assert [line.get_marker() for line in axes.lines[-1:]] == ["o"] * point
     assert [text.get_text() for text in axes.texts] == ["no episode has ended"] * (not point)
+
+
+def test_a_legend_names_what_is_drawn(tmp_path, figures):
+    many = Cell("Online", "ppo/a/mlp", 5, 1, 1, 0, 0, 1, 0, 2, np.nan, np.nan)
+    few = Cell("Online", "ppo/b/mlp", 3, 1, 1, 0, 0, np.nan, np.nan, np.nan, 2, 1, paper="2 ± 1")
+    plot.plot_table([many], tmp_path / "table.png")
+    plot.plot_table([many, few], tmp_path / "table.png")
+    texts = [[text.get_text() for text in f.legends[0].get_texts()] for f in figures]
+    middle = "interquartile mean, 95%"
+    assert texts == [[middle], [middle, "mean of fewer than 5 runs", "paper"]]
 
 
 def test_what_was_changed_has_room_beside_its_panel(tmp_path, figures):

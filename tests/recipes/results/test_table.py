@@ -47,7 +47,7 @@ def test_numbers(runs):
     (acrobot, cartpole, hidden), notes = make_table([runs])
     assert (acrobot.recipe, acrobot.runs) == ("ppo/acrobot/enhanced-tit", 5)
     assert acrobot.mean == pytest.approx(-836 / 5)
-    assert acrobot.std == pytest.approx(np.std([-80, -90, -500, -85, -81]))
+    assert acrobot.std == pytest.approx(np.std([-80, -90, -500, -85, -81], ddof=1))
     assert acrobot.std_episodes == pytest.approx(10)
     assert acrobot.iqm == pytest.approx((-81 - 85 - 90) / 3)  # a quarter is cut at both ends
     assert acrobot.low < acrobot.iqm < acrobot.high
@@ -55,7 +55,11 @@ def test_numbers(runs):
     # One with other settings stands near the paper's value.
     assert acrobot.paper.startswith("near -81 ± 17: backbone.frame.patch_size auto, ")
     assert (cartpole.paper, cartpole.table) == ("500 ± 0", "table 2: online, arrays")
-    assert np.isnan([cartpole.low, cartpole.high, hidden.paper_mean]).all()
+    # Two runs have no interquartile mean, and one has no deviation.
+    assert np.isnan([cartpole.iqm, cartpole.low, cartpole.high, hidden.paper_mean]).all()
+    assert np.isnan([hidden.std])
+    assert "Fewer than 5 runs" not in to_markdown([acrobot])
+    assert "Fewer than 5 runs" in to_markdown([acrobot, cartpole])
     assert hidden.table == "not in the paper"
     (note,) = notes
     assert "vanilla-tit-protocol/1 is left out: it has no evaluation yet" in note
@@ -72,12 +76,12 @@ def test_best_scores_stand_beside_the_papers_in_its_order(tmp_path):
     assert not notes
     for cell, (network, paper) in zip(cells, numbers.items(), strict=True):
         assert (cell.recipe.rsplit("/")[-1], cell.runs) == (network, 3)
-        assert (cell.mean, cell.std) == pytest.approx((80, np.std([70, 80, 90])))
+        assert (cell.mean, cell.std) == pytest.approx((80, np.std([70, 80, 90], ddof=1)))
         assert (cell.steps, cell.std_episodes) == (500_000, 3)
         assert (cell.paper_mean, cell.paper_std) == paper
     text = to_markdown(cells)
     assert "### Table 3: offline" in text
-    assert "| cql/hopper-medium-replay-v0/enhanced-tit | 3 | 80.0 ± 8.2 | 3.0 |" in text
+    assert "| cql/hopper-medium-replay-v0/enhanced-tit | 3 | 80 ± 10 | 3 | - |" in text
     assert text.count("| near 99.2 ± 1.7: evaluated on MuJoCo's v2, here v4 |") == 1
     assert "[d3rlpy](https://github.com/takuseno/d3rlpy-benchmarks) 85.1 ± 16.2" in text
     assert "[CQL's authors](https://arxiv.org/abs/2006.04779) 48.6 (no spread given)" in text
@@ -237,7 +241,7 @@ def test_command(runs, tmp_path, capsys):
     out = tmp_path / "tables"
     main(["table", str(runs / "ppo"), "--out", str(out)])
     printed = capsys.readouterr()
-    assert "| ppo/acrobot/enhanced-tit | 5 | -167 ± 166 | 10.0 |" in printed.out
+    assert "| ppo/acrobot/enhanced-tit | 5 | -167 ± 186 | 10 |" in printed.out
     assert "note: " in printed.err
     assert (out / "table.md").read_text() in printed.out
     rows = list(csv.DictReader(io.StringIO((out / "table.csv").read_text())))
@@ -341,7 +345,7 @@ def test_changed_fields_are_named_and_make_another_cell(tmp_path):
     assert linear in found["ppo/cartpole/enhanced-tit"]
     d2rl = [(cell.label, cell.runs) for cell in cells if "d2rl" in cell.recipe]
     assert d2rl == [("ppo/cartpole/d2rl", 1), ("ppo/cartpole/d2rl (learning_rate 0.001)", 1)]
-    assert "| ppo/cartpole/d2rl (learning_rate 0.001) | 1 | 20.0" in to_markdown(cells)
+    assert "| ppo/cartpole/d2rl (learning_rate 0.001) | 1 | 20 | 0 | - |" in to_markdown(cells)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,298 @@
+"""Whether one experiment is better than another: over its seeds, and over several tasks."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from math import ceil, lcm, nan
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm, permutation_test, trim_mean
+
+from ...core.recipe import Recipe
+from .interval import FEWEST, Interval
+from .numbers import mean_std, number
+from .paper import read_rows
+from .table import measure_of, read_evaluations, value_of
+
+Task = tuple[Any, ...]
+Values = Mapping[Any, Sequence[float]]
+"""The values of runs by their task."""
+
+HEADER = (
+    *("recipe", "runs", "mean ± sample deviation", "difference from the first [95%]"),
+    *("probability of improvement", "p of a permutation test", "runs for 80% power"),
+)
+"""The header of :func:`compare_with_first`."""
+WORDS = (
+    f"The probability of improvement is that of one run being better than one of the first. The last "
+    f"column is how many runs of each find this difference at the 5% level four times in five. Below {FEWEST} runs there is no "
+    "interval."
+)
+SUMMARY = (
+    *("network", "tasks", "runs", "interquartile mean of normalised returns [95%]"),
+    "probability of improvement over the first [95%]",
+)
+"""The header of :func:`summarize`."""
+_LEVEL, _POWER = 0.05, 0.8
+_RESAMPLES = 2_000
+_PERMUTATIONS = 10_000
+_LEAST_RUNS = 4  # of 3 against 3, no permutation test is below 0.05
+_OF_TASK = (
+    *("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions"),
+    "dataset",
+)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """How the runs of one experiment differ from those of another."""
+
+    difference: Interval
+    """Of the means, with its bootstrap interval; without one for fewer than five runs."""
+    improvement: float
+    """The probability that a run of this one is better than a run of the other."""
+    p: float
+    """Of a two-sided permutation test of the difference; NaN for a single run."""
+    runs: float
+    """Runs of each that find such a difference at the 5% level four times in five; NaN if there is
+    none, or for a single run."""
+
+
+def compare(ours: Sequence[float], others: Sequence[float]) -> Comparison:
+    """Compares the values of runs.
+
+    The number of runs is that of a test of two normal distributions (Colas et al., "How Many Random
+    Seeds?", arXiv 1806.08295), with the difference and the deviations measured here.
+
+    Args:
+        ours: the value of each run (seed).
+        others: those of the experiment to compare with.
+
+    Example:
+        >>> found = compare([4.0, 5.0, 6.0, 7.0], [1.0, 2.0, 3.0, 4.0])
+        >>> found.difference.middle, found.improvement, round(found.p, 3), found.runs
+        (3.0, 0.96875, 0.057, 4)
+    """
+    a, b = np.asarray(ours, float), np.asarray(others, float)
+    difference = float(a.mean() - b.mean())
+    low = high = p = runs = nan
+    if min(len(a), len(b)) >= FEWEST:
+        draws = _resampled(a, 0).mean(1) - _resampled(b, 1).mean(1)
+        low, high = np.quantile(draws, [0.025, 0.975])
+    if min(len(a), len(b)) > 1:
+        p = permutation_test(
+            (a, b),
+            lambda x, y, axis: x.mean(axis) - y.mean(axis),
+            n_resamples=_PERMUTATIONS,
+            vectorized=True,
+            rng=0,
+        ).pvalue
+        if difference:
+            z = norm.ppf(1 - _LEVEL / 2) + norm.ppf(_POWER)
+            runs = max(ceil(z**2 * (a.var(ddof=1) + b.var(ddof=1)) / difference**2), _LEAST_RUNS)
+    better = probability_of_improvement({(): a}, {(): b}).middle
+    return Comparison(Interval(difference, float(low), float(high)), better, float(p), runs)
+
+
+def compare_with_first(named: Sequence[tuple[str, Sequence[float]]]) -> list[list[str]]:
+    """Writes how experiments differ from the first, under :data:`HEADER`.
+
+    Args:
+        named: the name and the values of each.
+
+    Returns:
+        A row for each; none if there is only one.
+    """
+    if len(named) < 2:
+        return []
+    rows = [[name, str(len(values)), mean_std(values)] for name, values in named]
+    for place, row in enumerate(rows):
+        found = compare(named[place][1], named[0][1])
+        texts = [str(found.difference), *map(number, (found.improvement, found.p, found.runs))]
+        row += texts if place else [""] * len(texts)
+    return rows
+
+
+def interquartile_mean(values: Values) -> Interval:
+    """The interquartile mean over all runs of all tasks, each task counting equally.
+
+    Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv
+    2108.13264: the interval is a bootstrap of the runs within each task.
+
+    Args:
+        values: normalised returns.
+
+    Example:
+        >>> interquartile_mean({("a",): [0.0, 0.4], ("b",): [0.6, 9.0]}).middle
+        0.5
+    """
+    groups = [np.asarray(found, float) for found in values.values()]
+    # Every value as often as makes all tasks equally large.
+    size = lcm(*map(len, groups))
+
+    def middle(draws: Sequence[np.ndarray]) -> np.ndarray:
+        equal = [np.repeat(x, size // x.shape[-1], axis=-1) for x in draws]
+        return trim_mean(np.concatenate(equal, -1), 0.25, axis=-1)
+
+    found = middle([_resampled(x, task) for task, x in enumerate(groups)])
+    return Interval(float(middle(groups)), *map(float, np.quantile(found, [0.025, 0.975])))
+
+
+def probability_of_improvement(ours: Values, others: Values) -> Interval:
+    """The probability that a run is better than one of others on the same task, the mean over tasks.
+
+    Ties count half. The interval is a bootstrap of the runs within each task (arXiv 2108.13264).
+
+    Args:
+        ours: values by task.
+        others: those to compare with, of the same tasks.
+
+    Example:
+        >>> probability_of_improvement({"a": [2.0, 3.0]}, {"a": [1.0, 3.0]}).middle
+        0.625
+    """
+
+    def better(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        x, y = x[..., :, None], y[..., None, :]
+        return ((x > y) + 0.5 * (x == y)).mean((-2, -1))
+
+    pairs = [(np.asarray(ours[task], float), np.asarray(others[task], float)) for task in ours]
+    draws = [
+        better(_resampled(x, 2 * i), _resampled(y, 2 * i + 1)) for i, (x, y) in enumerate(pairs)
+    ]
+    low, high = np.quantile(np.mean(draws, 0), [0.025, 0.975])
+    return Interval(float(np.mean([better(x, y) for x, y in pairs])), float(low), float(high))
+
+
+def _resampled(values: np.ndarray, seed: int) -> np.ndarray:
+    """Draws runs with replacement, [resamples, runs]."""
+    return np.random.default_rng(seed).choice(values, (_RESAMPLES, len(values)))
+
+
+def read_references(path: Path | None = None) -> dict[str, tuple[float, float]]:
+    """Reads the returns of a random policy and of the best published PPO, by the task's name.
+
+    Ours are those of random actions over 100 episodes, and of RL Zoo's tuned agents or the PPO of
+    TD3's authors (arXiv 1802.09477, table 1), on the version of the task that they had.
+
+    Args:
+        path: a CSV file with the columns env, random and best; by default ours.
+
+    Raises:
+        ValueError: if the file is not of this form.
+    """
+    try:
+        rows: Iterable[Mapping[str, str]] = read_rows("reference_returns.csv")
+        if path is not None:
+            rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        return {row["env"]: (float(row["random"]), float(row["best"])) for row in rows}
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} must be a CSV file with the columns env, random and best, and numbers in the "
+            f"last two: {error}"
+        ) from error
+
+
+def normalize(
+    values: Sequence[float], env: str, references: Mapping[str, tuple[float, float]]
+) -> list[float]:
+    """Returns as shares of the way from a random policy to the best published one.
+
+    Raises:
+        ValueError: if there are no reference returns for the task.
+    """
+    if env not in references:
+        raise ValueError(
+            f"no reference returns for {env}: give a CSV file with the columns env, random and "
+            "best, or leave its runs out"
+        )
+    random, best = references[env]
+    return [(value - random) / (best - random) for value in values]
+
+
+def read_networks(
+    folders: Iterable[Path],
+    patterns: Sequence[str] = (),
+    references: Path | None = None,
+) -> tuple[dict[str, dict[Task, list[float]]], list[str]]:
+    """Reads the normalised returns of networks on several tasks.
+
+    Args:
+        folders: as for ``table``.
+        patterns: which runs belong together, of the last part of their recipes' names, such as
+            "enhanced-tit*"; by default those with the same last part.
+        references: a file for :func:`read_references`.
+
+    Returns:
+        By network, and then by task, the value of each run, and notes about runs and tasks that are
+        left out. All networks have the same tasks.
+
+    Raises:
+        ValueError: if a pattern has no run, a network has two settings on a task, or no task is
+            common to all.
+    """
+    experiments, notes = read_evaluations(folders)
+    returns = read_references(references)
+    networks: dict[str, dict[Task, list[float]]] = {pattern: {} for pattern in patterns}
+    for experiment, evaluations in experiments:
+        settings = experiment.settings
+        last = experiment.name.rpartition("/")[2]
+        name = next((x for x in patterns if fnmatchcase(last, x)), "") if patterns else last
+        if not name:
+            continue
+        found = networks.setdefault(name, {})
+        task = task_of(settings)
+        if task in found:
+            raise ValueError(
+                f"{name} has two settings on {settings.env}, also {experiment.label}: name folders "
+                "or patterns that hold one of them"
+            )
+        values = [value_of(evaluation) for evaluation in evaluations]
+        scored = measure_of(settings, evaluations[0]) != "return"
+        found[task] = (
+            [x / 100 for x in values] if scored else normalize(values, settings.env, returns)
+        )
+    if missing := [name for name, found in networks.items() if not found] or not networks:
+        raise ValueError(f"no evaluated run{f' of {missing[0]}' if networks else ''}")
+    common = set.intersection(*({*found} for found in networks.values()))
+    if not common:
+        raise ValueError(f"no task has runs of all of {', '.join(networks)}")
+    notes += [
+        f"{task[0]} is left out of {name}: not all networks have runs of it"
+        for name, found in networks.items()
+        for task in found
+        if task not in common
+    ]
+    return {
+        name: {task: values for task, values in found.items() if task in common}
+        for name, found in networks.items()
+    }, notes
+
+
+def task_of(settings: Recipe) -> Task:
+    """The fields that determine what is learned."""
+    return tuple(getattr(settings, name, None) for name in _OF_TASK)
+
+
+def summarize(networks: Mapping[str, Values]) -> list[list[str]]:
+    """Writes a summary over tasks, a row for each network, under :data:`SUMMARY`.
+
+    Args:
+        networks: as :func:`read_networks` returns them; the others are compared with the first.
+    """
+    first = next(iter(networks.values()))
+    return [
+        [
+            name,
+            str(len(values)),
+            str(sum(map(len, values.values()))),
+            str(interquartile_mean(values)),
+            str(probability_of_improvement(values, first)) if values is not first else "",
+        ]
+        for name, values in networks.items()
+    ]
