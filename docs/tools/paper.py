@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
-from statistics import fmean, median, pstdev
+from statistics import fmean, median, stdev
 from typing import Any
 
 from recipes.core.recipe import Recipe, experiment_of
@@ -92,8 +92,8 @@ class Measured:
     def __str__(self) -> str:
         """Mean and spread over the runs, with their number and steps."""
         digits = self.match.cell.digits
-        spread = f"±{pstdev(self.values):.{digits}f}" * (len(self.values) > 1)
-        number = f"{fmean(self.values):.{digits}f}{spread}"
+        numbers = [fmean(self.values), *([stdev(self.values)] if self.values[1:] else [])]
+        number = "±".join(f"{one:.{digits}f}" for one in numbers)
         return f"[{number}]({self.page}) ({len(self.values)}x{_steps(self.steps)})"
 
 

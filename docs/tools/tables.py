@@ -13,10 +13,13 @@ A table stands between two comments. The first says where its numbers are from, 
 
 The first row is the header. ``=`` gives the form of the rows that follow: each names its runs and,
 after a colon, the cells that are not measured. A line that begins with ``|`` is a row with its own
-form. ``{mean}`` is a measure of :data:`MEASURES`, ``{mean.1}`` the same with one digit, ``{mean @
-hopper/mlp}`` that of the runs of a path below docs/results, ``{median FILE.json / KEY / ...}`` a
-number of a benchmark. Where a row names ``FILE.json / KEY``, or a key below ``<!-- table:
-FILE.json``, a measure names the rest: ``{median.1 KEY / ...}``.
+form. ``{mean}`` is a measure of :data:`MEASURES`, ``{mean @ hopper/mlp}`` that of the runs of a
+path below docs/results, ``{median FILE.json / KEY / ...}`` a number of a benchmark. Where a row
+names ``FILE.json / KEY``, or a key below ``<!-- table: FILE.json``, a measure names the rest:
+``{median KEY / ...}``. A path may have a ``*``: ``{overall @ update_size/new_seeds/*/lstm}`` is the
+interquartile mean over tasks, and ``{improvement @ PATH}`` compares a row's runs with others, also
+of ``sb3.csv stable_baselines3=2.9.2``. Means of fewer than five seeds are marked, and a line below
+the table says so.
 
 A folder ``paper/...`` is a table of docs/paper.md, which :mod:`docs.tools.paper` prints.
 
@@ -31,10 +34,11 @@ import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from fnmatch import fnmatchcase
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
-from statistics import fmean, median, pstdev
+from pathlib import Path, PurePosixPath
+from statistics import fmean, median
 from typing import Any
 
 import numpy as np
@@ -42,7 +46,14 @@ import numpy as np
 from docs.tools import paper
 from recipes.core.records import Records
 from recipes.core.run import RecordedRun
-from recipes.tools.results.interval import interval_of
+from recipes.tools.results.comparison import (
+    interquartile_mean,
+    normalize,
+    probability_of_improvement,
+    read_references,
+)
+from recipes.tools.results.interval import FEWEST, interval_of
+from recipes.tools.results.numbers import mean_std, number, numbers
 from recipes.tools.results.paper import match
 from torchrl_tit.files import write_text_atomic
 
@@ -52,6 +63,8 @@ PAGES = ("*.md", "docs/**/*.md")
 
 _TABLE = re.compile(r"(<!-- table: *(\S*)\n(.*?)-->\n)(.*?)(<!-- end -->)", re.DOTALL)
 _MEASURE = re.compile(r"\{([^{}]+)\}")
+_MARK = "†"
+_FEW = f"\n{_MARK} Fewer than five seeds: too few for a comparison.\n"
 
 
 class Runs:
@@ -98,8 +111,10 @@ class Runs:
 def _runs_below(path: str) -> Iterator[tuple[Records, str]]:
     page, _, below = path.partition("/")
     records = _records(page)
-    for run in records.below(below):
-        yield records, run
+    star = "*" in below
+    for run in records.rows if star else records.below(below):
+        if not star or fnmatchcase(str(PurePosixPath(run).parent), below):
+            yield records, run
 
 
 @cache
@@ -118,38 +133,28 @@ def _json(name: str) -> Any:
     return json.loads((RESULTS / name).read_bytes())
 
 
-def number(value: float, digits: int = 0) -> str:
-    """Formats a number: nothing for NaN, no minus sign before 0."""
-    if value != value:
-        return ""
-    text = f"{value:.{digits}f}"
-    return text.lstrip("-") if float(text) == 0 else text
+def _mean(values: Sequence[float]) -> str:
+    """A mean and its deviation; of too few seeds, with the mark of :data:`_FEW`."""
+    return mean_std(values) + _MARK * (len(values) < FEWEST)
 
 
-def _mean_std(values: Sequence[float], digits: int) -> str:
-    if len(values) == 1:
-        return number(values[0], digits)
-    return f"{number(fmean(values), digits)} ± {number(pstdev(values), digits)}"
-
-
-def _list(values: Sequence[float], digits: int) -> str:
-    texts = [number(value, digits) for value in values]
+def _list(values: Sequence[float]) -> str:
+    texts = numbers(values)
     return f"{texts[0]} each" if len(texts) > 2 and len({*texts}) == 1 else ", ".join(texts)
 
 
-def _range(values: Sequence[float], digits: int) -> str:
-    low, high = number(min(values), digits), number(max(values), digits)
+def _range(values: Sequence[float]) -> str:
+    low, high = numbers([min(values), max(values)])
     return low if low == high else f"{low} to {high}"
 
 
-def _around(values: Sequence[float], digits: int) -> str:
+def _around(values: Sequence[float]) -> str:
     """A mean and its range."""
-    if len({number(value, digits) for value in values}) == 1:
-        return _list(values, digits)
-    return f"{number(fmean(values), digits)} ({_range(values, digits)})"
+    middle, *ends = numbers([fmean(values), min(values), max(values)])
+    return _list(values) if ends[0] == ends[1] else f"{middle} ({' to '.join(ends)})"
 
 
-def _seeds(runs: Runs, digits: int) -> str:
+def _seeds(runs: Runs) -> str:
     seeds = sorted(int(row["seed"]) for row in runs.rows)
     if len(seeds) > 2 and all(after - before == 1 for before, after in pairwise(seeds)):
         return f"{seeds[0]} to {seeds[-1]}"
@@ -159,6 +164,20 @@ def _seeds(runs: Runs, digits: int) -> str:
 def _values(runs: Runs) -> list[float]:
     """Each run's evaluation: its mean return, or the mean of a CSV file."""
     return runs.numbers("mean" if runs.runs else "evaluation")
+
+
+def _normalized(runs: Runs) -> dict[Any, list[float]]:
+    """The normalized returns of each task; a row of a CSV file has the task's name."""
+    found: dict[Any, list[float]] = {}
+    of = zip(runs.runs or [None] * len(runs.rows), runs.rows, _values(runs), strict=True)
+    for pair, row, value in of:
+        if pair is None:
+            task = (row["env"], False)
+        else:
+            recipe = RecordedRun(*pair).recipe
+            task = (recipe.env, getattr(recipe, "hide_velocities", False))
+        found.setdefault(task, []).extend(normalize([value], task[0], read_references()))
+    return found
 
 
 def _scores(runs: Runs, which: str) -> list[float]:
@@ -201,7 +220,7 @@ def _at(runs: Runs, column: str, step: str) -> list[float]:
     return found
 
 
-def _paper(runs: Runs, digits: int) -> str:
+def _paper(runs: Runs) -> str:
     """The paper's number, marked as near if the runs have other settings."""
     found = match(RecordedRun(*runs.runs[0]).recipe)
     assert found is not None
@@ -230,68 +249,61 @@ def _thousands(steps: str) -> str:
     return f"{float(steps) / 1000:.0f}" if steps else "not"
 
 
-def _successes(runs: Runs, digits: int) -> str:
-    texts = [f"{value:.2f}" for value in runs.numbers("success")]
+def _successes(runs: Runs) -> str:
+    texts = numbers(runs.numbers("success"))
     same = len(texts) > 1 and len({*texts}) == 1
     return f"{len(texts)} x {texts[0]}" if same else ", ".join(texts)
 
 
-def _reached(runs: Runs, digits: int) -> str:
+def _reached(runs: Runs) -> str:
     return ", ".join(_thousands(row["steps_to_0.9"]) for row in runs.rows)
 
 
-def _span(runs: Runs, digits: int) -> str:
-    """The least and the most steps, to thousands."""
-    reached = [round(value, -3) for value in runs.numbers("steps_to_0.9")]
-    return f"{min(reached):,.0f} to {max(reached):,.0f}"
-
-
-def _reached_by(runs: Runs, digits: int) -> str:
+def _reached_by(runs: Runs) -> str:
     reached = [float(row["steps_to_0.9"]) / 1000 for row in runs.rows if row["steps_to_0.9"]]
     if not reached:
         return ""
-    text = f"{interval_of(reached):.0f}"
-    return (
-        text if len(reached) == len(runs.rows) else f"{text}, by {len(reached)} of {len(runs.rows)}"
-    )
+    by = f", by {len(reached)} of {len(runs.rows)}"
+    return f"{interval_of(reached)}{by * (len(reached) < len(runs.rows))}"
 
 
 MEASURES: dict[str, Callable[..., str]] = {
-    "runs": lambda runs, digits: str(len(runs.rows)),
+    "runs": lambda runs: str(len(runs.rows)),
     "seeds": _seeds,
-    "steps": lambda runs, digits: f"{max(int(c['step'][-1]) for c in runs.curves()):,}",
-    "ksteps": lambda runs, digits: f"{max(int(c['step'][-1]) for c in runs.curves()) / 1000:,.0f}k",
+    "steps": lambda runs: f"{max(int(c['step'][-1]) for c in runs.curves()):,}",
+    "ksteps": lambda runs: f"{max(int(c['step'][-1]) for c in runs.curves()) / 1000:,.0f}k",
     # Evaluations: the mean over the seeds, and each seed's
-    "mean": lambda runs, digits: _mean_std(_values(runs), digits),
-    "each": lambda runs, digits: _list(_values(runs), digits),
-    "episodes": lambda runs, digits: number(fmean(runs.numbers("std")), digits),
-    "iqm": lambda runs, digits: f"{interval_of(_values(runs)):.{digits}f}",
+    "mean": lambda runs: _mean(_values(runs)),
+    "each": lambda runs: _list(_values(runs)),
+    "episodes": lambda runs: number(fmean(runs.numbers("std"))),
+    "iqm": lambda runs: str(interval_of(_values(runs))),
+    # Over several tasks
+    "overall": lambda runs: str(interquartile_mean(_normalized(runs))),
     "paper": _paper,
-    "score": lambda runs, digits, which="last": _mean_std(_scores(runs, which), digits),
-    "scores": lambda runs, digits, which="last": _list(_scores(runs, which), digits),
-    "target": lambda runs, digits, target: _mean_std(
-        [evaluation["targets"][target]["score"] for evaluation in runs.evaluations()], digits
+    "score": lambda runs, which="last": _mean(_scores(runs, which)),
+    "scores": lambda runs, which="last": _list(_scores(runs, which)),
+    "target": lambda runs, target: _mean(
+        [evaluation["targets"][target]["score"] for evaluation in runs.evaluations()]
     ),
     # Metrics of training: over a share of the end, between steps, at a step, over the whole run
-    "last": lambda runs, digits, column, share: _around(_last(runs, column, float(share)), digits),
-    "lasts": lambda runs, digits, column, share: _list(_last(runs, column, float(share)), digits),
-    "after": lambda runs, digits, column, step: _mean_std(_tail(runs, column, float(step)), digits),
-    "between": lambda runs, digits, column, begin, end: number(
-        fmean(_tail(runs, column, float(begin), float(end))), digits
+    "last": lambda runs, column, share: _around(_last(runs, column, float(share))),
+    "lasts": lambda runs, column, share: _list(_last(runs, column, float(share))),
+    "after": lambda runs, column, step: _mean(_tail(runs, column, float(step))),
+    "between": lambda runs, column, begin, end: number(
+        fmean(_tail(runs, column, float(begin), float(end)))
     ),
-    "at": lambda runs, digits, column, step: _mean_std(_at(runs, column, step), digits),
-    "ats": lambda runs, digits, column, step: _list(_at(runs, column, step), digits),
-    "averages": lambda runs, digits, column: number(fmean(_over(runs, column, np.nanmean)), digits),
-    "average": lambda runs, digits, column: _range(_over(runs, column, np.nanmean), digits),
-    "middle": lambda runs, digits, column: _range(_over(runs, column, np.nanmedian), digits),
-    "reaches": lambda runs, digits, column, least: _reaches(runs, column, float(least)),
+    "at": lambda runs, column, step: _mean(_at(runs, column, step)),
+    "ats": lambda runs, column, step: _list(_at(runs, column, step)),
+    "averages": lambda runs, column: number(fmean(_over(runs, column, np.nanmean))),
+    "average": lambda runs, column: _range(_over(runs, column, np.nanmean)),
+    "middle": lambda runs, column: _range(_over(runs, column, np.nanmedian)),
+    "reaches": lambda runs, column, least: _reaches(runs, column, float(least)),
     # Rows of benchmarks.memory_tasks
-    "weights": lambda runs, digits: f"{int(runs.rows[0]['weights']):,}",
+    "weights": lambda runs: f"{int(runs.rows[0]['weights']):,}",
     "success": _successes,
     "reached": _reached,
     "reached_by": _reached_by,
-    "span": _span,
-    "column": lambda runs, digits, column: _list(runs.numbers(column), digits),
+    "column": lambda runs, column: _list(runs.numbers(column)),
 }
 """What can stand in braces, of the runs of a row."""
 
@@ -305,14 +317,16 @@ def _found(path: str) -> list[float]:
     return [float(one) for one in (value if isinstance(value, list) else [value])]
 
 
-def _of_benchmark(kind: str, words: str, below: str, digits: int) -> str:
+def _of_benchmark(kind: str, words: str, below: str) -> str:
     if kind == "ratio":  # round by round
         over, under = (_found(f"{below}{part}") for part in words.split(" : "))
         values = [a / b for a, b in zip(over, under, strict=True)]
     else:
         values = _found(f"{below}{words}")
-    text = number(median(values), digits)
-    return f"{text} ({_range(values, digits)})" if kind == "spread" else text
+    if kind == "spread":
+        middle, *ends = numbers([median(values), min(values), max(values)])
+        return f"{middle} ({' to '.join(ends)})"
+    return number(median(values))
 
 
 def measure(text: str, path: str) -> str:
@@ -323,13 +337,20 @@ def measure(text: str, path: str) -> str:
     """
     words, _, of = (part.strip() for part in text.partition("@"))
     name, _, rest = words.partition(" ")
-    name, _, digits = name.partition(".")
     if name in ("median", "ratio", "spread"):
         below = f"{path} / " if ".json" in path else ""
-        return _of_benchmark(name, rest, below, int(digits or 0))
+        return _of_benchmark(name, rest, below)
+    if name == "improvement":
+        return _improvement(_runs(path), _runs(of))
     if name not in MEASURES:
         raise ValueError(f"unknown measure {name!r}: choose from {', '.join(MEASURES)}")
-    return MEASURES[name](_runs(of or path), int(digits or 0), *rest.split())
+    return MEASURES[name](_runs(of or path), *rest.split())
+
+
+def _improvement(ours: Runs, others: Runs) -> str:
+    """The probability of improvement over the tasks that both have."""
+    a, b = _normalized(ours), _normalized(others)
+    return str(probability_of_improvement({task: a[task] for task in a if task in b}, b))
 
 
 @cache
@@ -362,7 +383,8 @@ def print_table(folder: str, form: str) -> str:
             lines.append(_row(f"| {pattern} |", path, rest.split("|")))
         if len(lines) == 1:
             lines.append("|" + "---|" * (lines[0].count("|") - 1))
-    return "\n".join(lines) + "\n"
+    text = "\n".join(lines) + "\n"
+    return text + _FEW if _MARK in text else text
 
 
 def _row(form: str, path: str, cells: Sequence[str]) -> str:
