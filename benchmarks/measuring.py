@@ -22,6 +22,8 @@ from unittest.mock import patch
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from recipes.tools.results.numbers import number
+from recipes.tools.results.numbers import numbers as format_all
 from torchrl_tit.files import write_text_atomic
 
 _PACKAGES = ["torch", "torchrl", "tensordict", "gymnasium", "stable-baselines3", "transformers"]
@@ -84,12 +86,7 @@ def peak_flops(rows: int = 2048, inner: int = 2048, columns: int = 2048) -> floa
 
 def spread(values: Sequence[float]) -> str:
     """Formats the median and the range of repeats, as ``300 (280 to 310)``."""
-    middle, low, high = map(_digits, (statistics.median(values), min(values), max(values)))
-    return f"{middle} ({low} to {high})"
-
-
-def _digits(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
+    return "{} ({} to {})".format(*format_all([statistics.median(values), min(values), max(values)]))
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -116,7 +113,7 @@ def _cells(numbers: Any, path: str = "") -> dict[str, object]:
         below = [_cells(part, f"{path} / {name}".strip(" /")) for name, part in numbers.items()]
         return {name: cell for part in below for name, cell in part.items()}
     if isinstance(numbers, float):
-        return {path: _digits(numbers)}
+        return {path: number(numbers)}
     return {path: spread(numbers) if isinstance(numbers, list | tuple) else numbers}
 
 

@@ -145,7 +145,7 @@ def to_markdown(rows: Sequence[dict[str, str]]) -> str:
             interval_of([float(run[column]) for run in runs]) for column in ("success", "return")
         )
         reached = [float(run["steps_to_0.9"]) / 1000 for run in runs if run["steps_to_0.9"]]
-        steps = [f"{interval_of(reached):.0f}"] if reached else []
+        steps = [str(interval_of(reached))] if reached else []
         if missing := len(runs) - len(reached):
             steps.append(f"not by {missing} of {len(runs)}")
         lines.append([name, runs[0]["weights"], len(runs), success, returned, ", ".join(steps)])

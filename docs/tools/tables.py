@@ -274,6 +274,7 @@ MEASURES: dict[str, Callable[..., str]] = {
     "ksteps": lambda runs: f"{max(int(c['step'][-1]) for c in runs.curves()) / 1000:,.0f}k",
     # Evaluations: the mean over the seeds, and each seed's
     "mean": lambda runs: _mean(_values(runs)),
+    "counted": lambda runs: f"{_mean(_values(runs))} ({len(runs.rows)})",
     "each": lambda runs: _list(_values(runs)),
     "episodes": lambda runs: number(fmean(runs.numbers("std"))),
     "iqm": lambda runs: str(interval_of(_values(runs))),
