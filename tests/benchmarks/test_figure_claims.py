@@ -10,7 +10,6 @@ import pytest
 from benchmarks.figure_claims import FigureClaims, main, measure_figure_claims, to_markdown
 from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.tools.results.interval import interval_of
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp, resnet
 
@@ -87,12 +86,11 @@ def test_tables():
         "cnn": [claims(0.25, None)],
     }
     maps, attention = to_markdown(groups).split("\n\n")
-    assert "| tit | 2 | 0.600 [0.500, 0.700] | 0.100 [0.100, 0.100] |" in maps
-    assert "| cnn | 1 | 0.250 | 0.100 | 0.200 | 0.300 | 0.000 |" in maps
+    assert "| tit | 2 | 0.6 | 0.1 | 0.2 | 0.3 | 0 |" in maps
+    assert "| cnn | 1 | 0.25 | 0.1 | 0.2 | 0.3 | 0 |" in maps
     assert attention.splitlines()[0] == "| recipe | runs | -2 steps | -1 steps | newest |"
-    assert "| tit | 2 | 0.400 [0.300, 0.500] | 0.100 [0.100, 0.100] | 0.500" in attention
+    assert "| tit | 2 | 0.4 | 0.1 | 0.5 |" in attention
     assert "cnn" not in attention
-    assert interval_of([0.0, 1.0, 2.0, 100.0]).iqm == 1.5
 
 
 def test_bad_input(runs, tmp_path, capsys):

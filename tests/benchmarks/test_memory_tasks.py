@@ -123,8 +123,8 @@ def test_the_table_has_a_row_a_recipe():
     ]
     table = memory_tasks.to_markdown([dict(zip(columns, row, strict=True)) for row in rows])
     assert table.splitlines()[2:] == [
-        "| a | 9 | 2 | 0.900 [0.800, 1.000] | 0.500 [0.500, 0.500] | 2 [1, 3] |",
-        "| b | 7 | 2 | 0.400 [0.400, 0.400] | 0.200 [0.200, 0.200] | 2, not by 1 of 2 |",
+        "| a | 9 | 2 | 0.9 | 0.5 | 2 |",
+        "| b | 7 | 2 | 0.4 | 0.2 | 2, not by 1 of 2 |",
     ]
 
 

@@ -14,13 +14,15 @@ FORM = """<!-- table: hopper
 | network | seeds | return | training |
 = {1} | {seeds} | {mean} | {between return_mean 900000 2000000}
 mlp: MLP
-| {paper @ hopper/mlp} | | {mean.1 @ ppo_settings/sb3.csv CartPole-v1} | |
+| {paper @ hopper/mlp} | | {counted@ppo_settings/sb3.csv CartPole-v1} | |
 -->
 """
 TABLE = """| network | seeds | return | training |
 |---|---|---|---|
-| MLP | 0, 1 | 1723 ± 1323 | 1964 |
-| near 3530 ± 13 | | 500.0 ± 0.0 | |
+| MLP | 0, 1 | 1723 ± 1871† | 1964 |
+| near 3530 ± 13 | | 500 ± 0 (5) | |
+
+† Fewer than five seeds: too few for a comparison.
 """
 
 
@@ -63,3 +65,14 @@ def test_check_names_the_pages_that_differ(tmp_path, monkeypatch, capsys):
 def test_what_the_data_lack_is_named(row, message):
     with pytest.raises(ValueError, match=message):
         tables.fill(f"{FORM.replace('mlp: MLP', row)}<!-- end -->\n")
+
+
+def test_measures_over_tasks():
+    """Of CartPole, all runs are at the best return, 500."""
+    best = tables.measure("overall@ppo_settings/cartpole/*", "")
+    assert best == "1 [1, 1]"
+    sb3 = "ppo_settings/sb3.csv stable_baselines3=2.9.2"
+    several = "ppo_settings/cartpole/mlp ppo_settings/mountaincar/mlp ppo_settings/hopper/mlp"
+    # CartPole is a tie, and on MountainCar Stable-Baselines3 never sees the goal.
+    assert tables.measure(f"improvement@{sb3}", several) == "0.75 [0.75, 0.75]"
+    assert tables.measure("overall@ppo_settings/sb3.csv MountainCar-v0", "") == "0 [0, 0]"
