@@ -86,7 +86,9 @@ def peak_flops(rows: int = 2048, inner: int = 2048, columns: int = 2048) -> floa
 
 def spread(values: Sequence[float]) -> str:
     """Formats the median and the range of repeats, as ``300 (280 to 310)``."""
-    return "{} ({} to {})".format(*format_all([statistics.median(values), min(values), max(values)]))
+    return "{} ({} to {})".format(
+        *format_all([statistics.median(values), min(values), max(values)])
+    )
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:

@@ -56,8 +56,8 @@ usage: {program} COMMAND ...
                               torchrl-tit
   sweep NAME [NAME ...]       train many recipes and seeds at once; names can be patterns
   tune NAME --out FOLDER      search for the best values of a recipe's fields, with Optuna
-  compare RUN [RUN ...]       plot learning curves of several runs, a recipe's seeds as one band, and
-                              test which recipe is better than the first
+  compare RUN [RUN ...]       plot learning curves of several runs, a recipe's seeds as one band,
+                              and test which recipe is better than the first
   summary FOLDER [FOLDER ...] print how well networks do over several tasks
   table FOLDER [FOLDER ...]   print the paper's tables with all runs in the folders
   record RUN... --out FOLDER  add finished runs to a table of runs, which lies beside the code;

@@ -22,6 +22,7 @@ from benchmarks import (
 )
 from benchmarks.__main__ import BENCHMARKS, main
 from benchmarks.straightforward import Case
+from docs.tools import tables
 from tests.numerics import assert_near
 from torchrl_tit.modules import Backbone
 
@@ -31,6 +32,14 @@ CASES = [
     Case("Enhanced", "images", 1, 2),
     Case("Vanilla", "images", 4, 2),
 ]
+
+
+def test_pages_quote_what_make_bench_measures():
+    """Each record is made by a benchmark, and a page has numbers of it."""
+    records = {path.stem for path in (tables.RESULTS / "benchmarks").glob("*.json")}
+    pages = "".join(path.read_text() for path in tables.ROOT.glob("docs/*.md"))
+    assert records == {*BENCHMARKS}
+    assert {name for name in records if f"benchmarks/{name}.json" in pages} == records
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -29,10 +29,11 @@ HEADER = (
 )
 """The header of :func:`compare_with_first`."""
 WORDS = (
-    f"The probability of improvement is that of one run being better than one of the first. The last "
-    f"column is how many runs of each find this difference at the 5% level four times in five. Below {FEWEST} runs there is no "
-    "interval."
+    "The probability of improvement is that of one run being better than one of the first. The "
+    "last column is how many runs of each find this difference at the 5% level four times in five. "
+    f"Below {FEWEST} runs there is no interval."
 )
+"""What its columns mean."""
 SUMMARY = (
     *("network", "tasks", "runs", "interquartile mean of normalised returns [95%]"),
     "probability of improvement over the first [95%]",
@@ -144,7 +145,7 @@ def interquartile_mean(values: Values) -> Interval:
 
 
 def probability_of_improvement(ours: Values, others: Values) -> Interval:
-    """The probability that a run is better than one of others on the same task, the mean over tasks.
+    """The probability that a run is better than one of others, the mean over tasks.
 
     Ties count half. The interval is a bootstrap of the runs within each task (arXiv 2108.13264).
 

@@ -1,4 +1,4 @@
-"""Numbers for people: three significant digits, and as many decimals for all that stand together."""
+"""Numbers for people: three significant digits, and the same decimals side by side."""
 
 from __future__ import annotations
 

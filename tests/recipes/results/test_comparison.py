@@ -86,7 +86,9 @@ def test_summary(tasks, capsys):
     assert "| enhanced-* | 2 | 4 | 0.992 [0.992, 0.992] | 1 [1, 1] |" in printed.out
     assert "MountainCar-v0 is left out of enhanced-*: not all networks have" in printed.err
     file = tasks / "mine.csv"
-    file.write_text("env,random,best\nCartPole-v1,0,1000\nAcrobot-v1,-180,-80\nMountainCar-v0,0,1\n")
+    file.write_text(
+        "env,random,best\nCartPole-v1,0,1000\nAcrobot-v1,-180,-80\nMountainCar-v0,0,1\n"
+    )
     main(["summary", str(tasks), "--networks", "mlp", "--references", str(file)])
     assert "MountainCar-v0" not in capsys.readouterr().err
     main(["summary", str(tasks / "cartpole"), "--references", str(file)])
