@@ -187,7 +187,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     main(["acting", "segments", "--out", str(tmp_path)])
     for name in ("acting", "segments"):
         assert json.loads((tmp_path / f"{name}.json").read_text())["a"] == {"ms": [1.0, 2.0]}
-        assert "| a | 1.5 (1 to 2) |" in (tmp_path / f"{name}.md").read_text()
+        assert "| a | 1.5 (1.0 to 2.0) |" in (tmp_path / f"{name}.md").read_text()
     assert "A step of acting: " in capsys.readouterr().out  # what is measured
     (tmp_path / "file").touch()
     for words, reason in [

@@ -188,11 +188,11 @@ def drawn(axes):
 
 
 def test_a_run_that_ended_keeps_its_last_value(make_run):
-    runs = [make_run("ppo/memory-s7/lstm", *run) for run in enumerate([SOON, LATER])]
+    runs = [make_run("ppo/memory-s7/lstm", *run) for run in enumerate([SOON, LATER] * 3)]
     [axes] = plot_curves(runs).axes
     assert axes.get_title() == "memory-s7"
     [(label, (steps, values))] = drawn(axes).items()
-    assert label == "lstm (2)"
+    assert label == "lstm (6)"
     assert np.allclose(steps[[0, -1]], [0.1, 0.4])  # thousands
     assert np.allclose(values[[0, -1]], [0.5, 0.5])  # in the end, 1 and 0
     assert np.allclose(np.interp([0.15, 0.3], steps, values), [0.75, 0.75], atol=0.01)

@@ -110,7 +110,7 @@ def test_a_new_run_fills_its_cell(monkeypatch):
     monkeypatch.setattr(paper, "measured", lambda: {cell: [found]})
     assert paper.ours(cell) == [
         "code: *not run*",
-        "paper: [-95±5](results/classic_control.md) (2x100k)",
+        "paper: [-95±7](results/classic_control.md) (2x100k)",
     ]
     near = paper.Measured(
         paper.Match(cell, "epochs 4"), recipe, "results/pong/records.csv", (-90.0,), 2_000_000
