@@ -96,7 +96,7 @@ def compare(ours: Sequence[float], others: Sequence[float]) -> Comparison:
         if difference:
             z = norm.ppf(1 - _LEVEL / 2) + norm.ppf(_POWER)
             runs = max(ceil(z**2 * (a.var(ddof=1) + b.var(ddof=1)) / difference**2), _LEAST_RUNS)
-    better = probability_of_improvement({(): a}, {(): b}).middle
+    better = probability_of_improvement({(): ours}, {(): others}).middle
     return Comparison(Interval(difference, float(low), float(high)), better, float(p), runs)
 
 
@@ -258,8 +258,10 @@ def read_networks(
         found[task] = (
             [x / 100 for x in values] if scored else normalize(values, settings.env, returns)
         )
-    if missing := [name for name, found in networks.items() if not found] or not networks:
-        raise ValueError(f"no evaluated run{f' of {missing[0]}' if networks else ''}")
+    if not networks:
+        raise ValueError("no evaluated run")
+    if missing := [name for name, found in networks.items() if not found]:
+        raise ValueError(f"no evaluated run of {missing[0]}")
     common = set.intersection(*({*found} for found in networks.values()))
     if not common:
         raise ValueError(f"no task has runs of all of {', '.join(networks)}")

@@ -27,8 +27,8 @@ def test_a_difference_that_every_seed_shows():
 
 
 def test_a_difference_that_needs_more_seeds():
-    ours = np.arange(5.0)
-    found = compare(ours + 1, ours)
+    ours = [0.0, 1.0, 2.0, 3.0, 4.0]
+    found = compare([1.0, 2.0, 3.0, 4.0, 5.0], ours)
     # (1.9600 + 0.8416)**2 * (2.5 + 2.5) / 1**2 = 39.2
     assert (found.difference.middle, found.runs) == (1, 40)
     assert found.difference.low < 0 < found.p
