@@ -169,7 +169,8 @@ def _values(runs: Runs) -> list[float]:
 def _normalized(runs: Runs) -> dict[Any, list[float]]:
     """The normalized returns of each task; a row of a CSV file has the task's name."""
     found: dict[Any, list[float]] = {}
-    of = zip(runs.runs or [None] * len(runs.rows), runs.rows, _values(runs), strict=True)
+    pairs: Sequence[tuple[Records, str] | None] = runs.runs or [None] * len(runs.rows)
+    of = zip(pairs, runs.rows, _values(runs), strict=True)
     for pair, row, value in of:
         if pair is None:
             task = (row["env"], False)
