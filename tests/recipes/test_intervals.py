@@ -86,7 +86,6 @@ RECIPES: dict[str, Recipe] = {
         observation_keys=("arm/joint_angles",),
         backbone=mlp(),
     ),
-    "processes": replace(PPO_RECIPE, vectorization_mode="async"),
     "collectors": replace(PPO_RECIPE, collectors=2),
     "SAC": SAC_RECIPE,
     "DQN": DQN_RECIPE,
