@@ -286,7 +286,7 @@ def play_episodes(
     """Plays episodes until the parts hold enough transitions; the last episode is complete.
 
     Each part holds one episode of every environment, started together. Short episodes are therefore
-    not favoured, and a part depends only on its number and the seed, not on earlier parts, so that
+    not favored, and a part depends only on its number and the seed, not on earlier parts, so that
     a resumed process plays none again. A single episode that is longer than the set is cut off.
 
     Args:

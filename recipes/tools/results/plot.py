@@ -179,7 +179,7 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
             iqm, places, xerr=ends, fmt="o", c="C0", capsize=3, label="interquartile mean, 95%"
         )
         paper, spread = np.array([(cell.paper_mean, cell.paper_std) for cell in group]).T
-        axes.errorbar(paper, places + 0.22, xerr=spread, fmt="s", c="grey", ms=4, label="paper")
+        axes.errorbar(paper, places + 0.22, xerr=spread, fmt="s", c="gray", ms=4, label="paper")
         axes.set_yticks(places, labels[task, measure])
         axes.set(title=task, xlabel=measure, ylim=(len(group) - 0.4, -0.6))
         axes.grid(alpha=0.3)

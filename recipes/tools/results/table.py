@@ -52,7 +52,7 @@ class Published:
 class Cell:
     """All runs of the same settings: one cell of a table.
 
-    A run's value is the mean return of its evaluation, or its best normalised score if it has one
+    A run's value is the mean return of its evaluation, or its best normalized score if it has one
     (offline recipes).
     """
 

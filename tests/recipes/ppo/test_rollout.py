@@ -208,7 +208,7 @@ def numbers_of(minibatch, rollout):
 
 
 def advantages_by_hand(reward, value, next_value, done, stops, gamma, lmbda):
-    """Generalised advantage estimation (arXiv 1506.02438), [envs, time, 1].
+    """Generalized advantage estimation (arXiv 1506.02438), [envs, time, 1].
 
     Args:
         stops: where no value follows: at terminations, and at time limits if they count as such.
