@@ -157,7 +157,7 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
 
     Args:
         episodes: the data.
-        target: A file ending in ".hdf5" or ".h5", or a folder or name for Minari.
+        target: a file ending in ".hdf5" or ".h5", or a folder or name for Minari.
         env_name: the Gymnasium task that the data are from, for Minari; by default the recorded
             one, if Gymnasium knows it.
 

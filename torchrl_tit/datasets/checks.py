@@ -64,7 +64,7 @@ def task_spaces(env_name: str) -> TaskSpaces:
     """Returns the spaces of a Gymnasium task.
 
     Args:
-        env_name: A name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
+        env_name: a name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
             "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one gray
             image of 84 x 84.
 
@@ -196,7 +196,7 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
     Args:
         source: where the data came from, for error messages.
         values: some rows of the actions.
-        space: A `Box` or `Discrete` action space; others are not checked.
+        space: a `Box` or `Discrete` action space; others are not checked.
         first_row: index of the first of these rows.
 
     Raises:

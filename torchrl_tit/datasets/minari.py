@@ -98,7 +98,7 @@ def read_minari(name: str | os.PathLike[str], **settings: Any) -> Episodes:
     """Reads a Minari data set in HDF5, in chunks; it may be larger than memory.
 
     Args:
-        name: A folder with a data set, or a data set's name such as "mujoco/hopper/medium-v0",
+        name: a folder with a data set, or a data set's name such as "mujoco/hopper/medium-v0",
             which Minari downloads if it is not in Minari's own folder yet.
         **settings: ``task``, ``dtype`` and ``directory`` as for
             :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.

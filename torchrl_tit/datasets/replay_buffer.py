@@ -136,6 +136,7 @@ class ConsecutiveSampler(RandomSampler):
             )
         device, count = storage.device, batch_size // self.slice_length
 
+        # TorchRL gives its samplers the buffer's generator under this name only.
         def draw(high: int) -> Tensor:
             return torch.randint(high, (count, 1), generator=self._rng, device=device)
 

@@ -53,7 +53,7 @@ def load_episodes(
         gaps: what to do where "next_observations" of an HDF5 file is not the observation of the
             next row: see the same function.
         dtype: the dtype for floats; None keeps that of each field. Integers stay integers.
-        directory: A folder on a disk with room for the rows; no files remain there. By default the
+        directory: a folder on a disk with room for the rows; no files remain there. By default the
             system's folder for temporary files.
         cache_dir: folder of D4RL's files: see :func:`~torchrl_tit.datasets.download_d4rl`.
 

@@ -113,7 +113,7 @@ class EpisodeStorage(TensorStorage):
         """Checks that a state was saved with the same data.
 
         Args:
-            state_dict: A state that `state_dict` returned.
+            state_dict: a state that `state_dict` returned.
 
         Raises:
             ValueError: if it was saved with other data.
