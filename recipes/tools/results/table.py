@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 
@@ -19,8 +20,10 @@ from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import interval_of
 from .paper import HEADINGS, Match, has_its_data, match, paper_cells, plain_name, read_rows
+from .plot import new_figure, plain, save_figure
 
 OTHER = "not in the paper"
+_WIDEST_LABEL = 26  # letters in a line beside a panel
 HEADER = (
     *("recipe", "runs", "mean ± over runs", "± over episodes"),
     *("interquartile mean [95%]", "paper"),
@@ -206,6 +209,47 @@ def to_csv(cells: Sequence[Cell]) -> str:
         )
         writer.writerow({k: "" if v != v else v for k, v in values.items()})
     return buffer.getvalue()
+
+
+def plot_table(cells: Sequence[Cell], picture: Path) -> None:
+    """Draws cells next to the paper's values, one panel for each task and measure.
+
+    Args:
+        cells: what :func:`make_table` returns.
+        picture: the PNG file to write.
+    """
+    tasks: dict[tuple[str, str], list[Cell]] = {}  # of one measure: scores are not returns
+    for cell in cells:
+        tasks.setdefault((cell.recipe.rpartition("/")[0], cell.measure), []).append(cell)
+    labels = {
+        (task, measure): [
+            fill(plain(cell.label.removeprefix(f"{task}/")), _WIDEST_LABEL) for cell in group
+        ]
+        for (task, measure), group in tasks.items()
+    }
+    breaks = max(label.count("\n") for group in labels.values() for label in group)
+    height = 0.6 + (0.32 + 0.16 * breaks) * max(map(len, tasks.values()))
+    columns = min(3, len(tasks))
+    rows = -(-len(tasks) // columns)
+    figure = new_figure((4.2 * columns, height * rows + 0.6))
+    panels = figure.subplots(rows, columns, squeeze=False).flatten()
+    for axes, ((task, measure), group) in zip(panels, tasks.items(), strict=False):
+        places = np.arange(len(group))
+        iqm, low, high = np.array([(cell.iqm, cell.low, cell.high) for cell in group]).T
+        # A single run has no interval.
+        ends = np.nan_to_num([iqm - low, high - iqm])
+        axes.errorbar(
+            iqm, places, xerr=ends, fmt="o", c="C0", capsize=3, label="interquartile mean, 95%"
+        )
+        paper, spread = np.array([(cell.paper_mean, cell.paper_std) for cell in group]).T
+        axes.errorbar(paper, places + 0.22, xerr=spread, fmt="s", c="gray", ms=4, label="paper")
+        axes.set_yticks(places, labels[task, measure])
+        axes.set(title=task, xlabel=measure, ylim=(len(group) - 0.4, -0.6))
+        axes.grid(alpha=0.3)
+    for axes in panels[len(tasks) :]:
+        axes.set_visible(False)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    save_figure(figure, picture)
 
 
 @cache
