@@ -77,6 +77,7 @@ class OnlineHistoryStorage(LazyTensorStorage):
         torch.Size([32, 8, 4])
     """
 
+    _default_checkpointer = StateCheckpointer
     supports_conditional_update = False
 
     @checked_arguments
@@ -93,7 +94,6 @@ class OnlineHistoryStorage(LazyTensorStorage):
         if ndim not in (1, 2):
             raise ValueError(f"ndim must be 1 (steps) or 2 (environments, steps), not {ndim}")
         super().__init__(max_size, device=device, ndim=ndim)
-        self.checkpointer = StateCheckpointer()
         self.max_size: int
         self._num_frames = num_frames
         self._padding: Padding = padding

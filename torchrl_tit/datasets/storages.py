@@ -55,6 +55,8 @@ class EpisodeStorage(TensorStorage):
         DatasetError: if no step is left.
     """
 
+    # A replay buffer replaces a checkpointer that was set, and knows the usual one by this name.
+    _default_checkpointer = StateCheckpointer
     supports_conditional_update = False
     oldest = 0
     """Index of the oldest item."""
@@ -71,7 +73,6 @@ class EpisodeStorage(TensorStorage):
         shifts = episodes.first_rows - (counts.cumsum(0) - counts)
         rows = torch.arange(count, device=device) + shifts.repeat_interleave(counts)
         super().__init__(rows, device=device)
-        self.checkpointer = StateCheckpointer()
         self._fields = dict(episodes.rows.items())  # [R, ...]
         self._first_rows = episodes.first_rows
 
