@@ -197,7 +197,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, help="of the first episode; default: the evaluation's")
     parser.add_argument(
         "--background",
-        choices=["place", "colour"],
+        choices=["place", "color"],
         default="place",
         help="what is no object: the median at each place, or each frame's most common color",
     )

@@ -48,7 +48,7 @@ def plot_lengths(path: Path) -> Figure:
         raise ValueError(f"{path} has no run on a T-Maze")
     figure = new_figure((6.5, 4))
     axes = figure.subplots()
-    axes.axhline(0.5, ls=":", c="grey", label="a guess at the junction")
+    axes.axhline(0.5, ls=":", c="gray", label="a guess at the junction")
     for index, (network, found) in enumerate(sorted(successes.items())):
         beside = 1.08 ** (index - (len(successes) - 1) / 2)
         style: dict[str, Any] = {"c": f"C{index}", "marker": "osD^v"[index % 5], "ms": 5}

@@ -58,7 +58,7 @@ NUM_ENVS = 16
 
 
 class Tiles(BaseFeaturesExtractor):
-    """A convolution over the tiles, another over their 3 x 3 neighbourhood, and a linear layer.
+    """A convolution over the tiles, another over their 3 x 3 neighborhood, and a linear layer.
 
     The default, NatureCNN, takes images of 36 x 36 pixels or more, and these have 24 x 24. Like
     NatureCNN, it ends with a ReLU.

@@ -1,4 +1,4 @@
-"""Behaviour cloning: settings, then the algorithm."""
+"""Behavior cloning: settings, then the algorithm."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from .offline import TransitionAlgorithm, TransitionRecipe
 
 @dataclass(frozen=True, kw_only=True)
 class BC(TransitionRecipe, algorithm="bc"):
-    """Behaviour cloning: maximizes the likelihood of a data set's actions, of any kind."""
+    """Behavior cloning: maximizes the likelihood of a data set's actions, of any kind."""
 
     learning_rate: Rate = 3e-4
     """Learning rate of Adam."""
     best_fraction: Share = 1.0
     """Share of the finished episodes that are learned from: those with the highest returns
-    (filtered behaviour cloning, as in arXiv 2106.01345)."""
+    (filtered behavior cloning, as in arXiv 2106.01345)."""
     time_limits: Literal["keep", "drop"] = "keep"
     """Whether to keep the last transition of an episode that a time limit truncated."""
     unfinished: Literal["keep", "drop"] = "keep"

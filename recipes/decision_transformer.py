@@ -127,7 +127,7 @@ class SequenceRecipe(DatasetRecipe):
 RecipeT = TypeVar("RecipeT", bound=SequenceRecipe)
 
 
-class Agent(nn.Module):
+class SequenceModel(nn.Module):
     """Network and head.
 
     Args:
@@ -154,7 +154,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
     action_padding = -10.0
     """Value of the actions at padding; no loss reads it."""
 
-    model: Agent
+    model: SequenceModel
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
@@ -168,7 +168,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             self.model = self.networks(task).to(self.device).eval()
         self._policy = make_dt_actor(self.model.network, self.model.head)
 
-    def networks(self, env: EnvBase) -> Agent:
+    def networks(self, env: EnvBase) -> SequenceModel:
         """Builds network and head, and what a subclass adds to them.
 
         Args:
@@ -186,7 +186,9 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         encoder = network.history_encoder
         assert isinstance(encoder, DecisionTransformer)
         encoder.return_scale.fill_(recipe.return_scale)
-        return Agent(network, DTHead(network.features_dim, self.action_dim, recipe.action_space))
+        return SequenceModel(
+            network, DTHead(network.features_dim, self.action_dim, recipe.action_space)
+        )
 
     @abstractmethod
     def loss(self, samples: TensorDictBase) -> Terms:

@@ -103,7 +103,7 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with the network of the values, which is also the policy, and its target.
 
-        Actions are random with a probability that falls: see :attr:`behaviour`.
+        Actions are random with a probability that falls: see :attr:`behavior`.
         """
         recipe, spec = self.recipe, env.action_spec_unbatched.to(self.device)
         if not is_discrete(spec):
@@ -123,7 +123,7 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
             action_mask_key=mask_key,
             device=self.device,
         )
-        self._behaviour = TensorDictSequential(self._policy, self.exploration)
+        self._behavior = TensorDictSequential(self._policy, self.exploration)
         loss = DQNLoss(
             self._policy,
             loss_function=recipe.loss_function,
@@ -134,9 +134,9 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         return loss
 
     @property
-    def behaviour(self) -> TensorDictModuleBase:
+    def behavior(self) -> TensorDictModuleBase:
         """The policy, with random actions whose probability falls."""
-        return self._behaviour
+        return self._behavior
 
     def prepare(self, step: int, folder: Path) -> None:
         """Builds optimizer, target update, collector and replay buffer."""

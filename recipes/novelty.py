@@ -213,7 +213,12 @@ class NovelPPOAlgorithm(PPOAlgorithm):
         batch["following"] = following
         this, after = self._observations(batch), self._observations(following)
         novelty.update(after)
-        risen = (novelty(after) - recipe.novelty_alpha * novelty(this)).clamp(min=0)
+        begins = done.squeeze(-1).roll(1, 1)
+        begins[:, 0] = True  # elsewhere, the step before led here
+        new = novelty(after)
+        before = new.roll(1, 1)
+        before[begins] = novelty([seen[begins] for seen in this])
+        risen = (new - recipe.novelty_alpha * before).clamp(min=0)
         width = recipe.novelty_cell
         first = self.visits.add(novelty.cells(this, width), novelty.cells(after, width), done)
         bonus = risen.unsqueeze(-1) * first

@@ -25,8 +25,7 @@ from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps
 
 from .core.algorithm import Algorithm
 from .core.evaluation import Outcome
-from .core.ray_cluster import check_address
-from .core.ray_collector import ClusterCollector, check_cluster
+from .core.ray_cluster import ask_for_machines, check_address, check_room
 from .core.recipe import Recipe
 from .core.task import make_task, seed_copies
 
@@ -127,7 +126,10 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
         Args:
             **settings: further settings of the task.
         """
-        check_cluster(self.recipe.ray, self.recipe.collectors, self.recipe.threads)
+        if (address := self.recipe.ray) is not None:
+            check_room(
+                ask_for_machines(address), address, self.recipe.collectors, self.recipe.threads
+            )
         with closing(self.make_env(1, self.recipe.seed, **settings)) as env, torch.no_grad():
             self.policy(env.reset())
 
@@ -188,6 +190,8 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
                 **length,
                 **settings,
             )
+        from .core.ray_collector import ClusterCollector  # Ray is an extra
+
         return ClusterCollector(
             shares,
             policy,

@@ -30,11 +30,8 @@ from torchrl_tit.frames.normalized import NormalizedFrames
 from torchrl_tit.layers import init_orthogonal_, standardize
 from torchrl_tit.modules import Backbone, history_keys, make_actor, make_value
 from torchrl_tit.modules.backbone import trunks_of
-from torchrl_tit.networks import build_network, masked_predictions
-from torchrl_tit.objectives import contrastive_prediction_loss
+from torchrl_tit.networks import build_network
 from torchrl_tit.rollout import FrameCollector, Rollout
-from torchrl_tit.settings import CoBERL
-from torchrl_tit.settings.choices import VectorizationMode
 from torchrl_tit.settings.numbers import (
     Batch,
     Fraction,
@@ -66,9 +63,6 @@ from .online import OnlineAlgorithm, OnlineRecipe
 # this many sequences at least. Through a state, gradients reach as far as a sequence is long.
 _LONGEST = _SEQUENCES = 16
 
-# The share of the steps that CoBERL's contrastive loss masks (arXiv 2107.05431).
-_MASKED = 0.15
-
 
 @dataclass(frozen=True, kw_only=True)
 class PPO(OnlineRecipe, algorithm="ppo"):
@@ -80,6 +74,8 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     removed: ClassVar[dict[str, Any]] = {
         "async_collection": False,
         "at_target_kl": "stop",
+        "bootstrap_time_limit": True,
+        "contrastive_coeff": 0.0,
         "masked_fraction": 0.15,
         "next_frame_coeff": 0.0,
         "normalize_values": False,
@@ -87,13 +83,11 @@ class PPO(OnlineRecipe, algorithm="ppo"):
         "reconstruction_coeff": 0.0,
         "residual_gain": 1.0,
         "value_gradient": 1.0,
+        "vectorization_mode": "sync",
     }
 
     mask_actions: bool = False
     """Whether the policy chooses only actions that the task's action_mask allows."""
-    vectorization_mode: VectorizationMode = "sync"
-    """Whether environments run in this process ("sync") or in one process each ("async", for slow
-    tasks)."""
     minibatch_size: Batch = 64
     """Steps in one gradient step."""
     sequence_length: Batch | None = None
@@ -124,8 +118,6 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     """Whether that weight falls linearly to 0 over the run."""
     critic_coeff: Positive = 0.5
     """Weight of the mean squared value error."""
-    contrastive_coeff: Weight = 0.0
-    """Weight of CoBERL's contrastive loss (arXiv 2107.05431 uses 1); 0 for other networks."""
     clip_rewards: bool = False
     """Whether to train on the signs of rewards; reported returns are always unclipped."""
     reward_scale: Weight = 1.0
@@ -154,9 +146,6 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     OpenAI's Spinning Up."""
     gae_lambda: Fraction = 0.95
     """Lambda of generalized advantage estimation (arXiv 1506.02438)."""
-    bootstrap_time_limit: bool = True
-    """Whether to bootstrap from the value of the last state when a time limit truncates an episode.
-    The paper's runs (SB3 1.3.0) treated time limits as terminations."""
     initialization: Literal["orthogonal", "own"] = "orthogonal"
     """Initialization of the backbone: orthogonal, as in Stable-Baselines3 and so in the paper's
     online runs, or the network's own (TIT: normal with a standard deviation of 0.02)."""
@@ -175,11 +164,6 @@ class PPO(OnlineRecipe, algorithm="ppo"):
         for field in ("steps_per_batch", "minibatch_size"):
             if getattr(self, field) < 2:  # a single advantage has no standard deviation
                 raise ValueError(f"{field} must be at least 2, not {getattr(self, field)}")
-        if self.contrastive_coeff and not isinstance(self.backbone.history, CoBERL):
-            raise ValueError(
-                "contrastive_coeff is the weight of a loss that only coberl has: set it to 0 for "
-                "other history encoders"
-            )
         if self.reads_sequences and self.sequence_length is not None:
             steps = self.steps_per_batch // self.num_envs
             self.check_divides("sequence_length", "minibatch_size", self.minibatch_size)
@@ -286,8 +270,6 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         with closing(make_task(recipe)) as task:
             self.model = self.networks(task).to(self.device)
         self.model.backbone.autocast = autocast_type(recipe.precision, self.device)
-        if recipe.contrastive_coeff:
-            self.terms = (*self.terms, "loss_contrastive")
         means = ["feature_spread", "explained_variance", "epochs", *self.terms, "gradient_norm"]
         self.columns = ["learning_rate", *means]
         self.return_scale = ReturnScale(recipe.gamma)
@@ -459,8 +441,6 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
             batch: [envs, time], with the "state_value" of its states.
             rollout: its frames.
         """
-        if not self.recipe.bootstrap_time_limit:
-            batch["next", "terminated"] = batch["next", "done"]
         batch["next", "state_value"] = self.next_values(batch, rollout)
         self.gae(batch)
 
@@ -516,15 +496,12 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         # TorchRL's estimate of the divergence, mean(-log r), can be negative. Schulman's,
         # mean((r - 1) - log r), cannot (http://joschu.net/blog/kl-approx.html).
         terms["kl_approx"] += terms["mean_ratio"] - 1
-        if self.recipe.contrastive_coeff:
-            contrast = self._contrastive_loss(frames, windows)
-            terms["loss_contrastive"] = self.recipe.contrastive_coeff * contrast
         return terms
 
     def check(self, **settings: Any) -> None:
         """As :meth:`OnlineAlgorithm.check`; a compiler must be there if it is required."""
         check_compiler(self.recipe.compile)
-        super().check(vectorization_mode=self.recipe.vectorization_mode, **settings)
+        super().check(**settings)
 
     @property
     def _state_keys(self) -> list[str]:
@@ -590,13 +567,6 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
                 if isinstance(encoder, NormalizedFrames):
                     encoder.update(table[rollout.newest])
 
-    def _contrastive_loss(self, frames: list[Tensor], windows: Windows) -> Tensor:
-        """CoBERL's contrastive loss, in a separate pass, because its attention is bidirectional."""
-        histories = [windows.gather(table).flatten(0, 1) for table in frames]
-        mask = torch.rand(histories[0].shape[:2], device=histories[0].device) < _MASKED
-        predictions = masked_predictions(self.model.backbone.module, histories, mask)
-        return contrastive_prediction_loss(*predictions, mask)
-
     def _check_update(self, steps: list[Tensor]) -> None:
         """Checks the terms of gradient steps, and the weights."""
         if steps:
@@ -608,9 +578,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
 
 def _make_envs(state: Compose, recipe: PPO, num_envs: int) -> EnvBase:
     """Builds environments whose steps keep each observation once."""
-    mode = recipe.vectorization_mode
-    task = make_task(recipe, num_envs, vectorization_mode=mode, keep_histories=False)
-    return _with_state(state, task)
+    return _with_state(state, make_task(recipe, num_envs, keep_histories=False))
 
 
 def _with_state(transforms: Compose, env: EnvBase) -> EnvBase:

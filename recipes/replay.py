@@ -93,7 +93,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
     """
 
     draws_random_steps: ClassVar[bool] = True
-    """Whether the collector, not :attr:`behaviour`, draws the actions of the random steps at the
+    """Whether the collector, not :attr:`behavior`, draws the actions of the random steps at the
     start."""
 
     optimizer: torch.optim.Optimizer
@@ -105,7 +105,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
             self.model = self.networks(task).to(self.device)
 
     @property
-    def behaviour(self) -> TensorDictModuleBase:
+    def behavior(self) -> TensorDictModuleBase:
         """The policy that the collector runs; by default, :attr:`policy`."""
         return self._policy
 
@@ -119,7 +119,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         self.policy.eval()
         random_steps = recipe.random_steps if self.draws_random_steps else 0
         self.collector = self.make_collector(
-            self.behaviour, _make_envs, step, random_steps=max(0, random_steps - step)
+            self.behavior, _make_envs, step, random_steps=max(0, random_steps - step)
         )
         storage = OnlineHistoryStorage(
             recipe.buffer_size,

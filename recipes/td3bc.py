@@ -1,4 +1,4 @@
-"""TD3 with a behaviour cloning term: settings, then the algorithm."""
+"""TD3 with a behavior cloning term: settings, then the algorithm."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .offline import ActorCriticRecipe, TransitionAlgorithm
 
 @dataclass(frozen=True, kw_only=True)
 class TD3BC(ActorCriticRecipe, algorithm="td3bc"):
-    """TD3 with a behaviour cloning term (arXiv 2106.06860), with the paper's defaults."""
+    """TD3 with a behavior cloning term (arXiv 2106.06860), with the paper's defaults."""
 
     normalize_observations: bool = True
     """Whether to normalize observations by their mean and standard deviation in the data; only for
@@ -32,7 +32,7 @@ class TD3BC(ActorCriticRecipe, algorithm="td3bc"):
     critic_learning_rate: Rate = 3e-4
     """Learning rate of Adam for the critics."""
     alpha: Weight = 2.5
-    """Weight of the value in the actor's loss, relative to the behaviour cloning term."""
+    """Weight of the value in the actor's loss, relative to the behavior cloning term."""
     policy_delay: Steps = 2
     """Gradient steps of the critics for each update of the actor and the targets."""
     policy_noise: Weight = 0.2

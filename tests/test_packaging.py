@@ -100,7 +100,7 @@ sys.exit(main())
     assert "ppo/cartpole/enhanced-tit" in result.stdout
 
 
-def test_metadata_names_licence_python_and_readme(metadata: Message) -> None:
+def test_metadata_names_license_python_and_readme(metadata: Message) -> None:
     assert metadata["Name"] == "torchrl-tit"
     assert metadata["License-Expression"] == "MIT"
     assert metadata["License-File"] == "LICENSE"

@@ -23,15 +23,15 @@ def normalized_score(returns: Returns, name: str) -> Returns:
     """Normalizes returns to D4RL's scale: a random policy scores 0, an expert 100.
 
     Args:
-        returns: One return or many.
-        name: Name of a data set or task that begins with a key of ``REFERENCE_RETURNS``, such as
+        returns: one return or many.
+        name: name of a data set or task that begins with a key of ``REFERENCE_RETURNS``, such as
             "hopper-medium-v0" or "Hopper-v5".
 
     Returns:
         100 * (return - random) / (expert - random), of the same kind and shape.
 
     Raises:
-        ValueError: If there are no reference returns for the name.
+        ValueError: if there are no reference returns for the name.
 
     Source: D4RL (arXiv 2004.07219), section 5.
 
@@ -47,14 +47,14 @@ def normalized_spread(spread: Returns, name: str) -> Returns:
     """Normalizes a standard deviation of returns, or another difference, to D4RL's scale.
 
     Args:
-        spread: The difference of returns.
-        name: See :func:`normalized_score`.
+        spread: the difference of returns.
+        name: see :func:`normalized_score`.
 
     Returns:
         100 * spread / (expert - random), without the offset of returns.
 
     Raises:
-        ValueError: If there are no reference returns for the name.
+        ValueError: if there are no reference returns for the name.
 
     Example:
         >>> round(normalized_spread(325.4572305, "Hopper-v5"), 6)
@@ -68,7 +68,7 @@ def has_reference(name: str) -> bool:
     """Returns whether there are reference returns for a data set or task.
 
     Args:
-        name: See :func:`normalized_score`.
+        name: see :func:`normalized_score`.
 
     Example:
         >>> has_reference("CartPole-v1")

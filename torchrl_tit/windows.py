@@ -79,9 +79,7 @@ class Windows(NamedTuple):
         return windows.masked_fill(missing, 0)
 
 
-def find_windows(
-    newest: Tensor, oldest: Tensor, num_frames: int, padding: Padding, stride: int = 1
-) -> Windows:
+def find_windows(newest: Tensor, oldest: Tensor, num_frames: int, padding: Padding) -> Windows:
     """Finds the rows of windows.
 
     Args:
@@ -90,10 +88,8 @@ def find_windows(
             [...]; at most ``newest``.
         num_frames: number K of frames in a window.
         padding: what replaces frames before ``oldest``: that frame, or zeros.
-        stride: rows from one step to the next, if the steps of several environments are
-            interleaved.
     """
-    steps = torch.arange(1 - num_frames, 1, device=newest.device) * stride
+    steps = torch.arange(1 - num_frames, 1, device=newest.device)
     rows = newest.unsqueeze(-1) + steps
     oldest = oldest.unsqueeze(-1)
     missing = rows < oldest if padding == "constant" and num_frames > 1 else None

@@ -48,7 +48,7 @@ def main(steps: int = 1_000, dropout: float = 0.0) -> SACLoss:
     )
     # Critics have backbones of their own: SAC stacks the parameters of its critics and runs them in
     # one vmap, and the actor's update must not change the critics' features. Two critics are given
-    # because TorchRL would initialise copies of a single one differently from a TIT.
+    # because TorchRL would initialize copies of a single one differently from a TIT.
     critics = []
     for _ in range(2):
         critic_tit = EnhancedTIT((3,), num_frames=2, ffn_dropout_inner=dropout)

@@ -270,7 +270,7 @@ def share(arguments: list[str]) -> None:
     parser.add_argument("repository", nargs="?", metavar="REPO", help="user/name on the Hub")
     parser.add_argument("--out", type=Path, help="folder to make for the agent")
     parser.add_argument("--name", help="name on the card; default: that of REPO or of the folder")
-    parser.add_argument("--license", help="licence on the card, such as mit; default: none")
+    parser.add_argument("--license", help="license on the card, such as mit; default: none")
     parser.add_argument("--private", action="store_true", help="make a new REPO private")
     options = parser.parse_args(arguments)
     if options.repository is None and options.out is None:

@@ -98,10 +98,10 @@ def describe(episodes: Episodes) -> str:
     """Describes the size and the contents of a data set.
 
     Args:
-        episodes: The data.
+        episodes: the data.
 
     Returns:
-        Transitions, episodes, returns, normalised scores (if any), shapes and dtypes.
+        Transitions, episodes, returns, normalized scores (if any), shapes and dtypes.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -156,18 +156,18 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
     """Writes a data set as an HDF5 file in D4RL's layout or as a Minari data set.
 
     Args:
-        episodes: The data.
-        target: A file ending in ".hdf5" or ".h5", or a folder or name for Minari.
-        env_name: The Gymnasium task that the data are from, for Minari; by default the recorded
+        episodes: the data.
+        target: a file ending in ".hdf5" or ".h5", or a folder or name for Minari.
+        env_name: the Gymnasium task that the data are from, for Minari; by default the recorded
             one, if Gymnasium knows it.
 
     Returns:
         A message that says what was written and what was left out.
 
     Raises:
-        FileExistsError: If there is something at the target already.
-        ValueError: If the target's name cannot be used, or the data do not fit its layout.
-        OSError: If it cannot be written.
+        FileExistsError: if there is something at the target already.
+        ValueError: if the target's name cannot be used, or the data do not fit its layout.
+        OSError: if it cannot be written.
 
     Example:
         >>> import tempfile

@@ -1,4 +1,4 @@
-"""`evaluate` and `render`: a trained run plays episodes."""
+"""`evaluate`: a trained run plays episodes, or is measured on data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.recipe import Recipe
-from .arguments import Parser, add_machine_options, check_seed, fail, override, say
+from .arguments import Parser, add_machine_options, fail, override, say
 
 
 def evaluate(arguments: list[str]) -> None:
@@ -113,28 +113,3 @@ def _measured(evaluation: dict[str, Any]) -> str:
             f"{evaluation['data_value']:.4g}"
         )
     return text
-
-
-def render(arguments: list[str]) -> None:
-    """Films the agent of a run."""
-    parser = Parser("render", "Film a run's agent.")
-    parser.add_argument("run", type=Path, help="run folder")
-    parser.add_argument("--out", type=Path, required=True, help="new file: .gif or .mp4")
-    parser.add_argument("--episodes", type=int, default=1, help="episodes, or whole Atari games")
-    parser.add_argument(
-        "--seed", type=int, help="seed of the first episode; default: the evaluation's"
-    )
-    options = parser.parse_args(arguments)
-    check_seed(options.seed)
-    from ..core.run import Run  # not at the top: help needs no PyTorch
-    from ..core.runner import load_trained
-    from ..tools.results.film import check_film, film_policy
-
-    check_film(options.out)
-    run = Run.open(options.run)
-    _, algorithm, _ = load_trained(run)
-    seed = run.recipe.evaluation_seed if options.seed is None else options.seed
-    returns = film_policy(
-        algorithm.make_env, algorithm.policy, run.folder, options.out, options.episodes, seed
-    )
-    say(f"returns {', '.join(f'{value:g}' for value in returns)}\nwritten to {options.out}")

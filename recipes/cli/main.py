@@ -17,7 +17,6 @@ COMMANDS = {
     "show": "named_recipes:show",
     "train": "train:train",
     "evaluate": "evaluate:evaluate",
-    "render": "evaluate:render",
     "explain": "agents:explain",
     "sweep": "sweep:sweep",
     "tune": "sweep:tune",
@@ -47,9 +46,9 @@ usage: {program} COMMAND ...
   train --resume RUN          resume a run that was stopped or killed; with --total-steps N (or
                               --total-updates, --iterations, --rounds) train a finished one further
   evaluate RUN                evaluate a run's newest checkpoint
-  render RUN --out FILE       film a run's agent: a GIF or MP4
   explain AGENT --out FILE    film what a trained agent looks at, or draw one step of it as PNG
-  play [AGENT]                let a trained agent play, or list those that come with torchrl-tit
+  play [AGENT] [--out FILE]   let a trained agent play and film it as GIF or MP4; without AGENT,
+                              list those that come with torchrl-tit
   share RUN REPO              make an agent of a run and upload it to the Hugging Face Hub; with
                               --out FOLDER, write it to a folder
   export AGENT --out FILE     write its policy as .pt2 (torch.export) or .onnx, which act without

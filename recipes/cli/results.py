@@ -88,8 +88,7 @@ def table(arguments: list[str]) -> None:
     options = parser.parse_args(arguments)
     from torchrl_tit.files import write_text_atomic
 
-    from ..tools.results.plot import plot_table
-    from ..tools.results.table import make_table, to_csv, to_markdown
+    from ..tools.results.table import make_table, plot_table, to_csv, to_markdown
 
     cells, notes = make_table(options.folders)
     for line in notes:

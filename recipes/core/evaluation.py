@@ -75,7 +75,7 @@ def summarize(
         environment, otherwise only ``env``, ``dataset`` and ``steps``. With one, also ``mean``,
         ``std`` (population), ``episodes`` and ``returns`` of the better target return, ``env``, and
         the ``steps`` that the networks were trained for. For a run on a data set also
-        the ``dataset`` and the ``score``, normalised as D4RL does: ``last``, of the better target,
+        the ``dataset`` and the ``score``, normalized as D4RL does: ``last``, of the better target,
         and ``best``, over all steps and targets (raw returns if there is no reference).
         With target returns, ``target_return`` is the better one, and ``targets`` holds the
         same for each.

@@ -11,6 +11,7 @@ import logging
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,28 @@ def ask_for_machines(address: str) -> list[dict[str, float]]:
         reason = error.stderr.strip().splitlines()[-1:]
         raise ValueError(f"no connection to Ray at {address!r}: {' '.join(reason)}") from error
     return json.loads(answer.stdout.splitlines()[-1])
+
+
+def check_room(
+    machines: Sequence[dict[str, float]], address: str, collectors: int, threads: int
+) -> None:
+    """Checks that machines have enough CPUs, even if others are using them now.
+
+    Raises:
+        ValueError: if they do not; Ray itself would wait silently.
+
+    Example:
+        >>> check_room([{"CPU": 4.0}, {"CPU": 3.0}], "auto", collectors=4, threads=2)
+        Traceback (most recent call last):
+            ...
+        ValueError: the Ray cluster at 'auto' has room for 3 collectors of 2 CPUs (threads), not ...
+    """
+    room = sum(int(machine.get("CPU", 0)) // threads for machine in machines)
+    if room < collectors:
+        raise ValueError(
+            f"the Ray cluster at {address!r} has room for {room} collectors of {threads} CPUs "
+            f"(threads), not for {collectors}: add machines, or lower collectors or threads"
+        )
 
 
 def connect(address: str) -> None:

@@ -15,7 +15,7 @@ from torchrl.collectors import Collector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-from .ray_cluster import ask_for_machines, connect, import_variables
+from .ray_cluster import check_room, connect, import_variables
 
 _RESUME = "A resumed run goes on from its last checkpoint, with new collectors"
 
@@ -90,38 +90,6 @@ class ClusterCollector(RayCollector):
         """Sends the policy's weights to all collectors."""
         with _one_line():
             super().update_policy_weights_(*(args or (self._trained,)), **kwargs)
-
-
-def check_cluster(address: str | None, collectors: int, threads: int) -> None:
-    """Checks that the cluster, if one is used, has room for the collectors.
-
-    Raises:
-        ValueError: if Ray is missing, no cluster answers, or it has too few CPUs.
-    """
-    if address is not None:
-        check_room(ask_for_machines(address), address, collectors, threads)
-
-
-def check_room(
-    machines: Sequence[dict[str, float]], address: str, collectors: int, threads: int
-) -> None:
-    """Checks that machines have enough CPUs, even if others are using them now.
-
-    Raises:
-        ValueError: if they do not; Ray itself would wait silently.
-
-    Example:
-        >>> check_room([{"CPU": 4.0}, {"CPU": 3.0}], "auto", collectors=4, threads=2)
-        Traceback (most recent call last):
-            ...
-        ValueError: the Ray cluster at 'auto' has room for 3 collectors of 2 CPUs (threads), not ...
-    """
-    room = sum(int(machine.get("CPU", 0)) // threads for machine in machines)
-    if room < collectors:
-        raise ValueError(
-            f"the Ray cluster at {address!r} has room for {room} collectors of {threads} CPUs "
-            f"(threads), not for {collectors}: add machines, or lower collectors or threads"
-        )
 
 
 def _check_own_name(addresses: set[str]) -> None:

@@ -196,6 +196,7 @@ _MODULES = {
     "iql": "iql",
     "odt": "online_decision_transformer",
     "ppo": "ppo",
+    "ppo-coberl": "coberl",
     "ppo-gsde": "gsde",
     "ppo-noveld": "novelty",
     "sac": "sac",

@@ -73,7 +73,7 @@ def _convert(kind: type[T], fields: Any, prefix: str = "") -> T:
             if value != removed[name]:
                 raise ValueError(
                     f"field {prefix + name!r} no longer exists, and only {removed[name]!r} can be "
-                    "read, which did nothing: leave it out"
+                    "read, which changes nothing: leave it out"
                 )
             continue
         if name not in types:

@@ -60,7 +60,7 @@ def make_task(
 def seed_copies(env: EnvBase, seed: int, step: int = 0, first: int = 0) -> EnvBase:
     """Seeds the environments in which a run trains, each from a random stream of its own.
 
-    So runs with neighbouring seeds have no environment in common.
+    So runs with neighboring seeds have no environment in common.
 
     Args:
         env: the environments, [N], which are reset.

@@ -1,4 +1,4 @@
-"""Behaviour cloning, IQL and TD3+BC on D4RL's sets of version 2, as in the last two's papers."""
+"""Behavior cloning, IQL and TD3+BC on D4RL's sets of version 2, as in the last two's papers."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from torchrl_tit.settings.networks import (
     vanilla_tit,
 )
 
-from .preset import PPO, Preset
+from .preset import PPO, ContrastivePPO, Preset
 
 _GAMES = {
     "breakout": "ALE/Breakout-v5",
@@ -77,7 +77,9 @@ def _named(game: str) -> list[Preset]:
         "catformer-tuned": tuned.replace(
             backbone=catformer(4, attention_expansion=2, ffn_expansion=4)
         ),
-        "coberl-tuned": tuned.replace(backbone=coberl(4, gate_bias=2.0), contrastive_coeff=1.0),
+        "coberl-tuned": ContrastivePPO(
+            **{**tuned.fields, "backbone": coberl(4, gate_bias=2.0), "contrastive_coeff": 1.0}
+        ),
     }
     tit = base.replace(minibatch_size=64)  # the authors' code; the paper names no other than 256
     recipes |= {name: tit.replace(backbone=network) for name, network in _TIT.items()}

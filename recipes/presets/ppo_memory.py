@@ -72,7 +72,7 @@ _RECURRENT: dict[str, HistorySettings] = {
 def _t_maze_settings(length: int) -> dict[str, Any]:
     """Sequences as long as an episode, so that an LSTM's gradient reaches the cue.
 
-    An agent that has learnt to walk before it has seen a junction must not be too sure there. As
+    An agent that has learned to walk before it has seen a junction must not be too sure there. As
     nearly all advantages become 0, the few others must not be divided by almost nothing. The floor,
     in standard deviations of the return, falls with the price of a step, which is 1 / length: an
     entropy bonus that is worth more than a step would keep the agent from walking.

@@ -34,10 +34,10 @@ class Preset:
         return Preset(self.algorithm, **{**self.fields, **fields})
 
 
-PPO, NovelPPO, SmoothPPO, SAC, DQN, CQL, DiscreteCQL, BC, IQL, TD3BC, DT, ODT = (
+PPO, ContrastivePPO, NovelPPO, SmoothPPO, SAC, DQN, CQL, DiscreteCQL, BC, IQL, TD3BC, DT, ODT = (
     partial(Preset, algorithm)
     for algorithm in (
-        *("ppo", "ppo-noveld", "ppo-gsde", "sac", "dqn"),
+        *("ppo", "ppo-coberl", "ppo-noveld", "ppo-gsde", "sac", "dqn"),
         *("cql", "discrete-cql", "bc", "iql", "td3bc", "dt", "odt"),
     )
 )

@@ -32,7 +32,7 @@ STACKED = ("without outer", "nature-cnn", "resnet")
 
 
 class LaidOut(nn.Module):
-    """A normalisation that lays its tokens out as an image on the way, for captum."""
+    """A normalization that lays its tokens out as an image on the way, for captum."""
 
     def __init__(self, norm: nn.Module, patches: int) -> None:
         super().__init__()

@@ -20,14 +20,14 @@ def test_objects_move_before_a_still_background() -> None:
     assert objects.nonzero().tolist() == [[step, 3, step] for step in range(5)]
 
 
-def test_objects_have_another_colour_than_the_ground() -> None:
+def test_objects_have_another_color_than_the_ground() -> None:
     frames = torch.zeros(2, 3, 6, 6)
     frames[:, 1] = 0.4  # green ground
     frames[:, 0, 2:4, 2:4] = 0.9
-    objects = find_objects(frames, background="colour")
+    objects = find_objects(frames, background="color")
     assert objects.sum((1, 2)).tolist() == [4, 4]
     assert objects[:, 2:4, 2:4].all()
-    assert not find_objects(frames, background="colour", tolerance=0.95).any()
+    assert not find_objects(frames, background="color", tolerance=0.95).any()
     assert not find_objects(frames).any(), "nothing moves"
 
 
@@ -65,7 +65,7 @@ def test_change() -> None:
 
 
 def test_bad_input() -> None:
-    with pytest.raises(ValueError, match="a background is 'place' or 'colour', not 'sky'"):
+    with pytest.raises(ValueError, match="a background is 'place' or 'color', not 'sky'"):
         find_objects(torch.zeros(2, 4, 4), background="sky")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"frames have the shape \[4, 4\]"):
         find_objects(torch.zeros(4, 4))

@@ -47,9 +47,9 @@ def lowered(outputs):
 @pytest.mark.parametrize("index", [0, 2])
 def test_measured(runs, index):
     # Without training a map can be 0 everywhere; then what lowers the value is not.
-    # Agents may stand still, so objects are what has another colour than the walls.
+    # Agents may stand still, so objects are what has another color than the walls.
     found = [
-        measure_figure_claims(runs[index], steps=14, target=target, background="colour")
+        measure_figure_claims(runs[index], steps=14, target=target, background="color")
         for target in (raised, lowered)
     ]
     claims = min(found, key=lambda claims: claims.empty_maps)

@@ -139,7 +139,6 @@ FIELDS = {
 @pytest.mark.parametrize("name", memory_variants.RECIPES)
 def test_a_variant(name):
     pytest.importorskip("minigrid")
-    pytest.importorskip("minigrid")
     recipe = find_recipe(f"{Path(memory_variants.__file__)}:{name}")
     task, _, word = name.rpartition("/")
     named = get_recipe(f"{task}/enhanced-tit")

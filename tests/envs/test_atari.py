@@ -212,8 +212,8 @@ def test_pictures_of_the_games():
         screen, _ = games.render()
         assert screen.shape == (210, 160, 3)
         # The small picture is of the same moment as the large one.
-        grey = torch.from_numpy(screen @ np.array([0.299, 0.587, 0.114]))
-        small = torch.nn.functional.interpolate(grey[None, None], (84, 84), mode="area")[0, 0]
+        gray = torch.from_numpy(screen @ np.array([0.299, 0.587, 0.114]))
+        small = torch.nn.functional.interpolate(gray[None, None], (84, 84), mode="area")[0, 0]
         assert np.corrcoef(small.flatten(), image[0].flatten())[0, 1] > 0.95
     games.close()
     with pytest.raises(ValueError, match='only with render_mode="rgb_array"'):

@@ -29,8 +29,8 @@ def test_gymnasium_wrappers_in_order():
         ],
     )
     assert kinds(pixels) == ((3, 14, 14), "uint8")
-    grey = "gymnasium.wrappers:GrayscaleObservation"
-    inner_first = ["minigrid.wrappers:ImgObsWrapper", grey]
+    gray = "gymnasium.wrappers:GrayscaleObservation"
+    inner_first = ["minigrid.wrappers:ImgObsWrapper", gray]
     assert kinds(make_env(MINIGRID, wrappers=inner_first)) == ((7, 7), "uint8")
     with pytest.raises(ValueError, match="GrayscaleObservation' cannot be made"):
         make_env(MINIGRID, wrappers=inner_first[::-1])

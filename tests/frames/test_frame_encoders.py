@@ -139,7 +139,7 @@ def test_own_weights_tell_sizes_of_an_entry_apart() -> None:
     torch.manual_seed(0)
 
     def distance(patch_weights: str) -> float:
-        """Between the normalised tokens of 1 and 2, relative to that of 1 and -1."""
+        """Between the normalized tokens of 1 and 2, relative to that of 1 and -1."""
         inner = settings.Inner(patch_weights=patch_weights).build((4,))  # type: ignore[arg-type]
         assert isinstance(inner, InnerTransformer)
         values = torch.tensor([[1.0], [2.0], [-1.0]]).expand(3, 4)

@@ -28,8 +28,8 @@ def make(num_tokens: int = 1, gate_bias: float = 2.0, num_blocks: int = 2) -> GT
 
 
 def layer_norm(norm: nn.LayerNorm, x: Tensor) -> Tensor:
-    centred = x - x.mean(-1, keepdim=True)
-    return centred / (centred.square().mean(-1, keepdim=True) + norm.eps).sqrt() * norm.weight + (
+    centered = x - x.mean(-1, keepdim=True)
+    return centered / (centered.square().mean(-1, keepdim=True) + norm.eps).sqrt() * norm.weight + (
         norm.bias
     )
 

@@ -7,13 +7,13 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.collectors import Collector, MultiSyncCollector
+from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.data import Unbounded
 
 from tests.modules.frames import CountedFrames, assert_exact, encoder_of, features, make
 from tests.numerics import assert_near
 from torchrl_tit.envs import make_env
-from torchrl_tit.modules import ActingCollector, make_actor, while_acting
+from torchrl_tit.modules import ActingCollector, make_actor
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -153,23 +153,19 @@ SETTINGS = {
 }
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["while_acting", "ActingCollector", pytest.param("processes", marks=pytest.mark.slow)],
-)
-def test_weights_sent_to_a_collector_are_used(kind):
+@pytest.mark.parametrize("processes", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_weights_sent_to_a_collector_are_used(processes):
     """Each batch has the features of the network before the update that follows it."""
     policy, network = make_policy()
-    if kind == "processes":
+    collector: BaseCollector
+    if processes:
         collector = MultiSyncCollector(
             [make_pendulum], policy, collector_class=ActingCollector, **SETTINGS
         )
     else:
-        acts = kind == "ActingCollector"
-        collector = (ActingCollector if acts else Collector)(make_pendulum(), policy, **SETTINGS)
-    batches = while_acting(policy, collector) if kind == "while_acting" else collector
+        collector = ActingCollector(make_pendulum(), policy, **SETTINGS)
     count = 0
-    for batch in batches:
+    for batch in collector:
         assert policy[0]._acting is None
         with torch.no_grad():
             assert_near(batch["features"], network(batch["history"]))

@@ -1,4 +1,4 @@
-"""TensorDict's ``reset_parameters_recursive`` repeats the initialisation of the constructors."""
+"""TensorDict's ``reset_parameters_recursive`` repeats the initialization of the constructors."""
 
 import math
 from collections.abc import Callable

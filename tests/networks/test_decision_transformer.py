@@ -1,4 +1,4 @@
-"""Decision Transformer: its behaviour beyond equality with the reference in tests/interop."""
+"""Decision Transformer: its behavior beyond equality with the reference in tests/interop."""
 
 from __future__ import annotations
 

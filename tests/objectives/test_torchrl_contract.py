@@ -50,7 +50,7 @@ def transitions(action: torch.Tensor, num_frames: int) -> TensorDictBase:
     return TensorDict({"history": frames[:, :-1], "action": action, "next": following}, [BATCH])
 
 
-def behaviour_cloning(**settings: Any) -> Case:
+def behavior_cloning(**settings: Any) -> Case:
     encoder, size = backbone(num_frames=3)
     actor = ProbabilisticTensorDictSequential(encoder, *make_actor(size, Categorical(3)))
     batch = transitions(torch.randint(3, (BATCH,)), num_frames=3).exclude("next")
@@ -105,7 +105,7 @@ def discrete_cql(**settings: Any) -> Case:
     return Case(loss, transitions(torch.randint(3, (BATCH,)), num_frames=3))
 
 
-MAKERS = [behaviour_cloning, decision_transformer, continuous_cql, discrete_cql]
+MAKERS = [behavior_cloning, decision_transformer, continuous_cql, discrete_cql]
 each_loss = pytest.mark.parametrize("make", MAKERS, ids=lambda make: make.__name__)
 
 

@@ -12,6 +12,7 @@ import torch
 from tensordict import TensorDictBase
 
 from recipes.bc import BC
+from recipes.coberl import ContrastivePPO
 from recipes.core import algorithm, runner
 from recipes.core.callback import Callback
 from recipes.core.metrics import read_metrics
@@ -30,7 +31,7 @@ from recipes.td3bc import TD3BC
 from tests.datasets.rollouts import roll, write
 from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
-from torchrl_tit.settings import Network
+from torchrl_tit.settings import CoBERL, Inner, Network
 from torchrl_tit.settings.networks import decision_transformer, dt_tit, enhanced_tit, mlp
 
 _roll = cache(roll)
@@ -55,6 +56,9 @@ def tit(num_frames: int = 1, **hyperparameters: Any) -> Network:
 
 
 SMALL = mlp(hidden_dim=8, activation="relu")
+COBERL = Network(
+    frame=Inner(embed_dim=8), history=CoBERL(num_blocks=1, num_heads=2, hidden_dim=8), num_frames=3
+)
 SMALL_DT: dict[str, Any] = {"num_frames": 6, "embed_dim": 16, "num_blocks": 2}
 _INTERVALS = {
     "batch_size": 8,
@@ -188,6 +192,9 @@ TINY = PPO(
 RECIPES: dict[str, Callable[[Path], Recipe]] = {
     "ppo": lambda folder: PPO(env="CartPole-v1", **_ROLLOUTS),
     "ppo, continuous": lambda folder: PPO(env="Pendulum-v1", **_ROLLOUTS),
+    "ppo, contrastive": lambda folder: ContrastivePPO(
+        env="CartPole-v1", **{**_ROLLOUTS, "backbone": COBERL}
+    ),
     "ppo, novelty": lambda folder: NovelPPO(env="CartPole-v1", **_ROLLOUTS),
     "ppo, smooth": lambda folder: SmoothPPO(env="Pendulum-v1", **_ROLLOUTS),
     "sac": lambda folder: SAC(env="Pendulum-v1", **_REPLAY),

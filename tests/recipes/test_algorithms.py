@@ -39,7 +39,14 @@ NOISE = {
         "odt",
         "odt, offline",
     ),
-    "gumbel": ("ppo", "ppo, novelty", "bc, discrete", "iql, discrete", "dt, discrete"),
+    "gumbel": (
+        "ppo",
+        "ppo, contrastive",
+        "ppo, novelty",
+        "bc, discrete",
+        "iql, discrete",
+        "dt, discrete",
+    ),
 }
 """With which the actions of policies are drawn that draw them."""
 

@@ -86,7 +86,6 @@ RECIPES: dict[str, Recipe] = {
         observation_keys=("arm/joint_angles",),
         backbone=mlp(),
     ),
-    "processes": replace(PPO_RECIPE, vectorization_mode="async"),
     "collectors": replace(PPO_RECIPE, collectors=2),
     "SAC": SAC_RECIPE,
     "DQN": DQN_RECIPE,
@@ -175,7 +174,7 @@ def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path
 
 
 @pytest.mark.parametrize("kind", ["CartPole", "TorchRL", "processes", "collectors", "SAC", "DQN"])
-def test_neighbouring_seeds_share_no_environment(kind: str, tmp_path: Path) -> None:
+def test_neighboring_seeds_share_no_environment(kind: str, tmp_path: Path) -> None:
     """No copy of one begins as a copy of another; other tasks are seeded in the same way."""
     starts = []
     for seed in (20, 21, 22):
@@ -186,7 +185,7 @@ def test_neighbouring_seeds_share_no_environment(kind: str, tmp_path: Path) -> N
     assert len(set(starts)) == len(starts) == 6
 
 
-def test_neighbouring_seeds_share_no_game(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neighboring_seeds_share_no_game(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ale_py")
     seeds: list[int] = []
     monkeypatch.setattr(AtariGames, "_begin", lambda games, which, given: seeds.extend(given or ()))

@@ -67,9 +67,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "ppo/*-protocol": {
         "learning_rate": 3e-4, "decay_learning_rate": False, "warmup_steps": 0, "adam_eps": 1e-5,
         "max_grad_norm": 0.5, "num_envs": 1, "steps_per_batch": 2048, "minibatch_size": 64,
-        "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95, "bootstrap_time_limit": True,
+        "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95,
         "clip_epsilon": 0.2, "decay_clip_epsilon": False, "entropy_coeff": 0.0,
-        "critic_coeff": 0.5, "contrastive_coeff": 0.0, "clip_rewards": False, "reward_scale": 1.0,
+        "critic_coeff": 0.5, "clip_rewards": False, "reward_scale": 1.0,
         "hide_velocities": False, "initialization": "orthogonal", "evaluation_episodes": 100,
         "backbone.num_frames": 1,
     },
@@ -117,8 +117,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
             "learning_rate": 2.5e-4, "decay_learning_rate": True, "clip_epsilon": 0.1,
             "decay_clip_epsilon": True, "entropy_coeff": 0.01, "critic_coeff": 0.5, "gamma": 0.99,
             "gae_lambda": 0.95, "clip_rewards": True, "total_steps": 10_000_000,
-            "evaluation_episodes": 100, "initialization": "orthogonal", "contrastive_coeff": 0.0,
-            "warmup_steps": 0, "backbone.num_frames": 4,
+            "evaluation_episodes": 100, "initialization": "orthogonal", "warmup_steps": 0,
+            "backbone.num_frames": 4,
         }
         for game, env in GAMES.items()
         for network in IMAGE_NETWORKS

@@ -81,7 +81,7 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
         "steps_per_batch / num_envs 40",
     ),
     (PPO_RECIPE, {**RECURRENT, "sequence_length": 0}, "sequence_length must be at least 1"),
-    (PPO_RECIPE, {"backbone": mlp(), "contrastive_coeff": 1.0}, "only coberl has"),
+    (get_recipe("ppo/pong/coberl-tuned"), {"backbone": mlp()}, "only coberl predicts, not mlp"),
     (PPO_RECIPE, {"backbone": nature_cnn()}, "image"),
     (PPO_RECIPE, {"backbone": catformer(4)}, "do not read an array"),
     (PPO_RECIPE, {"backbone": coberl(4)}, "do not read an array"),
@@ -246,7 +246,6 @@ def test_rewards_that_cannot_be_scaled(tmp_path: Path) -> None:
         ({"env": "CartPole-v1"}, "image"),
         ({"backbone": enhanced_tit(4, patch_size=85)}, "patch"),
         ({"backbone": replace(nature_cnn(4), frame=enhanced_tit(patch_size=12).frame)}, "flat"),
-        ({"vectorization_mode": "async"}, "leave vectorization_mode at 'sync'"),
         ({"hide_velocities": True}, "velocities"),
     ],
 )

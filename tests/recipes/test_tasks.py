@@ -58,13 +58,13 @@ def test_trains_evaluates_and_renders(name, tmp_path, capsys):
     main(["evaluate", str(whole.folder)])
     assert "2 episodes" in capsys.readouterr().out
     film = tmp_path / "film.gif"
-    render = ["render", str(whole.folder), "--out", str(film)]
+    film_it = ["play", str(whole.folder), "--out", str(film)]
     if name == "repeat-previous":
         with pytest.raises(SystemExit):
-            main(render)
+            main(film_it)
         assert "cannot be rendered: Task 'popgym" in capsys.readouterr().err
     else:
-        main(render)
+        main(film_it)
         assert imageio.imread(film).shape[-1] == 3
 
 

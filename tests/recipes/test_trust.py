@@ -75,7 +75,6 @@ WAYS = [
     "train --resume RUN",
     f"train {NAME} --init-from RUN --out new",
     "evaluate RUN",
-    "render RUN --out a.gif",
     "explain RUN --out a.gif",
     "compare RUN",
     "table .",

@@ -40,7 +40,7 @@ MEASURES: dict[str, tuple[str, Callable[[np.ndarray], np.floating]]] = {
 }
 """What is fitted: a column, and how the samples of a block are summarised."""
 _BLOCKS = 12
-"""Blocks of time whose means are fitted: neighbouring samples are not independent."""
+"""Blocks of time whose means are fitted: neighboring samples are not independent."""
 _FOREVER = "1000000000"
 _ENDLESS_CQL = ("--total-updates", _FOREVER, "--checkpoint-interval", "100")
 """Checkpoints as often as the other runs write them, by time: each returns free memory."""

@@ -48,7 +48,7 @@ def test_a_name_that_only_begins_alike_is_not_allowed():
     assert not is_named("pack_a")
 
 
-def test_a_file_is_imported_under_its_own_name_with_its_neighbours(own_modules):
+def test_a_file_is_imported_under_its_own_name_with_its_neighbors(own_modules):
     (own_modules / "pack_a" / "mine.py").write_text("from parts import ANSWER\n")
     module = import_allowed("pack_a/mine.py")
     assert (module.__name__, module.ANSWER) == ("mine", 42)

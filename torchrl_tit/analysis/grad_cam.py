@@ -37,7 +37,7 @@ def grad_cam(
         w_c = \frac{1}{hw} \sum_{ij} \frac{\partial\, \mathrm{target}}{\partial A_{cij}}
 
     for the output A of a layer with c channels on h x w places. For inner transformers, places are
-    patches, channels are the entries of their tokens, and the layer is the input normalisation of
+    patches, channels are the entries of their tokens, and the layer is the input normalization of
     the last block: after it, the last block computes only the class token, so patches get no
     gradient. The class token is left out. For convolutional networks, the layer is the last
     convolution.

@@ -46,14 +46,14 @@ class ImageLayer:
         raise ValueError(
             f"the output of the layer {self.name!r} has the shape {found}, which is no image "
             "[N, C, h, w] and no row of patches: choose a convolution, or the input "
-            "normalisation of a block (norm1)"
+            "normalization of a block (norm1)"
         )
 
 
 def image_layers(network: HistoryNetwork) -> dict[str, ImageLayer]:
     """Finds the layer of Grad-CAM for each image that a network reads.
 
-    For transformers, it is the input normalisation of the last inner block: after it, the last
+    For transformers, it is the input normalization of the last inner block: after it, the last
     block computes only the class token, so patches get no gradient. For convolutional networks, it
     is the last convolution.
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-Background = Literal["place", "colour"]
+Background = Literal["place", "color"]
 _SYMBOLS = 25
 
 
@@ -22,7 +22,7 @@ def find_objects(
             less than 25, they are treated as symbols, whose differences exceed the default
             tolerance.
         background: the background: the median over the frames at each place, for static cameras
-            ("place"); or the most common colour of each frame ("colour").
+            ("place"); or the most common color of each frame ("color").
         tolerance: largest difference from the background, in a range from 0 to 1.
 
     Returns:
@@ -38,7 +38,7 @@ def find_objects(
         tensor([[1, 2, 3]])
     """
     if background not in get_args(Background):
-        raise ValueError(f"a background is 'place' or 'colour', not {background!r}")
+        raise ValueError(f"a background is 'place' or 'color', not {background!r}")
     if frames.ndim not in (3, 4):
         raise ValueError(f"frames have the shape {list(frames.shape)}, not [T, H, W] or with C")
     images = frames if frames.ndim == 4 else frames.unsqueeze(1)
@@ -117,6 +117,6 @@ def map_change(maps: Tensor, grid: tuple[int, int] = (7, 7)) -> Tensor:
 
 
 def _most_common(image: Tensor) -> Tensor:
-    """The most common colour of an image, [C, H, W] -> [C]."""
-    colours, counts = image.flatten(1).unique(dim=1, return_counts=True)
-    return colours[:, counts.argmax()]
+    """The most common color of an image, [C, H, W] -> [C]."""
+    colors, counts = image.flatten(1).unique(dim=1, return_counts=True)
+    return colors[:, counts.argmax()]

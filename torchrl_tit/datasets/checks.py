@@ -27,10 +27,10 @@ class DatasetError(ValueError):
     """A data set is damaged, incomplete, or of another task; the message names file, field and row.
 
     Args:
-        source: The file, or another description of the source.
-        problem: What is wrong, what was expected and what to do.
-        field: Name of the field, if the problem is in one.
-        row: Index of the row, if the problem is in one.
+        source: the file, or another description of the source.
+        problem: what is wrong, what was expected and what to do.
+        field: name of the field, if the problem is in one.
+        row: index of the row, if the problem is in one.
 
     Example:
         >>> print(DatasetError("a.hdf5", "is nan, but must be finite.", "rewards", 3))
@@ -51,7 +51,7 @@ class TaskSpaces(NamedTuple):
     Attributes:
         observation: Gymnasium's space of one observation.
         action: Gymnasium's space of one action.
-        name: The task's name, for error messages.
+        name: the task's name, for error messages.
     """
 
     observation: Space
@@ -64,15 +64,15 @@ def task_spaces(env_name: str) -> TaskSpaces:
     """Returns the spaces of a Gymnasium task.
 
     Args:
-        env_name: A name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
-            "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one grey
+        env_name: a name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
+            "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one gray
             image of 84 x 84.
 
     Returns:
         Its spaces.
 
     Raises:
-        ValueError: If the task cannot be made.
+        ValueError: if the task cannot be made.
 
     Example:
         >>> task_spaces("Pendulum-v1").action.shape
@@ -99,13 +99,13 @@ def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:
     otherwise.
 
     Args:
-        source: Where the data came from, for error messages.
-        recorded: The recorded name of the task; anything but a string if there is none.
-        task: The requested task. The versions may differ. If its name does not have Gymnasium's
+        source: where the data came from, for error messages.
+        recorded: the recorded name of the task; anything but a string if there is none.
+        task: the requested task. The versions may differ. If its name does not have Gymnasium's
             form, nothing is checked.
 
     Raises:
-        DatasetError: If it is another task.
+        DatasetError: if it is another task.
 
     Example:
         >>> check_task_name("a.hdf5", "Pendulum-v0", task_spaces("Pendulum-v1"))
@@ -132,7 +132,7 @@ def check_shape(
     """Checks that one row of observations or actions has the shape of the task's space.
 
     Raises:
-        DatasetError: If the shape differs.
+        DatasetError: if the shape differs.
 
     Example:
         >>> task = task_spaces("Pendulum-v1")
@@ -159,14 +159,14 @@ def check_finite(
     """Checks that values are finite, also after conversion, or integers that fit.
 
     Args:
-        source: Where the data came from, for error messages.
-        field: Name of the field.
-        values: Some rows of it.
-        first_row: Index of the first of these rows.
-        kept_as: The dtype that they are converted to, which may have a smaller range.
+        source: where the data came from, for error messages.
+        field: name of the field.
+        values: some rows of it.
+        first_row: index of the first of these rows.
+        kept_as: the dtype that they are converted to, which may have a smaller range.
 
     Raises:
-        DatasetError: If a value is not finite or too large; the message names the first such row.
+        DatasetError: if a value is not finite or too large; the message names the first such row.
 
     Example:
         >>> check_finite("a.hdf5", "rewards", np.array([0.0, np.nan]), first_row=100)
@@ -194,13 +194,13 @@ def check_actions(source: str, values: NDArray, space: Space, first_row: int = 0
     """Checks that actions lie in the action space.
 
     Args:
-        source: Where the data came from, for error messages.
-        values: Some rows of the actions.
-        space: A `Box` or `Discrete` action space; others are not checked.
-        first_row: Index of the first of these rows.
+        source: where the data came from, for error messages.
+        values: some rows of the actions.
+        space: a `Box` or `Discrete` action space; others are not checked.
+        first_row: index of the first of these rows.
 
     Raises:
-        DatasetError: If an action lies outside; the message names the first such row.
+        DatasetError: if an action lies outside; the message names the first such row.
 
     Example:
         >>> check_actions("a.hdf5", np.array([[1.5]]), Box(-1.0, 1.0, (1,)))
@@ -232,17 +232,17 @@ def kept_dtype(source: str, field: str, dtype: np.dtype, floats: torch.dtype | N
     """Returns the dtype in which a field is stored.
 
     Args:
-        source: Where the data came from, for error messages.
-        field: Name of the field.
-        dtype: The field's dtype in the source.
-        floats: The dtype for floats; None keeps that of the source.
+        source: where the data came from, for error messages.
+        field: name of the field.
+        dtype: the field's dtype in the source.
+        floats: the dtype for floats; None keeps that of the source.
 
     Returns:
         The dtype: bool for flags, floating for rewards, uint8 or int64 for other integers.
 
     Raises:
-        DatasetError: If the field's values are not numbers.
-        ValueError: If ``floats`` is not a floating-point dtype.
+        DatasetError: if the field's values are not numbers.
+        ValueError: if ``floats`` is not a floating-point dtype.
 
     Example:
         >>> kept_dtype("a.hdf5", "rewards", np.dtype("float64"), torch.float32)

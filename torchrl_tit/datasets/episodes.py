@@ -32,12 +32,12 @@ class Episodes:
     Args:
         rows: [R] with "observation" [R, *obs], "action" [R, *action], and "reward", "terminated"
             and "truncated" [R, 1].
-        lengths: Number of steps of each episode; int64 [E], all at least 1.
-        final_known: Whether the final observation of each episode is known (otherwise it is zeros);
+        lengths: number of steps of each episode; int64 [E], all at least 1.
+        final_known: whether the final observation of each episode is known (otherwise it is zeros);
             bool [E].
-        source: Name of the source, for error messages.
-        attributes: The source's metadata, as strings and numbers.
-        left_out: Names of the source's fields that were not read.
+        source: name of the source, for error messages.
+        attributes: the source's metadata, as strings and numbers.
+        left_out: names of the source's fields that were not read.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -107,7 +107,7 @@ class Episodes:
         """Copies the data to a device; windows are then gathered there.
 
         Args:
-            device: The device, such as "cuda".
+            device: the device, such as "cuda".
 
         Returns:
             The same episodes on the device.
@@ -159,14 +159,14 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
     """Copies some of the episodes.
 
     Args:
-        episodes: The data.
-        index: Indices of the episodes, in the order of the result; int64 [M].
+        episodes: the data.
+        index: indices of the episodes, in the order of the result; int64 [M].
 
     Returns:
         The selected episodes.
 
     Raises:
-        ValueError: If there is no such episode.
+        ValueError: if there is no such episode.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -197,16 +197,16 @@ def split_episodes(episodes: Episodes, fraction: float, seed: int) -> tuple[Epis
     If a single one is finished, its last part is held out, with a warning.
 
     Args:
-        episodes: The data.
-        fraction: Share of the finished episodes to hold out, above 0 and below 1; at least one
+        episodes: the data.
+        fraction: share of the finished episodes to hold out, above 0 and below 1; at least one
             episode is held out, and at least one is not.
-        seed: Seed of the choice.
+        seed: seed of the choice.
 
     Returns:
         The episodes to learn from, unfinished ones among them, and those that are held out.
 
     Raises:
-        DatasetError: If the only finished episode has a single step.
+        DatasetError: if the only finished episode has a single step.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -263,14 +263,14 @@ def join_episodes(parts: Sequence[Episodes]) -> Episodes:
     """Concatenates data sets.
 
     Args:
-        parts: Data sets with the same fields, at least one; the result has the source and the
+        parts: data sets with the same fields, at least one; the result has the source and the
             attributes of the first.
 
     Returns:
         The episodes of all of them.
 
     Raises:
-        ValueError: If there are none, or the shapes or dtypes of their fields differ.
+        ValueError: if there are none, or the shapes or dtypes of their fields differ.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -302,10 +302,10 @@ def check_final_observations(episodes: Episodes) -> None:
     """Checks that the episodes can be written with their final observations.
 
     Args:
-        episodes: The data.
+        episodes: the data.
 
     Raises:
-        DatasetError: If the final observation of a truncated episode is unknown.
+        DatasetError: if the final observation of a truncated episode is unknown.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -329,7 +329,7 @@ def rows_per_chunk(bytes_per_row: int) -> int:
     """Returns the number of rows to process at a time, at least 1.
 
     Args:
-        bytes_per_row: Size of one row.
+        bytes_per_row: size of one row.
 
     Example:
         >>> rows_per_chunk(1024)
@@ -349,16 +349,16 @@ def memory_mapped_rows(
     of them when the tensors are freed or the program ends in any way.
 
     Args:
-        num_rows: Number R of rows.
-        fields: The shape of one row of each field, and its dtype.
-        directory: Folder for the files; by default the system's folder for temporary files, which
+        num_rows: number R of rows.
+        fields: the shape of one row of each field, and its dtype.
+        directory: folder for the files; by default the system's folder for temporary files, which
             may be small.
 
     Returns:
         Tensors [R, *shape] by name.
 
     Raises:
-        OSError: If the disk is full, or the folder cannot be written.
+        OSError: if the disk is full, or the folder cannot be written.
 
     Example:
         >>> memory_mapped_rows(5, {"reward": ((1,), torch.float32)})["reward"].shape

@@ -31,19 +31,19 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     :func:`~torchrl_tit.datasets.hdf5_files.find`.
 
     Args:
-        path: The file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
+        path: the file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
             "terminals" [N], and optionally "timeouts" [N], "next_observations" [N, *obs], and
             "timestamps" [N], whose order is checked.
             Other fields, and attributes that are neither text nor a few numbers, are not read.
-        **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
+        **settings: as for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
             which describes how missing fields are replaced.
 
     Returns:
         The episodes.
 
     Raises:
-        FileNotFoundError: If there is no such file.
-        DatasetError: If it is not a complete HDF5 file, takes values from other files, declares
+        FileNotFoundError: if there is no such file.
+        DatasetError: if it is not a complete HDF5 file, takes values from other files, declares
             more than it can hold, or its data cannot be used.
 
     Example:
@@ -80,14 +80,14 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     is, because the data came without them.
 
     Args:
-        episodes: The episodes. Only the last one may be unfinished.
-        path: The file, which must not exist yet; it is written atomically.
+        episodes: the episodes. Only the last one may be unfinished.
+        path: the file, which must not exist yet; it is written atomically.
 
     Raises:
-        FileExistsError: If the file exists already.
-        ValueError: If an episode before the last is unfinished, or the final observations of only
+        FileExistsError: if the file exists already.
+        ValueError: if an episode before the last is unfinished, or the final observations of only
             some truncated ones are known; the layout cannot represent either.
-        OSError: If the file cannot be written.
+        OSError: if the file cannot be written.
 
     Example:
         >>> import tempfile

@@ -46,13 +46,13 @@ def damage_named(
     """Turns h5py's errors on damaged files into one error that names the place.
 
     Args:
-        source: The file.
-        problem: What is wrong, for the error message.
-        field: Name of the field, if the problem is in one.
-        row: Index of the row, if the problem is in one.
+        source: the file.
+        problem: what is wrong, for the error message.
+        field: name of the field, if the problem is in one.
+        row: index of the row, if the problem is in one.
 
     Raises:
-        DatasetError: If anything goes wrong inside.
+        DatasetError: if anything goes wrong inside.
 
     Example:
         >>> with damage_named("a.hdf5", "is not a whole HDF5 file", "rewards"):
@@ -73,7 +73,7 @@ def open_hdf5(path: str | os.PathLike[str]) -> h5py.File:
     """Opens a file for reading.
 
     Raises:
-        DatasetError: If it is not a complete HDF5 file.
+        DatasetError: if it is not a complete HDF5 file.
 
     Example:
         >>> import tempfile
@@ -91,15 +91,15 @@ def find(source: str, group: h5py.Group, name: str) -> h5py.Dataset | h5py.Group
     """Finds an entry of a file, and checks that the file itself holds its values.
 
     Args:
-        source: The file, for error messages.
-        group: The file, or a group in it.
-        name: Name of a field or a group in it.
+        source: the file, for error messages.
+        group: the file, or a group in it.
+        name: name of a field or a group in it.
 
     Returns:
         The field or group; None if there is none of that name.
 
     Raises:
-        DatasetError: If it is a link to another place or a field with values in other files, if the
+        DatasetError: if it is a link to another place or a field with values in other files, if the
             file is too small for what the field declares, or if a chunk, which can only be read as
             a whole, is too large.
 
@@ -144,13 +144,13 @@ def check_size(source: str, declared: int, held: int, field: str | None = None) 
     """Checks that values, possibly compressed, fit into the bytes that a file has for them.
 
     Args:
-        source: The file, for error messages.
-        declared: Size of the values in bytes.
-        held: Bytes that the file has for them.
-        field: Name of the field, if they belong to one.
+        source: the file, for error messages.
+        declared: size of the values in bytes.
+        held: bytes that the file has for them.
+        field: name of the field, if they belong to one.
 
     Raises:
-        DatasetError: If they do not fit.
+        DatasetError: if they do not fit.
 
     Example:
         >>> check_size("a.hdf5", declared=10**9, held=10**8)
@@ -224,10 +224,10 @@ class JoinedField:
     have about a thousand open files.
 
     Args:
-        pieces: The number of rows of each piece, and a function that reads some of them, given the
+        pieces: the number of rows of each piece, and a function that reads some of them, given the
             first and the one after the last.
-        shape: Shape of one row.
-        dtype: Dtype of all pieces.
+        shape: shape of one row.
+        dtype: dtype of all pieces.
 
     Example:
         >>> pieces = [(3, np.arange(3)), (2, np.array([10, 11]))]
@@ -274,14 +274,14 @@ def new_hdf5(
     the error is raised once the library has closed the file.
 
     Args:
-        hidden: The file to create.
-        path: The name that it will get, for error messages.
+        hidden: the file to create.
+        path: the name that it will get, for error messages.
 
     Yields:
         The file, and a function that raises the error early, for long writes.
 
     Raises:
-        OSError: If a write failed.
+        OSError: if a write failed.
 
     Example:
         >>> import tempfile

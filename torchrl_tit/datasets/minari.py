@@ -98,7 +98,7 @@ def read_minari(name: str | os.PathLike[str], **settings: Any) -> Episodes:
     """Reads a Minari data set in HDF5, in chunks; it may be larger than memory.
 
     Args:
-        name: A folder with a data set, or a data set's name such as "mujoco/hopper/medium-v0",
+        name: a folder with a data set, or a data set's name such as "mujoco/hopper/medium-v0",
             which Minari downloads if it is not in Minari's own folder yet.
         **settings: ``task``, ``dtype`` and ``directory`` as for
             :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
@@ -108,8 +108,8 @@ def read_minari(name: str | os.PathLike[str], **settings: Any) -> Episodes:
         the metadata, and the name of the task as "env_id".
 
     Raises:
-        FileNotFoundError: If Minari has no such data set, or cannot download it.
-        DatasetError: If it is damaged, declares more than its files can hold, takes data from other
+        FileNotFoundError: if Minari has no such data set, or cannot download it.
+        DatasetError: if it is damaged, declares more than its files can hold, takes data from other
             files or is of another task; or if a field is missing, has the wrong length, shape or
             dtype, or contains NaN, infinity, or actions out of bounds. Rows are counted over all
             episodes.
@@ -179,7 +179,7 @@ def is_minari_name(name: str) -> bool:
     """Returns whether a name has the form of Minari's, such as "mujoco/hopper/medium-v0".
 
     Args:
-        name: The name.
+        name: the name.
 
     Example:
         >>> is_minari_name("mujoco/hopper/medium-v0"), is_minari_name("./data.hdf5")
@@ -215,10 +215,10 @@ def _joined(
     """Joins the fields of all episodes in the layout of D4RL.
 
     Args:
-        source: The data set, for error messages.
-        file: The file with a group for each episode.
-        num_episodes: Number of episodes.
-        image: Shape of an observation that may be stored as a JPEG image; None otherwise.
+        source: the data set, for error messages.
+        file: the file with a group for each episode.
+        num_episodes: number of episodes.
+        image: shape of an observation that may be stored as a JPEG image; None otherwise.
 
     Returns:
         The fields, the length of each episode, and the names of what is not read.
@@ -297,18 +297,18 @@ def write_minari(
     "author", "author_email" and "code_permalink" also go into Minari's own metadata.
 
     Args:
-        episodes: The data.
-        name: The folder to create, an absolute path or one that begins with a dot, whose last part
+        episodes: the data.
+        name: the folder to create, an absolute path or one that begins with a dot, whose last part
             ends in a version such as "-v0"; or the name of a data set in Minari's own folder.
-        env_name: The Gymnasium task of the data, from which Minari can recreate the environment.
+        env_name: the Gymnasium task of the data, from which Minari can recreate the environment.
             For Atari games it only determines the action space, because the environment that Minari
             recreates has different images from :func:`~torchrl_tit.envs.make_env`.
 
     Raises:
-        FileExistsError: If the data set exists already.
-        ValueError: If Minari does not accept the name, or Gymnasium does not know the task.
-        DatasetError: If the final observation of a truncated episode is unknown.
-        OSError: If it cannot be written.
+        FileExistsError: if the data set exists already.
+        ValueError: if Minari does not accept the name, or Gymnasium does not know the task.
+        DatasetError: if the final observation of a truncated episode is unknown.
+        OSError: if it cannot be written.
 
     Example:
         >>> import tempfile

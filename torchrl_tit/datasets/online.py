@@ -55,17 +55,17 @@ class OnlineHistoryStorage(LazyTensorStorage):
     ever written begins an episode.
 
     Args:
-        max_size: Maximum number of steps, rounded up to whole steps of all environments. Memory is
+        max_size: maximum number of steps, rounded up to whole steps of all environments. Memory is
             used as the storage fills up.
-        num_frames: Number K of observations in a history, at least 1.
+        num_frames: number K of observations in a history, at least 1.
         ndim: 1 for the steps of one environment, [T]; 2 for those of several, [envs, T].
-        padding: The frames before the first step of an episode: ``"same"`` repeats the first
+        padding: the frames before the first step of an episode: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
-        is_init: Whether items have "is_init"; see :class:`HistoryStorage`.
-        device: Device on which the steps are stored.
+        is_init: whether items have "is_init"; see :class:`HistoryStorage`.
+        device: device on which the steps are stored.
 
     Raises:
-        ValueError: If a number is less than 1, the padding is unknown, or ``ndim`` is not 1 or 2.
+        ValueError: if a number is less than 1, the padding is unknown, or ``ndim`` is not 1 or 2.
 
     Example:
         >>> from torchrl.data import ReplayBuffer
@@ -141,13 +141,13 @@ class OnlineHistoryStorage(LazyTensorStorage):
         """Gathers items with their observations and histories.
 
         Args:
-            index: An index of a tensor of the storage's shape.
+            index: an index of a tensor of the storage's shape.
 
         Returns:
             The items, with the shape of the selection.
 
         Raises:
-            IndexError: If there is no such item, or none yet.
+            IndexError: if there is no such item, or none yet.
         """
         if not self._count:
             raise IndexError("there are no items yet: extend the buffer first")
@@ -178,16 +178,16 @@ class OnlineHistoryStorage(LazyTensorStorage):
         """Writes steps after the newest ones.
 
         Args:
-            cursor: Where TorchRL's `RoundRobinWriter` puts them, which is in order.
-            data: Steps [T], or [T, envs] if the storage has two dimensions, with "observation"
+            cursor: where TorchRL's `RoundRobinWriter` puts them, which is in order.
+            data: steps [T], or [T, envs] if the storage has two dimensions, with "observation"
                 (a tensor, or a tensordict of several), "action", and under "next" "observation",
                 "reward", "terminated" and "done"; of all other entries, only "truncated" and
                 "action_mask" are stored.
             set_cursor: False if items are to be changed, which is not supported.
 
         Raises:
-            RuntimeError: If items are to be changed, or written out of order.
-            ValueError: If the steps do not cover all environments.
+            RuntimeError: if items are to be changed, or written out of order.
+            ValueError: if the steps do not cover all environments.
         """
         if not set_cursor:
             raise RuntimeError("Stored steps cannot be changed, only added.")
@@ -274,9 +274,9 @@ class OnlineHistoryStorage(LazyTensorStorage):
         """Notes that steps, int64 [envs], ended their episodes, unless that is known; bool [envs].
 
         Args:
-            steps: The rows of the steps.
-            frames: What followed them, [envs].
-            ended: Whether they ended an episode.
+            steps: the rows of the steps.
+            frames: what followed them, [envs].
+            ended: whether they ended an episode.
         """
         ended = ended & (self._ends[steps] < 0)
         self._ends[steps[ended]] = self._end_frames.push(frames[ended]).to(self.device)
@@ -355,7 +355,7 @@ class OnlineHistoryStorage(LazyTensorStorage):
         """Adds a piece that :meth:`part` returned, after the previous pieces.
 
         Raises:
-            ValueError: If a storage of another size saved it, or a previous piece is missing.
+            ValueError: if a storage of another size saved it, or a previous piece is missing.
         """
         if not part:
             return
@@ -400,7 +400,7 @@ class OnlineHistoryStorage(LazyTensorStorage):
         """Allocates the memory of frames, which the system provides as it is written.
 
         Args:
-            frames: The frames of all environments at one time, [envs].
+            frames: the frames of all environments at one time, [envs].
         """
         self._envs = len(frames)
         self.max_size = -(-self.max_size // self._envs) * self._envs
@@ -419,7 +419,7 @@ class EndFrames:
     """A queue of frames, numbered from 0, in a table that grows when it is full.
 
     Args:
-        like: Frames [N] that give the shapes and dtypes.
+        like: frames [N] that give the shapes and dtypes.
 
     Example:
         >>> frames = EndFrames(TensorDict({"observation": torch.zeros(1, 2)}, [1]))

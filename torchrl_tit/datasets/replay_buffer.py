@@ -32,21 +32,21 @@ def make_replay_buffer(
     loads the state continues with the same batches. The data are not part of the state.
 
     Args:
-        storage: The data: transitions with histories
+        storage: the data: transitions with histories
             (:class:`~torchrl_tit.datasets.HistoryStorage`) or windows
             (:class:`~torchrl_tit.datasets.SequenceStorage`).
-        batch_size: Items in a batch.
-        seed: Seed of the generator.
-        slice_length: If it is more than 1, a batch is [batch_size / slice_length, slice_length]:
+        batch_size: items in a batch.
+        seed: seed of the generator.
+        slice_length: if it is more than 1, a batch is [batch_size / slice_length, slice_length]:
             slices of consecutive items (see :class:`~torchrl_tit.datasets.ConsecutiveSampler`).
-        **settings: Passed to `torchrl.data.ReplayBuffer`: ``transform``, ``prefetch``, another
+        **settings: passed to `torchrl.data.ReplayBuffer`: ``transform``, ``prefetch``, another
             ``sampler``.
 
     Returns:
         The buffer; ``buffer.sample()`` gives a tensordict [batch_size].
 
     Raises:
-        ValueError: If ``batch_size`` or ``slice_length`` is less than 1, or the second does not
+        ValueError: if ``batch_size`` or ``slice_length`` is less than 1, or the second does not
             divide the first.
 
     Example:
@@ -76,7 +76,7 @@ def make_sampler(slice_length: int) -> RandomSampler:
     """Makes a sampler of single items, or of slices if ``slice_length`` is not 1.
 
     Args:
-        slice_length: Number of items in a slice.
+        slice_length: number of items in a slice.
     """
     return RandomSampler() if slice_length == 1 else ConsecutiveSampler(slice_length)
 
@@ -90,10 +90,10 @@ class ConsecutiveSampler(RandomSampler):
     episode's first and last steps less often, and it reads the whole storage to find them.)
 
     Args:
-        slice_length: Number of steps in a slice, at least 1.
+        slice_length: number of steps in a slice, at least 1.
 
     Raises:
-        ValueError: If it is less than 1; or, when sampling, if it does not divide the batch size or
+        ValueError: if it is less than 1; or, when sampling, if it does not divide the batch size or
             the storage has fewer steps.
 
     Example:
@@ -119,9 +119,9 @@ class ConsecutiveSampler(RandomSampler):
         """Draws indices, int64 [batch_size / slice_length, slice_length].
 
         Args:
-            storage: Steps of one environment or, in two dimensions, of several. No slice continues
+            storage: steps of one environment or, in two dimensions, of several. No slice continues
                 from the newest step to the oldest.
-            batch_size: Total number of steps.
+            batch_size: total number of steps.
         """
         if batch_size % self.slice_length:
             raise ValueError(
@@ -136,6 +136,7 @@ class ConsecutiveSampler(RandomSampler):
             )
         device, count = storage.device, batch_size // self.slice_length
 
+        # TorchRL gives its samplers the buffer's generator under this name only.
         def draw(high: int) -> Tensor:
             return torch.randint(high, (count, 1), generator=self._rng, device=device)
 

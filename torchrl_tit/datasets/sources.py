@@ -43,28 +43,28 @@ def load_episodes(
     """Reads a data set of any supported kind, in chunks, into memory-mapped rows.
 
     Args:
-        source: An HDF5 file in D4RL's layout (".hdf5" or ".h5"); a folder with a Minari data set;
+        source: an HDF5 file in D4RL's layout (".hdf5" or ".h5"); a folder with a Minari data set;
             D4RL's name of a data set, such as "hopper-medium-replay-v0"; or Minari's, such as
             "mujoco/hopper/medium-v0". Named data sets are downloaded once.
-        task: The task that the data must match in shapes, action bounds and (if recorded) name: a
+        task: the task that the data must match in shapes, action bounds and (if recorded) name: a
             name registered with Gymnasium, such as "Hopper-v5", or the spaces. Not checked if None.
-        max_episode_steps: The time limit of an HDF5 file without "timeouts": see
+        max_episode_steps: the time limit of an HDF5 file without "timeouts": see
             :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
-        gaps: What to do where "next_observations" of an HDF5 file is not the observation of the
+        gaps: what to do where "next_observations" of an HDF5 file is not the observation of the
             next row: see the same function.
-        dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
-        directory: A folder on a disk with room for the rows; no files remain there. By default the
+        dtype: the dtype for floats; None keeps that of each field. Integers stay integers.
+        directory: a folder on a disk with room for the rows; no files remain there. By default the
             system's folder for temporary files.
-        cache_dir: Folder of D4RL's files: see :func:`~torchrl_tit.datasets.download_d4rl`.
+        cache_dir: folder of D4RL's files: see :func:`~torchrl_tit.datasets.download_d4rl`.
 
     Returns:
         The episodes.
 
     Raises:
-        ValueError: If the source is none of these, or the task is unknown.
-        FileNotFoundError: If there is no such file or data set.
-        OSError: If the data set cannot be downloaded, or the disk is full.
-        DatasetError: If the data cannot be used; the message names the file, field and row.
+        ValueError: if the source is none of these, or the task is unknown.
+        FileNotFoundError: if there is no such file or data set.
+        OSError: if the data set cannot be downloaded, or the disk is full.
+        DatasetError: if the data cannot be used; the message names the file, field and row.
 
     Example:
         >>> load_episodes("hopper")
@@ -118,17 +118,17 @@ def download_d4rl(name: str, cache_dir: str | os.PathLike[str] | None = None) ->
 
     Args:
         name: D4RL's name, such as "hopper-medium-replay-v0" or "hopper-medium-v2".
-        cache_dir: Folder for the files; by default "torchrl-tit/d4rl" in the user's cache folder
+        cache_dir: folder for the files; by default "torchrl-tit/d4rl" in the user's cache folder
             (``$XDG_CACHE_HOME``, or ``~/.cache``).
 
     Returns:
         The file.
 
     Raises:
-        ValueError: If D4RL has no data set of that name.
-        OSError: If the file cannot be downloaded or written, or the server redirects away from
+        ValueError: if D4RL has no data set of that name.
+        OSError: if the file cannot be downloaded or written, or the server redirects away from
             https.
-        DatasetError: If the file is damaged, or not the one that was downloaded first.
+        DatasetError: if the file is damaged, or not the one that was downloaded first.
 
     Source: D4RL (arXiv 2004.07219); the URLs are those of TorchRL, which begin with http.
 
@@ -164,7 +164,7 @@ def address(name: str) -> str:
     """Returns the URL of a data set, over https, which D4RL's host supports.
 
     Args:
-        name: One of D4RL's names.
+        name: one of D4RL's names.
 
     Example:
         >>> address("hopper-medium-v2")

@@ -48,13 +48,14 @@ class EpisodeStorage(TensorStorage):
     as any tensor.
 
     Args:
-        episodes: The data, on the device on which items are gathered.
-        counts: Number of steps of each episode, from the first, that are items; int64 [E].
+        episodes: the data, on the device on which items are gathered.
+        counts: number of steps of each episode, from the first, that are items; int64 [E].
 
     Raises:
-        DatasetError: If no step is left.
+        DatasetError: if no step is left.
     """
 
+    # A replay buffer replaces a checkpointer that was set, and knows the usual one by this name.
     _default_checkpointer = StateCheckpointer
     supports_conditional_update = False
     oldest = 0
@@ -79,13 +80,13 @@ class EpisodeStorage(TensorStorage):
         """Cuts items out of the episodes.
 
         Args:
-            index: An index of a tensor [N].
+            index: an index of a tensor [N].
 
         Returns:
             The items, with the shape of the selection.
 
         Raises:
-            IndexError: If there is no such item.
+            IndexError: if there is no such item.
         """
         return nest(*self._cut(*self._find(index)))
 
@@ -113,10 +114,10 @@ class EpisodeStorage(TensorStorage):
         """Checks that a state was saved with the same data.
 
         Args:
-            state_dict: A state that `state_dict` returned.
+            state_dict: a state that `state_dict` returned.
 
         Raises:
-            ValueError: If it was saved with other data.
+            ValueError: if it was saved with other data.
         """
         count = int(state_dict["num_items"])
         if count != len(self):
@@ -140,9 +141,9 @@ class HistoryStorage(EpisodeStorage):
     ``storage.get(...)`` gathers these too, with any index.
 
     Args:
-        episodes: The data.
-        num_frames: Number K of observations in a history, at least 1.
-        padding: The frames before the first step of an episode: ``"same"`` repeats the first
+        episodes: the data.
+        num_frames: number K of observations in a history, at least 1.
+        padding: the frames before the first step of an episode: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.
         time_limits: ``"drop"`` leaves out the last transition of truncated episodes, as d3rlpy 1
             does. It is always left out if the next observation is unknown.
@@ -150,13 +151,13 @@ class HistoryStorage(EpisodeStorage):
             as d3rlpy 1 does. They are always zeros if unknown.
         unfinished: ``"drop"`` leaves out an episode that is neither terminated nor truncated
             because the data end there. If such an episode is kept, no flag marks its end.
-        is_init: Whether items have "is_init" and ("next", "is_init") [1], True at the first step of
+        is_init: whether items have "is_init" and ("next", "is_init") [1], True at the first step of
             an episode. In slices of consecutive items, a :class:`~torchrl_tit.modules.Backbone`
             then encodes each frame once.
 
     Raises:
-        ValueError: If a setting is not one of the above.
-        DatasetError: If no transition is left.
+        ValueError: if a setting is not one of the above.
+        DatasetError: if no transition is left.
 
     Source: "Transformer in Transformer as Backbone for Deep Reinforcement Learning" (arXiv
     2212.14538), section 3; d3rlpy 1.1.1 for the two settings.
@@ -244,14 +245,14 @@ class SequenceStorage(EpisodeStorage):
     uniformly distributed start within it.
 
     Args:
-        episodes: The data.
-        num_frames: Number K of steps, at least 1.
-        return_scale: Divisor of the returns-to-go.
-        action_padding: Value of the actions at padding, where all other entries are 0.
+        episodes: the data.
+        num_frames: number K of steps, at least 1.
+        return_scale: divisor of the returns-to-go.
+        action_padding: value of the actions at padding, where all other entries are 0.
 
     Raises:
-        ValueError: If ``num_frames`` is less than 1, or ``return_scale`` is not positive.
-        DatasetError: If no episode is finished.
+        ValueError: if ``num_frames`` is less than 1, or ``return_scale`` is not positive.
+        DatasetError: if no episode is finished.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3 and its authors' code.
 
@@ -324,12 +325,12 @@ def frame_entries(
     """Returns the entries of observations and histories, none a view of another.
 
     Args:
-        leaf: The rest of the keys after "observation" and "history": empty, or the name of one of
+        leaf: the rest of the keys after "observation" and "history": empty, or the name of one of
             several observations.
-        newest: The observations, [..., *obs].
-        history: The histories, [..., K, *obs].
-        following: The next observations, [..., *obs].
-        ndim: Number of leading dimensions.
+        newest: the observations, [..., *obs].
+        history: the histories, [..., K, *obs].
+        following: the next observations, [..., *obs].
+        ndim: number of leading dimensions.
     """
     kept = history.narrow(ndim, 1, history.shape[ndim] - 1)
     return {

@@ -26,7 +26,7 @@ class TransitionParts:
     process are not lost.
 
     Args:
-        folder: The folder of the files, which is created if missing.
+        folder: the folder of the files, which is created if missing.
 
     Example:
         >>> import tempfile
@@ -50,7 +50,7 @@ class TransitionParts:
         """Lists the parts.
 
         Args:
-            last: Number of the last part to list; by default all are listed.
+            last: number of the last part to list; by default all are listed.
 
         Returns:
             The numbers of the parts in ascending order.
@@ -63,12 +63,12 @@ class TransitionParts:
         """Writes a part.
 
         Args:
-            number: The part's number, which determines the order of the parts.
-            fields: All of D4RL's fields, by name: [S, T, ...] each, one row per transition.
+            number: the part's number, which determines the order of the parts.
+            fields: all of D4RL's fields, by name: [S, T, ...] each, one row per transition.
 
         Raises:
-            FileExistsError: If a part of that number exists already.
-            OSError: If it cannot be written.
+            FileExistsError: if a part of that number exists already.
+            OSError: if it cannot be written.
         """
         path = self._path(number)
         with whole_or_not_at_all(path) as hidden, new_hdf5(hidden, path) as (file, check):
@@ -81,7 +81,7 @@ class TransitionParts:
         """Removes the parts after a number, and unfinished files of killed processes.
 
         Args:
-            number: Number of the last part to keep.
+            number: number of the last part to keep.
         """
         for path in self.folder.glob(".*.tmp"):
             path.unlink()
@@ -93,7 +93,7 @@ class TransitionParts:
         """Counts transitions.
 
         Args:
-            last: Number of the last part to count; by default all are counted.
+            last: number of the last part to count; by default all are counted.
 
         Returns:
             The number of transitions.
@@ -107,14 +107,14 @@ class TransitionParts:
         with the observation with which the previous part ended.
 
         Args:
-            last: Number of the last part to join; by default all are joined.
-            **settings: As for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
+            last: number of the last part to join; by default all are joined.
+            **settings: as for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`.
 
         Returns:
             The episodes, with the dtypes of the files.
 
         Raises:
-            DatasetError: If there are no parts, one is damaged, or their shapes differ.
+            DatasetError: if there are no parts, one is damaged, or their shapes differ.
         """
         numbers = self.numbers(last)
         if not numbers:

@@ -53,18 +53,18 @@ def episodes_from_arrays(
         observations: [N, *obs]; floats, or integers such as uint8 images, one frame each.
         actions: [N, A] floats, or [N] integers.
         rewards: [N].
-        terminals: Whether the transition led to a terminal state; bool [N].
-        timeouts: Whether the episode was truncated after it; bool [N].
+        terminals: whether the transition led to a terminal state; bool [N].
+        timeouts: whether the episode was truncated after it; bool [N].
         next_observations: [N, *obs].
-        timestamps: Times of the steps in any unit, [N], to check their order.
-        **settings: As for :func:`episodes_from_transitions`, which describes how missing arrays are
+        timestamps: times of the steps in any unit, [N], to check their order.
+        **settings: as for :func:`episodes_from_transitions`, which describes how missing arrays are
             replaced.
 
     Returns:
         The episodes.
 
     Raises:
-        DatasetError: If the data cannot be used.
+        DatasetError: if the data cannot be used.
 
     Example:
         >>> frames = np.zeros((6, 84, 84), dtype=np.uint8)
@@ -105,28 +105,28 @@ def episodes_from_transitions(
     before a time limit is then used in returns and sequences, but never drawn as a transition.
 
     Args:
-        fields: Arrays by D4RL's names: NumPy arrays or HDF5 data sets, which are read in slices.
+        fields: arrays by D4RL's names: NumPy arrays or HDF5 data sets, which are read in slices.
             See :func:`episodes_from_arrays` for their shapes.
-        source: Name of the source, for error messages.
-        task: The task whose shapes and action bounds the data must have; not checked if None.
-        max_episode_steps: The time limit of data without ``timeouts``.
-        gaps: What to do where ``next_observations`` is not the observation of the next row within
+        source: name of the source, for error messages.
+        task: the task whose shapes and action bounds the data must have; not checked if None.
+        max_episode_steps: the time limit of data without ``timeouts``.
+        gaps: what to do where ``next_observations`` is not the observation of the next row within
             an episode: ``"error"`` raises, ``"cut"`` truncates the episode there.
-        dtype: The dtype for floats; None keeps that of each field. Integers stay integers.
-        directory: Folder for the memory-mapped rows; see
+        dtype: the dtype for floats; None keeps that of each field. Integers stay integers.
+        directory: folder for the memory-mapped rows; see
             :func:`~torchrl_tit.datasets.episodes.memory_mapped_rows`.
-        attributes: Metadata of the source. If they contain "env_id", the name of the task, it must
+        attributes: metadata of the source. If they contain "env_id", the name of the task, it must
             be that of ``task``, except for the version.
-        lengths: Number of steps of each episode, if the source says so; int64 [E]. Episodes then
+        lengths: number of steps of each episode, if the source says so; int64 [E]. Episodes then
             end there only, also without a flag.
 
     Returns:
         The episodes. The last one may be unfinished.
 
     Raises:
-        ValueError: If ``max_episode_steps`` is less than 1, ``gaps`` is not one of the above, or
+        ValueError: if ``max_episode_steps`` is less than 1, ``gaps`` is not one of the above, or
             ``dtype`` is not a floating-point dtype.
-        DatasetError: If a field is missing or empty, has the wrong length, shape or dtype, or
+        DatasetError: if a field is missing or empty, has the wrong length, shape or dtype, or
             contains NaN, infinity, or actions out of bounds; if no episode ends; or if, within an
             episode, ``next_observations`` is not the observation of the next row, or ``timestamps``
             go backwards.

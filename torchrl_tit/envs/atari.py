@@ -87,8 +87,8 @@ class AtariGames(VectorEnv):
     ale-py's `AtariVectorEnv` emulates and scales in its own threads. There is one instance per
     game, since an instance cannot step only some of its games (those that lost a life), and its own
     options for lost lives either end the game or never press fire. The conversion from scaled
-    colors to grey is done here, since the grey of the maximum of colors is not the maximum of the
-    greys. `AtariWrapper` converts before it scales; the difference is one grey level of rounding.
+    colors to gray is done here, since the gray of the maximum of colors is not the maximum of the
+    grays. `AtariWrapper` converts before it scales; the difference is one gray level of rounding.
 
     Games that are reset with the same seed and given the same actions repeat exactly.
 

@@ -158,7 +158,7 @@ def identifiers(names: Sequence[str]) -> list[str]:
     return made
 
 
-class Head(nn.Module):
+class ActionHead(nn.Module):
     """The modules of a policy that map features to an action, and no others.
 
     By default, it takes the most likely action. A sample is the most likely action after noise was
@@ -250,7 +250,7 @@ class Parts:
     trunk: HistoryNetwork
     """The network of the action; a separate network of the value is left out."""
     features_key: NestedKey
-    head: Head
+    head: ActionHead
     observed: Sequence[Observed]
     """The observations, in the order of the network."""
     further: Mapping[str, NestedKey]
@@ -287,7 +287,7 @@ def read_parts(policy: nn.Module, env: EnvBase) -> Parts:
             f"the backbone is around a {type(backbone.module).__name__}; only one around a "
             "HistoryNetwork or TwoTrunks can be exported"
         )
-    head = Head(modules)
+    head = ActionHead(modules)
     known = zip(backbone.features_keys, trunks, strict=True)
     read = [(key, trunk) for key, trunk in known if unravel_key(key) in head.reads]
     if len(read) != 1:

@@ -34,7 +34,7 @@ def export_policy(
 ) -> dict[str, Any]:
     """Writes a policy to a file that needs neither this library nor TorchRL.
 
-    The file holds everything between the task's observation and its action: normalisation, hidden
+    The file holds everything between the task's observation and its action: normalization, hidden
     velocities, the network, the choice of an action and its clipping. The batch size N is free, but
     at least 1; weights are float32, on a CPU. A policy that reads K > 1 observations can have two
     forms:

@@ -48,7 +48,7 @@ def make_program(parts: Parts, *, step_by_step: bool = False, sample: bool = Fal
     elif step_by_step and trunk.num_frames > 1:
         program = TokenSteps(parts, sample=sample)
     else:
-        program = Windows(parts, sample=sample)
+        program = WindowProgram(parts, sample=sample)
     return program.complete().eval()
 
 
@@ -146,7 +146,7 @@ class Program(nn.Module, ABC):
         return {**zeros, **masks}
 
 
-class Windows(Program):
+class WindowProgram(Program):
     """Reads the last K observations or, if K = 1, the observation itself.
 
         history [N, K, *obs]  ->  action

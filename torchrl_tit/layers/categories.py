@@ -42,7 +42,7 @@ class CategoryIndex(nn.Module):
 
 
 class CategoryPatchEmbedding(nn.Module):
-    """Embeds P neighbouring categories as one token: the sum of their embeddings.
+    """Embeds P neighboring categories as one token: the sum of their embeddings.
 
     This is a linear layer on the one-hot vectors of the patch, without a bias. The last patch may
     have fewer entries.

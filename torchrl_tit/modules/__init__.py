@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_tit.modules.acting import ActingCollector, acting, while_acting
+from torchrl_tit.modules.acting import ActingCollector, acting
 from torchrl_tit.modules.backbone import Backbone, history_keys
 from torchrl_tit.modules.decision_transformer import (
     DTHead,
@@ -28,5 +28,4 @@ __all__ = [
     "make_dt_predictor",
     "make_squashed_actor",
     "make_value",
-    "while_acting",
 ]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -14,8 +14,6 @@ from torchrl.collectors import Collector
 from torchrl_tit.modules.frame_cache import ActingNetwork
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import HistoryNetwork, TwoTrunks
-
-T = TypeVar("T")
 
 
 class ActingModule(TensorModule):
@@ -46,8 +44,8 @@ class ActingModule(TensorModule):
         Nothing shows that a fused optimizer stepped, or that weights were written through ``.data``
         or shared memory: call :meth:`clear_cache` afterwards; otherwise, for the next K - 1 steps,
         frames seen before the change keep the tokens of the old weights. There is no need for it
-        between two collections, each of which enters a new context, as with
-        :func:`~torchrl_tit.modules.while_acting` and :class:`~torchrl_tit.modules.ActingCollector`.
+        between two collections, each of which enters a new context, as those of
+        :class:`~torchrl_tit.modules.ActingCollector` do.
 
         The cache (copies of one batch of histories and of its tokens) starts empty. It is discarded
         at the end, when weights change, and whenever the backbone or a module that contains it is
@@ -176,49 +174,15 @@ def _within(policy: Callable[..., Any]) -> list[ActingModule]:
     return [module for module in modules if isinstance(module, ActingModule)]
 
 
-def while_acting(policy: Callable[..., Any], batches: Iterable[T]) -> Iterator[T]:
-    """Iterates over a collector, with its policy in acting mode only while it collects.
-
-    Between two batches, when the policy is trained and saved, no tokens are kept. This does not
-    reach policies in other processes: for those, pass ``collector_class=ActingCollector`` to the
-    collector.
-
-    Args:
-        policy: the collector's policy, or a module that contains its backbones.
-        batches: the collector, or any other iterable that acts when its next item is requested.
-
-    Yields:
-        The batches.
-
-    Example:
-        >>> from torchrl.collectors import Collector
-        >>> from torchrl.modules import RandomPolicy
-        >>> from torchrl_tit.envs import make_env
-        >>> env = make_env("CartPole-v1", 2)
-        >>> policy = RandomPolicy(env.action_spec)
-        >>> collector = Collector(env, policy, frames_per_batch=16, total_frames=64)
-        >>> len([batch.shape for batch in while_acting(policy, collector)])
-        4
-        >>> collector.shutdown()
-    """
-    iterator = iter(batches)
-    while True:
-        with acting(policy):
-            try:
-                batch = next(iterator)
-            except StopIteration:
-                return
-        yield batch
-
-
 class ActingCollector(Collector):
     """TorchRL's collector, with its policy in acting mode while it collects a batch.
 
-    For collectors in other processes, whose policies :func:`~torchrl_tit.modules.while_acting` does
-    not reach. New weights apply to all frames: each batch starts with an empty cache, and weights
-    that arrive during a batch, in a ``MultiAsyncCollector`` for example, clear it.
+    Between two batches, when the policy is trained and saved, no tokens are kept. New weights apply
+    to all frames: each batch starts with an empty cache, and weights that arrive during a batch, in
+    a ``MultiAsyncCollector`` for example, clear it.
 
-    The arguments are those of ``torchrl.collectors.Collector``.
+    The arguments are those of ``torchrl.collectors.Collector``. Collectors of several processes
+    take it as their ``collector_class``.
 
     Example:
         >>> from functools import partial

@@ -289,29 +289,30 @@ class Backbone(ActingModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys of all entries that it reads; fixed, because other attributes follow from them."""
-        return self._in_keys
+        return super().in_keys
 
     @in_keys.setter
     def in_keys(self, keys: Sequence[NestedKey]) -> None:
-        self._in_keys = self._fixed("in_keys", keys)
+        ActingModule.in_keys.fset(self, self._fixed("in_keys", keys))
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """Keys of all entries that it writes, or those of ``select_out_keys``; fixed, too."""
-        return self._out_keys_apparent
+        return super().out_keys
 
     @out_keys.setter
     def out_keys(self, keys: Sequence[NestedKey]) -> None:
-        self._out_keys = self._out_keys_apparent = self._fixed("out_keys", keys)
+        ActingModule.out_keys.fset(self, self._fixed("out_keys_source", keys))
 
     def _fixed(self, name: str, keys: Sequence[NestedKey]) -> list[NestedKey]:
         """Returns keys; raises AttributeError if they would replace others."""
         given: list[NestedKey] = unravel_key_list(list(keys))
-        present = self.__dict__.get(f"_{name}", given)
+        present = getattr(super(), name, given)
         if given != present:
             raise AttributeError(
-                f"{name} of a backbone cannot be changed from {present} to {given}: build another "
-                "one of the same network, Backbone(backbone.module, in_keys, out_keys)"
+                f"{name.removesuffix('_source')} of a backbone cannot be changed from {present} to "
+                f"{given}: build another one of the same network, Backbone(backbone.module, "
+                "in_keys, out_keys)"
             )
         return given
 

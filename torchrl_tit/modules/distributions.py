@@ -98,7 +98,11 @@ class IndependentOneHotCategorical(IndependentCategorical):
     ) -> None:
         super().__init__(logits, mask, dtype=dtype)
         self._sizes = list(sizes)
-        self._event_shape = Size([sum(sizes)])
+
+    @property
+    def event_shape(self) -> Size:
+        """The shape of an action: the one-hot vectors side by side."""
+        return Size([sum(self._sizes)])
 
     def _encode(self, options: Tensor) -> Tensor:
         components = zip(options.unbind(-1), self._sizes, strict=True)

@@ -11,14 +11,14 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, Any]:
     """Reads settings such as "is_slippery=False" or "map_name=8x8".
 
     Args:
-        assignments: Strings "name=value", with a Python literal as the value; anything else is kept
+        assignments: strings "name=value", with a Python literal as the value; anything else is kept
             as text.
 
     Returns:
         The values by name.
 
     Raises:
-        ValueError: If an assignment has another form, or a name occurs twice.
+        ValueError: if an assignment has another form, or a name occurs twice.
 
     Example:
         >>> parse_assignments(["is_slippery=False", "map_name=8x8", "sizes=(3, 4)"])
@@ -46,7 +46,7 @@ def parse_call(text: str) -> tuple[str, dict[str, Any]]:
         "module:Name", and the arguments.
 
     Raises:
-        ValueError: If it has another form, or an argument is not a literal.
+        ValueError: if it has another form, or an argument is not a literal.
 
     Example:
         >>> parse_call("minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)")

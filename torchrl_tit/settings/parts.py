@@ -18,14 +18,14 @@ class Names(dict[str, T]):
         kind: what the things are, for error messages.
 
     Example:
-        >>> colours = Names("colour")
-        >>> colours.add("red", 0xFF0000, "paint")
-        >>> colours.find("red")
+        >>> colors = Names("color")
+        >>> colors.add("red", 0xFF0000, "paint")
+        >>> colors.find("red")
         16711680
-        >>> colours.add("red", 0xEE0000, "other.paint")
+        >>> colors.add("red", 0xEE0000, "other.paint")
         Traceback (most recent call last):
             ...
-        ValueError: two colours are called 'red', in paint and in other.paint: rename one of them
+        ValueError: two colors are called 'red', in paint and in other.paint: rename one of them
     """
 
     def __init__(self, kind: str) -> None:

@@ -46,7 +46,7 @@ class History(CatFrames):
             "history")``. Of several, "pixels" has ``("history", "pixels")``; in nested keys,
             "history" replaces "observation".
         observation_ndim: number of dimensions of one observation, for a check: 1 for arrays [D], 2
-            for grey images [H, W], 3 for images [C, H, W]. By default each observation has those
+            for gray images [H, W], 3 for images [C, H, W]. By default each observation has those
             that the batch of its group, such as [*B, agents], does not have.
         padding: how to pad before an episode's first step: ``"same"`` repeats the first
             observation, ``"constant"`` writes zeros.

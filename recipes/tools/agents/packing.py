@@ -39,7 +39,7 @@ def pack(
         name: the agent's name, the title of its card.
         source: what :func:`~torchrl_tit.agents.load_agent` will find it by, for its card; its name
             if None.
-        license: identifier of its licence, such as "mit", for its card; none is named if None.
+        license: identifier of its license, such as "mit", for its card; none is named if None.
 
     Returns:
         The files by name, as :func:`~torchrl_tit.agents.folder.write_agent` takes them, and the

@@ -51,7 +51,7 @@ class Score:
     """Standard deviation of their returns (population)."""
 
 
-class Agent(ABC):
+class DataAgent(ABC):
     """An agent that reaches marks, and then plays episodes for a data set.
 
     Args:
@@ -96,7 +96,7 @@ class Agent(ABC):
         return Score(step, returns.mean().item(), returns.std(correction=0).item())
 
 
-class FinishedRun(Agent):
+class FinishedRun(DataAgent):
     """The newest checkpoint of a run: an agent without the data that it was trained on.
 
     Args:
@@ -128,7 +128,7 @@ class FinishedRun(Agent):
         return score
 
 
-class AgentInTraining(Agent, Callback):
+class AgentInTraining(DataAgent, Callback):
     """An agent that is trained from mark to mark, in a run folder from which it is resumed.
 
         recipe.json, checkpoints/, ...   those of any run
@@ -244,7 +244,7 @@ class AgentInTraining(Agent, Callback):
         )
 
 
-def find_agent(settings: Collection, folder: Path, action_space: Space) -> Agent | None:
+def find_agent(settings: Collection, folder: Path, action_space: Space) -> DataAgent | None:
     """Finds the agent that the settings name, and checks that it fits the task.
 
     Args:

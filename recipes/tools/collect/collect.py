@@ -40,7 +40,7 @@ from ...core.algorithm import naming
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.run import locked, package_versions
-from .agents import Agent, AgentInTraining, as_fields, find_agent
+from .agents import AgentInTraining, DataAgent, as_fields, find_agent
 from .settings import KINDS, Collection, Kind
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -199,7 +199,7 @@ class _Sets:
     settings: Collection
     folder: Path
     task: TaskSpaces
-    agent: Agent | None
+    agent: DataAgent | None
     record: dict[str, Any]
 
     def make(self, kind: Kind) -> str:
@@ -286,7 +286,7 @@ def play_episodes(
     """Plays episodes until the parts hold enough transitions; the last episode is complete.
 
     Each part holds one episode of every environment, started together. Short episodes are therefore
-    not favoured, and a part depends only on its number and the seed, not on earlier parts, so that
+    not favored, and a part depends only on its number and the seed, not on earlier parts, so that
     a resumed process plays none again. A single episode that is longer than the set is cut off.
 
     Args:

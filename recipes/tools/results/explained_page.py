@@ -178,7 +178,7 @@ class Page:
         """Draws bars for the entries of an array: the newest step's, and all earlier steps'."""
         newest, before = maps[-1], maps[:-1].sum(0)
         places = np.arange(len(newest))
-        earlier = "\nnow, and (grey) in earlier steps" if len(maps) > 1 else ""
+        earlier = "\nnow, and (gray) in earlier steps" if len(maps) > 1 else ""
         axes.set_title(title + earlier, fontsize=8)
         axes.barh(places, before, color="0.75")
         axes.barh(places, newest, 0.5, color="C1")

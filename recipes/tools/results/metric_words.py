@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 
-from ...core.recipe import Recipe
+from ...core.recipe import Recipe, get_recipe_class
 
 _TARGET = re.compile(r"return_-?[\d.]+(e[+-]?\d+)?")
 _TIMES = " * "
@@ -46,7 +46,7 @@ def words_of(algorithm: str, column: str) -> MetricWords:
         'mean return of the evaluation that aims for 3600'
     """
     found = _read()
-    known = found.get((algorithm, column)) or found.get(("", column))
+    known = next((found[of, column] for of in _family(algorithm) if (of, column) in found), None)
     if known is None and _TARGET.fullmatch(column):
         target = column.removeprefix("return_")
         return MetricWords(column, f"mean return of the evaluation that aims for {target}")
@@ -55,7 +55,14 @@ def words_of(algorithm: str, column: str) -> MetricWords:
 
 def known_columns(algorithm: str) -> list[str]:
     """Lists the described columns of an algorithm, the most informative first."""
-    return [column for of, column in _read() if of in ("", algorithm)]
+    family = _family(algorithm)
+    return [column for of, column in _read() if of in family]
+
+
+def _family(algorithm: str) -> list[str]:
+    """An algorithm, those whose recipes its own is a subclass of, and all of them, ""."""
+    kinds = get_recipe_class(algorithm).__mro__
+    return [*(vars(kind)["algorithm"] for kind in kinds if "algorithm" in vars(kind)), ""]
 
 
 def to_markdown(algorithm: str) -> str:

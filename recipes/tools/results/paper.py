@@ -32,9 +32,7 @@ _TASK = ("env", "env_settings", "wrappers", "observation_keys", "hide_velocities
 """The fields that determine which task is learned."""
 _KIND = ("backbone.frame.encoder", "backbone.history.encoder", "backbone.num_frames")
 """The fields that determine which kind of network learns."""
-_OF_THE_RUN = {
-    *("name", "collectors", "evaluation_seed", "log_interval", "ray", "vectorization_mode"),
-}
+_OF_THE_RUN = {"name", "collectors", "evaluation_seed", "log_interval", "ray"}
 """Fields with which the same is learned."""
 
 

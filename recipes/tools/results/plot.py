@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,7 +18,6 @@ from torchrl_tit.files import write_bytes_atomic
 from ...core.run import Run
 from .experiments import Experiment, common_part, read_metrics
 from .interval import FEWEST, intervals_of
-from .table import Cell
 
 NEARLY = 0.9
 """A run that has fewer steps than this share of its longest sibling is left out of bold lines."""
@@ -30,7 +28,6 @@ _MOST_SINGLE = 9  # more runs would hide the bold lines
 _POINTS = 400  # of a curve; of longer ones, neighbors are averaged
 _GRID = 200  # points at which runs with different steps are compared
 _WIDEST = 60  # letters in a line of a legend
-_WIDEST_LABEL = 26  # letters in a line beside a panel
 
 
 @dataclass(frozen=True)
@@ -146,51 +143,6 @@ def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: 
         folders = ", ".join(str(run.folder) for one in experiments for run in one.runs)
         raise ValueError(f"there is nothing to draw: no episode has ended in {folders}")
     add_legend(figure)
-    save_figure(figure, picture)
-
-
-def plot_table(cells: Sequence[Cell], picture: Path) -> None:
-    """Draws cells next to the paper's values, one panel for each task and measure.
-
-    Args:
-        cells: what :func:`~recipes.tools.results.table.make_table` returns.
-        picture: the PNG file to write.
-    """
-    tasks: dict[tuple[str, str], list[Cell]] = {}  # of one measure: scores are not returns
-    for cell in cells:
-        tasks.setdefault((cell.recipe.rpartition("/")[0], cell.measure), []).append(cell)
-    labels = {
-        (task, measure): [
-            fill(plain(cell.label.removeprefix(f"{task}/")), _WIDEST_LABEL) for cell in group
-        ]
-        for (task, measure), group in tasks.items()
-    }
-    breaks = max(label.count("\n") for group in labels.values() for label in group)
-    height = 0.6 + (0.32 + 0.16 * breaks) * max(map(len, tasks.values()))
-    columns = min(3, len(tasks))
-    rows = -(-len(tasks) // columns)
-    figure = new_figure((4.2 * columns, height * rows + 0.6))
-    panels = figure.subplots(rows, columns, squeeze=False).flatten()
-    shown: dict[str, Any] = {}  # what the legend names
-    for axes, ((task, measure), group) in zip(panels, tasks.items(), strict=False):
-        for place, cell in enumerate(group):
-            if cell.runs >= FEWEST:
-                ends = [[cell.iqm - cell.low], [cell.high - cell.iqm]]
-                label = "interquartile mean, 95%"
-                shown[label] = axes.errorbar(cell.iqm, place, xerr=ends, fmt="o", c="C0", capsize=3)
-            else:
-                label = f"mean of fewer than {FEWEST} runs"
-                (shown[label],) = axes.plot(cell.mean, place, "o", c="C0", mfc="none")
-            if cell.paper:
-                shown["paper"] = axes.errorbar(
-                    cell.paper_mean, place + 0.22, xerr=cell.paper_std, fmt="s", c="grey", ms=4
-                )
-        axes.set_yticks(range(len(group)), labels[task, measure])
-        axes.set(title=task, xlabel=measure, ylim=(len(group) - 0.4, -0.6))
-        axes.grid(alpha=0.3)
-    for axes in panels[len(tasks) :]:
-        axes.set_visible(False)
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown))
     save_figure(figure, picture)
 
 

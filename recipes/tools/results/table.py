@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 from statistics import fmean, stdev
+from textwrap import fill
 from typing import Any
 
 from torchrl_tit.scores import has_reference
@@ -20,9 +21,11 @@ from .experiments import Experiment, find_runs, group_runs, label
 from .interval import FEWEST, Interval, interval_of
 from .numbers import mean_std, number, numbers
 from .paper import HEADINGS, Match, has_its_data, match, paper_cells, plain_name, read_rows
+from .plot import new_figure, plain, save_figure
 
 OTHER = "not in the paper"
 FEW = f"Fewer than {FEWEST} runs have no interquartile mean, and say little about others."
+_WIDEST_LABEL = 26  # letters in a line beside a panel
 HEADER = (
     *("recipe", "runs", "mean ± sample deviation over runs", "± over episodes"),
     *("interquartile mean [95%]", "paper"),
@@ -59,7 +62,7 @@ class Published:
 class Cell:
     """All runs of the same settings: one cell of a table.
 
-    A run's value is the mean return of its evaluation, or its best normalised score if it has one
+    A run's value is the mean return of its evaluation, or its best normalized score if it has one
     (offline recipes).
     """
 
@@ -234,6 +237,51 @@ def to_csv(cells: Sequence[Cell]) -> str:
         )
         writer.writerow({k: "" if v != v else v for k, v in values.items()})
     return buffer.getvalue()
+
+
+def plot_table(cells: Sequence[Cell], picture: Path) -> None:
+    """Draws cells next to the paper's values, one panel for each task and measure.
+
+    Args:
+        cells: what :func:`make_table` returns.
+        picture: the PNG file to write.
+    """
+    tasks: dict[tuple[str, str], list[Cell]] = {}  # of one measure: scores are not returns
+    for cell in cells:
+        tasks.setdefault((cell.recipe.rpartition("/")[0], cell.measure), []).append(cell)
+    labels = {
+        (task, measure): [
+            fill(plain(cell.label.removeprefix(f"{task}/")), _WIDEST_LABEL) for cell in group
+        ]
+        for (task, measure), group in tasks.items()
+    }
+    breaks = max(label.count("\n") for group in labels.values() for label in group)
+    height = 0.6 + (0.32 + 0.16 * breaks) * max(map(len, tasks.values()))
+    columns = min(3, len(tasks))
+    rows = -(-len(tasks) // columns)
+    figure = new_figure((4.2 * columns, height * rows + 0.6))
+    panels = figure.subplots(rows, columns, squeeze=False).flatten()
+    shown: dict[str, Any] = {}  # what the legend names
+    for axes, ((task, measure), group) in zip(panels, tasks.items(), strict=False):
+        for place, cell in enumerate(group):
+            if cell.runs >= FEWEST:
+                ends = [[cell.iqm - cell.low], [cell.high - cell.iqm]]
+                label = "interquartile mean, 95%"
+                shown[label] = axes.errorbar(cell.iqm, place, xerr=ends, fmt="o", c="C0", capsize=3)
+            else:
+                label = f"mean of fewer than {FEWEST} runs"
+                (shown[label],) = axes.plot(cell.mean, place, "o", c="C0", mfc="none")
+            if cell.paper:
+                shown["paper"] = axes.errorbar(
+                    cell.paper_mean, place + 0.22, xerr=cell.paper_std, fmt="s", c="grey", ms=4
+                )
+        axes.set_yticks(range(len(group)), labels[task, measure])
+        axes.set(title=task, xlabel=measure, ylim=(len(group) - 0.4, -0.6))
+        axes.grid(alpha=0.3)
+    for axes in panels[len(tasks) :]:
+        axes.set_visible(False)
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown))
+    save_figure(figure, picture)
 
 
 @cache

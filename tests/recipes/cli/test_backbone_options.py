@@ -9,7 +9,6 @@ from recipes.cli import main
 from recipes.cli.backbone_options import choose_network
 from recipes.core.registry import get_recipe
 from tests.recipes.cli.test_cli import SHORT
-from tests.recipes.commands import fails
 from torchrl_tit.settings import (
     NETWORKS,
     Flat,
@@ -113,16 +112,12 @@ def test_a_pair_trains_and_resumes(tmp_path, capsys):
 
 
 def test_what_only_fits_with_a_later_option(tmp_path, monkeypatch, capsys):
-    """CoBERL needs several frames, and only CoBERL has a contrastive loss."""
+    """CoBERL needs several frames."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("recipes.cli.training.start", lambda recipe, *_: print(recipe.backbone))
     coberl = ["--backbone.network", "coberl", "--backbone.num-frames", "2"]
     main(["train", "ppo/cartpole/mlp", *coberl])
     assert "CoBERL(" in capsys.readouterr().out
-    words = ["train", "ppo/pong/coberl-tuned", "--backbone.history", "outer"]
-    assert "contrastive_coeff is the weight" in fails(capsys, *words)
-    main([*words, "--contrastive-coeff", "0"])
-    assert "Outer(" in capsys.readouterr().out
 
 
 def test_help_names_the_choices_and_the_fields_of_the_chosen_part(capsys):

@@ -86,7 +86,7 @@ def test_a_run_with_own_parts_says_what_to_import(own_modules, capsys, monkeypat
     capsys.readouterr()
     # As in a process that does not know the module.
     forget(monkeypatch)
-    for command in (["evaluate"], ["train", "--resume"], ["render", "--out", "a.gif"]):
+    for command in (["evaluate"], ["train", "--resume"], ["play", "--out", "a.gif"]):
         line = fails(capsys, *command, "run")
         assert "field 'backbone.frame.encoder': unknown frame encoder 'own'" in line
         assert line.endswith(

@@ -244,7 +244,7 @@ def test_images_are_stored_one_by_one(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_rewards_are_the_tasks_own(tmp_path: Path) -> None:
-    """Though the recipe clips and scales them, and treats time limits as terminations."""
+    """Though the recipe clips and scales them."""
     recipe = replace(
         CARTPOLE_RECIPE,
         env="Pendulum-v1",
@@ -252,7 +252,6 @@ def test_rewards_are_the_tasks_own(tmp_path: Path) -> None:
         steps_per_batch=800,
         clip_rewards=True,
         reward_scale=0.1,
-        bootstrap_time_limit=False,
     )
     (tmp_path / "small.json").write_text(recipe_to_json(recipe))
     settings = replace(

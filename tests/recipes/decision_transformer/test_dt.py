@@ -74,7 +74,7 @@ def test_a_step_is_the_protocols(tmp_path):
 
 
 def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
-    """Step by step in Gymnasium: normalised states, return to go and actions of the last steps."""
+    """Step by step in Gymnasium: normalized states, return to go and actions of the last steps."""
     settings: dict[str, Any] = {"target_returns": (60.0,), "evaluation_episodes": 1}
     recipe = make_dt(
         tmp_path, acting_num_frames=4, return_scale=50.0, evaluation_seed=3, **settings

@@ -104,7 +104,7 @@ def test_explores_with_drawn_actions_and_keeps_observations_as_they_are(tmp_path
     first, again, other = (algorithm.explore(number) for number in (0, 0, 1))
     assert len(first.lengths) == 1
     assert first.finished.all()
-    assert 1.0 < first.rows["observation"][0, 0] < 1.5  # Hopper's height, not normalised
+    assert 1.0 < first.rows["observation"][0, 0] < 1.5  # Hopper's height, not normalized
     assert torch.equal(first.rows["observation"][0], again.rows["observation"][0])
     assert not torch.equal(first.rows["observation"][0], other.rows["observation"][0])
     actions = [episode.rows["action"][0] for episode in (first, again)]

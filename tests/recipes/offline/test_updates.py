@@ -1,4 +1,4 @@
-"""Updates of behaviour cloning, IQL and TD3+BC against their formulas, and what they read."""
+"""Updates of behavior cloning, IQL and TD3+BC against their formulas, and what they read."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def assert_follows(before, after, network, tau):
 
 
 @pytest.mark.parametrize("env", ["Hopper-v5", "CartPole-v1"])
-def test_behaviour_cloning(tmp_path, env):
+def test_behavior_cloning(tmp_path, env):
     algorithm, batch = double(make(BC, tmp_path, env=env), tmp_path)
     for name, weight in weights_of(algorithm.model, keep=True).items():
         if name.startswith("actor") and tuple(weight.shape) == (3, 8):

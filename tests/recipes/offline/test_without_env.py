@@ -116,7 +116,7 @@ def test_the_measures_of_held_out_episodes(tmp_path):
     assert torch.equal(torch.get_rng_state(), state)
 
 
-def test_the_best_weights_are_those_before_the_data_are_learnt_by_heart(tmp_path):
+def test_the_best_weights_are_those_before_the_data_are_learned_by_heart(tmp_path):
     noise = np.random.default_rng(1).uniform(-1, 1, (60, 2))
     data = log_machine(tmp_path / "log.hdf5", steps=60, actions=noise)
     recipe = BC(

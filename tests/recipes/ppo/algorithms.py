@@ -17,7 +17,7 @@ def named(name: str) -> PPO:
 
 def prepared(recipe: PPO, folder: Path) -> PPOAlgorithm:
     """Loss and optimizer are built; the collector, which is closed, is not needed."""
-    algorithm = PPOAlgorithm(recipe)
+    algorithm = recipe.build()
     algorithm.prepare(0, folder)
     algorithm.close()
     return algorithm

@@ -9,19 +9,17 @@ from dataclasses import replace
 
 import pytest
 import torch
-from gymnasium.vector import AsyncVectorEnv
 from torch import multiprocessing
 
 from recipes.core.metrics import Metrics
 from recipes.core.run import Run
-from recipes.core.runner import evaluate, train
+from recipes.core.runner import train
 from recipes.core.task import seed_copies
 from recipes.ppo import PPOAlgorithm
 from tests.numerics import assert_near
-from tests.recipes import small
 from tests.recipes.ppo import tasks
 from tests.recipes.small import TINY
-from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
+from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.settings.networks import enhanced_tit
 
 RECIPE = replace(
@@ -68,8 +66,7 @@ def test_batches_are_those_of_the_policy(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fields", [{}, {"collectors": 1, "vectorization_mode": "async"}])
-def test_a_terminals_ctrl_c_reaches_every_process_and_saves(fields, tmp_path, monkeypatch):
+def test_a_terminals_ctrl_c_reaches_every_process_and_saves(tmp_path, monkeypatch):
     log = Metrics.log
 
     def ctrl_c(metrics, step, **values):
@@ -83,29 +80,7 @@ def test_a_terminals_ctrl_c_reaches_every_process_and_saves(fields, tmp_path, mo
             os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(Metrics, "log", ctrl_c)
-    recipe = replace(RECIPE, checkpoint_interval=10**6, **fields)
+    recipe = replace(RECIPE, checkpoint_interval=10**6)
     with Run.create(tmp_path / "run", recipe) as run, pytest.raises(KeyboardInterrupt):
         train(recipe, run)
     assert checkpoint_steps(run.checkpoints) == [128]
-
-
-def test_a_run_in_processes_is_the_run_in_one(tmp_path, monkeypatch):
-    recipe = replace(RECIPE, collectors=1, total_steps=128, hide_velocities=True)
-    results, made = [], []
-
-    class Processes(AsyncVectorEnv):
-        def __init__(self, *arguments, **options):
-            made.append(recipe.vectorization_mode)
-            super().__init__(*arguments, **options)
-
-    monkeypatch.setattr("torchrl_tit.envs.gymnasium_tasks.AsyncVectorEnv", Processes)
-    for mode in ("sync", "async"):
-        recipe = replace(recipe, vectorization_mode=mode)
-        run = small.train(recipe, tmp_path / mode)
-        evaluation = evaluate(run)
-        results.append((load_checkpoint(run.checkpoints)[1]["networks"], evaluation["returns"]))
-    assert made == ["async"]
-    (sync, returns), (async_, async_returns) = results
-    assert returns == async_returns
-    for name, weight in sync.items():
-        assert (weight == async_[name]).all()

@@ -160,12 +160,10 @@ def collected(recipe, folder):
 
 
 @pytest.mark.numerics
-@pytest.mark.parametrize("bootstrap", [True, False])
 @pytest.mark.parametrize("padding", ["same", "constant"])
 @pytest.mark.parametrize("name", ["tit", "separate trunks", "lstm on windows"])
-def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstrap, tmp_path):
+def test_values_and_advantages_are_those_of_whole_windows(name, padding, tmp_path):
     recipe = replace(SHORT_EPISODES, backbone=NETWORKS[name], padding=padding)
-    recipe = replace(recipe, bootstrap_time_limit=bootstrap)
     algorithm, batch, rollout, outcome = collected(recipe, tmp_path)
     model, algorithm.gae = algorithm.model, GAE(gamma=0.875, lmbda=0.75, value_network=None)
     done = batch["next", "done"]
@@ -179,7 +177,7 @@ def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstr
         value, next_value = model.critic(model.backbone(states))["state_value"]
         batch["state_value"] = value
         algorithm.advantages(batch, rollout)
-    stops = done & ~truncated if bootstrap else done
+    stops = done & ~truncated
     assert_near(batch["next", "state_value"], next_value.masked_fill(stops, 0))
     reward = batch["next", "reward"]
     expected = advantages_by_hand(reward, value, next_value, done, stops, 0.875, 0.75)
@@ -189,9 +187,8 @@ def test_values_and_advantages_are_those_of_whole_windows(name, padding, bootstr
 
 @torch.no_grad()
 def test_no_frame_is_encoded_for_what_follows_a_termination(tmp_path):
-    recipe = replace(SHORT_EPISODES, bootstrap_time_limit=False)
-    algorithm, batch, rollout, _ = collected(recipe, tmp_path)
-    done = batch["next", "done"]
+    algorithm, batch, rollout, _ = collected(SHORT_EPISODES, tmp_path)
+    done = batch["next", "terminated"] = batch["next", "done"]
     assert done[:, :-1].sum() >= 6
     counted = CountedFrames(algorithm.model.backbone.module)
     algorithm.advantages(batch, rollout)
@@ -211,7 +208,7 @@ def numbers_of(minibatch, rollout):
 
 
 def advantages_by_hand(reward, value, next_value, done, stops, gamma, lmbda):
-    """Generalised advantage estimation (arXiv 1506.02438), [envs, time, 1].
+    """Generalized advantage estimation (arXiv 1506.02438), [envs, time, 1].
 
     Args:
         stops: where no value follows: at terminations, and at time limits if they count as such.
@@ -253,7 +250,6 @@ def test_loss_and_gradient_are_those_of_whole_windows(name, envs, padding, tmp_p
         num_envs=envs,
         padding=padding,
         entropy_coeff=0.1,
-        contrastive_coeff=1.0 if name == "coberl" else 0.0,
     )
     algorithm, batch, rollout, _ = collected(recipe, tmp_path)
     model, weights = algorithm.model, list(algorithm.model.parameters())
@@ -267,16 +263,12 @@ def test_loss_and_gradient_are_those_of_whole_windows(name, envs, padding, tmp_p
         resets += int(steps["is_init"][:, 1:].sum())
         [histories] = rollout.histories(numbers_of(minibatch, rollout))
         assert torch.equal(windows.gather(frames[0]), histories)
-        torch.manual_seed(1)
         total, terms = algorithm._objective(minibatch._replace(steps=steps.copy()))
         gradients = torch.autograd.grad(total, weights, allow_unused=True)
 
         whole = steps.flatten(0, 1).update(features_by_hand(model, minibatch, histories))
         losses = algorithm.ppo_loss(whole)
         expected = losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]
-        if recipe.contrastive_coeff:
-            torch.manual_seed(1)
-            expected = expected + algorithm._contrastive_loss(frames, windows)
         expected_gradients = torch.autograd.grad(expected, weights, allow_unused=True)
         assert 0 < terms[5] < 1  # of the ratios some are clipped, others are not
         assert_near(total, expected)

@@ -50,8 +50,6 @@ def test_every_column_is_described(algorithm):
     recipe = next(r for r in recipes if getattr(r, "dataset", True))  # not one for any data
     made = make_algorithm(recipe)
     columns = [*made.columns, *(f"held_out_{name}" for name in getattr(made, "measures", ()))]
-    if algorithm == "ppo":  # which depend on the recipe
-        columns.append("loss_contrastive")
     for column in ("steps_per_second", "return_mean", *columns):
         assert words_of(algorithm, column).what, f"{column} of {algorithm} in metrics.csv"
         assert column in known_columns(algorithm)

@@ -111,7 +111,7 @@ def test_pictures_of_observations(frame, brightest):
     assert picture[5, 6].tolist() == [0] * 3
 
 
-def test_colours_stay_and_small_images_grow():
+def test_colors_stay_and_small_images_grow():
     frame = np.zeros((3, 7, 7), np.uint8)
     frame[0, 2, 3] = 255
     picture = as_picture(frame)

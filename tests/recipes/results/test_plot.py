@@ -7,7 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from recipes.core.run import Run
-from recipes.tools.results import plot
+from recipes.tools.results import plot, table
 from recipes.tools.results.experiments import Experiment
 from recipes.tools.results.plot import (
     Curve,
@@ -17,7 +17,7 @@ from recipes.tools.results.plot import (
     plot_comparison,
     plot_run,
 )
-from recipes.tools.results.table import Cell
+from recipes.tools.results.table import Cell, plot_table
 from tests.recipes.results.report_runs import write_run
 
 TWO = {"step": [1, 2], "time": [0, 1], "return_mean": [1.0, 3.0]}
@@ -32,7 +32,8 @@ def experiments_of(folder, *names):
 def figures(monkeypatch):
     """Figures instead of files."""
     found = []
-    monkeypatch.setattr(plot, "save_figure", lambda figure, picture: found.append(figure))
+    for module in (plot, table):
+        monkeypatch.setattr(module, "save_figure", lambda figure, picture: found.append(figure))
     return found
 
 
@@ -128,7 +129,7 @@ def test_what_was_changed_has_room_beside_its_panel(tmp_path, figures):
         for task in ("a", "b", "c")
         for text in ("", changes)
     ]
-    plot.plot_table(cells, tmp_path / "table.png")
+    plot_table(cells, tmp_path / "table.png")
     (figure,) = figures
     figure.canvas.draw()
     boxes = []

@@ -11,7 +11,7 @@ import pytest
 from recipes.cli import main
 from recipes.core.registry import RECIPES
 from recipes.core.run import Run
-from recipes.tools.results import plot
+from recipes.tools.results import table
 from recipes.tools.results.paper import paper_cells
 from recipes.tools.results.table import (
     make_table,
@@ -94,8 +94,8 @@ def test_scores_and_returns_are_not_of_one_measure(tmp_path, monkeypatch):
     cells, _ = make_table([tmp_path])
     assert [cell.measure for cell in cells] == ["normalized score", "return"]
     figures = []
-    monkeypatch.setattr(plot, "save_figure", lambda figure, _: figures.append(figure))
-    plot.plot_table(cells, tmp_path / "table.png")
+    monkeypatch.setattr(table, "save_figure", lambda figure, _: figures.append(figure))
+    table.plot_table(cells, tmp_path / "table.png")
     panels = [axes for axes in figures[0].axes if axes.get_visible()]
     assert [axes.get_xlabel() for axes in panels] == ["normalized score", "return"]
 

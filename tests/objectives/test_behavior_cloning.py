@@ -1,4 +1,4 @@
-"""Behaviour cloning with the heads of `make_actor`, against likelihoods written out."""
+"""Behavior cloning with the heads of `make_actor`, against likelihoods written out."""
 
 import math
 

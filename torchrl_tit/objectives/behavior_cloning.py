@@ -1,4 +1,4 @@
-"""Behaviour cloning with any distribution of actions."""
+"""Behavior cloning with any distribution of actions."""
 
 from __future__ import annotations
 
