@@ -52,7 +52,7 @@ MISTAKES = [
     ("share run", "share needs REPO, such as me/cartpole, or --out FOLDER"),
     ("share empty --out new", "holds no checkpoint: train the run first"),
     ("share nowhere --out new", "there is no agent or folder"),
-    ("share run --out no/new", "cannot be written: there is no folder"),
+    ("share run --out run/recipe.json/new", "File exists: 'run/recipe.json'"),
     ("share run --out 'a b'", "name must be letters"),
     ("export empty --out a.pt2", "holds no checkpoint: train the run first"),
     ("export nothing --out a.pt2", "neither an agent nor a run"),
