@@ -1,7 +1,7 @@
-"""Checks what `make release` has built: ``python -m docs.tools.release FOLDER --pythons python3.11``.
+"""Checks what `make release` has built: ``python -m docs.tools.release FOLDER --pythons ...``.
 
-Each Python makes a clean environment and installs the wheel there as a user does. In an empty folder
-it then plays a trained agent, copies the examples, and runs the Python of the README; with
+Each Python makes a clean environment and installs the wheel there as a user does. In an empty
+folder it then plays a trained agent, copies the examples, and runs the Python of the README; with
 ``--suite`` it also runs the tests of the sdist. A Python that is not there is named and skipped.
 The release's notes, the version's section of the changelog, are written to FOLDER/notes.md.
 """
