@@ -100,7 +100,7 @@ bench: $(VENV)/installed-bench  ## Measure speed against other libraries
 # The commands and fields are read from the code; the site is built beside it, with packages of its own.
 docs: $(VENV)/installed-recipes $(VENV)-docs/installed  ## Build the documentation site: build/site/index.html
 	rm -rf build/docs
-	$(ONE_THREAD) $(BIN)/python -m docs.tools.reference build/docs/reference
+	$(ONE_THREAD) $(BIN)/python -m docs.tools.reference
 	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict --quiet
 
 # Up to the upload: wheel, sdist, runs, site and notes, in RELEASE. URL is the repository's address.
