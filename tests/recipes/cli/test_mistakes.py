@@ -54,6 +54,8 @@ MISTAKES = [
     ("share nowhere --out new", "there is no agent or folder"),
     ("share run --out run/recipe.json/new", "File exists: 'run/recipe.json'"),
     ("share run --out 'a b'", "name must be letters"),
+    ("examples", "the following arguments are required: OUT"),
+    ("examples run", "run exists already"),
     ("export empty --out a.pt2", "holds no checkpoint: train the run first"),
     ("export nothing --out a.pt2", "neither an agent nor a run"),
     ("export nobody --out a.pt2", "there is no agent or folder 'nobody'"),
