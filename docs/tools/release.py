@@ -78,7 +78,8 @@ def check(python: str, wheel: Path, sdist: Path, suite: bool) -> None:
             with tarfile.open(sdist) as tar:
                 tar.extractall(folder, filter="data")
             source = Path(folder, sdist.name.removesuffix(".tar.gz"))
-            run(bin_ / "python", "-m", "pip", "install", "--quiet", f"{source}[test]")
+            pins = ("-c", source / "constraints.txt")
+            run(bin_ / "python", "-m", "pip", "install", "--quiet", *pins, f"{source}[test]")
             run(bin_ / "python", "-m", "pytest", "-q", "-m", "not slow", "-n", "2", cwd=source)
 
 

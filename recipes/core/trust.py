@@ -19,8 +19,8 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from importlib import import_module
 from contextlib import suppress
+from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
