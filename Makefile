@@ -29,7 +29,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PRECIOUS: $(VENV)/installed-%
 # The tests come last, also under `make -j`: their closing line ends the log.
 .NOTPARALLEL:
-.PHONY: help demo demo-memory test lint types unit slow numerics versions kill fuzz soak bench docs format hooks clean
+.PHONY: help demo demo-memory test lint types unit slow numerics versions kill fuzz soak bench docs release format hooks clean
 
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -100,8 +100,21 @@ bench: $(VENV)/installed-bench  ## Measure speed against other libraries
 # The commands and fields are read from the code; the site is built beside it, with packages of its own.
 docs: $(VENV)/installed-recipes $(VENV)-docs/installed  ## Build the documentation site: build/site/index.html
 	rm -rf build/docs
-	$(ONE_THREAD) $(BIN)/python -m docs.tools.reference build/docs/reference
+	$(ONE_THREAD) $(BIN)/python -m docs.tools.reference
 	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --strict --quiet
+
+# Up to the upload: wheel, sdist, runs, site and notes, in RELEASE. URL is the repository's address.
+RELEASE ?= build/release
+PYTHONS ?= python3.11 python3.12 python3.13
+URL ?=
+SUITE ?=
+
+release: $(VENV)/installed-release docs  ## Build and check what is published (SUITE=--suite: with the sdist's tests)
+	rm -rf $(RELEASE) build/lib
+	PROJECT_URL=$(URL) $(BIN)/python -m build --outdir $(RELEASE)
+	$(BIN)/python -m docs.tools.archive docs/results --out $(RELEASE)/results.tar.xz
+	tar -cJf $(RELEASE)/site.tar.xz -C build site
+	$(ONE_THREAD) PROJECT_URL=$(URL) $(BIN)/python -m docs.tools.release $(RELEASE) --pythons $(PYTHONS) $(SUITE)
 
 format: $(VENV)/installed-test  ## Rewrite the code in the project's style
 	$(BIN)/ruff check --fix .

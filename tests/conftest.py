@@ -7,6 +7,7 @@ import gc
 import os
 import platform
 import random
+import secrets
 import signal
 import sys
 from collections.abc import Generator, Iterator
@@ -79,9 +80,10 @@ def _describe(item: pytest.Item) -> Iterator[str]:
 
 
 @pytest.fixture(autouse=True)
-def _imports(monkeypatch: pytest.MonkeyPatch) -> None:
+def _imports(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
     """What a test allows to be imported stays its own."""
     monkeypatch.setenv("TORCHRL_TIT_IMPORTS", "")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / secrets.token_hex(4)))
 
 
 @pytest.fixture

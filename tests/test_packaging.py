@@ -1,6 +1,7 @@
 """What is built from the project: the wheel, its metadata, and the files that repeat them."""
 
 import ast
+import os
 import re
 import shutil
 import subprocess
@@ -16,9 +17,11 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import NormalizedName, canonicalize_name
 
+from docs.tools import release
 from torchrl_tit.extras import EXTRAS
 
 ROOT = Path(__file__).parents[1]
+ADDRESS = "https://example.org/torchrl-tit"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -27,12 +30,11 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel, built from the sdist, built from a copy, so that the clone stays clean."""
     source = tmp_path_factory.mktemp("source") / "project"
     outdir = tmp_path_factory.mktemp("dist")
-    unpublished = shutil.ignore_patterns(
-        ".*", "__pycache__", "*.egg-info", "build", "dist", "docs", "runs"
-    )
+    unpublished = shutil.ignore_patterns(".*", "__pycache__", "*.egg-info", "build", "dist", "runs")
     shutil.copytree(ROOT, source, ignore=unpublished)
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(outdir)]
-    result = subprocess.run(command, cwd=source, capture_output=True, text=True)
+    env = os.environ | {"PROJECT_URL": ADDRESS}
+    result = subprocess.run(command, cwd=source, env=env, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
     assert len(list(outdir.glob("*.tar.gz"))) == 1
     [path] = outdir.glob("*.whl")
@@ -67,8 +69,15 @@ def test_wheel_holds_every_module_once_and_nothing_beside_the_library(wheel: Pat
     }
 
     assert "torchrl_tit/agents/cartpole/model.safetensors" in agents
+    examples = {
+        p.relative_to(ROOT / "docs").as_posix()
+        for p in (ROOT / "docs" / "examples").rglob("*")
+        if p.suffix in (".py", ".toml")
+    }
+
+    assert "examples/own_package/pyproject.toml" in examples
     library |= agents | {"torchrl_tit/py.typed"}
-    assert names == library | {f"torchrl_tit/{n}" for n in recipes}
+    assert names == library | {f"torchrl_tit/{n}" for n in recipes | examples}
 
 
 def test_installed_wheel_starts_the_command_without_a_top_level_recipes(
@@ -105,7 +114,24 @@ def test_metadata_names_license_python_and_readme(metadata: Message) -> None:
     assert metadata["License-Expression"] == "MIT"
     assert metadata["License-File"] == "LICENSE"
     assert metadata["Requires-Python"] == ">=3.11"
-    assert metadata.get_payload() == (ROOT / "README.md").read_text()
+
+
+def test_links_of_the_description_hold_outside_of_the_repository(metadata: Message) -> None:
+    urls = dict(text.split(", ") for text in metadata.get_all("Project-URL", []))
+    assert urls.keys() == {"Paper", "Homepage", "Documentation", "Changelog", "Issues"}
+    page, readme = str(metadata.get_payload()), (ROOT / "README.md").read_text()
+    links = re.findall(r"\]\((.*?)\)", page)
+    assert len(links) == len(re.findall(r"\]\((.*?)\)", readme))
+    assert all(link.startswith("https://") for link in links)
+    tag = f"v{PROJECT['version']}"
+    local = [link for link in [*links, *urls.values()] if f"/{tag}/" in link]
+    assert len(local) > 10
+    for link in local:
+        match = re.fullmatch(rf"{ADDRESS}/(raw|blob)/{tag}/(.*)", link)
+        assert match is not None, link
+        assert (ROOT / match[2].partition("#")[0]).exists(), link
+        assert (match[1] == "raw") == link.endswith(".png")
+    assert re.sub(r"\]\(.*?\)", "", page) == re.sub(r"\]\(.*?\)", "", readme)
 
 
 def test_version_is_the_same_everywhere(metadata: Message) -> None:
@@ -114,6 +140,39 @@ def test_version_is_the_same_everywhere(metadata: Message) -> None:
 
     assert newest is not None
     assert {metadata["Version"], citation["version"], newest[1]} == {PROJECT["version"]}
+
+
+def test_workflows_call_targets_that_there_are() -> None:
+    targets = {*re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)}
+    called = set()
+    for path in (ROOT / ".github" / "workflows").glob("*.yml"):
+        for job in yaml.safe_load(path.read_text())["jobs"].values():
+            runs = [step["run"] for step in job["steps"] if "run" in step]
+            called |= {run.split()[1] for run in runs if run.startswith("make ")}
+    assert called == {"test", "docs", "release"}
+    assert called <= targets
+
+
+def test_notes_of_a_release_are_its_section_of_the_changelog() -> None:
+    changelog = "# Changelog\n\n## [0.2.0] - unreleased\n\nnew\n\n## [0.1.0] - 2026\n\nold\n"
+    assert release.notes(changelog, "0.2.0") == "new\n"
+    assert release.notes(changelog, "0.1.0") == "old\n"
+    with pytest.raises(ValueError, match=r"no section \[0.3.0\]"):
+        release.notes(changelog, "0.3.0")
+
+
+def test_a_release_names_what_it_leaves_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in (f"torchrl_tit-{PROJECT['version']}-py3-none-any.whl", "torchrl_tit.tar.gz"):
+        (tmp_path / name).touch()
+    monkeypatch.delenv("PROJECT_URL", raising=False)
+    with pytest.raises(SystemExit, match="none of python0 can be used"):
+        release.main([str(tmp_path), "--pythons", "python0"])
+    printed = capsys.readouterr().out
+    for words in ("python0: there is no such program", "tests of the sdist", "addresses"):
+        assert re.search(rf"^skipped: .*{words}", printed, re.MULTILINE), words
+    assert (tmp_path / "notes.md").stat().st_size > 1000
 
 
 def test_every_direct_dependency_is_pinned_within_its_range() -> None:

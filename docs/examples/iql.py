@@ -7,10 +7,9 @@ from tensordict.nn import NormalParamExtractor, TensorDictModule, TensorDictSequ
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import GymEnv, TransformedEnv
-from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 from torchrl.objectives import IQLLoss, SoftUpdate
 
-from docs.examples.sac import QHead
 from torchrl_tit import Backbone, EnhancedTIT, History
 
 
@@ -38,7 +37,9 @@ def main(updates: int = 200, dropout: float = 0.0) -> IQLLoss:
     for _ in range(2):
         q_backbone, width = backbone("q_features")
         q_head = ValueOperator(
-            QHead(width, 1), in_keys=["q_features", "action"], out_keys=["state_action_value"]
+            MLP(width + 1, 1, num_cells=[64], activation_class=nn.ReLU),
+            in_keys=["q_features", "action"],
+            out_keys=["state_action_value"],
         )
         q_networks.append(TensorDictSequential(q_backbone, q_head))
     v_backbone, width = backbone("v_features")

@@ -8,23 +8,10 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import GymEnv, TransformedEnv
-from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from torchrl_tit import Backbone, EnhancedTIT, History
-
-
-class QHead(nn.Module):
-    """Features [..., F] and action [..., A] to a value [..., 1]."""
-
-    def __init__(self, features_dim: int, action_dim: int) -> None:
-        super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(features_dim + action_dim, 64), nn.ReLU(), nn.Linear(64, 1)
-        )
-
-    def forward(self, features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        return self.layers(torch.cat([features, action], dim=-1))
 
 
 def main(steps: int = 1_000, dropout: float = 0.0) -> SACLoss:
@@ -53,7 +40,7 @@ def main(steps: int = 1_000, dropout: float = 0.0) -> SACLoss:
     for _ in range(2):
         critic_tit = EnhancedTIT((3,), num_frames=2, ffn_dropout_inner=dropout)
         head = ValueOperator(
-            QHead(critic_tit.features_dim, 1),
+            MLP(critic_tit.features_dim + 1, 1, num_cells=[64], activation_class=nn.ReLU),
             in_keys=["critic_features", "action"],
             out_keys=["state_action_value"],
         )

@@ -1,6 +1,6 @@
 """MkDocs' hooks: the same Markdown is read in the repository and on the site.
 
-- ``<!-- reference: NAME.md -->`` is replaced by a page that docs/tools/reference.py wrote.
+- Links to the file of a public package lead to its page, which docs/tools/reference.py wrote.
 - Links to files outside of docs/, and to source code, lead to pages that show these files.
 - Links to folders of results lead to lists of what is in them.
 """
@@ -24,7 +24,6 @@ WRITTEN = ROOT / "build" / "docs" / "reference"
 
 _LINK = re.compile(r"(\]\()([^)\s]+)(\))")
 _CODE = re.compile(r"^(`{3,}).*?^\1`*$", re.MULTILINE | re.DOTALL)
-_MARKER = re.compile(r"<!-- reference: (\S+) -->")
 _LANGUAGES = {".py": "python", ".toml": "toml", ".txt": "text", ".json": "json", ".cff": "yaml"}
 
 
@@ -47,9 +46,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Fills in what was written from the code, and mends the links."""
+    """Mends the links."""
     uri = page.file.src_uri
-    markdown = _MARKER.sub(lambda m: (WRITTEN / m[1]).read_text(encoding="utf-8"), markdown)
     here = DOCS / uri if page.file.abs_src_path else None
     if uri.startswith("source/") and uri.endswith(".md.md"):
         here = ROOT / uri.removeprefix("source/").removesuffix(".md")
@@ -100,6 +98,10 @@ def _uri(target: Path) -> str:
     name = target.relative_to(ROOT).as_posix()
     if name == "README.md":
         return "index.md"
+    module = name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    for package in (module, f"torchrl_tit.{module}"):  # recipes have another name in the wheel
+        if (WRITTEN / "api" / f"{package}.md").exists():
+            return f"reference/api/{package}.md"
     in_docs = name.startswith("docs/") and target.is_file()
     if in_docs and target.suffix not in (".py", ".toml"):
         return name.removeprefix("docs/")

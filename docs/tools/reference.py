@@ -1,12 +1,13 @@
-"""Writes the pages of the site that follow from the code.
+"""Writes the pages that follow from the code: ``python -m docs.tools.reference``.
 
-    python -m docs.tools.reference FOLDER
+docs/reference/commands.md      what each command's --help prints
+docs/reference/fields.md        the fields of recipes and networks, with their bounds and defaults
+docs/reference/metrics.md       the columns of metrics.csv
+docs/reference/api.md           the public names of each package
+build/docs/reference/api/*.md   a page of the site for each package, which mkdocstrings fills in
 
-commands.md     what each command's --help prints
-fields.md       the fields of recipes and networks, with their bounds and defaults
-metrics.md      the columns of metrics.csv, but for PPO's
-api.md, api/    every public name, a page for each package; mkdocstrings fills them in
-
+In docs/ they are between ``<!-- reference: NAME.md -->`` and ``<!-- end -->``, and tests compare
+them.
 The site needs none of this library's dependencies: they are imported here, in its environment.
 """
 
@@ -45,16 +46,20 @@ _HUGE = 1e9
 def pages() -> dict[str, str]:
     """Returns the pages by their path in docs/reference."""
     api = {f"api/{package}.md": _api(package, names) for package, names in public().items()}
-    index = "\n".join(
-        f"| [{package}](api/{package}.md) | {_summary(package)} |" for package in public()
-    )
     return {
         "commands.md": _commands(),
         "fields.md": _fields(),
         "metrics.md": _metrics(),
-        "api.md": f"| package | |\n|---|---|\n{index}\n",
+        "api.md": _index(),
         **api,
     }
+
+
+def fill(page: str, name: str, text: str) -> str:
+    """Returns a page of docs/reference with what was written from the code in its place."""
+    begin, end = f"<!-- reference: {name} -->\n", "<!-- end -->"
+    before, rest = page.split(begin)
+    return f"{before}{begin}{text}{end}{rest.split(end)[1]}"
 
 
 def public() -> dict[str, list[str]]:
@@ -131,8 +136,9 @@ def _section(cls: type, title: str | None) -> str:
         for base in cls.__mro__[1:]
         if dataclasses.is_dataclass(base) and list(_rows(base))
     ]
-    heading = f"## {title or f'`{cls.__name__}`'} {{ #{cls.__name__.lower()} }}"
-    text = [heading, "", (cls.__doc__ or "").split("\n\n")[0].strip(), ""]
+    title, anchor = title or f"`{cls.__name__}`", cls.__name__.lower()
+    text = [] if title.lower() == f"`{anchor}`" else [f'<a id="{anchor}"></a>', ""]
+    text += [f"## {title}", "", (cls.__doc__ or "").split("\n\n")[0].strip(), ""]
     if above:
         text += [f"Beside its own it has the fields of {', '.join(above)}.", ""]
     if rows:
@@ -205,11 +211,22 @@ def _default(field: dataclasses.Field[Any]) -> str:
 
 
 def _metrics() -> str:
-    sections = [f"## `{name}`\n\n{to_markdown(name)}" for name in _algorithms() if name != "ppo"]
+    names = sorted(_algorithms(), key=lambda name: (name != "ppo", name))
+    sections = [f"## `{name}`\n\n{to_markdown(name)}" for name in names]
     return "\n".join(sections)
 
 
 # Public names
+
+
+def _index() -> str:
+    """Leads to the packages' files; the site leads to their pages instead."""
+    lines = ["| package | public names |", "|---|---|"]
+    for package, names in public().items():
+        file = Path(str(_import(package).__file__)).relative_to(ROOT).as_posix()
+        listed = ", ".join(f"`{name}`" for name in sorted(names, key=str.lower))
+        lines.append(f"| [{package}](../../{file}): {_summary(package)} | {listed} |")
+    return "\n".join(lines) + "\n"
 
 
 def _api(package: str, names: Iterable[str]) -> str:
@@ -255,7 +272,11 @@ def _plain(text: str) -> str:
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1])
     for path, text in pages().items():
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_text(text, encoding="utf-8")
+        file = ROOT / "docs" / "reference" / path
+        if path.startswith("api/"):  # what only mkdocstrings reads
+            file = ROOT / "build" / "docs" / "reference" / path
+            file.parent.mkdir(parents=True, exist_ok=True)
+        else:
+            text = fill(file.read_text(encoding="utf-8"), path, text)
+        file.write_text(text, encoding="utf-8")

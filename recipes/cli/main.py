@@ -29,6 +29,7 @@ COMMANDS = {
     "record": "results:record",
     "report": "results:report",
     "data": "data:data",
+    "examples": "examples:examples",
 }
 """The commands by name, each a "module:function" of this package."""
 
@@ -65,6 +66,7 @@ usage: {program} COMMAND ...
   data info SOURCE            describe a data set: an HDF5 file, D4RL's or Minari's name
   data convert SOURCE TARGET  convert between HDF5 in D4RL's layout and Minari
   data collect TASK           make medium, mixed, expert and random data sets, as D4RL does
+  examples OUT                copy the examples of the documentation into a new folder
 
 Common options: --seed, --out, --device, --threads where they apply; see COMMAND --help.
 Every command takes --import MODULE, for recipes, encoders, algorithms and tasks of your own.

@@ -77,7 +77,9 @@ def tune(arguments: list[str]) -> None:
     parser = Parser(
         "tune",
         "Search for the best values of a recipe's fields, with Optuna: trials are runs, and those "
-        "whose returns stay low are pruned. The same command resumes a search.",
+        "whose returns stay low are pruned. The same command resumes a search. The recipe's fields "
+        "are options, as of `train NAME`.",
+        allow_abbrev=False,  # --seed is a field
     )
     parser.add_argument("name", help="name of a recipe, or a JSON or Python file")
     parser.add_argument(
@@ -96,18 +98,17 @@ def tune(arguments: list[str]) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, help="folder of the search; best.json is its result"
     )
-    options = parser.parse_args(arguments)
+    options, typed = parser.parse_known_args(arguments)
     for name in ("trials", "workers", "startup_trials"):
         if getattr(options, name) < 1:
             fail(f"{option(name)} must be at least 1, not {getattr(options, name)}")
     from ..core.algorithm import make_algorithm
     from ..core.registry import find_recipe
-    from ..core.trust import allow_names
     from ..tools.sweeps.search_space import load_space
-    from ..tools.sweeps.tune import Search, Settings, importances
+    from ..tools.sweeps.tune import Search, Settings, importances, why_no_importances
+    from .train import parse_recipe
 
-    recipe = find_recipe(options.name)
-    allow_names(recipe)
+    recipe, _ = parse_recipe(find_recipe(options.name), typed, f"tune {options.name}")
     make_algorithm(recipe).check()
     settings = Settings(
         recipe,
@@ -132,4 +133,6 @@ def tune(arguments: list[str]) -> None:
     if shares := importances(search.study):
         named = ", ".join(f"{field} {share:.0%}" for field, share in shares.items())
         say(f"what mattered: {named}")
+    else:
+        say(f"no importance.csv: {why_no_importances(search.study)}")
     say(f"all trials: {options.out / 'trials.csv'}")

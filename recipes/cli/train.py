@@ -6,6 +6,7 @@ Help and errors are therefore fast: they do not need PyTorch.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from inspect import getdoc
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,33 +35,50 @@ def train(arguments: list[str]) -> None:
             options.resume, options.device, options.threads, options.lengths, options.wandb
         )
     else:
-        recipe, options = _parse_recipe(find_recipe(arguments[0]), arguments[1:])
+        recipe, options = _parse_train(find_recipe(arguments[0]), arguments[1:])
         resolve(f"{__package__}.training:start")(
             recipe, options.out, options.init_from, options.wandb
         )
 
 
-def _parse_recipe(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
-    """Overrides a recipe's fields, including its network's, and reads --out and --init-from."""
+def _parse_train(recipe: Recipe, arguments: list[str]) -> tuple[Recipe, Any]:
+    """Overrides a recipe's fields, and reads --out, --init-from and --wandb."""
     out = tyro.conf.arg(help="Run folder to make; runs/NAME/seed-SEED-DATE if missing.")
     init_from = tyro.conf.arg(
         help="Run folder whose newest checkpoint gives the first weights, as far as they fit.",
         metavar="RUN",
     )
     wandb = tyro.conf.arg(help=WANDB_HELP, metavar="PROJECT")
+    beside = [
+        ("out", Annotated[Path | None, out], None),
+        ("init_from", Annotated[Path | None, init_from], None),
+        ("wandb", Annotated[str | None, wandb], None),
+    ]
+    return parse_recipe(recipe, arguments, f"train {recipe.name}", beside)
+
+
+def parse_recipe(
+    recipe: Recipe, arguments: list[str], command: str, beside: Sequence[Any] = ()
+) -> tuple[Recipe, Any]:
+    """Overrides a recipe's fields, including its network's.
+
+    Args:
+        recipe: the recipe.
+        arguments: the arguments after its name.
+        command: the command, for messages.
+        beside: further options of the command, as :func:`dataclasses.make_dataclass` takes them.
+
+    Returns:
+        The recipe, and an object with the values of the further options.
+    """
     if not {"-h", "--help"}.isdisjoint(arguments):
         load_plugins()  # their parts are choices too
     _check_length(recipe, arguments)
     recipe = choose_network(recipe, arguments)
     parsed = parse_fields(
-        [
-            ("recipe", Annotated[type(recipe), tyro.conf.arg(name="")], recipe),
-            ("out", Annotated[Path | None, out], None),
-            ("init_from", Annotated[Path | None, init_from], None),
-            ("wandb", Annotated[str | None, wandb], None),
-        ],
+        [("recipe", Annotated[type(recipe), tyro.conf.arg(name="")], recipe), *beside],
         without_names(arguments),
-        f"train {recipe.name}",
+        command,
         f"{getdoc(type(recipe))}\n\n{describe_options(recipe)}",
     )
     checked = check_recipe(parsed.recipe)

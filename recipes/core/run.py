@@ -31,6 +31,7 @@ from .recipe import Recipe
 from .recipe_json import recipe_from_json, recipe_to_json
 from .records import Records
 from .registry import find_recipe
+from .trust import import_remembered, remember_imports
 
 _IMPORTS = "imports.json"
 _WEIGHTS = "initial_weights"
@@ -102,7 +103,7 @@ class Run:
                 write_text_atomic(folder / _IMPORTS, json.dumps(modules) + "\n")
             if initial_weights is not None:
                 save_checkpoint(folder / _WEIGHTS, 0, initial_weights)
-            write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
+            run._write_recipe()
         return run
 
     @staticmethod
@@ -135,9 +136,13 @@ class Run:
         if not path.is_file():
             raise FileNotFoundError(f"{folder} is not a run folder: there is no {path}")
         try:
-            return cls(folder, find_recipe(str(path)))
+            recipe = find_recipe(str(path))
+            remember_imports(path)
         except ValueError as error:
-            raise ValueError(f"{error}{_import_hint(folder)}") from error
+            if not import_remembered(path):
+                raise ValueError(f"{error}{_import_hint(folder)}") from error
+            recipe = find_recipe(str(path))
+        return cls(folder, recipe)
 
     def read(self, name: str) -> bytes | None:
         """Reads a file of the run.
@@ -180,8 +185,13 @@ class Run:
         if done and recipe != self.recipe and recipe.schedules:
             earlier = [*self.earlier_lengths(), (done, getattr(self.recipe, field))]
             write_text_atomic(self.folder / _LENGTHS, json.dumps(earlier) + "\n")
-        write_text_atomic(self.folder / "recipe.json", recipe_to_json(recipe))
         self.recipe = recipe
+        self._write_recipe()
+
+    def _write_recipe(self) -> None:
+        path = self.folder / "recipe.json"
+        write_text_atomic(path, recipe_to_json(self.recipe))
+        remember_imports(path)
 
     def earlier_lengths(self) -> list[tuple[int, int]]:
         """Returns the lengths that the run's schedules followed before the recipe's.

@@ -39,8 +39,10 @@ def test_python_runs(document):
 
 
 def test_all_pages_together_are_short():
+    """What was written from the code is as long as the code makes it."""
     pages = [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
-    assert sum(len(page.read_text().split()) for page in pages) <= 45_000
+    written = re.compile(r"<!-- reference: .*?<!-- end -->", re.DOTALL)
+    assert sum(len(written.sub("", page.read_text()).split()) for page in pages) <= 45_000
 
 
 def test_the_page_on_recipes_lists_every_encoder():

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shlex
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -26,8 +25,8 @@ def blocks(language: str) -> list[str]:
 
 @pytest.fixture
 def installed(own_modules: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The package, installed by pip into a folder of its own."""
-    shutil.copytree(PACKAGE, own_modules / "docs" / "examples" / "own_package")
+    """The package, copied by `examples` and installed by pip into a folder of its own."""
+    main(["examples", "examples"])
     [words] = [c for block in blocks("sh") for c in block.splitlines() if c.startswith("pip ")]
     site = own_modules / "site"
     offline = ["--no-deps", "--no-build-isolation", "--no-index", "--quiet", "--target", str(site)]
@@ -56,7 +55,8 @@ def test_commands_of_the_page(installed, own_modules, capsys):
     [source] = [block for block in blocks("python") if "small = " in block]
     (own_modules / "my_recipes.py").write_text(source)
     lines = "".join(blocks("sh")).replace("\\\n", "").splitlines()
-    commands = [line.removeprefix("torchrl-tit ") for line in lines if not line.startswith("pip")]
+    lines = [line.removeprefix("torchrl-tit ") for line in lines]
+    commands = [line for line in lines if not line.startswith(("pip", "examples"))]
     printed = {}
     for command in commands:
         if not command.startswith("sweep"):  # see below

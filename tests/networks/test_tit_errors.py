@@ -26,10 +26,15 @@ def test_history_of_another_shape(kind: type[Any], shape: tuple[int, ...]) -> No
 @pytest.mark.parametrize("dtype", [torch.float64, torch.int64, torch.bool, torch.bfloat16])
 def test_history_of_another_dtype(kind: type[Any], dtype: torch.dtype) -> None:
     tit = kind((3,), 2)
-    hint = "give it uint8, or convert" if dtype.is_floating_point else "if it counts categories"
+    hint = "give it torch.float32 or" if dtype.is_floating_point else "if it counts categories"
     for call in (tit, tit.attention_maps):
         with pytest.raises(TypeError, match=rf"{dtype} .* network of torch.float32: {hint}"):
             call(torch.zeros(5, 2, 3, dtype=dtype))
+
+
+def test_float_history_of_a_network_in_double() -> None:
+    with pytest.raises(TypeError, match=r"give it torch.float64 .* with \.to\(torch.float32\)"):
+        EnhancedTIT((3,), 2).double()(torch.zeros(5, 2, 3))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.int64])

@@ -467,7 +467,10 @@ def _check_dtype(history: Tensor, observation: Observation, dtype: torch.dtype) 
         autocast and history.is_floating_point() and history.dtype != torch.float64
     )
     if not fits and history.dtype != torch.uint8:
-        hint = "give it uint8, or convert it first (TorchRL's DoubleToFloat, say)"
+        hint = (
+            f"give it {dtype} or uint8 (TorchRL's DTypeCastTransform converts it in an "
+            f"environment), or convert the network with .to({history.dtype})"
+        )
         if not history.is_floating_point():
             hint = (
                 "if it counts categories, build the network with their spec (MultiCategorical) "

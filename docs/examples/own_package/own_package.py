@@ -1,6 +1,6 @@
 """A frame encoder, a history encoder, a task, an algorithm and a recipe of one's own.
 
-docs/extending.md explains them. `pip install docs/examples/own_package` makes them known.
+docs/extending.md explains them. `pip install ./examples/own_package` makes them known.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Descriptions of the metrics: the single source of the reports and of docs/recipes.md."""
+"""Descriptions of the metrics: the single source of reports and of docs/reference/metrics.md."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ _TIMES = " * "
 
 @dataclass(frozen=True)
 class MetricWords:
-    """What a column of ``metrics.csv`` is, and how to read it. Code is between backticks."""
+    """What a column of ``metrics.csv`` is, and how to read it, in sentences.
+
+    Code is between backticks.
+    """
 
     column: str
     what: str
@@ -41,15 +44,16 @@ def words_of(algorithm: str, column: str) -> MetricWords:
 
     Example:
         >>> words_of("ppo", "clip_fraction").what
-        'share of the samples whose probability ratio was clipped'
+        'This is the share of the samples whose probability ratio was clipped.'
         >>> words_of("dt", "return_3600").what
-        'mean return of the evaluation that aims for 3600'
+        'This is the mean return of the evaluation that aims for 3600.'
     """
     found = _read()
     known = next((found[of, column] for of in _family(algorithm) if (of, column) in found), None)
     if known is None and _TARGET.fullmatch(column):
         target = column.removeprefix("return_")
-        return MetricWords(column, f"mean return of the evaluation that aims for {target}")
+        what = f"This is the mean return of the evaluation that aims for {target}."
+        return MetricWords(column, what)
     return known or MetricWords(column, "")
 
 

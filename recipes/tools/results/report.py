@@ -359,7 +359,7 @@ def _chart(groups: Sequence[Group], column: str) -> tuple[Chart, dict[str, Curve
     bold = draw_curves(axes, curves, WINDOW if of_batches else 1)
     if len(groups) > 1:
         add_legend(figure)
-    notes = "Thin lines are batches, bold ones means of five. " if of_batches else ""
+    notes = "Thin lines are batches, and bold lines means of five batches. " if of_batches else ""
     values = np.concatenate([curve.values for runs in curves.values() for curve in runs])
     if _cut(axes, values):
         notes += "A few extreme values lie outside the axis. "
@@ -401,7 +401,9 @@ def _episode_chart(groups: Sequence[Group]) -> Chart | None:
         f"{name}: median {number(middle)}, half of them from {number(low)} to {number(high)}"
         for name, (low, middle, high) in quarters.items()
     ]
-    what = "boxes hold half of the episodes, lines are medians, dashed lines means"
+    what = (
+        "Each box holds the middle half of the episodes. Lines are medians, and dashed lines means."
+    )
     alt = f"Box plot of the returns of evaluation episodes. {'. '.join(texts)}."
     return Chart("Evaluation episodes", MetricWords("", what), _svg(figure), alt)
 
@@ -448,7 +450,7 @@ def _findings(groups: Sequence[Group], columns: Iterable[str]) -> list[tuple[Met
                 if share >= _OFTEN:
                     side = "above" if sign > 0 else "below"
                     of = f" of {group.label}" if groups[1:] else ""
-                    text = f"{side} {number(bound)} in {share:.0%} of the batches{of}"
+                    text = f"was {side} {number(bound)} in {share:.0%} of the batches{of}"
                     found.setdefault(words, []).append(text)
     return [(words, ", ".join(texts)) for words, texts in found.items()]
 
@@ -578,6 +580,5 @@ def _render(context: dict[str, Any]) -> str:
 
 
 def _sentence(text: str) -> str:
-    """Escapes a text, formats what is between backticks as code, and adds a full stop."""
-    text = text if text[0] in "`0123456789" else f"{text[0].upper()}{text[1:]}"
-    return re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(f"{text}."))
+    """Escapes sentences, and formats what is between backticks as code."""
+    return re.sub(r"`([^`]*)`", r"<code>\1</code>", html.escape(text))

@@ -51,11 +51,12 @@ def test_the_name_on_the_card(run, tmp_path, capsys):
     card = (tmp_path / "some_agent" / CARD).read_text()
     assert "\n# some_agent\n" in card
     assert "\nlicense: mit\n" in card
-    main(["share", str(run), "--out", str(tmp_path / "other"), "--name", "mine"])
-    card = (tmp_path / "other" / CARD).read_text()
+    other = tmp_path / "new" / "other"  # in a folder that is not there yet
+    main(["share", str(run), "--out", str(other), "--name", "mine"])
+    card = (other / CARD).read_text()
     assert "\n# mine\n" in card
     assert "license" not in card
-    assert load_agent(tmp_path / "other").steps == 7
+    assert load_agent(other).steps == 7
 
 
 def test_a_folder_of_another_is_not_written_into_and_changed_weights_are_named(

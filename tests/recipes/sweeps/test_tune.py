@@ -25,7 +25,7 @@ optuna = pytest.importorskip("optuna")
 
 from recipes.tools.sweeps import tune  # noqa: E402
 from recipes.tools.sweeps.search_space import load_space, with_values  # noqa: E402
-from recipes.tools.sweeps.tune import Search, Settings, importances  # noqa: E402
+from recipes.tools.sweeps.tune import Search, Settings, importances, why_no_importances  # noqa: E402
 
 RECIPE = replace(TINY, name="ppo/cartpole/mine", backbone=mlp(), total_steps=256)
 SPACE: dict[str, Any] = {
@@ -347,6 +347,22 @@ def test_other_algorithms_need_a_space():
         load_space(None, get_recipe("dt/hopper-medium-v2/dt"))
 
 
+def test_fields_are_options_and_a_missing_table_of_importances_is_explained(
+    files, naps, capsys, monkeypatch
+):
+    monkeypatch.setattr(tune, "start", complete)
+    typed = ["--env", "Acrobot-v1", "--seed", "3", "--backbone.network", "lstm"]
+    main([*words(files, 2), *typed])
+    assert "no importance.csv: it takes 4 complete trials, and 2 are complete" in (
+        capsys.readouterr().out
+    )
+    recipe = recipe_from_json((files / "out" / "best.json").read_bytes(), "best.json")
+    assert (recipe.env, recipe.seed) == ("Acrobot-v1", 3)
+    assert recipe.backbone.history.name == "lstm"
+    assert "other settings" in fails(capsys, *words(files, 2))  # without these fields
+    assert "--evn" in fails(capsys, *words(files, 2), "--evn", "Acrobot-v1")
+
+
 @pytest.mark.parametrize("value", [lambda rate: 100 * rate, lambda rate: 1.0])
 def test_the_field_that_decides_is_the_most_important(value):
     study = optuna.create_study(direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
@@ -357,7 +373,8 @@ def test_the_field_that_decides_is_the_most_important(value):
         study.tell(trial, value(rate))
     shares = importances(study)
     if value(0) == value(1):
-        assert shares == {}, "equal values say nothing"
+        assert shares == {}
+        assert why_no_importances(study) == "all complete trials have the same value"
         return
     assert list(shares) == ["learning_rate", "epochs"]
     assert shares["learning_rate"] > 0.6
