@@ -165,7 +165,7 @@ def test_each_module_needs_its_own_word():
     check_names(gym, "recipe.json")
 
 
-def test_what_was_typed_is_asked_for_again_in_another_directory(folder, capsys):
+def test_what_was_typed_is_asked_for_again(folder, capsys):
     short = ["--total-steps", "128", "--steps-per-batch", "128", "--evaluation-episodes", "1"]
     words = ["--wrappers", "gymnasium.wrappers:RecordEpisodeStatistics", "--env", "evilmod:Mine-v0"]
     settings = ["--env-settings", "max_episode_steps=20", "--compile", "off", "--num-envs", "1"]
@@ -177,9 +177,8 @@ def test_what_was_typed_is_asked_for_again_in_another_directory(folder, capsys):
     main(["evaluate", "run", *imports])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCHRL_TIT_IMPORTS", "")
-        patch.chdir(folder / "run")
         with pytest.raises(SystemExit):
-            main(["evaluate", "."])
+            main(["evaluate", "run"])
     line = capsys.readouterr().err.splitlines()[-1]
     assert "add `--import evilmod`" in line
     assert "the run began with `--import" in line

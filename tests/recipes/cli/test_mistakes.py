@@ -52,7 +52,7 @@ MISTAKES = [
     ("share run", "share needs REPO, such as me/cartpole, or --out FOLDER"),
     ("share empty --out new", "holds no checkpoint: train the run first"),
     ("share nowhere --out new", "there is no agent or folder"),
-    ("share run --out run/recipe.json/new", "File exists: "),
+    ("share run --out run/recipe.json/new", "File exists: 'run/recipe.json'"),
     ("share run --out 'a b'", "name must be letters"),
     ("examples", "the following arguments are required: OUT"),
     ("examples run", "run exists already"),
