@@ -7,7 +7,6 @@ import gc
 import os
 import platform
 import random
-import secrets
 import signal
 import sys
 from collections.abc import Generator, Iterator
@@ -80,10 +79,9 @@ def _describe(item: pytest.Item) -> Iterator[str]:
 
 
 @pytest.fixture(autouse=True)
-def _imports(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+def _imports(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test allows to be imported stays its own."""
     monkeypatch.setenv("TORCHRL_TIT_IMPORTS", "")
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / secrets.token_hex(4)))
 
 
 @pytest.fixture

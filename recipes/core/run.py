@@ -31,7 +31,6 @@ from .recipe import Recipe
 from .recipe_json import recipe_from_json, recipe_to_json
 from .records import Records
 from .registry import find_recipe
-from .trust import import_remembered, remember_imports
 
 _IMPORTS = "imports.json"
 _WEIGHTS = "initial_weights"
@@ -103,7 +102,7 @@ class Run:
                 write_text_atomic(folder / _IMPORTS, json.dumps(modules) + "\n")
             if initial_weights is not None:
                 save_checkpoint(folder / _WEIGHTS, 0, initial_weights)
-            run._write_recipe()
+            write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
         return run
 
     @staticmethod
@@ -136,13 +135,9 @@ class Run:
         if not path.is_file():
             raise FileNotFoundError(f"{folder} is not a run folder: there is no {path}")
         try:
-            recipe = find_recipe(str(path))
-            remember_imports(path)
+            return cls(folder, find_recipe(str(path)))
         except ValueError as error:
-            if not import_remembered(path):
-                raise ValueError(f"{error}{_import_hint(folder)}") from error
-            recipe = find_recipe(str(path))
-        return cls(folder, recipe)
+            raise ValueError(f"{error}{_import_hint(folder)}") from error
 
     def read(self, name: str) -> bytes | None:
         """Reads a file of the run.
@@ -185,13 +180,8 @@ class Run:
         if done and recipe != self.recipe and recipe.schedules:
             earlier = [*self.earlier_lengths(), (done, getattr(self.recipe, field))]
             write_text_atomic(self.folder / _LENGTHS, json.dumps(earlier) + "\n")
+        write_text_atomic(self.folder / "recipe.json", recipe_to_json(recipe))
         self.recipe = recipe
-        self._write_recipe()
-
-    def _write_recipe(self) -> None:
-        path = self.folder / "recipe.json"
-        write_text_atomic(path, recipe_to_json(self.recipe))
-        remember_imports(path)
 
     def earlier_lengths(self) -> list[tuple[int, int]]:
         """Returns the lengths that the run's schedules followed before the recipe's.

@@ -13,27 +13,15 @@ read and never run (:mod:`torchrl_tit.datasets`).
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib import import_module
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Any
 
-from torchrl_tit.files import write_text_atomic
-from torchrl_tit.settings.imports import (
-    GROUP,
-    allow,
-    allowed_modules,
-    import_allowed,
-    is_named,
-    load_plugins,
-)
+from torchrl_tit.settings.imports import GROUP, allow, is_named, load_plugins
 from torchrl_tit.settings.literals import parse_call
 
 from .recipe import Recipe
@@ -123,42 +111,6 @@ def allow_names(recipe: Recipe) -> None:
     for _, module in list(_not_listed(recipe)):
         if all(part.isidentifier() for part in module.split(".")):  # others cannot be imported
             allow(module)
-
-
-def remember_imports(recipe: Path) -> None:
-    """Remembers what the user named in this process for the recipe of a run.
-
-    It is kept in the user's own folder for states, never beside the run, which can come from a
-    stranger. It holds for a file with the same bytes, and in the current directory, from which a
-    module is imported: there, ``--import`` need not be typed again.
-
-    Args:
-        recipe: the run's recipe.json.
-    """
-    file, text = _remembered(recipe), json.dumps(allowed_modules())
-    if allowed_modules() and not (file.is_file() and file.read_text(encoding="utf-8") == text):
-        with suppress(OSError):  # without a folder to write to, users type it again
-            file.parent.mkdir(parents=True, exist_ok=True)
-            write_text_atomic(file, text)
-
-
-def import_remembered(recipe: Path) -> bool:
-    """Imports what the user named before for a run; returns whether there is any such module.
-
-    Raises:
-        ImportError: if a module is no longer there.
-    """
-    file = _remembered(recipe)
-    modules = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else []
-    for module in modules:
-        import_allowed(module)
-    return bool(modules)
-
-
-def _remembered(recipe: Path) -> Path:
-    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    key = hashlib.sha256(recipe.read_bytes() + os.getcwd().encode())
-    return Path(home, "torchrl-tit", "imports", f"{key.hexdigest()}.json")
 
 
 def may_name_task(name: object) -> bool:
