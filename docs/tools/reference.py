@@ -6,7 +6,8 @@ docs/reference/metrics.md       the columns of metrics.csv
 docs/reference/api.md           the public names of each package
 build/docs/reference/api/*.md   a page of the site for each package, which mkdocstrings fills in
 
-In docs/ they are between ``<!-- reference: NAME.md -->`` and ``<!-- end -->``; a test compares them.
+In docs/ they are between ``<!-- reference: NAME.md -->`` and ``<!-- end -->``; a test compares
+them.
 The site needs none of this library's dependencies: they are imported here, in its environment.
 """
 

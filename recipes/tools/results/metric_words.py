@@ -44,15 +44,15 @@ def words_of(algorithm: str, column: str) -> MetricWords:
 
     Example:
         >>> words_of("ppo", "clip_fraction").what
-        'This is the share of the samples whose probability ratio was clipped.'
+        'The share of the samples whose probability ratio was clipped.'
         >>> words_of("dt", "return_3600").what
-        'This is the mean return of the evaluation that aims for 3600.'
+        'The mean return of the evaluation that aims for 3600.'
     """
     found = _read()
     known = next((found[of, column] for of in _family(algorithm) if (of, column) in found), None)
     if known is None and _TARGET.fullmatch(column):
         target = column.removeprefix("return_")
-        what = f"This is the mean return of the evaluation that aims for {target}."
+        what = f"The mean return of the evaluation that aims for {target}."
         return MetricWords(column, what)
     return known or MetricWords(column, "")
 
@@ -63,6 +63,11 @@ def known_columns(algorithm: str) -> list[str]:
     return [column for of, column in _read() if of in family]
 
 
+def own_columns(algorithm: str) -> list[str]:
+    """Lists those that an algorithm adds to the ones of the algorithm it is a subclass of."""
+    return [column for of, column in _read() if of == algorithm]
+
+
 def _family(algorithm: str) -> list[str]:
     """An algorithm, those whose recipes its own is a subclass of, and all of them, ""."""
     kinds = get_recipe_class(algorithm).__mro__
@@ -71,8 +76,13 @@ def _family(algorithm: str) -> list[str]:
 
 def to_markdown(algorithm: str) -> str:
     """Writes the table of an algorithm's metrics for the documentation."""
-    lines = ["| column | what it is | healthy | otherwise |", "|---|---|---|---|"]
-    for column in known_columns(algorithm):
+    _, *above = (name for name in _family(algorithm) if name)
+    own = own_columns(algorithm)
+    if above and not own:
+        return f"Those of `{above[0]}`.\n"
+    lines = [f"Beside those of `{above[0]}`:", ""] if above else []
+    lines += ["| column | what it is | healthy | otherwise |", "|---|---|---|---|"]
+    for column in own if above else known_columns(algorithm):
         words = words_of(algorithm, column)
         lines.append(f"| `{column}` | {words.what} | {words.healthy} | {words.otherwise} |")
     return "\n".join(lines) + "\n"

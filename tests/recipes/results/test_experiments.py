@@ -71,7 +71,6 @@ def test_limits():
 def test_columns_that_are_not_known():
     assert words_of("ppo", "mine").what == ""
     assert (
-        words_of("dt", "return_-20").what
-        == "This is the mean return of the evaluation that aims for -20."
+        words_of("dt", "return_-20").what == "The mean return of the evaluation that aims for -20."
     )
     assert words_of("dt", "return_scale").what == ""

@@ -93,7 +93,7 @@ def test_what_a_page_says_of_one_run(alone):
         f"torchrl-tit train {TIT} --seed 0",
         "torch 2.13.0",
         "No film of enhanced-tit: there is no checkpoint.",
-        "This is how far the policy moved from the one that collected the batch",
+        "How far the policy moved from the one that collected the batch",
         "Healthy: It is between 0.003 and 0.02.",
         "If it is larger, choose a lower learning_rate",
         "These are the same in all rows: epochs 10.",
