@@ -45,7 +45,7 @@ from torchrl_tit.settings.numbers import (
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 from torchrl_tit.transforms import SequenceHistory
 
-from .core.algorithm import Stateful, Terms, check_finite, total_loss
+from .core.algorithm import Stateful, Terms, check_without_waiting, storage_device, total_loss
 from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import Outcome
 from .core.networks import normalize_frames
@@ -252,7 +252,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         for encoder in self.model.network.frames:
             if isinstance(encoder, NormalizedFrames):
                 encoder.set_statistics(*episodes.observation_statistics(encoder.samples))
-        return episodes.to(self.device)
+        return episodes.to(storage_device(recipe))
 
     def make_storage(self, episodes: Episodes) -> SequenceStorage:
         """Cuts windows out of episodes."""
@@ -376,7 +376,7 @@ class DTAlgorithm(SequenceAlgorithm[DT]):
         self.optimizer.zero_grad()
         loss.backward()
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.recipe.max_grad_norm)
-        check_finite(self.columns[:2], torch.stack([loss.detach(), norm]))
+        check_without_waiting(self.columns[:2], torch.stack([loss.detach(), norm]))
         self.optimizer.step()
         return {"loss": loss.detach(), "gradient_norm": norm, "learning_rate": learning_rate}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import closing
@@ -31,7 +32,7 @@ from torchrl_tit.datasets import (
     make_replay_buffer,
     split_episodes,
 )
-from torchrl_tit.datasets.checks import check_actions
+from torchrl_tit.datasets.checks import check_actions, check_shape
 from torchrl_tit.envs import make_env, observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
@@ -45,8 +46,10 @@ from .core.algorithm import (
     LearnsFromSamples,
     Stateful,
     Terms,
-    check_finite,
+    check_without_waiting,
     numbers,
+    storage_device,
+    to_networks,
 )
 from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import HeldOut, Outcome
@@ -65,7 +68,7 @@ DatasetRecipeT = TypeVar("DatasetRecipeT", bound=DatasetRecipe)
 
 
 def read_data(recipe: DatasetRecipe) -> Episodes:
-    """Reads the data set of a recipe.
+    """Reads the data set of a recipe, unless it is the one that was read last and has not changed.
 
     Raises:
         FileNotFoundError: if there are no such data.
@@ -77,14 +80,51 @@ def read_data(recipe: DatasetRecipe) -> Episodes:
             f"{recipe.name or recipe.algorithm} is a recipe for any data: name them with "
             "--dataset FILE"
         )
-    settings, spaces = recipe.reading(), recipe.task_settings
-    if not recipe.env and "observation_shape" in spaces:
-        shape = tuple(spaces["observation_shape"])
-        action: Space = Box(-np.inf, np.inf, (np.size(spaces.get("low", ())),))
-        if "num_actions" in spaces:
-            action = Discrete(spaces["num_actions"])
-        settings["task"] = TaskSpaces(Box(-np.inf, np.inf, shape), action, "the recipe")
-    return load_episodes(recipe.dataset, **settings)
+    path = Path(recipe.dataset)
+    files = [path, *path.rglob("*")] if path.is_dir() else [path]
+    stamps = {file: file.stat().st_mtime_ns for file in files if file.exists()}
+    key = recipe.dataset, path.absolute(), recipe.reading(), stamps
+    if key != _NEWEST.key:
+        _NEWEST.key, _NEWEST.episodes = None, None  # frees their memory first
+        _NEWEST.episodes = load_episodes(recipe.dataset, **recipe.reading())
+        _NEWEST.key = key
+    episodes, spaces = _NEWEST.episodes, recipe.task_settings
+    assert episodes is not None
+    if recipe.env or "observation_shape" not in spaces:
+        return episodes
+    return _checked(episodes, spaces)
+
+
+@dataclass
+class _Newest:
+    """The episodes that were read last, and from what: commands need them more than once."""
+
+    key: Any = None
+    episodes: Episodes | None = None
+
+
+_NEWEST = _Newest()
+
+
+def _checked(episodes: Episodes, spaces: Mapping[str, Any]) -> Episodes:
+    """Checks episodes against spaces that other data said, and reshapes discrete actions to [R].
+
+    Raises:
+        DatasetError: if shapes differ, or an action is outside.
+    """
+    source, rows = episodes.source, episodes.rows.copy()
+    observation, action = Box(-np.inf, np.inf, tuple(spaces["observation_shape"])), rows["action"]
+    if "num_actions" in spaces:
+        space: Space = Discrete(spaces["num_actions"])
+        rows["action"] = action = action.squeeze(-1) if action.shape[1:] == (1,) else action
+    else:
+        low, high = (np.atleast_1d(np.float32(spaces[name])) for name in ("low", "high"))
+        space = Box(low, high)
+    task = TaskSpaces(observation, space, "the recipe")
+    check_shape(source, "observations", tuple(rows["observation"].shape[1:]), observation, task)
+    check_shape(source, "actions", tuple(action.shape[1:]), space, task)
+    check_actions(source, action[episodes.step_rows].numpy(), space)
+    return replace(episodes, rows=rows)
 
 
 def with_spaces(recipe: DatasetRecipeT) -> DatasetRecipeT:
@@ -112,20 +152,31 @@ def with_spaces(recipe: DatasetRecipeT) -> DatasetRecipeT:
         "observation_shape": list(observation.shape[1:]),
         "observation_dtype": kind,
     }
-    steps = action[episodes.step_rows]
-    if not action.is_floating_point():
+    steps, discrete = action[episodes.step_rows], not action.is_floating_point()
+    if steps.shape[1:] not in ((), (1,)) if discrete else steps.ndim != 2:
+        problem = (
+            f"are {action.dtype} {list(steps.shape)}: store continuous actions as floats [N, A], "
+            "and one choice as integers [N]."
+        )
+        raise DatasetError(episodes.source, problem, "actions")
+    if discrete:
         found["num_actions"] = int(steps.max()) + 1
     else:
         low, high = steps.amin(0), steps.amax(0)
         if low.min() >= -1 and high.max() <= 1:
             low, high = -torch.ones_like(low), torch.ones_like(high)
         constant = low == high
+        for entry in constant.nonzero().flatten().tolist():
+            warnings.warn(
+                f"{episodes.source}: entry {entry} of all actions is {low[entry]:g}, so its bounds "
+                f"are {low[entry] - 1:g} and {high[entry] + 1:g}",
+                stacklevel=2,
+            )
         found |= {"low": (low - 1.0 * constant).tolist(), "high": (high + 1.0 * constant).tolist()}
         make_env("", **{**found, **known}).close()  # checks what the recipe has already
-        lowest, highest = (np.array({**found, **known}[x], np.float32) for x in ("low", "high"))
-        check_actions(episodes.source, steps.numpy(), Box(lowest, highest))
-    settings = tuple(f"{name}={value}" for name, value in {**found, **known}.items())
-    return replace(recipe, env_settings=settings)
+    settings = {**found, **known}
+    _checked(episodes, settings)
+    return replace(recipe, env_settings=tuple(f"{x}={value}" for x, value in settings.items()))
 
 
 _MOST_MEASURED = 10_000
@@ -188,7 +239,7 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
             self.split(read_data(recipe))
         episodes = episodes or self._held_out
         assert episodes is not None
-        episodes = episodes.to(self.device)
+        episodes = episodes.to(storage_device(recipe))
         items, length = self.measured_items(episodes), getattr(recipe, "slice_length", 1)
         starts = torch.arange(0, len(items) - length + 1, max(1, len(items) // _MOST_MEASURED))
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
@@ -201,8 +252,8 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
             set_exploration_type(ExplorationType.DETERMINISTIC),
         ):
             torch.manual_seed(recipe.evaluation_seed)
-            for part in index.to(self.device).split(max(1, _MEASURED_AT_ONCE // length)):
-                means = self.measure_batch(items.get(part))
+            for part in index.to(items.device).split(max(1, _MEASURED_AT_ONCE // length)):
+                means = self.measure_batch(to_networks(items.get(part), self.device))
                 for name in sums:
                     sums[name] += means[name].item() * len(part)
         values = {name: total / len(index) for name, total in sums.items()}
@@ -221,7 +272,7 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
     def batches(self) -> Iterator[TensorDictBase]:
         """Yields batches from the replay buffer forever."""
         while True:
-            yield self.buffer.sample()
+            yield to_networks(self.buffer.sample(), self.device)
 
     def check(self) -> None:
         """Lets the policy act once in the task, and reads the data unless they are remote."""
@@ -352,7 +403,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
                 )
             if recipe.normalize_observations and not observation.dtype.is_floating_point:
                 raise ValueError(
-                    f"normalize_observations is on, but observations of {recipe.env} are "
+                    f"normalize_observations is on, but observations of {recipe.task_name} are "
                     f"{observation.dtype}, not floats: switch it off"
                 )
             self.model = self.networks(task).to(self.device)
@@ -434,7 +485,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         recipe, episodes = self.recipe, self.load_data()
         if recipe.normalize_observations:
             self._set_statistics(episodes)
-        storage = self.measured_items(episodes.to(self.device))
+        storage = self.measured_items(episodes.to(storage_device(recipe)))
         length = recipe.slice_length
         return make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed, slice_length=length)
 
@@ -475,14 +526,9 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         return torch.stack(values).amin(0)
 
     def numbers(self, terms: Terms) -> Mapping[str, Tensor]:
-        """Selects and checks the numbers that an update returns.
-
-        On a GPU, checking would have to wait for it, so the runner checks there instead, less
-        often.
-        """
+        """Selects and checks the numbers that an update returns."""
         values = numbers(self.columns, terms)
-        if values.device.type == "cpu":
-            check_finite(self.columns, values)
+        check_without_waiting(self.columns, values)
         return dict(zip(self.columns, values, strict=True))
 
     def play(self, step: int) -> list[Outcome]:

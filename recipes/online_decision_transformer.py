@@ -46,7 +46,7 @@ from torchrl_tit.settings.numbers import (
 )
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
-from .core.algorithm import Stateful, check_finite, total_loss
+from .core.algorithm import Stateful, check_without_waiting, to_networks, total_loss
 from .core.task import seed_copies
 from .decision_transformer import ActionSpace, SequenceAlgorithm, SequenceRecipe
 
@@ -209,7 +209,7 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
         while True:
             if self.recipe.round_begins(self.step):
                 self.buffer.add(self.explore(self.buffer.rounds))
-            yield self.buffer.sample()
+            yield to_networks(self.buffer.sample(), self.device)
 
     def loss(self, samples: TensorDictBase) -> TensorDictBase:
         """Returns the terms of the loss; see :meth:`SequenceAlgorithm.loss`."""
@@ -226,7 +226,7 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
         total_loss(terms).backward()
         norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.recipe.max_grad_norm)
         values = torch.stack([*(terms[name].detach() for name in _TERMS), norm])
-        check_finite(self.columns[: len(values)], values)
+        check_without_waiting(self.columns[: len(values)], values)
         for optimizer in (self.optimizer, self.alpha_optimizer):
             optimizer.step()
         self.step = step + 1
@@ -317,7 +317,8 @@ class OnlineData:
             order = self._episodes.returns[finished.cpu()].argsort(stable=True)
             best = finished[order.to(finished.device)][-self._capacity :]
             self._episodes = select_episodes(self._episodes, best)
-        joined = join_episodes([self._episodes, episodes])
+        device = self._episodes.lengths.device
+        joined = join_episodes([self._episodes, episodes.to(device)])
         oldest = max(0, len(joined.lengths) - self._capacity)
         index = joined.lengths.new_tensor(range(oldest, len(joined.lengths)))
         self._episodes = select_episodes(joined, index)

@@ -18,9 +18,18 @@ from torchrl.envs import EnvBase
 
 from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_checkpoint
 from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
+from torchrl_tit.settings.choices import Device
 from torchrl_tit.settings.numbers import Batch, Steps, Weight
 
-from .core.algorithm import LearnsFromSamples, Stateful, Terms, check_finite, numbers
+from .core.algorithm import (
+    LearnsFromSamples,
+    Stateful,
+    Terms,
+    check_finite,
+    numbers,
+    storage_device,
+    to_networks,
+)
 from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
 
@@ -52,6 +61,9 @@ class ReplayRecipe(OnlineRecipe):
     slice_length: Batch = 1
     """Number of consecutive steps that are drawn together, so that a backbone encodes their frames
     once; must divide batch_size. 1 draws transitions one by one."""
+    storage_device: Device = "cpu"
+    """Device of the stored data, from which batches are moved to the networks; those on the CPU
+    store data there, too. "cuda" is faster if all data fit on the GPU."""
     log_interval: Steps = 1000
     """Environment steps between rows of metrics."""
 
@@ -127,7 +139,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
             ndim=2,
             padding=recipe.padding,
             is_init=recipe.slice_length > 1,
-            device=self.device,
+            device=storage_device(recipe),
         )
         self.buffer = ReplayBuffer(
             storage=storage,
@@ -154,7 +166,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         done = (step - recipe.random_steps) // recipe.steps_per_batch * recipe.updates_per_batch
         self.policy.train()
         for number in range(done, done + recipe.updates_per_batch):
-            terms = self.learn(self.buffer.sample(), number)
+            terms = self.learn(to_networks(self.buffer.sample(), self.device), number)
         self.policy.eval()
         values = numbers(self.columns, terms)
         check_finite(self.columns, values)

@@ -12,7 +12,6 @@ import os
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, get_args
 
 import pytest
@@ -32,6 +31,7 @@ from torchrl.data import (
 from torchrl.modules import TanhModule, set_recurrent_mode
 
 from recipes.core import networks, task
+from recipes.core.algorithm import to_networks
 from recipes.core.recipe import Recipe
 from recipes.ppo import PPO, Minibatch
 from recipes.replay import _STORED as STORED
@@ -171,14 +171,21 @@ def test_squashed_actor_and_value() -> None:
 class Agreeing(TorchDispatchMode):
     """Answers what is asked about tensors without numbers: yes, and 1."""
 
+    asked = 0
+    """How often a number was read back."""
+
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         first = args[0] if args and isinstance(args[0], Tensor) else None
         if first is not None and first.is_meta:
             if func is torch.ops.aten._local_scalar_dense.default:
+                self.asked += 1
                 return torch.ones((), dtype=first.dtype, device="cpu").item()
             if func is torch.ops.aten.is_set_to.default:
                 return False
         return func(*args, **(kwargs or {}))
+
+
+UNASKED = ("dqn", "bc", "iql", "discrete-cql", "dt")  # TorchRL's TanhNormal asks for its bounds
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -197,17 +204,27 @@ def test_updates_of_each_algorithm(
     for kind in (torch.optim.Adam, torch.optim.AdamW):  # fused ones do not run on "meta"
         plain = partial(optimizer, kind)
         monkeypatch.setattr(torch.optim, kind.__name__, plain)
-    with Agreeing():
+    with Agreeing() as agreeing:
         algorithm = make_algorithm(replace(recipe, device="meta"))
         algorithm.make_collector = lambda *_, **__: None
-        algorithm.make_buffer = lambda: SimpleNamespace(newest_return=0.0)
         algorithm.prepare(0, tmp_path)
+        if isinstance(algorithm, ReplayAlgorithm):
+            algorithm.buffer.extend(batch)
+            batch = to_networks(algorithm.buffer.sample(), DEVICE)
+        elif not isinstance(recipe, PPO):
+            batch = next(algorithm.batches())
+        if not isinstance(recipe, PPO):  # the data stay on the CPU
+            stored = algorithm.buffer.sample()
+            assert {x.device.type for x in stored.values(True, True)} == {"cpu"}
+        agreeing.asked = 0
         if isinstance(recipe, PPO):
             terms = algorithm._step(batch)
         elif isinstance(algorithm, ReplayAlgorithm):
             terms = algorithm.learn(batch, 0)
         else:
             terms = algorithm.update(batch, 0)
+    if name.split(",")[0] in UNASKED:
+        assert not agreeing.asked, "a GPU would be waited for"
     terms = {"terms": terms} if isinstance(terms, Tensor) else terms
     assert {x.device.type for x in terms.values() if isinstance(x, Tensor)} == {"meta"}
     assert {x.device.type for x in algorithm.model.parameters()} == {"meta"}
@@ -228,8 +245,7 @@ def batch_of(recipe: Recipe, folder: Path) -> Any:
     algorithm.prepare(0, folder)
     batch = next(iter(algorithm.batches()))
     if isinstance(algorithm, ReplayAlgorithm):
-        algorithm.buffer.extend(algorithm.collected(batch).select(*STORED, strict=False))
-        batch = algorithm.buffer.sample()
+        return algorithm.collected(batch).select(*STORED, strict=False)
     if isinstance(recipe, PPO):
         with torch.no_grad():
             batch = algorithm.collected(batch)
@@ -238,4 +254,4 @@ def batch_of(recipe: Recipe, folder: Path) -> Any:
         steps, frames, windows = next(algorithm.minibatches(batch, rollout))
         windows = windows._replace(rows=windows.rows.to(DEVICE))
         return Minibatch(steps.to(DEVICE), [x.to(DEVICE) for x in frames], windows)
-    return batch.to(DEVICE)
+    return batch

@@ -44,6 +44,8 @@ def start(
     _check_wandb(wandb)
     algorithm = make_algorithm(recipe)
     algorithm.check()
+    if algorithm.recipe.env_settings != recipe.env_settings:
+        say(f"taken from the data: {', '.join(algorithm.recipe.env_settings)}")
     weights = None
     if init_from is not None:
         weights, report = weights_from(init_from, algorithm)

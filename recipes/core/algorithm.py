@@ -226,6 +226,33 @@ def torch_device(device: str) -> torch.device:
         ) from error
 
 
+def storage_device(recipe: Any) -> torch.device:
+    """Returns the PyTorch device for a recipe's ``storage_device``; beside networks on the CPU, it.
+
+    Raises:
+        ValueError: if there is no such device.
+    """
+    own = torch_device(recipe.device)
+    return own if own.type == "cpu" else torch_device(recipe.storage_device)
+
+
+def to_networks(batch: TensorDictBase, device: torch.device) -> TensorDictBase:
+    """Moves a batch of stored data to the networks' device, through pinned memory to a GPU.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> batch = TensorDict({"reward": torch.ones(8, 1)}, [8])
+        >>> to_networks(batch, torch.device("meta"))["reward"].device
+        device(type='meta')
+    """
+    stored = next(iter(batch.values(True, True))).device
+    if stored == device:
+        return batch
+    if device.type == "cuda" and stored.type == "cpu":
+        return batch.pin_memory().to(device, non_blocking=True)
+    return batch.to(device)
+
+
 def load_weights(networks: Stateful, weights: Mapping[str, Any]) -> None:
     """Loads weights strictly: names, shapes and dtypes must match, and values must be finite.
 
@@ -298,6 +325,16 @@ def check_finite(names: Sequence[str], values: Tensor) -> None:
     if not finite.all():
         index = int(finite.logical_not().nonzero()[0])
         raise NotFiniteError(f"{names[index]} became {values[index].item()}")
+
+
+def check_without_waiting(names: Sequence[str], values: Tensor) -> None:
+    """As :func:`check_finite`, on the CPU only.
+
+    Reading a number back from a GPU waits for all its work, so what is there is checked by the
+    runner, before it writes metrics or a checkpoint.
+    """
+    if values.device.type == "cpu":
+        check_finite(names, values)
 
 
 @contextmanager

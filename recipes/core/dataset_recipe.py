@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from torchrl_tit.settings.choices import Gaps
+from torchrl_tit.settings.choices import Device, Gaps
 from torchrl_tit.settings.numbers import Batch, Probability, Steps
 
 from .recipe import Recipe
@@ -36,6 +36,9 @@ class DatasetRecipe(Recipe):
     follows: "error" refuses the data, "cut" ends the episode there."""
     batch_size: Batch = 64
     """Batch size of a gradient step."""
+    storage_device: Device = "cpu"
+    """Device of the stored data, from which batches are moved to the networks; those on the CPU
+    store data there, too. "cuda" is faster if all data fit on the GPU."""
     log_interval: Steps = 100
     """Gradient steps between rows of metrics."""
     checkpoint_interval: Steps = 1000

@@ -159,7 +159,7 @@ class Recipe:
             )
 
 
-_OF_THE_MACHINE = ("device", "threads", "compile", "checkpoint_interval")
+_OF_THE_MACHINE = ("device", "storage_device", "threads", "compile", "checkpoint_interval")
 
 
 def experiment_of(recipe: Recipe) -> Recipe:

@@ -190,8 +190,18 @@ def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:
     data = episodes_from_arrays(**arrays, gaps="cut")
 
     arrays["timeouts"][row] = True
-    assert (data.rows == episodes_from_arrays(**arrays).rows).all()
+    expected = episodes_from_arrays(**arrays).rows
+    assert (data.rows == expected).all()
     assert (row + 1 - start) in data.lengths
+    arrays["timeouts"][row] = False
+    arrays["next_observations"][row, 4] -= 1
+    times = np.arange(len(arrays["rewards"])) * 0.01
+    times[row + 1 :] += 0.01  # a step was not recorded
+    with pytest.raises(DatasetError, match=f"'timestamps', row {row + 1}: .* interval, 0.01, or"):
+        episodes_from_arrays(**arrays, timestamps=times)
+    arrays["next_observations"][row, 4] += 1
+    data = episodes_from_arrays(**arrays, timestamps=times, gaps="cut")
+    assert (data.rows == expected).all()
 
 
 def test_writing_is_lossless_and_never_overwrites(tmp_path: Path, rolled: Transitions) -> None:

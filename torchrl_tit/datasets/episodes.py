@@ -131,7 +131,7 @@ class Episodes:
         Returns:
             Mean and population standard deviation, float32 [*sample] each, for
             :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`. The deviation of a constant
-            entry of an array is 1, so that it is not amplified if it changes later.
+            entry of an array is 1, with a warning, so that it is not amplified if it changes later.
         """
         count, total = 0, torch.zeros((), dtype=torch.float64)
         for chunk in map(samples, self._observations()):
@@ -142,7 +142,14 @@ class Episodes:
             squares += chunk.double().sub_(mean).square_().sum(0)
         std = (squares / count).sqrt().float()
         if mean.ndim == 1:  # pixels of an image have the statistics of their channel
-            std = std.where(std > 1e-7 * mean.abs(), 1.0)  # less is rounding
+            varies = std > 1e-7 * mean.abs()  # less is rounding
+            std = std.where(varies, 1.0)
+            if constant := (~varies).nonzero().flatten().tolist():
+                warnings.warn(
+                    f"{self.source}: entries {', '.join(map(str, constant))} of the observations "
+                    "are constant, so they are not divided by their deviation",
+                    stacklevel=2,
+                )
         return mean.float(), std
 
     def _observations(self) -> Iterator[Tensor]:
@@ -238,8 +245,8 @@ def _split_single(episodes: Episodes, fraction: float) -> tuple[Episodes, Episod
     if place < 1:
         raise DatasetError(
             episodes.source,
-            "has a single finished episode of one step, of which nothing can be held out: set "
-            "validation_fraction to 0.",
+            "has a single finished episode of one step, of which nothing can be held out: record "
+            "more.",
         )
     warnings.warn(
         f"{episodes.source} has a single finished episode: its last {length - place} of {length} "

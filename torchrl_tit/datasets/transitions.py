@@ -110,8 +110,9 @@ def episodes_from_transitions(
         source: name of the source, for error messages.
         task: the task whose shapes and action bounds the data must have; not checked if None.
         max_episode_steps: the time limit of data without ``timeouts``.
-        gaps: what to do where ``next_observations`` is not the observation of the next row within
-            an episode: ``"error"`` raises, ``"cut"`` truncates the episode there.
+        gaps: what to do where, within an episode, ``next_observations`` is not the observation of
+            the next row, or ``timestamps`` are more than one and a half times their median interval
+            apart: ``"error"`` raises, ``"cut"`` truncates the episode there.
         dtype: the dtype for floats; None keeps that of each field. Integers stay integers.
         directory: folder for the memory-mapped rows; see
             :func:`~torchrl_tit.datasets.episodes.memory_mapped_rows`.
@@ -128,8 +129,7 @@ def episodes_from_transitions(
             ``dtype`` is not a floating-point dtype.
         DatasetError: if a field is missing or empty, has the wrong length, shape or dtype, or
             contains NaN, infinity, or actions out of bounds; if no episode ends; or if, within an
-            episode, ``next_observations`` is not the observation of the next row, or ``timestamps``
-            go backwards.
+            episode, there are gaps or ``timestamps`` go backwards.
 
     Example:
         >>> fields = {"observations": np.zeros((2, 3)), "rewards": np.zeros(2)}
@@ -143,14 +143,14 @@ def episodes_from_transitions(
     if task is not None:
         check_task_name(source, (attributes or {}).get("env_id"), task)
     reader = _Reader(fields, source, task, dtype)
-    terminated = reader.flags("terminals")
+    terminated, times = reader.flags("terminals"), _times(reader)
     if lengths is None:
-        truncated = _truncations(reader, terminated, max_episode_steps, gaps)
+        truncated = _truncations(reader, terminated, max_episode_steps, gaps, times)
         ends = terminated | truncated
         if not ends.any():
-            hint = "; give max_episode_steps if there is a time limit"
-            hint = "" if "timeouts" in fields else hint
-            raise DatasetError(source, f"no episode ends in its {reader.num_rows} rows{hint}.")
+            hint = "" if "timeouts" in fields else ", or give max_episode_steps"
+            problem = f"no episode ends in its {reader.num_rows} rows: mark the last row of each"
+            raise DatasetError(source, f"{problem} in 'timeouts'{hint}.")
         ends[-1] = True
     else:
         truncated = reader.flags("timeouts")
@@ -160,8 +160,8 @@ def episodes_from_transitions(
             problem = "ends the episode, but more steps follow."
             raise DatasetError(source, problem, "terminals", int(inside.argmax()))
 
-    if fields.get(TIMESTAMPS) is not None:
-        _check_times(reader, ends)
+    if times is not None:
+        _check_times(source, times, ends)
     last_steps = np.flatnonzero(ends)
     rows = memory_mapped_rows(reader.num_rows + len(last_steps), reader.row_fields(), directory)
     # The final observation of an episode is an additional row, so all later rows move by one.
@@ -302,13 +302,19 @@ class _Reader:
 
 
 def _truncations(
-    reader: _Reader, terminated: NDArray, max_episode_steps: int | None, gaps: Gaps
+    reader: _Reader,
+    terminated: NDArray,
+    max_episode_steps: int | None,
+    gaps: Gaps,
+    times: NDArray | None,
 ) -> NDArray:
     """Where episodes were truncated; bool [N]."""
     marked = "timeouts" in reader.fields
     truncated = reader.flags("timeouts") if marked else np.zeros_like(terminated)
     if "next_observations" in reader.fields and (gaps == "cut" or not marked):
         truncated |= _gaps(reader) & ~terminated
+    if times is not None and gaps == "cut":
+        truncated |= _pauses(times)[0] & ~terminated
     if max_episode_steps is not None and not marked:
         ends = np.flatnonzero(terminated | truncated)
         for before, last in pairwise([-1, *ends, reader.num_rows - 1]):
@@ -317,21 +323,38 @@ def _truncations(
     return truncated
 
 
-def _check_times(reader: _Reader, ends: NDArray) -> None:
-    """Checks that the steps of an episode are in chronological order; ends bool [N]."""
+def _times(reader: _Reader) -> NDArray | None:
+    """The times of the steps, [N], if there are any."""
+    if reader.fields.get(TIMESTAMPS) is None:
+        return None
     with damage_named(reader.source, "cannot be read", TIMESTAMPS):
         times = np.asarray(reader.fields[TIMESTAMPS]).reshape(-1)
     if len(times) != reader.num_rows or times.dtype.kind not in "iuf":
         problem = f"must be {reader.num_rows} numbers, one for each row."
         raise DatasetError(reader.source, problem, TIMESTAMPS)
-    backwards = ~(times[1:] >= times[:-1]) & ~ends[:-1]  # also where it is NaN
-    if backwards.any():
-        row = int(backwards.argmax()) + 1
-        problem = (
-            f"is {times[row]} after {times[row - 1]}, within an episode: sort the rows by time, or "
-            "mark where episodes end."
-        )
-        raise DatasetError(reader.source, problem, TIMESTAMPS, row)
+    return times
+
+
+def _pauses(times: NDArray) -> tuple[NDArray, float]:
+    """Where the next row comes too late for the next step, bool [N], and the usual interval."""
+    intervals = np.diff(times.astype(np.float64))
+    usual = float(np.median(intervals)) if len(intervals) else 0.0
+    late = (intervals > 1.5 * usual) & (usual > 0)  # not where only the second is recorded
+    return np.append(late, False), usual
+
+
+def _check_times(source: str, times: NDArray, ends: NDArray) -> None:
+    """Checks that the steps of an episode are in order, one period apart; ends bool [N]."""
+    backwards = np.append(~(times[1:] >= times[:-1]), False)  # also where it is NaN
+    pauses, usual = _pauses(times)
+    for problem, wrong in {
+        "sort the rows by time, or mark where episodes end": backwards,
+        f'resample them to their usual interval, {usual:g}, or gaps="cut" truncates it': pauses,
+    }.items():
+        if (inside := wrong & ~ends).any():
+            row = int(inside.argmax()) + 1
+            problem = f"is {times[row]} after {times[row - 1]}, within an episode: {problem}."
+            raise DatasetError(source, problem, TIMESTAMPS, row)
 
 
 def _gaps(reader: _Reader) -> NDArray:

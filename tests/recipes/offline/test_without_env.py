@@ -8,11 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 import torch
 
+from recipes import offline
 from recipes.cli import main
 from recipes.core import runner
 from recipes.core.evaluation import score_of
@@ -41,7 +41,7 @@ from tests.recipes.small import (
     train,
 )
 from torchrl_tit import load_agent
-from torchrl_tit.datasets import DatasetError
+from torchrl_tit.datasets import DatasetError, load_episodes
 from torchrl_tit.evaluation_file import check_evaluation
 
 RECIPES = {
@@ -145,17 +145,42 @@ def test_an_environment_and_held_out_episodes(tmp_path):
     assert returns[best] == max(returns[9], returns[18])  # not by the error
 
 
+def test_data_are_read_once_and_again_if_they_change(tmp_path, monkeypatch):
+    recipe, read = RECIPES["dt"](tmp_path), []
+
+    def load(source, **settings):
+        read.append(source)
+        return load_episodes(source, **settings)
+
+    monkeypatch.setattr(offline, "load_episodes", load)
+    algorithm = make_algorithm(recipe)
+    algorithm.check()
+    runner.evaluate(train(algorithm.recipe, tmp_path / "run"))
+    assert len(read) == 1
+    log_machine(Path(recipe.dataset))
+    with pytest.raises(DatasetError, match="but in the recipe it is"):
+        read_data(algorithm.recipe)
+    assert len(read) == 2
+
+
 @pytest.mark.parametrize(
-    ("actions", "low", "high"),
+    ("actions", "low", "high", "warned"),
     [
-        (np.linspace(-0.5, 0.9, 400).reshape(200, 2), [-1, -1], [1, 1]),
-        (np.stack([np.linspace(0, 90, 200), np.full(200, 40)], 1), [0, 39], [90, 41]),
+        (np.linspace(-0.5, 0.9, 400).reshape(200, 2), [-1, -1], [1, 1], []),
+        (
+            np.stack([np.linspace(0, 90, 200), np.full(200, 40)], 1),
+            [0, 39],
+            [90, 41],
+            ["entry 1 of all actions is 40, so its bounds are 39 and 41"],
+        ),
     ],
     ids=["within -1 to 1", "others, one of them constant"],
 )
-def test_spaces_of_the_data(tmp_path, actions, low, high):
+def test_spaces_of_the_data(tmp_path, actions, low, high, warned, recwarn):
     data = log_machine(tmp_path / "log.hdf5", actions=actions)
     recipe = with_spaces(BC(dataset=str(data), backbone=SMALL))
+    ours = [str(x.message) for x in recwarn if str(data) in str(x.message)]
+    assert ours == [f"{data}: {text}" for text in warned]
     assert recipe.task_settings == {
         "observation_shape": [5],
         "observation_dtype": "float32",
@@ -193,11 +218,16 @@ def test_bad_settings_in_one_line(tmp_path, capsys):
         assert re.search(message, fails(capsys, *words, *further))
     with pytest.raises(ValueError, match="needs an environment"):
         make_odt(tmp_path, env="")
-    with h5py.File(data, "a") as file:
-        integers = np.zeros((200, 5), int)
-        del file["observations"]
-        file["observations"] = integers
-    assert "store arrays as floats" in fails(capsys, *words, data)
+    integers = np.arange(200) % 3
+    bad: dict[str, Any] = {
+        "store arrays as floats": {"observations": np.zeros((200, 5), int)},
+        "and one choice as integers": {"actions": np.eye(3, dtype=int)[integers]},
+        "floats [N, A]": {"actions": 0.5 * integers},
+        "row 0: is -1": {"actions": integers - 1},
+        "mark the last row of each in 'timeouts'.": {"timeouts": np.zeros(200, bool)},
+    }
+    for message, arrays in bad.items():
+        assert message in fails(capsys, *words, log_machine(tmp_path / "bad.hdf5", **arrays))
 
 
 def test_one_episode_is_cut_in_two(tmp_path):
@@ -240,8 +270,9 @@ def test_the_command_line(tmp_path, capsys):
     words = ["train", "bc/enhanced-tit", "--dataset", data, "--out", out]
     main([str(x) for x in [*words, "--total-updates", 4, "--evaluation-interval", 2]])
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("bc/enhanced-tit: after 4 updates (last weights), on 1 ep")
-    assert "return" not in lines[0]
+    assert lines[0].startswith("taken from the data: observation_shape=[5], ")
+    assert lines[-3].startswith("bc/enhanced-tit: after 4 updates (last weights), on 1 ep")
+    assert "return" not in lines[-3]
     assert Run.open(out).is_complete()
     main(["evaluate", str(out), "--best"])
     assert "(best weights, chosen on held-out episodes)" in capsys.readouterr().out
