@@ -28,14 +28,15 @@ def evaluate(arguments: list[str]) -> None:
     )
     parser.add_argument(
         "--ope",
-        choices=["fqe"],
-        help="also estimate the policy's return from the data, by fitted Q evaluation",
+        choices=["fqe", "wis"],
+        help="also estimate the policy's return from the data, by fitted Q evaluation or, for "
+        "discrete actions, weighted importance sampling",
     )
     parser.add_argument(
         "--out",
         type=Path,
-        help="file to write; default: RUN/evaluation.json, with _best and other --episodes, --seed "
-        "or --dataset in its name, so that it never replaces the run's own evaluation",
+        help="file to write; default: RUN/evaluation.json, with _best and other --episodes, "
+        "--seed, --dataset or --ope in its name: it never replaces the run's own evaluation",
     )
     add_machine_options(parser)
     options = parser.parse_args(arguments)
@@ -64,13 +65,15 @@ def evaluate(arguments: list[str]) -> None:
 
             settings = {"best": options.best, "ope": options.ope}
             evaluation = evaluate_on_data(run, recipe, options.dataset, **settings)
-        name = _file_name(run.recipe, recipe, options.best, options.dataset)
+        name = _file_name(run.recipe, recipe, options.best, options.dataset, options.ope)
         out = options.out or run.folder / name
         run.save_evaluation(evaluation, out)
     say(f"{one_line(recipe, evaluation)}\nwritten to {out}")
 
 
-def _file_name(own: Recipe, recipe: Recipe, best: bool, dataset: str | None) -> str:
+def _file_name(
+    own: Recipe, recipe: Recipe, best: bool, dataset: str | None, ope: str | None
+) -> str:
     """Builds a file name from the settings that differ from the run's own evaluation."""
     parts = ["evaluation", *(["best"] if best else [])]
     for field in ("episodes", "seed"):
@@ -78,7 +81,7 @@ def _file_name(own: Recipe, recipe: Recipe, best: bool, dataset: str | None) -> 
         if value != getattr(own, f"evaluation_{field}"):
             parts.append(f"{field}-{value}")
     if dataset is not None:
-        parts.append(f"dataset-{Path(dataset).stem}")
+        parts += [f"dataset-{Path(dataset).stem}", *([ope] if ope else [])]
     return f"{'_'.join(parts)}.json"
 
 
@@ -111,5 +114,10 @@ def _measured(evaluation: dict[str, Any]) -> str:
             f"\ndiscounted return ({evaluation['gamma']}) by {evaluation['ope']}: "
             f"{evaluation['value']:.4g} ({low} to {high} over episodes); of the data: "
             f"{evaluation['data_value']:.4g}"
+        )
+    if "behavior" in evaluation:
+        text += (
+            f"\nprobabilities of the data's actions: {evaluation['behavior']}; the weights are "
+            f"worth {evaluation['effective_episodes']:.1f} episodes"
         )
     return text

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -12,15 +14,21 @@ from torch import nn
 
 from recipes.cli import main
 from recipes.iql import IQL
-from recipes.offline import with_spaces
+from recipes.offline import read_data, with_spaces
 from recipes.ppo import PPO
 from recipes.tools import off_policy
-from recipes.tools.off_policy import fit_q, fitted_q
+from recipes.tools.off_policy import (
+    clone,
+    fit_q,
+    fitted_q,
+    recorded_log_probs,
+    weighted_returns,
+)
 from tests.agents.runs import make_run
 from tests.recipes.commands import fails
 from tests.recipes.offline.test_without_env import log_machine
-from tests.recipes.small import SMALL, make_algorithm, make_dt, train
-from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays
+from tests.recipes.small import BC, SMALL, DiscreteCQL, make, make_algorithm, make_dt, train
+from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays, load_episodes
 
 GAMMA = 0.8
 
@@ -102,8 +110,56 @@ def test_an_estimate_of_an_algorithms_policy(tmp_path):
     assert fitted_q(algorithm, episodes, 600) == found
 
 
+def test_weights_are_those_of_the_formula(tmp_path):
+    """A third of the steps take the policy's action; what an episode pays later weighs less."""
+    draw = np.random.default_rng(1)
+    actions, log_probs = draw.integers(3, size=200), np.log(draw.uniform(0.2, 0.9, 200))
+    data = log_machine(tmp_path / "log.hdf5", length=2, actions=actions)
+    with h5py.File(data, "a") as file:
+        file["action_log_probs"] = log_probs[:, None]
+    algorithm = make_algorithm(make(DiscreteCQL, tmp_path, env="", dataset=str(data), gamma=0.5))
+    episodes = read_data(algorithm.recipe)
+    known = recorded_log_probs(str(data), episodes)
+    found = weighted_returns(algorithm, episodes, known, 0)
+
+    items = HistoryStorage(replace(episodes, final_known=torch.ones(100).bool()))
+    same = (algorithm.policy(items.get(slice(None)))["action"].numpy() == actions).reshape(100, 2)
+    ratios = np.cumprod(same / np.exp(log_probs).reshape(100, 2), 1)
+    rewards = episodes.rows["reward"].view(100, 3)[:, :2].double().numpy()
+    value = sum(0.5**t * np.average(rewards[:, t], weights=ratios[:, t]) for t in range(2))
+    assert found["value"] == pytest.approx(value, rel=1e-6)
+    assert found["low"] < value < found["high"]
+    last = ratios[:, 1]
+    assert found["effective_episodes"] == pytest.approx(last.sum() ** 2 / (last**2).sum())
+    assert found["behavior"] == "read from action_log_probs"
+
+    rows = episodes.rows.copy()
+    rows["action"] = (rows["action"] + 1) % 3  # no longer what the policy does, where it was
+    rows["action"][episodes.step_rows[~same.ravel()]] = actions.max() + 1
+    with pytest.raises(ValueError, match="up to its end"):
+        weighted_returns(algorithm, replace(episodes, rows=rows), known, 0)
+
+
+def test_behavior_is_cloned_and_not_learnt_by_heart(tmp_path):
+    """It acts by the sign of the first sensor, three times in four."""
+    draw = np.random.default_rng(0)
+    observations = draw.normal(size=(600, 5))
+    side = observations[:, 0] > 0
+    actions = (side ^ (draw.random(600) < 0.25)).astype(int)
+    data = log_machine(tmp_path / "log.hdf5", 600, observations=observations, actions=actions)
+    items = HistoryStorage(load_episodes(data))
+    torch.manual_seed(0)
+    layers = nn.Sequential(nn.Linear(5, 256), nn.ReLU(), nn.Linear(256, 2))
+    behavior = TensorDictModule(layers, ["observation"], ["state_action_value"])
+    clone(behavior, items, 1000)
+    found = items.get(slice(None))
+    likely = layers(found["observation"]).softmax(-1)[:, 1].detach()
+    right = (found["observation"][:, 0] > 0).float()
+    assert (likely - (0.25 + 0.5 * right)).abs().mean() < 0.12
+
+
 def test_the_command(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(off_policy, "UPDATES", 5)
+    monkeypatch.setattr(off_policy, "UPDATES", {"fqe": 5, "wis": 5})
     data = str(log_machine(tmp_path / "log.hdf5"))
     recipe = with_spaces(IQL(dataset=data, backbone=SMALL, total_updates=2, name="iql/mine"))
     run = train(recipe, tmp_path / "run")
@@ -111,7 +167,7 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("iql/mine: after 2 updates (best weights, chosen on held-out")
     assert lines[1].startswith("discounted return (0.99) by fqe: ")
-    evaluation = json.loads((run.folder / "evaluation_best_dataset-log.json").read_bytes())
+    evaluation = json.loads((run.folder / "evaluation_best_dataset-log_fqe.json").read_bytes())
     assert evaluation["held_out_episodes"] == 10
     assert evaluation["low"] <= evaluation["value"] <= evaluation["high"]
     dt = train(make_dt(tmp_path), tmp_path / "dt")
@@ -121,4 +177,16 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     }.items():
         words = ["evaluate", folder, "--dataset", tmp_path / "hopper.hdf5", "--ope", "fqe"]
         assert message in fails(capsys, *words)
+    wis = ["--dataset", data, "--ope", "wis"]
+    assert "by --ope fqe" in fails(capsys, "evaluate", run.folder, *wis)
+    discrete = log_machine(tmp_path / "discrete.hdf5", length=2, actions=np.arange(200) % 2)
+    bc = BC(dataset=str(discrete), backbone=SMALL, total_updates=2, name="bc/mine")
+    run = train(with_spaces(bc), tmp_path / "bc")
+    main(["evaluate", str(run.folder), "--dataset", str(discrete), "--ope", "wis"])
+    last = capsys.readouterr().out.splitlines()[-2]
+    assert last.startswith("probabilities of the data's actions: cloned from the data; the weights")
+    with h5py.File(discrete, "a") as file:
+        file["action_log_probs"] = np.ones(200)
+    words = ["evaluate", run.folder, "--dataset", discrete, "--ope", "wis"]
+    assert "'action_log_probs': must be 200 finite numbers, at most 0" in fails(capsys, *words)
     assert "name them with --dataset" in fails(capsys, "evaluate", run.folder, "--ope", "fqe")
