@@ -14,11 +14,12 @@ BENCHMARKS = [
     "segments",
     "window_tables",
     "memories",
-    "cql",
+    "offline",
     "decision_transformer",
     "history_windows",
     "export",
     "ppo_cartpole",
+    "off_policy",
 ]
 
 

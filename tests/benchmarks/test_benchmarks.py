@@ -7,6 +7,7 @@ import json
 from functools import partial
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 from torchrl.modules import set_recurrent_mode
@@ -17,6 +18,7 @@ from benchmarks import (
     history_windows,
     measuring,
     memories,
+    off_policy,
     segments,
     window_tables,
 )
@@ -172,6 +174,13 @@ def test_rows_are_measured_once(tmp_path, capsys):
     assert capsys.readouterr().out.startswith("a 0 0.5\n")
 
 
+def test_policies_are_ranked_by_discounted_returns():
+    assert off_policy.discounted(np.array([2.0, 3.0]), 0.5).tolist() == [1.5, 1.75]
+    found = off_policy.rank_correlation(np.array([1.0, 5.0, 5.0, 9.0]), np.array([0, 1, 2, -7.0]))
+    # Ranks 1, 2.5, 2.5, 4 and 2, 3, 4, 1: covariance -1.5, variances 4.5 and 5.
+    assert found == pytest.approx(-1.5 / (4.5 * 5) ** 0.5)
+
+
 def test_nested_numbers_are_a_table():
     times = {"one": {"ms": [1.0, 3.0, 200.0], "of": {"what": "x"}}, "two": {"ms": [0.12345]}}
     lines = measuring.summary(times).splitlines()
@@ -181,7 +190,7 @@ def test_nested_numbers_are_a_table():
 
 
 def test_the_command(tmp_path, monkeypatch, capsys):
-    for name in set(BENCHMARKS) - {"cql"}:  # which needs d3rlpy
+    for name in set(BENCHMARKS) - {"offline"}:  # which needs d3rlpy
         module = importlib.import_module(f"benchmarks.{name}")
         monkeypatch.setattr(module, "main", lambda: {"a": {"ms": [1.0, 2.0]}})
     main(["acting", "segments", "--out", str(tmp_path)])
