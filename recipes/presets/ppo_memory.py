@@ -24,14 +24,12 @@ from torchrl_tit.settings import (
     Network,
 )
 
-from .ppo_settings import PPO_SETTINGS, reliable_tit
+from .ppo_settings import STEADY_PPO_SETTINGS, reliable_tit
 from .preset import PPO, Preset
 
-MEMORY_SETTINGS: dict[str, Any] = PPO_SETTINGS | {
+MEMORY_SETTINGS: dict[str, Any] = STEADY_PPO_SETTINGS | {
     "num_envs": 16,
     "steps_per_batch": 2048,
-    "minibatch_size": 256,
-    "target_kl": 0.02,
     "sequence_length": 64,  # by default 16; K - 1 frames more are encoded for each sequence
     "epochs": 8,
     # Less noise in the advantage of the one step where memory decides.

@@ -8,7 +8,7 @@ from __future__ import annotations
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
-from .ppo_settings import PPO_SETTINGS, reliable_tit
+from .ppo_settings import STEADY_PPO_SETTINGS, reliable_tit
 from .preset import PPO, Preset
 
 _TASKS = {
@@ -33,7 +33,7 @@ NO_VELOCITY_RECIPES: dict[str, Preset] = {
         total_steps=total_steps,
         hide_velocities=True,
         backbone=backbone,
-        **PPO_SETTINGS,
+        **STEADY_PPO_SETTINGS,
     )
     for task, (env, total_steps) in _TASKS.items()
     for network, backbone in _NETWORKS.items()
