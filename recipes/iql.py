@@ -91,6 +91,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
             loss_function="l2",
             temperature=recipe.temperature,
             expectile=recipe.expectile,
+            deactivate_vmap=recipe.slice_length > 1,  # which it cannot map over
             **discrete_only,
         )
         loss.make_value_estimator(gamma=recipe.gamma)
