@@ -91,7 +91,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
             loss_function="l2",
             temperature=recipe.temperature,
             expectile=recipe.expectile,
-            deactivate_vmap=recipe.slice_length > 1,  # which it cannot map over
+            deactivate_vmap=recipe.backbone.carries_state,  # it cannot map over an LSTM
             **discrete_only,
         )
         loss.make_value_estimator(gamma=recipe.gamma)

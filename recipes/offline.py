@@ -37,8 +37,8 @@ from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.modules import Backbone
 from torchrl_tit.settings.choices import Padding
-from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
+from torchrl_tit.settings.numbers import Fraction, Steps, Widths
 
 from .core.algorithm import (
     Algorithm,

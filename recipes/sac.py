@@ -100,7 +100,7 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
             critics,
             loss_function="l2",
             target_entropy=-float(size),
-            deactivate_vmap=slices,  # which it cannot map over
+            deactivate_vmap=recipe.backbone.carries_state,  # it cannot map over an LSTM
         )
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss

@@ -151,7 +151,6 @@ class Recipe:
             )
 
 
-
 @dataclass(frozen=True, kw_only=True)
 class SamplesRecipe(Recipe):
     """Settings of every recipe that learns from samples of transitions."""

@@ -198,7 +198,10 @@ def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
     begins = samples["is_init"].reshape(samples.shape)
     for key, now in seen.exclude("is_init").items(True, True):
         _check_consecutive(now, after[key], begins)
-    before, (seen, after, begins) = seen[:, :burn_in], (x[:, burn_in:] for x in (seen, after, begins))
+    before, (seen, after, begins) = (
+        seen[:, :burn_in],
+        (x[:, burn_in:] for x in (seen, after, begins)),
+    )
     count, length = begins.shape
     within = begins.clone()
     within[:, 0] = False
