@@ -429,6 +429,12 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         if recipe.normalize_observations:
             self._set_statistics(episodes)
         storage = self.measured_items(episodes.to(self.device))
+        held_out = [] if self._held_out is None else [self.measured_items(self._held_out)]
+        if (count := min(map(len, [storage, *held_out]))) < recipe.drawn_length:
+            raise ValueError(
+                f"slice_length {recipe.slice_length} and burn_in {recipe.burn_in} are longer than "
+                f"the {count} transitions to learn from or to hold out: make them shorter"
+            )
         return make_replay_buffer(
             storage,
             recipe.drawn_size,

@@ -72,7 +72,8 @@ class Backbone(ActingModule):
     sequences, if the tensordict has ``is_init``: the last batch dimension is time, and each frame
     is encoded once, not once for each of the K windows that contain it. The features are the same
     as those of single steps. A recurrent network reads its state only at the first step of each
-    sequence; any other network reads:
+    sequence (slices of a replay buffer, which have none, are arranged by
+    :func:`~torchrl_tit.modules.as_sequences`); any other network reads:
 
     ==================  =====================  =====================================================
     key                 shape                  what it is
@@ -117,7 +118,8 @@ class Backbone(ActingModule):
             the starts of sequences are read; without histories, "same" is used.
         observation_keys: keys of the observations, one for each history; by default a history's
             key with "history" replaced by "observation". If these or ``padding`` are given, the
-            ``in_keys`` include them and ``is_init``, for losses that select the ``in_keys``.
+            ``in_keys`` include them and ``is_init``, for losses that select the ``in_keys``, and
+            those of a recurrent network "sequence".
 
     Raises:
         ValueError: if the number of keys does not match the network's inputs and outputs,

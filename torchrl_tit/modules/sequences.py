@@ -177,7 +177,8 @@ def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
         The last T steps, [N, T], with "sequence", also under "next".
 
     Raises:
-        ValueError: if the next observation of a step is not that of the step after it.
+        ValueError: if these are no slices of more than B steps, or the next observation of a step
+            is not that of the step after it.
 
     Example:
         >>> from torchrl_tit.datasets import ConsecutiveSampler, OnlineHistoryStorage
@@ -193,6 +194,11 @@ def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
         >>> buffer.sample().shape
         torch.Size([4, 20])
     """
+    if samples.ndim != 2 or not 0 <= burn_in < samples.shape[1]:
+        raise ValueError(
+            f"samples must be slices [N, burn_in + T], but they are {list(samples.shape)} and "
+            f"burn_in is {burn_in}: draw longer slices, or reshape flat ones"
+        )
     seen = samples.select("observation", "is_init")
     after = samples["next"].select("observation")
     begins = samples["is_init"].reshape(samples.shape)
