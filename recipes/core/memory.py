@@ -15,13 +15,9 @@ from .recipe import Recipe
 
 
 def state_transforms(policy: nn.Module) -> Compose:
-    """Makes the transforms that carry a policy's state through an environment; none if it has none.
-
-    Args:
-        policy: the policy, with a backbone.
-    """
-    backbone = next(module for module in policy.modules() if isinstance(module, Backbone))
-    return backbone.make_transforms()
+    """Makes the transforms that carry a policy's state through an environment, if it has one."""
+    backbones = (module for module in policy.modules() if isinstance(module, Backbone))
+    return next((backbone.make_transforms() for backbone in backbones), Compose())
 
 
 def with_transforms(env: EnvBase, transforms: Compose) -> EnvBase:

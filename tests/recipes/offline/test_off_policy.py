@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,8 +20,9 @@ from recipes.tools.off_policy import fit_q, fitted_q
 from tests.agents.runs import make_run
 from tests.recipes.commands import fails
 from tests.recipes.offline.test_without_env import log_machine
-from tests.recipes.small import SMALL, make_algorithm, make_dt, train
+from tests.recipes.small import BC, SMALL, make, make_algorithm, make_dt, train
 from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays
+from torchrl_tit.settings.networks import gru
 
 GAMMA = 0.8
 
@@ -115,7 +117,11 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert evaluation["held_out_episodes"] == 10
     assert evaluation["low"] <= evaluation["value"] <= evaluation["high"]
     dt = train(make_dt(tmp_path), tmp_path / "dt")
+    memory: dict[str, Any] = {"backbone": gru(hidden_dim=8), "slice_length": 4}
     for folder, message in {
+        train(
+            make(BC, tmp_path, total_updates=1, **memory), tmp_path / "memory"
+        ).folder: "gru carries a state: leave out --ope",
         dt.folder: "depends on the return that it is told",
         make_run(tmp_path / "ppo", PPO(env="CartPole-v1", backbone=SMALL)): "reads no data sets",
     }.items():
