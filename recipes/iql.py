@@ -91,9 +91,11 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
             loss_function="l2",
             temperature=recipe.temperature,
             expectile=recipe.expectile,
-            deactivate_vmap=recipe.backbone.carries_state,  # it cannot map over an LSTM
             **discrete_only,
         )
+        if recipe.backbone.carries_state:  # vmap cannot map over an LSTM
+            loss.deactivate_vmap = True  # DiscreteIQLLoss takes no such argument
+            loss._make_vmap()
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss
 

@@ -37,8 +37,8 @@ from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.modules import Backbone
 from torchrl_tit.settings.choices import Padding
+from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
-from torchrl_tit.settings.numbers import Fraction, Steps, Widths
 
 from .core.algorithm import (
     Algorithm,
@@ -235,7 +235,7 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TransitionRecipe(SamplesRecipe, DatasetRecipe):
+class TransitionRecipe(DatasetRecipe, SamplesRecipe):
     """Settings of every recipe that learns from transitions of a data set."""
 
     length: ClassVar[str] = "total_updates"
@@ -244,6 +244,8 @@ class TransitionRecipe(SamplesRecipe, DatasetRecipe):
     """What fills a history before the first observation: that observation, or zeros."""
     total_updates: Steps = 500_000
     """Gradient steps to train for."""
+    batch_size: Batch = 256
+    """Transitions in one gradient step, sampled with replacement."""
     normalize_observations: bool = False
     """Whether to normalize observations by their mean and standard deviation in the data; only for
     arrays of floats."""
