@@ -47,7 +47,7 @@ class DQN(ReplayRecipe, algorithm="dqn"):
     buffer_size: Batch = 10_000
     """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
     batch_size: Batch = 128
-    """Transitions in one gradient step, sampled with replacement from the buffer."""
+    """Transitions in one gradient step, sampled with replacement."""
     learning_rate: Rate = 2.5e-4
     """Learning rate of Adam."""
     double: bool = True

@@ -93,6 +93,9 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
             expectile=recipe.expectile,
             **discrete_only,
         )
+        if recipe.backbone.carries_state:  # vmap cannot map over an LSTM
+            loss.deactivate_vmap = True  # DiscreteIQLLoss takes no such argument
+            loss._make_vmap()
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss
 

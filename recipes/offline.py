@@ -53,7 +53,9 @@ from .core.algorithm import (
 )
 from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import HeldOut, Outcome
+from .core.memory import arranging, state_transforms, with_transforms
 from .core.networks import make_backbone, make_critic
+from .core.recipe import SamplesRecipe
 from .core.task import make_task
 
 
@@ -240,7 +242,8 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
         episodes = episodes or self._held_out
         assert episodes is not None
         episodes = episodes.to(storage_device(recipe))
-        items, length = self.measured_items(episodes), getattr(recipe, "slice_length", 1)
+        items, length = self.measured_items(episodes), getattr(recipe, "drawn_length", 1)
+        arrange = arranging(recipe) or (lambda samples: samples)
         starts = torch.arange(0, len(items) - length + 1, max(1, len(items) // _MOST_MEASURED))
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
         sums = dict.fromkeys(self.measures, 0.0)
@@ -253,7 +256,8 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
         ):
             torch.manual_seed(recipe.evaluation_seed)
             for part in index.to(items.device).split(max(1, _MEASURED_AT_ONCE // length)):
-                means = self.measure_batch(to_networks(items.get(part), self.device))
+                samples = to_networks(arrange(items.get(part)), self.device)
+                means = self.measure_batch(samples)
                 for name in sums:
                     sums[name] += means[name].item() * len(part)
         values = {name: total / len(index) for name, total in sums.items()}
@@ -283,7 +287,7 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TransitionRecipe(DatasetRecipe):
+class TransitionRecipe(DatasetRecipe, SamplesRecipe):
     """Settings of every recipe that learns from transitions of a data set."""
 
     length: ClassVar[str] = "total_updates"
@@ -294,9 +298,6 @@ class TransitionRecipe(DatasetRecipe):
     """Gradient steps to train for."""
     batch_size: Batch = 256
     """Transitions in one gradient step, sampled with replacement."""
-    slice_length: Batch = 1
-    """Number of consecutive transitions that are drawn together, so that a backbone encodes their
-    frames once; must divide batch_size. 1 draws transitions one by one."""
     normalize_observations: bool = False
     """Whether to normalize observations by their mean and standard deviation in the data; only for
     arrays of floats."""
@@ -309,11 +310,6 @@ class TransitionRecipe(DatasetRecipe):
     """Gradient steps between evaluations."""
     evaluation_episodes: EpisodeCount = 10
     """Number of episodes in an evaluation, played side by side."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_divides("slice_length", "batch_size", self.batch_size)
-        self.check_stateless()
 
     @property
     def final_step(self) -> int:
@@ -409,9 +405,10 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             self.model = self.networks(task).to(self.device)
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
-        """Builds the task, with histories."""
+        """Builds the task, with histories, and with the state of a recurrent network."""
         clips = self.clips_actions
-        return make_task(self.recipe, num_envs, seed, clip_actions=clips, **settings)
+        task = make_task(self.recipe, num_envs, seed, clip_actions=clips, **settings)
+        return with_transforms(task, state_transforms(self.policy))
 
     def make_backbone(self, env: EnvBase, *, slices: bool = False) -> Backbone:
         """Builds the policy's backbone.
@@ -486,8 +483,19 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         if recipe.normalize_observations:
             self._set_statistics(episodes)
         storage = self.measured_items(episodes.to(storage_device(recipe)))
-        length = recipe.slice_length
-        return make_replay_buffer(storage, recipe.batch_size, seed=recipe.seed, slice_length=length)
+        held_out = [] if self._held_out is None else [self.measured_items(self._held_out)]
+        if (count := min(map(len, [storage, *held_out]))) < recipe.drawn_length:
+            raise ValueError(
+                f"slice_length {recipe.slice_length} and burn_in {recipe.burn_in} are longer than "
+                f"the {count} transitions to learn from or to hold out: make them shorter"
+            )
+        return make_replay_buffer(
+            storage,
+            recipe.drawn_size,
+            seed=recipe.seed,
+            slice_length=recipe.drawn_length,
+            transform=arranging(recipe),
+        )
 
     def measured_items(self, episodes: Episodes) -> HistoryStorage:
         """Cuts episodes into transitions with histories, as in training."""

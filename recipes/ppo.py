@@ -54,6 +54,7 @@ from .core.compilation import (
     should_compile,
 )
 from .core.flat_parameters import FlatParameters
+from .core.memory import with_transforms
 from .core.networks import normalize_frames
 from .core.recipe import Compile, Precision
 from .core.task import make_task
@@ -304,11 +305,6 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
     def policy(self) -> TensorDictModuleBase:
         """Histories in; features, action, its log-probability and the state's value out."""
         return TensorDictSequential(self.model.backbone, self.model.actor, self.model.critic)
-
-    def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
-        """Builds the task, with histories, and with the state of a recurrent network."""
-        env = super().make_env(num_envs, seed, **settings)
-        return _with_state(self.model.backbone.make_transforms(), env)
 
     def prepare(self, step: int, folder: Path) -> None:
         """Builds loss, optimizer and collector."""
@@ -578,9 +574,4 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
 
 def _make_envs(state: Compose, recipe: PPO, num_envs: int) -> EnvBase:
     """Builds environments whose steps keep each observation once."""
-    return _with_state(state, make_task(recipe, num_envs, keep_histories=False))
-
-
-def _with_state(transforms: Compose, env: EnvBase) -> EnvBase:
-    """Adds the transforms that carry the state of a recurrent network, if there are any."""
-    return env.append_transform(transforms) if len(transforms) else env
+    return with_transforms(make_task(recipe, num_envs, keep_histories=False), state)

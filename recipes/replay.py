@@ -6,6 +6,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -14,7 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase
 
 from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_checkpoint
 from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
@@ -30,6 +31,8 @@ from .core.algorithm import (
     storage_device,
     to_networks,
 )
+from .core.memory import arranging, state_transforms, with_transforms
+from .core.recipe import SamplesRecipe
 from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
 
@@ -42,7 +45,7 @@ _STORED = [
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayRecipe(OnlineRecipe):
+class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     """Settings of every recipe that learns online from a replay buffer."""
 
     total_steps: Steps = 1_000_000
@@ -56,11 +59,6 @@ class ReplayRecipe(OnlineRecipe):
     """Gradient steps for each environment step."""
     buffer_size: Batch = 1_000_000
     """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
-    batch_size: Batch = 256
-    """Transitions in one gradient step, sampled with replacement from the buffer."""
-    slice_length: Batch = 1
-    """Number of consecutive steps that are drawn together, so that a backbone encodes their frames
-    once; must divide batch_size. 1 draws transitions one by one."""
     storage_device: Device = "cpu"
     """Device of the stored data, from which batches are moved to the networks; those on the CPU
     store data there, too. "cuda" is faster if all data fit on the GPU."""
@@ -70,23 +68,22 @@ class ReplayRecipe(OnlineRecipe):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_divides("steps_per_batch", "random_steps", self.random_steps)
-        self.check_divides("slice_length", "batch_size", self.batch_size)
         if self.collectors > 1 and self.ray is None:
             raise ValueError(
                 f"collectors is {self.collectors}, but {self.algorithm} collects in one process, "
                 "or on a Ray cluster: set ray to its address, such as auto, or collectors to 1"
             )
-        if self.buffer_size < max(self.steps_per_batch, self.slice_length * self.num_envs):
+        if self.buffer_size < max(self.steps_per_batch, self.drawn_length * self.num_envs):
             raise ValueError(
                 f"buffer_size {self.buffer_size} has no room for a batch of {self.steps_per_batch} "
                 "steps and a slice of each environment: make it larger"
             )
-        if self.slice_length * self.num_envs > self.random_steps:
+        if self.drawn_length * self.num_envs > self.random_steps:
+            burn_in = f" and burn_in {self.burn_in} are" if self.burn_in else " is"
             raise ValueError(
-                f"slice_length {self.slice_length} is longer than the {self.random_steps} "
+                f"slice_length {self.slice_length}{burn_in} longer than the {self.random_steps} "
                 f"random_steps of {self.num_envs} environments: change one of them"
             )
-        self.check_stateless()
 
     @property
     def updates_per_batch(self) -> int:
@@ -113,7 +110,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
-        with closing(self.make_env(1)) as task:
+        with closing(make_task(recipe, clip_actions=False)) as task:
             self.model = self.networks(task).to(self.device)
 
     @property
@@ -122,8 +119,8 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         return self._policy
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
-        """Builds the task, with histories; actions are passed on unchanged."""
-        return make_task(self.recipe, num_envs, seed, clip_actions=False, **settings)
+        """As :meth:`OnlineAlgorithm.make_env`; actions are passed on unchanged."""
+        return super().make_env(num_envs, seed, clip_actions=False, **settings)
 
     def prepare(self, step: int, folder: Path) -> None:
         """Builds collector and replay buffer."""
@@ -131,7 +128,10 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         self.policy.eval()
         random_steps = recipe.random_steps if self.draws_random_steps else 0
         self.collector = self.make_collector(
-            self.behavior, _make_envs, step, random_steps=max(0, random_steps - step)
+            self.behavior,
+            partial(_make_envs, state_transforms(self.policy)),
+            step,
+            random_steps=max(0, random_steps - step),
         )
         storage = OnlineHistoryStorage(
             recipe.buffer_size,
@@ -143,8 +143,9 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         )
         self.buffer = ReplayBuffer(
             storage=storage,
-            sampler=make_sampler(recipe.slice_length),
-            batch_size=recipe.batch_size,
+            sampler=make_sampler(recipe.drawn_length),
+            batch_size=recipe.drawn_size,
+            transform=arranging(recipe),
         )
         self.buffer_state = BufferState(self.buffer, folder / "replay")
 
@@ -179,7 +180,8 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         """Takes a gradient step on :meth:`loss`, and updates the targets.
 
         Args:
-            samples: transitions [B], or slices of consecutive ones, [N, T].
+            samples: transitions [B], or slices of consecutive ones, [N, T]; for a network that
+                carries a state, with what :func:`~torchrl_tit.modules.as_sequences` adds.
             number: number of gradient steps taken before.
 
         Returns:
@@ -187,9 +189,9 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         """
 
 
-def _make_envs(recipe: OnlineRecipe, num_envs: int) -> EnvBase:
+def _make_envs(state: Compose, recipe: OnlineRecipe, num_envs: int) -> EnvBase:
     """Builds the environments in which steps are collected."""
-    return make_task(recipe, num_envs, clip_actions=False)
+    return with_transforms(make_task(recipe, num_envs, clip_actions=False), state)
 
 
 class BufferState:

@@ -95,7 +95,13 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
             make_critic(observation, size, hidden, network, slices=slices).to(self.device)
             for _ in range(2)
         ]
-        loss = SACLoss(self._policy, critics, loss_function="l2", target_entropy=-float(size))
+        loss = SACLoss(
+            self._policy,
+            critics,
+            loss_function="l2",
+            target_entropy=-float(size),
+            deactivate_vmap=recipe.backbone.carries_state,  # it cannot map over an LSTM
+        )
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss
 

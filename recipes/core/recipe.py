@@ -12,7 +12,7 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.checks import check_fields
 from torchrl_tit.settings.choices import Device, ImageLayout
 from torchrl_tit.settings.literals import parse_assignments, parse_call
-from torchrl_tit.settings.numbers import Episodes, Seed, Steps, Threads
+from torchrl_tit.settings.numbers import Batch, Episodes, Seed, Steps, StepsOrNone, Threads
 from torchrl_tit.settings.parts import Names
 
 try:
@@ -150,13 +150,44 @@ class Recipe:
                 f"{field} {getattr(self, field)} does not divide {name} {value}: change one of them"
             )
 
-    def check_stateless(self) -> None:
-        """Raises ValueError if the network carries a state from step to step."""
-        if self.backbone.carries_state:
+
+@dataclass(frozen=True, kw_only=True)
+class SamplesRecipe(Recipe):
+    """Settings of every recipe that learns from samples of transitions."""
+
+    batch_size: Batch = 256
+    """Transitions in one gradient step, sampled with replacement."""
+    slice_length: Batch = 1
+    """Number of consecutive transitions that are drawn together, so that a backbone encodes their
+    frames once; must divide batch_size. 1 draws transitions one by one, from which a network that
+    carries a state cannot learn."""
+    burn_in: StepsOrNone = 0
+    """Number of steps before each slice that a network that carries a state reads first, from a
+    state of zeros and without gradient. They do not count as transitions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_divides("slice_length", "batch_size", self.batch_size)
+        name, carries_state = self.backbone.history.name, self.backbone.carries_state
+        if carries_state and self.slice_length == 1:
             raise ValueError(
-                f"{self.algorithm} draws single transitions, so its network cannot carry a state: "
-                "set backbone.num_frames to 2 or more, or use a ppo recipe"
+                f"{name} carries a state and learns from sequences, but slice_length is 1: set it "
+                "to their number of steps, such as 16, or backbone.num_frames to 2 or more"
             )
+        if self.burn_in and not carries_state:
+            raise ValueError(
+                f"burn_in is {self.burn_in}, but {name} carries no state here: set it to 0"
+            )
+
+    @property
+    def drawn_length(self) -> int:
+        """Number of consecutive steps that are drawn together, with those of the burn-in."""
+        return self.burn_in + self.slice_length
+
+    @property
+    def drawn_size(self) -> int:
+        """Number of steps in all that are drawn for one gradient step."""
+        return self.batch_size // self.slice_length * self.drawn_length
 
 
 _OF_THE_MACHINE = ("device", "storage_device", "threads", "compile", "checkpoint_interval")

@@ -81,6 +81,11 @@ def evaluate_on_data(
                 f"what a policy of {recipe.algorithm} does depends on the return that it is told "
                 "to reach, so its value is not estimated: use a bc, iql, td3bc or cql run"
             )
+        if recipe.backbone.carries_state:
+            raise ValueError(
+                f"off-policy evaluation reads single transitions, but "
+                f"{recipe.backbone.history.name} carries a state: leave out --ope"
+            )
         evaluation["ope"] = ope
         if ope == "fqe":
             evaluation |= fitted_q(algorithm, episodes, UPDATES[ope])

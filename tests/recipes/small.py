@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,8 @@ from recipes.td3bc import TD3BC
 from tests.datasets.rollouts import roll, write
 from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import checkpoint_steps, load_checkpoint
-from torchrl_tit.settings import CoBERL, Inner, Network
-from torchrl_tit.settings.networks import decision_transformer, dt_tit, enhanced_tit, mlp
+from torchrl_tit.settings import CoBERL, HistorySettings, Inner, Network
+from torchrl_tit.settings.networks import decision_transformer, dt_tit, enhanced_tit, lstm, mlp
 
 _roll = cache(roll)
 
@@ -177,6 +178,14 @@ _REPLAY: dict[str, Any] = {
 _NORMALIZED: dict[str, Any] = {"backbone": tit(3), "normalize_observations": True}
 _CRITIC: dict[str, Any] = {**_NORMALIZED, "critic": "backbone", "total_updates": 9}
 
+
+def _carries(history: str) -> dict[str, Any]:
+    """A network that carries a state, and the slices from which it learns."""
+    network = lstm(embed_dim=8, hidden_dim=8, features_dim=8)
+    backbone = replace(network, history=HistorySettings.get(history)())
+    return {"backbone": backbone, "slice_length": 4, "burn_in": 3, "batch_size": 16}
+
+
 TINY = PPO(
     name="ppo/cartpole/mlp",
     env="CartPole-v1",
@@ -199,6 +208,10 @@ RECIPES: dict[str, Callable[[Path], Recipe]] = {
     "ppo, smooth": lambda folder: SmoothPPO(env="Pendulum-v1", **_ROLLOUTS),
     "sac": lambda folder: SAC(env="Pendulum-v1", **_REPLAY),
     "dqn": lambda folder: DQN(env="CartPole-v1", **_REPLAY),
+    "dqn, lstm": lambda folder: DQN(env="CartPole-v1", **_REPLAY | _carries("lstm")),
+    "sac, mamba2": lambda folder: SAC(env="Pendulum-v1", **_REPLAY | _carries("mamba2")),
+    "iql, gru": partial(make, IQL, **_CRITIC | _carries("gru")),
+    "cql, mingru": partial(make, CQL, **_CRITIC | _carries("mingru")),
     "bc": partial(make, BC, **_NORMALIZED),
     "bc, discrete": partial(make, BC, env="CartPole-v1", **_NORMALIZED),
     "iql": partial(make, IQL, **_CRITIC),

@@ -33,9 +33,12 @@ NOISE = {
         "ppo, continuous",
         "ppo, smooth",
         "sac",
+        "sac, mamba2",
         "bc",
         "iql",
+        "iql, gru",
         "cql",
+        "cql, mingru",
         "odt",
         "odt, offline",
     ),
@@ -108,7 +111,7 @@ def test_the_environment_leaves_observations_as_they_are(trained):
     for seen in (step["observation"][0], newest):
         assert np.array_equal(seen.numpy(), raw)
     statistics = [m for m in trained.agent.policy.modules() if isinstance(m, NormalizedFrames)]
-    assert len(statistics) == (trained.name not in ("sac", "dqn"))
+    assert len(statistics) == (recipe.algorithm not in ("sac", "dqn"))
     for frames in statistics:
         assert (frames.variance < 0.9).any()
 

@@ -66,7 +66,7 @@ COLLECTORS = {"collectors": 2}
 REPLAY: dict[str, Any] = {"backbone": SMALL, "random_steps": 20, "steps_per_batch": 10}
 SAC_RECIPE = SAC(env="Pendulum-v1", critic_hidden=(16,), batch_size=8, **REPLAY)
 DQN_RECIPE = DQN(env="CartPole-v1", batch_size=8, **REPLAY)
-NO_STATE = "draws single transitions, so its network cannot carry a state"
+ONE_STEP = "lstm carries a state and learns from sequences, but slice_length is 1"
 BOUNDED = r"needs continuous actions within bounds, but .*\(.*shape \[2\].*\)"
 
 REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
@@ -115,7 +115,13 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
         {"slice_length": 8, "random_steps": 10, "num_envs": 2},
         "slice_length 8 is longer than",
     ),
-    (SAC_RECIPE, {"backbone": lstm()}, "sac draws single transitions.*or use a ppo recipe"),
+    (SAC_RECIPE, {"backbone": lstm()}, f"{ONE_STEP}.* or backbone.num_frames to 2 or more"),
+    (SAC_RECIPE, {"burn_in": 4, "slice_length": 2}, "burn_in is 4, but mlp carries no state"),
+    (
+        SAC_RECIPE,
+        {"backbone": lstm(), "slice_length": 4, "burn_in": 17},
+        "slice_length 4 and burn_in 17 are longer than the 20 random_steps of 1 env",
+    ),
     (SAC_RECIPE, {"env": "CartPole-v1"}, "sac needs .*, but CartPole-v1 has .*: use a ppo recipe"),
     (SAC_RECIPE, {"env": "EndlessActions-v0"}, f"sac {BOUNDED}"),
     (SAC_RECIPE, {"env": "UnboundedActions-v0"}, f"sac {BOUNDED}"),
@@ -135,7 +141,6 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
         {"env": "SeveralActions-v0"},
         r"dqn needs a few discrete .* \(MultiCategorical, shape \[2\]\): use a ppo",
     ),
-    (DQN_RECIPE, {"backbone": lstm()}, f"dqn {NO_STATE}"),
     (DQN_RECIPE, {"buffer_size": 5}, "buffer_size 5 has no room for a batch of 10 steps"),
 ]
 
@@ -156,7 +161,7 @@ ON_DATA: list[tuple[Any, dict[str, Any], str]] = [
     (CQL, {"dataset": "./no.hdf5"}, r"no\.hdf5"),
     (CQL, {"backbone": tit(num_heads_inner=3)}, "width 8 cannot be split over 3 attention heads"),
     (CQL, {"backbone": nature_cnn()}, r"\(11,\) is that of an array, but this encoder reads imag"),
-    (CQL, {"backbone": lstm()}, f"{NO_STATE}.* set backbone.num_frames to 2 or more"),
+    (CQL, {"backbone": lstm()}, ONE_STEP),
     (CQL, {"backbone": decision_transformer()}, "reads actions and returns .* use a dt or odt rec"),
     (CQL, {"slice_length": 2, "compile": "on"}, "compile is on, but slices of 2 are not compiled"),
     (CQL, {"slice_length": 3}, "slice_length 3 does not divide batch_size 8: change one of them"),
@@ -170,7 +175,6 @@ ON_DATA: list[tuple[Any, dict[str, Any], str]] = [
     (TD3BC, {"env": "CartPole-v1"}, "td3bc needs continuous actions .* CartPole-v1 are discrete"),
     (TD3BC, {"env": "EndlessActions-v0"}, f"td3bc {BOUNDED}"),
     (BC, {"env": "FrozenLake-v1", "normalize_observations": True}, "int64, not floats: switch"),
-    (BC, {"backbone": lstm()}, f"bc {NO_STATE}"),
     (IQL, {"env": "Blackjack-v1"}, "data sets hold one observation, but .* has several"),
     (IQL, {"expectile": 1.0}, r"expectile must be a probability in \(0, 1\), not 1.0"),
     (make_dt, {"acting_num_frames": 7}, "acting_num_frames must be at most 6, not 7"),

@@ -13,6 +13,7 @@ from torchrl_tit.modules.decision_transformer import (
 from torchrl_tit.modules.frame_cache import FrameCache
 from torchrl_tit.modules.heads import make_actor, make_squashed_actor, make_value
 from torchrl_tit.modules.many_actions import ManyActions
+from torchrl_tit.modules.sequences import as_sequences
 
 __all__ = [
     "ActingCollector",
@@ -21,6 +22,7 @@ __all__ = [
     "FrameCache",
     "ManyActions",
     "acting",
+    "as_sequences",
     "history_keys",
     "make_actor",
     "make_dt_actor",

@@ -25,6 +25,7 @@ from tensordict.nn import dispatch, skip_existing
 from torch import Tensor, nn
 from torchrl.data import Composite, Unbounded
 from torchrl.envs import Compose, InitTracker, TensorDictPrimer, Transform
+from torchrl.modules import set_recurrent_mode
 
 from torchrl_tit.histories.encoder import RecurrentEncoder
 from torchrl_tit.modules.acting import ActingModule, trunks_of
@@ -71,7 +72,8 @@ class Backbone(ActingModule):
     sequences, if the tensordict has ``is_init``: the last batch dimension is time, and each frame
     is encoded once, not once for each of the K windows that contain it. The features are the same
     as those of single steps. A recurrent network reads its state only at the first step of each
-    sequence; any other network reads:
+    sequence (slices of a replay buffer, which have none, are arranged by
+    :func:`~torchrl_tit.modules.as_sequences`); any other network reads:
 
     ==================  =====================  =====================================================
     key                 shape                  what it is
@@ -116,7 +118,8 @@ class Backbone(ActingModule):
             the starts of sequences are read; without histories, "same" is used.
         observation_keys: keys of the observations, one for each history; by default a history's
             key with "history" replaced by "observation". If these or ``padding`` are given, the
-            ``in_keys`` include them and ``is_init``, for losses that select the ``in_keys``.
+            ``in_keys`` include them and ``is_init``, for losses that select the ``in_keys``, and
+            those of a recurrent network "sequence".
 
     Raises:
         ValueError: if the number of keys does not match the network's inputs and outputs,
@@ -169,6 +172,7 @@ class Backbone(ActingModule):
         sequence_keys = _sequence_keys(trunks, in_keys, observation_keys, padding)
         step_keys = [*in_keys, *state_shapes, *(["is_init"] if state_shapes else [])]
         declared = [*sequence_keys.observations, "is_init"] if padding or observation_keys else []
+        declared += ["sequence"] if declared and state_shapes else []
         super().__init__(
             network,
             in_keys=[*step_keys, *(key for key in declared if key not in step_keys)],
@@ -204,7 +208,9 @@ class Backbone(ActingModule):
         if skip_existing() and all(key in tensordict.keys(True) for key in self.out_keys):
             return tensordict
         # A recurrent network reads sequences itself.
-        if not self.is_recurrent and self.sequence_keys.in_sequence(tensordict):
+        if self.is_recurrent and tensordict.get("sequence", None) is not None:
+            written = self._encode_arranged(tensordict["sequence"])
+        elif not self.is_recurrent and self.sequence_keys.in_sequence(tensordict):
             written = self.encode_sequences(tensordict)
         else:
             written = self.encode_steps(tensordict)
@@ -397,6 +403,40 @@ class Backbone(ActingModule):
             for key, value in state.items()
         }
         return (*(features for features, _ in outputs), *(after[key] for key in self.state_shapes))
+
+    def _encode_arranged(self, sequence: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Encodes what :func:`~torchrl_tit.modules.as_sequences` arranged, [N, T], by key."""
+        state: list[Tensor] | None = None
+        if (burn_in := sequence.get("burn_in", None)) is not None:
+            with torch.no_grad():
+                _, state = self._read(burn_in[:, 0], None)
+        features, _ = self._read(sequence["steps"][:, 0], state)
+        position = sequence["position"]
+        return {
+            key: entries.gather(1, position.expand(-1, -1, entries.shape[-1]))
+            for key, entries in zip(self.features_keys, features, strict=True)
+        }
+
+    def _read(
+        self, steps: TensorDictBase, state: list[Tensor] | None
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        """Reads sequences [N, S] from a state -> features [N, S, F] and the state after them."""
+        frames = [steps[key] for key in self.sequence_keys.observations]
+        like: dict[str, Any] = {"device": frames[0].device}
+        if frames[0].is_floating_point():
+            like["dtype"] = frames[0].dtype
+        is_init, states = steps["is_init"], []
+        for index, shape in enumerate(self.state_shapes.values()):
+            entry = torch.zeros(1, 1, *[1] * len(shape), **like).expand(*steps.shape, *shape)
+            if state is not None:  # it is read where an episode begins, too, and is zero there
+                first = state[index].masked_fill(is_init[:, 0].view(-1, *[1] * len(shape)), 0)
+                entry = torch.cat([first.unsqueeze(1), entry[:, 1:]], dim=1)
+            states.append(entry)
+        histories = [x.unsqueeze(steps.ndim) for x in frames]
+        with self.computing(is_init.device), set_recurrent_mode(True):
+            outputs = self._in_full(self._step([*histories, *states, is_init]))
+        count = len(self.features_keys)
+        return list(outputs[:count]), [x[:, -1] for x in outputs[count:]]
 
     def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
         """Gets an entry; raises KeyError if it is missing."""

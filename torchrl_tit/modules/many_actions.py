@@ -66,6 +66,6 @@ class ManyActions(TensorDictModuleBase):
         each.set(self.action_key, action.flatten(0, -2))
         for module in modules[first:]:
             each = module(each)
-        for key in self.out_keys:
+        for key in (key for module in modules[first:] for key in module.out_keys):
             tensordict.set(key, each.get(key).unflatten(0, shape))
         return tensordict

@@ -1,4 +1,4 @@
-"""Reads sequences of consecutive steps from tensordicts, in TorchRL's recurrent mode."""
+"""Sequences of consecutive steps: how they are read in TorchRL's recurrent mode, and arranged."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from torch import Tensor
 from torchrl.modules import recurrent_mode
 
@@ -146,6 +146,86 @@ class SequenceKeys:
             trunk.check_frames(*(x.flatten(0, leading - 1) for x in observations))
             if present:
                 trunk.check(*(tensordict.get(key) for key in present))
+
+
+def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
+    """Arranges slices of a replay buffer for networks that carry a state.
+
+    The features of a step and of the true next observation need all observations before them, each
+    once. So a sequence has the observation of each step in order and, where an episode ends, its
+    last one, which is that of no step. A :class:`Backbone` that finds "sequence" in a tensordict
+    reads it from a state of zeros, with whichever weights it has at that time, and gathers the
+    features at "position". So actors, critics and their targets each have a state of their own,
+    which TorchRL's `BurnInTransform` cannot give them: it writes one.
+
+    ==========================  ============  ==================================================
+    key                         batch         what it is
+    ==========================  ============  ==================================================
+    ``("sequence", "steps")``   [N, T, S]     "observation" and "is_init" of the sequence; zeros
+                                              after its end. The same for all T, in memory once
+    ``("sequence", "burn_in")`` [N, T, B]     those of the steps before it, if there are any:
+                                              they only lead to its first state, without gradient
+    ``("sequence", "position")`` [N, T]       int64 [N, T, 1], where in S a step is
+    ==========================  ============  ==================================================
+
+    Args:
+        samples: slices of B + T consecutive steps, [N, B + T], with "is_init"; of a
+            :class:`~torchrl_tit.datasets.HistoryStorage`, for example.
+        burn_in: number B of steps.
+
+    Returns:
+        The last T steps, [N, T], with "sequence", also under "next".
+
+    Raises:
+        ValueError: if these are no slices of more than B steps, or the next observation of a step
+            is not that of the step after it.
+
+    Example:
+        >>> from torchrl_tit.datasets import ConsecutiveSampler, OnlineHistoryStorage
+        >>> from torchrl.data import ReplayBuffer
+        >>> from torchrl.envs import GymEnv
+        >>> buffer = ReplayBuffer(
+        ...     storage=OnlineHistoryStorage(1000, is_init=True),
+        ...     sampler=ConsecutiveSampler(30),
+        ...     batch_size=120,
+        ...     transform=lambda samples: as_sequences(samples, burn_in=10),
+        ... )
+        >>> _ = buffer.extend(GymEnv("CartPole-v1").rollout(100, break_when_any_done=False))
+        >>> buffer.sample().shape
+        torch.Size([4, 20])
+    """
+    if samples.ndim != 2 or not 0 <= burn_in < samples.shape[1]:
+        raise ValueError(
+            f"samples must be slices [N, burn_in + T], but they are {list(samples.shape)} and "
+            f"burn_in is {burn_in}: draw longer slices, or reshape flat ones"
+        )
+    seen = samples.select("observation", "is_init")
+    after = samples["next"].select("observation")
+    begins = samples["is_init"].reshape(samples.shape)
+    for key, now in seen.exclude("is_init").items(True, True):
+        _check_consecutive(now, after[key], begins)
+    before, (seen, after, begins) = (
+        seen[:, :burn_in],
+        (x[:, burn_in:] for x in (seen, after, begins)),
+    )
+    count, length = begins.shape
+    within = begins.clone()
+    within[:, 0] = False
+    position = torch.arange(length, device=begins.device) + within.cumsum(1)
+    row = torch.arange(count, device=begins.device).unsqueeze(1)
+    steps = seen.new_zeros(count, int(position.max()) + 2)
+    steps[row, position + 1] = after.set("is_init", torch.zeros_like(seen["is_init"]))
+    steps[row, position] = seen
+    parts = {"steps": steps, "burn_in": before} if burn_in else {"steps": steps}
+    shared = {
+        name: part.unsqueeze(1).expand(count, length, part.shape[1]) for name, part in parts.items()
+    }
+    arranged = samples[:, burn_in:].copy()
+    for group, shift in ((arranged, 0), (arranged["next"], 1)):
+        group["sequence"] = TensorDict(
+            {**shared, "position": (position + shift).unsqueeze(-1)}, [count, length]
+        )
+    return arranged
 
 
 def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import h5py
 import numpy as np
@@ -29,6 +30,7 @@ from tests.recipes.commands import fails
 from tests.recipes.offline.test_without_env import log_machine
 from tests.recipes.small import BC, SMALL, DiscreteCQL, make, make_algorithm, make_dt, train
 from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays, load_episodes
+from torchrl_tit.settings.networks import gru
 
 GAMMA = 0.8
 
@@ -171,7 +173,11 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert evaluation["held_out_episodes"] == 10
     assert evaluation["low"] <= evaluation["value"] <= evaluation["high"]
     dt = train(make_dt(tmp_path), tmp_path / "dt")
+    memory: dict[str, Any] = {"backbone": gru(hidden_dim=8), "slice_length": 4}
     for folder, message in {
+        train(
+            make(BC, tmp_path, total_updates=1, **memory), tmp_path / "memory"
+        ).folder: "gru carries a state: leave out --ope",
         dt.folder: "depends on the return that it is told",
         make_run(tmp_path / "ppo", PPO(env="CartPole-v1", backbone=SMALL)): "reads no data sets",
     }.items():

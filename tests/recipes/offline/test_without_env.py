@@ -43,10 +43,12 @@ from tests.recipes.small import (
 from torchrl_tit import load_agent
 from torchrl_tit.datasets import DatasetError, load_episodes
 from torchrl_tit.evaluation_file import check_evaluation
+from torchrl_tit.settings.networks import gru
 
 RECIPES = {
     "bc": partial(make, BC, env="", normalize_observations=True),
     "bc, slices": partial(make, BC, env="", backbone=tit(3), slice_length=2),
+    "bc, memory": partial(make, BC, env="", backbone=gru(hidden_dim=8), slice_length=4, burn_in=2),
     "iql": partial(make, IQL, env=""),
     "td3bc": partial(make, TD3BC, env=""),
     "cql": partial(make, CQL, env=""),
