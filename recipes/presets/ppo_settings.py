@@ -1,6 +1,7 @@
-"""The set of PPO settings with which transformers, and all other networks here, learn reliably.
+"""The sets of PPO settings with which transformers, and all other networks here, learn.
 
-docs/results/ppo_settings.md describes how it was found, what each setting does, and the results.
+docs/results/ppo_settings.md describes how that of arrays was found, what each setting does, and the
+results.
 """
 
 from __future__ import annotations
@@ -23,6 +24,34 @@ PPO_SETTINGS: dict[str, Any] = {
     "target_kl": 0.05,
 }
 """Fields of the recipe; the others have their defaults, which are Stable-Baselines3's."""
+
+PICTURE_SETTINGS: dict[str, Any] = {
+    "num_envs": 8,
+    "steps_per_batch": 8 * 128,
+    "minibatch_size": 256,
+    "epochs": 3,
+    # Each frame is encoded once for the K steps of a sequence that read it, so all that an
+    # environment did in a batch is one sequence.
+    "sequence_length": 128,
+    # Nothing decays, so a short run is the beginning of a long one.
+    "learning_rate": 2.5e-4,
+    "clip_epsilon": 0.1,
+    "entropy_coeff": 0.01,
+    "clip_rewards": True,
+    "padding": "constant",
+}
+"""Fields of the recipes on pictures: those of rl-baselines3-zoo on Atari games, with longer
+sequences, one epoch less, and a learning rate and a clipping range that stay as they are."""
+
+PICTURE_TIT: dict[str, Any] = {
+    "embed_dim": 64,
+    "num_heads_inner": 4,
+    "num_heads_outer": 4,
+    "features_dim": 512,
+    "activation_head": "gelu",
+}
+"""The sizes of TIT on pictures, without dropout, with which old and new log-probabilities would
+differ by chance."""
 
 _TIT: dict[str, Any] = {"patch_size": "auto", "patch_weights": "own"}
 
