@@ -12,13 +12,12 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import (
     catformer,
     coberl,
-    enhanced_tit,
     nature_cnn,
     resnet,
     vanilla_tit,
 )
 
-from .ppo_settings import PICTURE_SETTINGS, PICTURE_TIT
+from .ppo_settings import PICTURE_SETTINGS, PICTURE_TIT, enhanced_tit_of_pictures
 from .preset import PPO, ContrastivePPO, Preset
 
 # Game: environment and steps. The paper ran each for 10,000,000 steps.
@@ -36,32 +35,29 @@ _BASELINES: dict[str, Network] = {
 }
 # The paper does not say which settings of TIT were used for which game, within two or four blocks,
 # patch 6, 12 or 42, width 64 or 128 and two or four heads.
-_SIZES: dict[str, Any] = {"patch_size": 12, **PICTURE_TIT}
-_DROPOUT: dict[str, Any] = {
+_PATCHES: dict[str, Any] = {"patch_size": 12}
+_TIT: dict[str, Network] = {
+    "vanilla-tit": vanilla_tit(4, temporal_positions="learned", **PICTURE_TIT, **_PATCHES),
+    **enhanced_tit_of_pictures(4, **_PATCHES),
+}
+_PROTOCOL: dict[str, Any] = {
+    **_PATCHES,
     "attention_dropout_inner": 0.1,
     "attention_dropout_outer": 0.1,
     "ffn_dropout_inner": 0.1,
     "ffn_dropout_outer": 0.1,
 }
-
-
-def _tit(**settings: Any) -> dict[str, Network]:
-    """The TIT networks of a game and their ablations."""
-    without_outer = {k: v for k, v in settings.items() if k != "temporal_positions"}
-    return {
-        "vanilla-tit": vanilla_tit(4, **settings),
-        "enhanced-tit": enhanced_tit(4, **settings),
-        "enhanced-tit-wo-dense": enhanced_tit(4, dense=False, **settings),
-        "enhanced-tit-wo-inner": enhanced_tit(4, inner=False, **settings),
-        "enhanced-tit-wo-outer": enhanced_tit(4, outer=False, **without_outer),
-    }
+_TIT_PROTOCOL: dict[str, Network] = {
+    "vanilla-tit": vanilla_tit(4, **PICTURE_TIT, **_PROTOCOL),
+    **enhanced_tit_of_pictures(4, "none", **_PROTOCOL),
+}
 
 
 def _named(game: str) -> list[Preset]:
     """All recipes of a game."""
     env, total_steps = _GAMES[game]
     base = PPO(env=env, total_steps=total_steps, **PICTURE_SETTINGS)
-    networks = _BASELINES | _tit(temporal_positions="learned", **_SIZES)
+    networks = _BASELINES | _TIT
     recipes = {name: base.replace(backbone=network) for name, network in networks.items()}
     # The paper's settings are those of rl-baselines3-zoo.
     protocol = base.replace(
@@ -88,13 +84,28 @@ def _named(game: str) -> list[Preset]:
     }
     tit = protocol.replace(minibatch_size=64)  # the authors' code; the paper names only 256
     recipes |= {
-        f"{name}-protocol": tit.replace(backbone=network)
-        for name, network in _tit(**_SIZES, **_DROPOUT).items()
+        f"{name}-protocol": tit.replace(backbone=network) for name, network in _TIT_PROTOCOL.items()
     }
     return [recipe.replace(name=f"ppo/{game}/{name}") for name, recipe in recipes.items()]
 
 
+# An agent that remembers where the ball was knows where it is (arXiv 1507.06527, section 5).
+_FLICKERING = {
+    f"ppo/pong-flickering/{network}": PPO(
+        name=f"ppo/pong-flickering/{network}",
+        env="ALE/Pong-v5",
+        env_settings=("blank_probability=0.5",),
+        total_steps=2_000_000,
+        backbone=backbone,
+        **PICTURE_SETTINGS,
+    )
+    for network, backbone in {
+        "nature-cnn": nature_cnn(4),
+        "enhanced-tit-k16": enhanced_tit_of_pictures(16, **_PATCHES)["enhanced-tit"],
+    }.items()
+}
+
 ATARI_RECIPES: dict[str, Preset] = {
     recipe.name: recipe for game in _GAMES for recipe in _named(game)
-}
+} | _FLICKERING
 """The recipes by name."""

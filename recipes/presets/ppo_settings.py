@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from torchrl_tit.settings import Network
+from torchrl_tit.settings import Network, TemporalPositions
 from torchrl_tit.settings.networks import enhanced_tit, vanilla_tit
 
 PPO_SETTINGS: dict[str, Any] = {
@@ -50,8 +50,29 @@ PICTURE_TIT: dict[str, Any] = {
     "features_dim": 512,
     "activation_head": "gelu",
 }
-"""The sizes of TIT on pictures, without dropout, with which old and new log-probabilities would
-differ by chance."""
+"""The sizes of TIT on pictures. It has no dropout, with which the old and the new probability of an
+action would differ by chance."""
+
+
+def enhanced_tit_of_pictures(
+    num_frames: int, temporal_positions: TemporalPositions = "learned", **settings: Any
+) -> dict[str, Network]:
+    """Returns Enhanced_TIT and its ablations by name, in the sizes of pictures.
+
+    Args:
+        num_frames: number K of observations.
+        temporal_positions: how frames are told apart, where there are outer blocks.
+        **settings: further settings of the networks.
+    """
+    settings = PICTURE_TIT | settings
+    ordered = {"temporal_positions": temporal_positions, **settings}
+    return {
+        "enhanced-tit": enhanced_tit(num_frames, **ordered),
+        "enhanced-tit-wo-dense": enhanced_tit(num_frames, dense=False, **ordered),
+        "enhanced-tit-wo-inner": enhanced_tit(num_frames, inner=False, **ordered),
+        "enhanced-tit-wo-outer": enhanced_tit(num_frames, outer=False, **settings),
+    }
+
 
 _TIT: dict[str, Any] = {"patch_size": "auto", "patch_weights": "own"}
 
