@@ -19,6 +19,7 @@ BENCHMARKS = [
     "history_windows",
     "export",
     "ppo_cartpole",
+    "ppo_pong",
 ]
 
 
