@@ -20,6 +20,7 @@ BENCHMARKS = [
     "export",
     "ppo_cartpole",
     "off_policy",
+    "ppo_pong",
 ]
 
 

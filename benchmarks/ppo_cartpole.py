@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
+from math import nan
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -45,6 +46,8 @@ MODES: dict[str, Compile] = {"compiled": "on", "ours": "off"}
 class Laps:
     """Wall time and processor time at the end of each batch, in seconds."""
 
+    steps: int
+    """Environment steps of a batch."""
     start: float = field(default_factory=time.perf_counter)
     ends: list[tuple[float, float]] = field(default_factory=list)
     training_return: float = float("nan")
@@ -55,7 +58,7 @@ class Laps:
 
     def speed(self, clock: int = 0) -> float:
         """Environment steps per second of wall time (0) or processor time (1)."""
-        return (len(self.ends) - 1) * STEPS / (self.ends[-1][clock] - self.ends[0][clock])
+        return (len(self.ends) - 1) * self.steps / (self.ends[-1][clock] - self.ends[0][clock])
 
 
 class Extractor(BaseFeaturesExtractor):
@@ -73,9 +76,9 @@ class Extractor(BaseFeaturesExtractor):
 class TheirLaps(BaseCallback):
     """Records when each batch and its update end, and the returns of the last batch."""
 
-    def __init__(self) -> None:
+    def __init__(self, steps: int) -> None:
         super().__init__()
-        self.laps = Laps()
+        self.laps = Laps(steps)
         self.returns: list[float] = []
 
     def _on_rollout_start(self) -> None:
@@ -89,14 +92,14 @@ class TheirLaps(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.laps.add()
-        self.laps.training_return = fmean(self.returns)
+        self.laps.training_return = fmean(self.returns or [nan])
 
 
 class OurLaps(Callback):
     """Records when each update ends."""
 
-    def __init__(self) -> None:
-        self.laps = Laps()
+    def __init__(self, steps: int) -> None:
+        self.laps = Laps(steps)
 
     def updated(self, step: int, policy: TensorDictModuleBase) -> bool:
         self.laps.add()
@@ -119,13 +122,13 @@ def run_sb3(num_frames: int, batches: int, seed: int) -> Laps:
         device="cpu",
         policy_kwargs=network,
     )
-    callback = TheirLaps()
+    callback = TheirLaps(STEPS)
     agent.learn(batches * STEPS, callback=callback)
     return callback.laps
 
 
 def run_ours(num_frames: int, batches: int, seed: int, compile: Compile) -> Laps:
-    """Trains the recipe as the command line does, with checkpoints and metrics."""
+    """Trains the recipe."""
     named = get_recipe("ppo/cartpole/enhanced-tit-protocol")
     assert isinstance(named, ppo.PPO)
     recipe = replace(
@@ -137,7 +140,12 @@ def run_ours(num_frames: int, batches: int, seed: int, compile: Compile) -> Laps
         seed=seed,
         compile=compile,
     )
-    callback = OurLaps()
+    return train(recipe)
+
+
+def train(recipe: ppo.PPO) -> Laps:
+    """Trains a recipe as the command line does, with checkpoints and metrics."""
+    callback = OurLaps(recipe.steps_per_batch)
     with tempfile.TemporaryDirectory() as folder, Run.create(Path(folder, "run"), recipe) as run:
         runner.train(recipe, run, [callback])
         callback.laps.training_return = read_metrics(run.folder / "metrics.csv")[-1]["return_mean"]

@@ -14,6 +14,7 @@ EXTRAS = {
     "jinja2": "report",
     "matplotlib": "recipes",
     "minari": "offline",
+    "minatar": "minatar",
     "minigrid": "minigrid",
     "onnx": "onnx",
     "onnxruntime": "onnx",

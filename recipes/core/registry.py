@@ -17,6 +17,7 @@ from ..presets.ppo_any_task import ANY_TASK_RECIPES
 from ..presets.ppo_arrays import ARRAY_RECIPES
 from ..presets.ppo_atari import ATARI_RECIPES
 from ..presets.ppo_memory import MEMORY_RECIPES
+from ..presets.ppo_minatar import MINATAR_RECIPES
 from ..presets.ppo_no_velocity import NO_VELOCITY_RECIPES
 from ..presets.preset import Preset
 from ..presets.sac import SAC_RECIPES
@@ -94,6 +95,7 @@ for _named in (
     NO_VELOCITY_RECIPES,
     MEMORY_RECIPES,
     ATARI_RECIPES,
+    MINATAR_RECIPES,
     SAC_RECIPES,
     DQN_RECIPES,
     CQL_RECIPES,

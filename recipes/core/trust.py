@@ -36,6 +36,7 @@ TASKS = {
     ),
     "ALE/": ("ale_py",),
     "BabyAI-": ("minigrid",),
+    "MinAtar/": ("torchrl_tit.tasks",),
     "MiniGrid-": ("minigrid",),
     "TMaze-": ("torchrl_tit.tasks",),
     "popgym-": ("popgym",),

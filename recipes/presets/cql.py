@@ -94,7 +94,7 @@ def _discrete() -> list[Preset]:
         evaluation_interval=4_000,
         evaluation_episodes=5,
     )
-    images = ATARI_RECIPES["ppo/pong/enhanced-tit"].fields["backbone"]
+    images = ATARI_RECIPES["ppo/pong/enhanced-tit-protocol"].fields["backbone"]
     return [
         cartpole,
         cartpole.replace(

@@ -58,7 +58,7 @@ def _named() -> list[Preset]:
         pong,
         pong.replace(
             name="dqn/pong/enhanced-tit",
-            backbone=ATARI_RECIPES["ppo/pong/enhanced-tit"].fields["backbone"],
+            backbone=ATARI_RECIPES["ppo/pong/enhanced-tit-protocol"].fields["backbone"],
         ),
     ]
 

@@ -1,13 +1,14 @@
-"""The set of PPO settings with which transformers, and all other networks here, learn reliably.
+"""The sets of PPO settings with which transformers, and all other networks here, learn.
 
-docs/results/ppo_settings.md describes how it was found, what each setting does, and the results.
+docs/results/ppo_settings.md describes how that of arrays was found, what each setting does, and the
+results.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from torchrl_tit.settings import Network
+from torchrl_tit.settings import Network, TemporalPositions
 from torchrl_tit.settings.networks import enhanced_tit, vanilla_tit
 
 PPO_SETTINGS: dict[str, Any] = {
@@ -26,6 +27,55 @@ PPO_SETTINGS: dict[str, Any] = {
 
 STEADY_PPO_SETTINGS: dict[str, Any] = PPO_SETTINGS | {"minibatch_size": 256, "target_kl": 0.02}
 """The same with smaller and less noisy updates, for tasks that only a history solves."""
+
+PICTURE_SETTINGS: dict[str, Any] = {
+    "num_envs": 8,
+    "steps_per_batch": 8 * 128,
+    "minibatch_size": 256,
+    "epochs": 3,
+    # Each frame is encoded once for the K steps of a sequence that read it, so all that an
+    # environment did in a batch is one sequence.
+    "sequence_length": 128,
+    # Nothing decays, so a short run is the beginning of a long one.
+    "learning_rate": 2.5e-4,
+    "clip_epsilon": 0.1,
+    "entropy_coeff": 0.01,
+    "clip_rewards": True,
+    "padding": "constant",
+}
+"""Fields of the recipes on pictures: those of rl-baselines3-zoo on Atari games, with longer
+sequences, one epoch less, and a learning rate and a clipping range that stay as they are."""
+
+PICTURE_TIT: dict[str, Any] = {
+    "embed_dim": 64,
+    "num_heads_inner": 4,
+    "num_heads_outer": 4,
+    "features_dim": 512,
+    "activation_head": "gelu",
+}
+"""The sizes of TIT on pictures. It has no dropout, with which the old and the new probability of an
+action would differ by chance."""
+
+
+def enhanced_tit_of_pictures(
+    num_frames: int, temporal_positions: TemporalPositions = "learned", **settings: Any
+) -> dict[str, Network]:
+    """Returns Enhanced_TIT and its ablations by name, in the sizes of pictures.
+
+    Args:
+        num_frames: number K of observations.
+        temporal_positions: how frames are told apart, where there are outer blocks.
+        **settings: further settings of the networks.
+    """
+    settings = PICTURE_TIT | settings
+    ordered = {"temporal_positions": temporal_positions, **settings}
+    return {
+        "enhanced-tit": enhanced_tit(num_frames, **ordered),
+        "enhanced-tit-wo-dense": enhanced_tit(num_frames, dense=False, **ordered),
+        "enhanced-tit-wo-inner": enhanced_tit(num_frames, inner=False, **ordered),
+        "enhanced-tit-wo-outer": enhanced_tit(num_frames, outer=False, **settings),
+    }
+
 
 _TIT: dict[str, Any] = {"patch_size": "auto", "patch_weights": "own"}
 

@@ -160,6 +160,25 @@ def test_no_ops_are_drawn_from_1_on():
     games.close()
 
 
+def test_a_flickering_game_is_the_same_game():
+    plain, flickering = AtariGames("pong", 2), AtariGames("pong", 2, blank_probability=0.5)
+    blank = []
+    for repeat in range(2):
+        shown, seen = plain.reset(seed=3)[0], flickering.reset(seed=3)[0]
+        for _ in range(100):
+            dark = ~seen.any((1, 2))
+            assert np.array_equal(shown[~dark], seen[~dark])
+            blank.append(dark)
+            actions = np.array([RIGHT, LEFT])
+            shown, seen = plain.step(actions)[0], flickering.step(actions)[0]
+        if repeat:  # a seeded reset also repeats what is blank
+            assert np.array_equal(blank[:100], blank[100:])
+    assert 70 < np.sum(blank[:100]) < 130  # of 200, with a standard deviation of 7
+    assert (np.array(blank[:100]).sum(1) == 1).any()  # each game by itself
+    plain.close()
+    flickering.close()
+
+
 def test_evaluation_counts_whole_games():
     def act(sums):
         return sums // 7 % 6  # anything that follows from the picture

@@ -43,6 +43,7 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "POPGym": ("popgym-RepeatPreviousEasy-v0", {}),
     "POPGym's numbers": ("popgym-PositionOnlyCartPoleEasy-v0", {}),
     "Atari": ("ALE/Breakout-v5", {}),
+    "MinAtar": ("MinAtar/Freeway-v1", {"image_layout": "HWC", **SHORT}),
     "TorchRL": (CORRIDOR, {"half": 1}),
     "TorchRL's masks": (
         CORRIDOR,
@@ -77,6 +78,8 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
 )
 def test_specs_tell_the_truth(kind: str, num_envs: int, num_frames: int) -> None:
     name, settings = TASKS[kind]
+    if kind == "MinAtar":
+        pytest.importorskip("minatar")
     env = make_env(name, num_envs, seed=0, num_frames=num_frames, **settings)
     try:
         check_env_specs(env, break_when_any_done="both")

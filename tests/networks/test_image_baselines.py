@@ -1,13 +1,17 @@
-"""NatureCNN against the same layers in a row; ResNet is in tests/interop."""
+"""NatureCNN and MinAtar's against the same layers in a row; ResNet is in tests/interop."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import nn
 
 from tests.numerics import assert_near
-from torchrl_tit.networks import NatureCNN
+from torchrl_tit.networks import HistoryNetwork, NatureCNN, build_network
+from torchrl_tit.settings import StackedCNN
+from torchrl_tit.settings.networks import nature_cnn as settings_of_nature_cnn
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -26,12 +30,35 @@ def nature_cnn(channels: int, positions: int) -> nn.Sequential:
     )
 
 
+def minatar_cnn(channels: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(channels, 16, kernel_size=3),
+        nn.ReLU(),
+        nn.Flatten(),
+        nn.Linear(16 * 8 * 8, 16),
+        nn.ReLU(),
+    )
+
+
 @pytest.mark.parametrize(
     ("shape", "num_frames", "channels", "positions"),
     [((84, 84), 4, 4, 49), ((3, 36, 52), 2, 6, 3), ((36, 36), 1, 1, 1)],
 )
 def test_equals_the_layers_in_a_row(shape, num_frames, channels, positions):
     network, layers = NatureCNN(shape, num_frames, features_dim=16), nature_cnn(channels, positions)
+    check(network, layers, shape, num_frames)
+
+
+def test_equals_the_layers_of_minatar_in_a_row():
+    settings = replace(
+        settings_of_nature_cnn(2, features_dim=16), history=StackedCNN(torso="minatar-cnn")
+    )
+    check(build_network(settings, (4, 10, 10)), minatar_cnn(8), (4, 10, 10), 2)
+
+
+def check(
+    network: HistoryNetwork, layers: nn.Module, shape: tuple[int, ...], num_frames: int
+) -> None:
     for ours, theirs in zip(network.parameters(), layers.parameters(), strict=True):
         theirs.data.copy_(ours)
     frames = torch.rand(5, num_frames, *shape, requires_grad=True)

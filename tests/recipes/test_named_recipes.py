@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fnmatch import fnmatch
+from importlib.util import find_spec
 from operator import attrgetter
 from typing import Any
 
@@ -15,8 +16,10 @@ from recipes.core.dataset_recipe import DatasetRecipe
 from recipes.core.recipe import LENGTHS, recipe_classes
 from recipes.core.registry import RECIPES, get_recipe
 from recipes.ppo import PPO
+from recipes.presets.ppo_atari import ATARI_RECIPES
 from recipes.presets.ppo_memory import MEMORY_RECIPES
-from recipes.presets.ppo_settings import PPO_SETTINGS
+from recipes.presets.ppo_minatar import MINATAR_RECIPES
+from recipes.presets.ppo_settings import PICTURE_SETTINGS, PPO_SETTINGS
 from torchrl_tit.settings import Inner
 from torchrl_tit.settings.networks import (
     catformer,
@@ -39,10 +42,11 @@ GAMES = {
     "breakout": "ALE/Breakout-v5", "mspacman": "ALE/MsPacman-v5", "pong": "ALE/Pong-v5",
     "spaceinvaders": "ALE/SpaceInvaders-v5",
 }  # fmt: skip
-IMAGE_NETWORKS = [
-    *("nature-cnn", "resnet", "catformer", "coberl", "vanilla-tit", "enhanced-tit"),
-    *("enhanced-tit-wo-dense", "enhanced-tit-wo-inner", "enhanced-tit-wo-outer"),
-]
+PICTURES = {**ATARI_RECIPES, **MINATAR_RECIPES}
+PAPERS = ("-protocol", "-paper", "-tuned")
+"""How the names of recipes end that have the paper's settings."""
+ABLATED = ["enhanced-tit", *(f"enhanced-tit-wo-{part}" for part in ("dense", "inner", "outer"))]
+IMAGE_NETWORKS = ["nature-cnn", "resnet", "catformer", "coberl", "vanilla-tit", *ABLATED]
 TANH_64: dict[str, Any] = {"hidden_dim": 64, "num_layers": 2, "activation": "tanh"}
 TIT_OF_ARRAYS: dict[str, Any] = {
     "patch_size": 1, "embed_dim": 32, "num_blocks": 2, "num_heads_outer": 1, "num_heads_inner": 1,
@@ -60,21 +64,20 @@ TIT_OF_IMAGES: dict[str, Any] = {
     "features_dim": 512, "activation_head": "gelu", "attention_dropout_inner": 0.1,
     "attention_dropout_outer": 0.1, "ffn_dropout_inner": 0.1, "ffn_dropout_outer": 0.1,
 }  # fmt: skip
-del TIT_OF_IMAGES["temporal_positions"]  # learned for several frames
 
 SETTINGS: dict[str, dict[str, Any]] = {
     # The protocol of arXiv 2212.14538, appendix; MountainCar's TiTs have settings of their own.
-    "ppo/*-protocol": {
-        "learning_rate": 3e-4, "decay_learning_rate": False, "warmup_steps": 0, "adam_eps": 1e-5,
-        "max_grad_norm": 0.5, "num_envs": 1, "steps_per_batch": 2048, "minibatch_size": 64,
-        "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95,
-        "clip_epsilon": 0.2, "decay_clip_epsilon": False, "entropy_coeff": 0.0,
-        "critic_coeff": 0.5, "clip_rewards": False, "reward_scale": 1.0,
-        "hide_velocities": False, "initialization": "orthogonal", "evaluation_episodes": 100,
-        "backbone.num_frames": 1,
-    },
     **{
-        f"ppo/{task}/*-protocol": {"env": env, "total_steps": steps}
+        f"ppo/{task}/*-protocol": {
+            "env": env, "total_steps": steps,
+            "learning_rate": 3e-4, "decay_learning_rate": False, "warmup_steps": 0,
+            "adam_eps": 1e-5, "max_grad_norm": 0.5, "num_envs": 1, "steps_per_batch": 2048,
+            "minibatch_size": 64, "epochs": 10, "gamma": 0.99, "gae_lambda": 0.95,
+            "clip_epsilon": 0.2, "decay_clip_epsilon": False,
+            "entropy_coeff": 0.0, "critic_coeff": 0.5,
+            "clip_rewards": False, "reward_scale": 1.0, "hide_velocities": False,
+            "initialization": "orthogonal", "evaluation_episodes": 100, "backbone.num_frames": 1,
+        }
         for task, (env, steps) in ARRAYS.items()
     },
     **{
@@ -111,7 +114,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     },
     "dt/*/dt-tit-paper": {"backbone": dt_tit(20, position_encoding=True)},
     **{
-        f"ppo/{game}/{network}": {
+        f"ppo/{game}/{network}-protocol": {
             "env": env, "padding": "constant", "num_envs": 8, "steps_per_batch": 1024,
             "minibatch_size": 64 if "tit" in network else 256, "epochs": 4,
             "learning_rate": 2.5e-4, "decay_learning_rate": True, "clip_epsilon": 0.1,
@@ -123,8 +126,9 @@ SETTINGS: dict[str, dict[str, Any]] = {
         for game, env in GAMES.items()
         for network in IMAGE_NETWORKS
     },
-    "ppo/pong/enhanced-tit": {"backbone": enhanced_tit(4, **TIT_OF_IMAGES)},
-    "ppo/pong/vanilla-tit": {"backbone": vanilla_tit(4, **TIT_OF_IMAGES)},
+    "*/pong*/enhanced-tit-protocol": {"backbone": enhanced_tit(4, **TIT_OF_IMAGES)},
+    "ppo/pong/vanilla-tit-protocol": {"backbone": vanilla_tit(4, **TIT_OF_IMAGES)},
+    "ppo/pong-flickering/*": {"env": "ALE/Pong-v5", "env_settings": ("blank_probability=0.5",)},
     "ppo/*/catformer-tuned": {
         "backbone": catformer(4, attention_expansion=2, ffn_expansion=4), "initialization": "own",
         "warmup_steps": 200_000,
@@ -198,8 +202,8 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
         recipe
         for name, recipe in RECIPES.items()
         if type(recipe) is PPO
-        and not name.endswith(("-protocol", "-paper"))
-        and "ALE" not in recipe.env
+        and not name.endswith(PAPERS)
+        and name not in PICTURES
         and name not in MEMORY_RECIPES
     ]
     assert len({recipe.env for recipe in recipes}) == 7  # the paper's
@@ -209,6 +213,31 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
         "hide_velocities": False,
     }  # fmt: skip
     assert {replace(recipe, **same) for recipe in recipes} == {one}
+
+
+def test_all_pictures_train_with_one_set_of_settings() -> None:
+    """And nothing in it depends on the number of steps, so a short run begins as a long one."""
+    recipes = [get_recipe(name) for name in PICTURES if not name.endswith(PAPERS)]
+    assert len({recipe.env for recipe in recipes}) == 4 + 5
+    one = PPO(env="one", backbone=mlp(), **PICTURE_SETTINGS)
+    same: dict[str, Any] = {
+        "env": "one", "env_settings": (), "backbone": mlp(), "total_steps": one.total_steps,
+        "name": "", "image_layout": "auto",
+    }  # fmt: skip
+    assert {replace(recipe, **same) for recipe in recipes} == {one}
+    assert not one.schedules
+    assert not one.warmup_steps
+
+
+def test_tit_on_pictures_has_no_dropout_and_tells_frames_apart() -> None:
+    sizes = {**TIT_OF_IMAGES, "temporal_positions": "learned"}
+    sizes |= {name: 0.0 for name in sizes if "dropout" in name}
+    for name in PICTURES:
+        if name.endswith(("/enhanced-tit", "/enhanced-tit-k16")):
+            num_frames = 16 if name.endswith("k16") else 4
+            patch = {"patch_size": 2} if "minatar" in name else {}
+            expected = enhanced_tit(num_frames, **{**sizes, **patch})
+            assert get_recipe(name).backbone == expected, name
 
 
 def test_all_tit_networks_differ_only_in_frames_and_positions() -> None:
@@ -222,9 +251,9 @@ def test_all_tit_networks_differ_only_in_frames_and_positions() -> None:
         for name, recipe in RECIPES.items()
         if isinstance(recipe, PPO)
         and "enhanced-tit" in name
-        and not name.endswith(("-protocol", "-paper"))
+        and not name.endswith(PAPERS)
         and "wo-outer" not in name
-        and "ALE" not in recipe.env
+        and name not in PICTURES
         and "MiniGrid" not in recipe.env  # whose patch is a tile
     }
     assert networks == {enhanced_tit(patch_size="auto", patch_weights="own")}
@@ -260,15 +289,19 @@ def test_recipes_of_memory_differ_in_the_memory_alone(task: str) -> None:
     "name",
     [f"ppo/{name}/enhanced-tit" for name in ("ant", "cartpole", "memory-s7")]
     + [f"ppo/pong/{network}" for network in (*IMAGE_NETWORKS, "catformer-tuned", "coberl-tuned")]
+    + [f"ppo/minatar-asterix/{network}" for network in ("minatar-cnn", *ABLATED)]
+    + ["ppo/pong-flickering/enhanced-tit-k16"]
     + ["sac/hopper/mlp", "odt/hopper-medium-replay-v2/odt-small"],
 )
 def test_networks_fit_their_tasks(name: str) -> None:
     """All of them are built in the slow test below."""
     pytest.importorskip("ale_py")
     pytest.importorskip("minigrid")
+    if "minatar" in name:
+        pytest.importorskip("minatar")
     algorithm = make_algorithm(get_recipe(name))
     algorithm.check()
-    if name.startswith("ppo/") and name.count("pong") == 0:
+    if name.startswith("ppo/") and name not in PICTURES:
         (frames,) = algorithm.policy[0].module.frames
         patches = frames.encoder.patch_embedding.num_patches
         assert patches == (3 * 3 if "memory" in name else 1)  # a tile; the whole array
@@ -280,6 +313,8 @@ def test_every_named_recipe_builds_its_agent():
     for name, recipe in RECIPES.items():
         # Recipes of Atari games differ in the game alone.
         if recipe.env.startswith("ALE/") and "pong" not in name and "nature-cnn" not in name:
+            continue
+        if recipe.env.startswith("MinAtar/") and find_spec("minatar") is None:
             continue
         if isinstance(recipe, DatasetRecipe) and recipe.dataset in D4RL_DATASETS:  # not read here
             alike = replace(recipe, name="", dataset="hopper-medium-v2")

@@ -1,5 +1,7 @@
-"""The passive T-Maze, and tasks with fewer actions."""
+"""The passive T-Maze, MinAtar's games, and tasks with fewer actions."""
 
+import re
+import sys
 from collections.abc import Callable
 
 import gymnasium
@@ -142,3 +144,38 @@ def test_a_spec_recreates_the_wrapper():
 )
 def test_checker_of_stable_baselines3(make: Callable[[], gymnasium.Env]) -> None:
     env_checker.check_env(make())
+
+
+@pytest.mark.parametrize("game", ["Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders"])
+def test_games_of_minatar(game):
+    minatar = pytest.importorskip("minatar")
+    name = "_".join(re.findall("[A-Z][a-z]+", game)).lower()
+    env, plain = (
+        gymnasium.make(f"MinAtar/{game}-v1", render_mode="rgb_array"),
+        minatar.Environment(name),
+    )
+    env.reset(seed=3)
+    plain.seed(3)
+    plain.reset()
+    for step in range(200):
+        action = step // 3 % env.action_space.n
+        seen, reward, over, _, _ = env.step(action)
+        assert (reward, over) == plain.act(plain.minimal_action_set()[action])
+        assert np.array_equal(seen, plain.state())
+        picture = env.render()
+        assert picture.shape == (160, 160, 3)
+        assert picture.dtype == np.uint8
+        # What is in a cell gives it a color.
+        assert np.array_equal(picture[8::16, 8::16].any(2), seen.any(2))
+        if over:
+            env.reset()
+            plain.reset()
+    assert env.spec.max_episode_steps == 10_000
+
+
+def test_a_game_of_minatar_without_its_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "minatar.gym", None)
+    with pytest.raises(
+        ValueError, match=r"minatar is not .*: pip install 'torchrl-tit\[minatar\]'"
+    ):
+        gymnasium.make("MinAtar/Breakout-v1")

@@ -16,7 +16,7 @@ from torchrl.data import Categorical, Unbounded
 
 from torchrl_tit.envs.vector import GymVectorEnv
 from torchrl_tit.settings.checks import checked_arguments
-from torchrl_tit.settings.numbers import Copies, Steps, StepsOrNone
+from torchrl_tit.settings.numbers import Copies, Probability, Steps, StepsOrNone
 
 _NOOP, _FIRE = 0, 1
 _HEIGHT, _WIDTH = 210, 160  # of the screen
@@ -98,6 +98,8 @@ class AtariGames(VectorEnv):
         noop_max: maximum number of no-op frames at the start of a game; 0 for none.
         max_num_frames_per_episode: number of frames (4 for each action) after which a game is
             truncated, not counting the no-op frames at its start.
+        blank_probability: probability with which an observation is all zeros, each by itself: 0.5
+            in flickering Pong (Hausknecht and Stone, arXiv 1507.06527, section 5).
         render_mode: ``"rgb_array"`` emulates each game a second time, for images in full size.
 
     Raises:
@@ -131,6 +133,7 @@ class AtariGames(VectorEnv):
         *,
         noop_max: StepsOrNone = 30,
         max_num_frames_per_episode: Steps = MAX_NUM_FRAMES,
+        blank_probability: Probability = 0.0,
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
         from ale_py import roms  # an optional extra
@@ -140,6 +143,8 @@ class AtariGames(VectorEnv):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self._noop_max = noop_max
+        self._blank_probability = blank_probability
+        self._blanks = [np.random.default_rng() for _ in range(num_envs)]
         # The second emulators, for rendering, repeat the actions of the first.
         self._emulators: list[list[Any]] = [
             [
@@ -252,6 +257,7 @@ class AtariGames(VectorEnv):
 
     def _restart(self, i: int, seed: int | None = None) -> list[tuple[np.ndarray, dict[str, Any]]]:
         if seed is not None:
+            self._blanks[i] = np.random.default_rng(seed)
             seed %= 2**31  # ale-py does not support larger seeds
         return [emulator.reset(seed=seed) for emulator in self._emulators[i]]
 
@@ -272,7 +278,8 @@ class AtariGames(VectorEnv):
 
     def _look(self, i: int, pictures: Sequence[np.ndarray]) -> None:
         """Stores the images of a game's emulators, [1, 1, height, width, 3] each."""
-        self._images[i] = (pictures[0][0, 0] @ _GREY).round()
+        blank = self._blanks[i].random() < self._blank_probability
+        self._images[i] = 0 if blank else (pictures[0][0, 0] @ _GREY).round()
         if self.render_mode:
             self._screens[i] = pictures[1][0, 0]
 

@@ -21,6 +21,7 @@ Wrap = Callable[[gymnasium.Env], gymnasium.Env]
 # The packages that register names with these prefixes; extras of the same names install them.
 _PACKAGES = {
     "BabyAI-": "minigrid",
+    "MinAtar/": "torchrl_tit.tasks",
     "MiniGrid-": "minigrid",
     "TMaze-": "torchrl_tit.tasks",
     "popgym-": "popgym",

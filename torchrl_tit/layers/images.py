@@ -75,8 +75,12 @@ class ResidualBlock(nn.Module):
         return x + self.conv(x).relu()
 
 
-_KERNELS = {"nature-cnn": [(8, 4), (4, 2), (3, 1)], "resnet": [(8, 4)]}
-"""Size and stride of the convolutions that make an image smaller."""
+_CONVOLUTIONS = {
+    "nature-cnn": [(32, 8, 4), (64, 4, 2), (64, 3, 1)],
+    "resnet": [(64, 8, 4)],
+    "minatar-cnn": [(16, 3, 1)],
+}
+"""Filters, kernel size and stride of the convolutions that make an image smaller."""
 
 
 class ConvolutionalTorso(nn.Module):
@@ -85,11 +89,13 @@ class ConvolutionalTorso(nn.Module):
     "nature-cnn" has three with relu: 32 filters of 8x8 and stride 4, 64 of 4x4 and stride 2, 64 of
     3x3 (Mnih et al., "Human-level control through deep reinforcement learning", Nature 518, 2015).
     "resnet" has one of 64 filters of 8x8 and stride 4 with relu, and two residual blocks, as the
-    authors of arXiv 2212.14538 built it for ResNet and Catformer.
+    authors of arXiv 2212.14538 built it for ResNet and Catformer. "minatar-cnn" has one of 16
+    filters of 3x3 with relu (Young and Tian, arXiv 1903.03176).
 
     Args:
         name: which convolutions.
-        observation_shape: (H, W) or (C, H, W), at least 36 pixels per side ("resnet": 8).
+        observation_shape: (H, W) or (C, H, W), at least 36 pixels per side ("resnet": 8,
+            "minatar-cnn": 3).
         num_frames: observations that are stacked as channels.
 
     Raises:
@@ -110,32 +116,26 @@ class ConvolutionalTorso(nn.Module):
                 "or stack them for an mlp"
             )
         smallest, sides = 1, list(observation_shape[-2:])
-        for kernel, stride in reversed(_KERNELS[name]):
+        for _, kernel, stride in reversed(_CONVOLUTIONS[name]):
             smallest = (smallest - 1) * stride + kernel
         if min(sides) < smallest:
             raise ValueError(
                 f"images of {sides[0]} x {sides[1]} pixels are too small for these convolutions: "
                 f"both sides must have at least {smallest}"
             )
-        for kernel, stride in _KERNELS[name]:
-            sides = [(side - kernel) // stride + 1 for side in sides]
-        self.out_features = 64 * math.prod(sides)
         channels = num_frames * math.prod(observation_shape[:-2])
-        layers: list[nn.Module]
-        if name == "nature-cnn":
-            layers = [
-                ImageConv2d(channels, 32, 8, stride=4),
-                nn.ReLU(),
-                nn.Conv2d(32, 64, 4, stride=2),
-                nn.ReLU(),
-                nn.Conv2d(64, 64, 3),
-                nn.ReLU(),
-            ]
-        else:
-            layers = [ImageConv2d(channels, 64, 8, stride=4), nn.ReLU()]
-            layers += [ResidualBlock(64), ResidualBlock(64)]
+        layers: list[nn.Module] = []
+        for filters, kernel, stride in _CONVOLUTIONS[name]:
+            layer = nn.Conv2d if layers else ImageConv2d
+            layers += [layer(channels, filters, kernel, stride=stride), nn.ReLU()]
+            sides = [(side - kernel) // stride + 1 for side in sides]
+            channels = filters
+        if name == "resnet":
+            layers += [ResidualBlock(channels), ResidualBlock(channels)]
+        self.out_features = channels * math.prod(sides)
         self.layers = nn.Sequential(*layers, nn.Flatten())
 
     def forward(self, x: Tensor) -> Tensor:
         """[N, channels, H, W], float or uint8 -> float [N, out_features]."""
-        return self.layers(x)
+        # Convolutions on a CPU take a quarter less time if the channels of a pixel lie together.
+        return self.layers(x.contiguous(memory_format=torch.channels_last))

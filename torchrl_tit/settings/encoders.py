@@ -258,8 +258,9 @@ class StackedCNN(
 ):
     """A convolutional network on K images that are stacked as channels."""
 
-    torso: Literal["nature-cnn", "resnet"] = "nature-cnn"
-    """The convolutions: those of the deep Q-network, or the residual network of the baselines."""
+    torso: Literal["nature-cnn", "resnet", "minatar-cnn"] = "nature-cnn"
+    """The convolutions: those of the deep Q-network, the residual network of the baselines, or the
+    one of MinAtar's baselines, for images of 10 x 10."""
 
 
 @dataclass(frozen=True, kw_only=True)

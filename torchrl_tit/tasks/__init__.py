@@ -1,4 +1,4 @@
-"""Tasks that require memory, registered with Gymnasium, and a wrapper for MiniGrid's tasks."""
+"""Tasks that this package registers with Gymnasium, and a wrapper for MiniGrid's tasks."""
 
 from __future__ import annotations
 
@@ -12,6 +12,14 @@ from torchrl_tit.tasks.t_maze import TMaze
 __all__ = ["FirstActions", "TMaze"]
 
 gymnasium.register("TMaze-v0", entry_point="torchrl_tit.tasks.t_maze:TMaze")
+for _game in ("asterix", "breakout", "freeway", "seaquest", "space_invaders"):
+    # MinAtar's own names. Its package registers them only when asked to.
+    gymnasium.register(
+        f"MinAtar/{_game.title().replace('_', '')}-v1",
+        entry_point="torchrl_tit.tasks.minatar:make_game",
+        kwargs={"game": _game},
+        max_episode_steps=10_000,  # a good agent's games of Breakout would not end
+    )
 
 
 class FirstActions(gymnasium.ActionWrapper[Any, Any, Any], gymnasium.utils.RecordConstructorArgs):

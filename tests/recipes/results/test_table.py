@@ -146,23 +146,27 @@ OF_CQL: dict[str, Any] = {
             "near -81 ± 17: backbone.frame.embed_dim 128",
         ),
         (
-            "ppo/breakout/enhanced-tit",
+            "ppo/breakout/enhanced-tit-protocol",
             {"backbone": enhanced_tit(4, patch_size=6, **IMAGES)},
             "321 ± 68",
         ),
         (
-            "ppo/breakout/enhanced-tit-wo-outer",
+            "ppo/breakout/enhanced-tit-wo-outer-protocol",
             {"backbone": enhanced_tit(4, outer=False, patch_size=42, **IMAGES)},
             "229 ± 83",
         ),
         (
-            "ppo/breakout/enhanced-tit",
+            "ppo/breakout/enhanced-tit-protocol",
             {"backbone": enhanced_tit(4, patch_size=7, **IMAGES)},
             "near 321 ± 68: backbone.frame.patch_size 7",
         ),
-        ("ppo/breakout/enhanced-tit", {"minibatch_size": 256}, "321 ± 68"),
-        ("ppo/breakout/nature-cnn", {"minibatch_size": 64}, "near 391 ± 26: minibatch_size 64"),
-        ("ppo/breakout/nature-cnn", {"sequence_length": 1}, "391 ± 26"),
+        ("ppo/breakout/enhanced-tit-protocol", {"minibatch_size": 256}, "321 ± 68"),
+        (
+            "ppo/breakout/nature-cnn-protocol",
+            {"minibatch_size": 64},
+            "near 391 ± 26: minibatch_size 64",
+        ),
+        ("ppo/breakout/nature-cnn-protocol", {"sequence_length": 1}, "391 ± 26"),
         (
             "ppo/breakout/coberl-tuned",
             {},
