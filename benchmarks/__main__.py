@@ -20,7 +20,6 @@ BENCHMARKS = [
     "export",
     "ppo_cartpole",
     "off_policy",
-    "ppo_pong",
 ]
 
 

@@ -60,7 +60,7 @@ def test_networks_and_trained_agents_need_no_extra(tmp_path: Path) -> None:
     )
 
     assert result.returncode == 0, result.stderr
-    assert len(readme) == 3
+    assert len(readme) == 2
     lines = result.stdout.splitlines()
     assert "tensor(500.)" in lines
     assert "ppo/cartpole/enhanced-tit" in lines

@@ -295,7 +295,7 @@ def share(arguments: list[str]) -> None:
     files, steps = pack(found, name, source=source, license=options.license)
     with TemporaryDirectory() as temporary:
         folder = options.out or Path(temporary, name)
-        folder.absolute().parent.mkdir(parents=True, exist_ok=True)
+        folder.parent.mkdir(parents=True, exist_ok=True)
         write_agent(folder, files, steps)
         if options.out is not None:
             size = sum(map(len, files.values()))

@@ -62,7 +62,8 @@ def test_commands(pages):
 def test_metrics(pages):
     algorithms = {recipe.algorithm for recipe in RECIPES.values()}
     assert {*re.findall(r"^## `(.*)`$", pages["metrics.md"], flags=re.MULTILINE)} == algorithms
-    assert pages["metrics.md"].count("| `return_mean` |") == len(algorithms)
+    of_ppo = [name for name in algorithms if name.startswith("ppo-")]  # only what they add
+    assert pages["metrics.md"].count("| `return_mean` |") == len(algorithms) - len(of_ppo)
 
 
 def test_fields(pages):

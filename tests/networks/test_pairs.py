@@ -485,7 +485,7 @@ def test_observations_by_name() -> None:
     [
         (ROWS, torch.zeros(2, 3, 3), r"float32 does not fit a row of categories \(4, 3, 5 values"),
         ((3,), torch.zeros(2, 3, 3).long(), r"build the network with their spec \(MultiCateg"),
-        ((3,), torch.zeros(2, 3, 3).double(), "DoubleToFloat"),
+        ((3,), torch.zeros(2, 3, 3).double(), "give it torch.float32 or uint8"),
     ],
 )
 def test_histories_of_another_dtype(observation: Any, history: Tensor, message: str) -> None:

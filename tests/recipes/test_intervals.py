@@ -173,7 +173,7 @@ def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path
         assert batch["is_init"][:, 0].all()
 
 
-@pytest.mark.parametrize("kind", ["CartPole", "TorchRL", "processes", "collectors", "SAC", "DQN"])
+@pytest.mark.parametrize("kind", ["CartPole", "TorchRL", "collectors", "SAC", "DQN"])
 def test_neighboring_seeds_share_no_environment(kind: str, tmp_path: Path) -> None:
     """No copy of one begins as a copy of another; other tasks are seeded in the same way."""
     starts = []
@@ -205,7 +205,7 @@ def paying(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recipe]:
     ("kind", "value"),
     [
         *(("CartPole", "-inf"), ("CartPole", "1e39")),  # in single precision, 1e39 is infinite
-        *(("processes", "nan"), ("SAC", "nan"), ("DQN", "nan")),
+        *(("SAC", "nan"), ("DQN", "nan")),
         pytest.param("collectors", "nan", marks=pytest.mark.slow),
     ],
 )

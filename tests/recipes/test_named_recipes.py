@@ -19,7 +19,7 @@ from recipes.ppo import PPO
 from recipes.presets.ppo_atari import ATARI_RECIPES
 from recipes.presets.ppo_memory import MEMORY_RECIPES
 from recipes.presets.ppo_minatar import MINATAR_RECIPES
-from recipes.presets.ppo_settings import PICTURE_SETTINGS, PPO_SETTINGS
+from recipes.presets.ppo_settings import PICTURE_SETTINGS, PPO_SETTINGS, STEADY_PPO_SETTINGS
 from torchrl_tit.settings import Inner
 from torchrl_tit.settings.networks import (
     catformer,
@@ -208,11 +208,11 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
     ]
     assert len({recipe.env for recipe in recipes}) == 7  # the paper's
     one = PPO(env="one", backbone=mlp(), **PPO_SETTINGS)
+    steady = replace(one, **STEADY_PPO_SETTINGS, hide_velocities=True)
     same: dict[str, Any] = {
         "env": "one", "backbone": mlp(), "total_steps": one.total_steps, "name": "",
-        "hide_velocities": False,
     }  # fmt: skip
-    assert {replace(recipe, **same) for recipe in recipes} == {one}
+    assert {replace(recipe, **same) for recipe in recipes} == {one, steady}
 
 
 def test_all_pictures_train_with_one_set_of_settings() -> None:

@@ -295,30 +295,29 @@ class Backbone(ActingModule):
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys of all entries that it reads; fixed, because other attributes follow from them."""
-        return super().in_keys
+        return self._in_keys
 
     @in_keys.setter
     def in_keys(self, keys: Sequence[NestedKey]) -> None:
-        ActingModule.in_keys.fset(self, self._fixed("in_keys", keys))
+        self._in_keys = self._fixed("in_keys", keys)
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """Keys of all entries that it writes, or those of ``select_out_keys``; fixed, too."""
-        return super().out_keys
+        return self._out_keys_apparent
 
     @out_keys.setter
     def out_keys(self, keys: Sequence[NestedKey]) -> None:
-        ActingModule.out_keys.fset(self, self._fixed("out_keys_source", keys))
+        self._out_keys = self._out_keys_apparent = self._fixed("out_keys", keys)
 
     def _fixed(self, name: str, keys: Sequence[NestedKey]) -> list[NestedKey]:
         """Returns keys; raises AttributeError if they would replace others."""
         given: list[NestedKey] = unravel_key_list(list(keys))
-        present = getattr(super(), name, given)
+        present = self.__dict__.get(f"_{name}", given)
         if given != present:
             raise AttributeError(
-                f"{name.removesuffix('_source')} of a backbone cannot be changed from {present} to "
-                f"{given}: build another one of the same network, Backbone(backbone.module, "
-                "in_keys, out_keys)"
+                f"{name} of a backbone cannot be changed from {present} to {given}: build another "
+                "one of the same network, Backbone(backbone.module, in_keys, out_keys)"
             )
         return given
 

@@ -33,6 +33,7 @@ RECIPE = PPO(
     total_steps=192,
     steps_per_batch=96,
     minibatch_size=32,
+    sequence_length=16,
     epochs=1,
     compile="off",
 )
@@ -340,4 +341,5 @@ def test_the_compiled_objective_is_one_graph_and_the_eager_one(tmp_path):
     ],
 )
 def test_the_length_of_sequences(fields, length):
-    assert replace(RECIPE, **fields).steps_per_sequence == length
+    recipe = replace(RECIPE, **{"sequence_length": None, **fields})
+    assert recipe.steps_per_sequence == length

@@ -131,8 +131,8 @@ def test_what_was_chosen_is_printed_and_recorded(monkeypatch, tmp_path, capsys):
     words = ["--env", TASK, "--backbone.frames.state/0", "linear", "--out", str(tmp_path / "run")]
     main(["train", "ppo/mlp", *words, "--backbone.frames.state/0.embed-dim", "8"])
     assert capsys.readouterr().out == (
-        "frames chosen by kind of observation: image: inner (patch_size auto, embed_dim 8, "
-        "every_block False); state/1: linear (embed_dim 8, bias True)\n"
+        "frames chosen by kind of observation: image: inner (embed_dim 8, "
+        "every_block False, patch_size auto); state/1: linear (embed_dim 8, bias True)\n"
     )
     (run,) = runs
     frames = {

@@ -114,8 +114,8 @@ def test_a_run_of_one_batch_is_seen(values, tmp_path, figures):
 def test_a_legend_names_what_is_drawn(tmp_path, figures):
     many = Cell("Online", "ppo/a/mlp", 5, 1, 1, 0, 0, 1, 0, 2, np.nan, np.nan)
     few = Cell("Online", "ppo/b/mlp", 3, 1, 1, 0, 0, np.nan, np.nan, np.nan, 2, 1, paper="2 ± 1")
-    plot.plot_table([many], tmp_path / "table.png")
-    plot.plot_table([many, few], tmp_path / "table.png")
+    plot_table([many], tmp_path / "table.png")
+    plot_table([many, few], tmp_path / "table.png")
     texts = [[text.get_text() for text in f.legends[0].get_texts()] for f in figures]
     middle = "interquartile mean, 95%"
     assert texts == [[middle], [middle, "mean of fewer than 5 runs", "paper"]]

@@ -101,7 +101,7 @@ def test_commands_take_tables(runs, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.endswith("page/seed-2\n2 recorded in page\n")
     assert Records("page").rows["seed-2"]["commit"] == "abc"
     main(["table", "page"])
-    assert f"| {MLP} | 2 | 368 ± 117 |" in capsys.readouterr().out
+    assert f"| {MLP} | 2 | 368 ± 166 |" in capsys.readouterr().out
     main(["compare", "page/seed-2", "page/seed-10", "--out", "a.png"])
     capsys.readouterr()
     main(["show", "page/seed-2/recipe.json"])
