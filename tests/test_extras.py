@@ -77,7 +77,7 @@ def test_networks_and_trained_agents_need_no_extra(tmp_path: Path) -> None:
     ]
     assert [line for line in result.stderr.splitlines() if line.startswith("error: ")] == [
         "error: tyro is not installed: pip install 'torchrl-tit[recipes]'",
-        "error: matplotlib is not installed: pip install 'torchrl-tit[recipes]'",
+        "error: scipy is not installed: pip install 'torchrl-tit[recipes]'",
         "error: tyro is not installed: pip install 'torchrl-tit[recipes]'",
     ]
     assert "Traceback" not in result.stderr

@@ -335,7 +335,8 @@ def test_what_an_environment_lacks_is_said_in_one_line() -> None:
     with pytest.raises(ValueError, match=r"no 'observation' .* only .*camera, place: add History"):
         observation_specs(env)
     pixels = History(2, in_keys=["camera"])
-    assert observation_specs(TransformedEnv(env, pixels)).shape == (3, 12, 12)
+    spec: Any = observation_specs(TransformedEnv(env, pixels))
+    assert spec.shape == (3, 12, 12)
     odd = History(2, in_keys=["camera", "place"], out_keys=["a", "b"])
     with pytest.raises(ValueError, match=r"\['a', 'b'\] have no names: call them"):
         observation_specs(TransformedEnv(env, odd))

@@ -43,7 +43,8 @@ class Ends(Meet):
 @pytest.mark.parametrize("make", [lambda: Meet(num_envs=2), Ends])
 def test_agents_are_read_as_if_alone(make: Any) -> None:
     env = TransformedEnv(make(), Compose(InitTracker(), History(4, in_keys=[KEY])))
-    assert (observation_specs(env).shape, observation_keys(env)) == ((2,), [KEY])
+    spec: Any = observation_specs(env)
+    assert (spec.shape, observation_keys(env)) == ((2,), [KEY])
     tit = EnhancedTIT((2,), num_frames=4, temporal_positions="learned").double()
     randomize(tit)
     rollout = env.rollout(27, break_when_any_done=False)  # episodes end after 20
@@ -60,7 +61,7 @@ def test_agents_are_read_as_if_alone(make: Any) -> None:
     torch.testing.assert_close(together(batch.clone())["agents", "features"], features)
     with set_recurrent_mode(True):
         for padding in (None, "same"):
-            read = Backbone(tit, [HISTORY], padding=padding)(batch.clone())  # type: ignore[arg-type]
+            read = Backbone(tit, [HISTORY], padding=padding)(batch.clone())
             torch.testing.assert_close(read["agents", "features"], features)
         within = together(batch[:, 5:].exclude(HISTORY))  # begins inside an episode
     valid = within["agents", "features_valid"]

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from tests.numerics import assert_near
-from torchrl_tit.networks import HistoryNetwork, NatureCNN, build_network
+from torchrl_tit.networks import NatureCNN, build_network
 from torchrl_tit.settings import StackedCNN
 from torchrl_tit.settings.networks import nature_cnn as settings_of_nature_cnn
 
@@ -56,9 +56,7 @@ def test_equals_the_layers_of_minatar_in_a_row():
     check(build_network(settings, (4, 10, 10)), minatar_cnn(8), (4, 10, 10), 2)
 
 
-def check(
-    network: HistoryNetwork, layers: nn.Module, shape: tuple[int, ...], num_frames: int
-) -> None:
+def check(network: nn.Module, layers: nn.Module, shape: tuple[int, ...], num_frames: int) -> None:
     for ours, theirs in zip(network.parameters(), layers.parameters(), strict=True):
         theirs.data.copy_(ours)
     frames = torch.rand(5, num_frames, *shape, requires_grad=True)

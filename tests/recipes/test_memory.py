@@ -124,7 +124,7 @@ def test_losses_of_sequences_are_those_of_steps(kind, env, history, tmp_path, mo
         algorithm.close()
         algorithm.buffer.extend(algorithm.collected(batch).select(*storage_keys(batch)))
     algorithm.model.double()
-    every = torch.arange(storage.shape[0])
+    every: Any = torch.arange(storage.shape[0])
     every = (every, torch.zeros_like(every)) if kind in (SAC, DQN) else every
     second, third = storage.get(every)["is_init"].flatten().nonzero().flatten()[1:3]
     first = torch.cat([second - torch.arange(1, 7), third - torch.arange(1, 7)])

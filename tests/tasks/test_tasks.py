@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -150,10 +151,8 @@ def test_checker_of_stable_baselines3(make: Callable[[], gymnasium.Env]) -> None
 def test_games_of_minatar(game):
     minatar = pytest.importorskip("minatar")
     name = "_".join(re.findall("[A-Z][a-z]+", game)).lower()
-    env, plain = (
-        gymnasium.make(f"MinAtar/{game}-v1", render_mode="rgb_array"),
-        minatar.Environment(name),
-    )
+    env: Any = gymnasium.make(f"MinAtar/{game}-v1", render_mode="rgb_array")
+    plain = minatar.Environment(name)
     env.reset(seed=3)
     plain.seed(3)
     plain.reset()
