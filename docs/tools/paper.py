@@ -24,6 +24,7 @@ from typing import Any
 from recipes.core.recipe import Recipe, experiment_of
 from recipes.core.registry import RECIPES, get_recipe
 from recipes.tools.results.experiments import changes_of, fields_of, find_runs, read_metrics
+from recipes.tools.results.interval import FEWEST
 from recipes.tools.results.paper import (
     Match,
     PaperCell,
@@ -82,12 +83,12 @@ class Measured:
         return self.match.differs != self.match.cell.note
 
     @property
-    def rank(self) -> tuple[int, int]:
-        """Comes first: the recipes of today, then those of older versions, then others."""
-        name = self.recipe.name
+    def rank(self) -> tuple[bool, int, int]:
+        """Comes first: enough runs; the recipes of today, then those of older versions."""
+        name, few = self.recipe.name, len(self.values) < FEWEST
         if name in RECIPES and not changes_of(get_recipe(name), self.recipe):
-            return 0, -len(self.values)
-        return 1 if name.endswith("-tuned") else 2, -len(self.values)
+            return few, 0, -len(self.values)
+        return few, 1 if name.endswith("-tuned") else 2, -len(self.values)
 
     def __str__(self) -> str:
         """Mean and spread over the runs, with their number and steps."""
