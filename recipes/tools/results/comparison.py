@@ -96,7 +96,7 @@ def compare(ours: Sequence[float], others: Sequence[float]) -> Comparison:
         if difference:
             z = norm.ppf(1 - _LEVEL / 2) + norm.ppf(_POWER)
             runs = max(ceil(z**2 * (a.var(ddof=1) + b.var(ddof=1)) / difference**2), _LEAST_RUNS)
-    better = probability_of_improvement({(): ours}, {(): others}).middle
+    better = float(_better(a, b))
     return Comparison(Interval(difference, float(low), float(high)), better, float(p), runs)
 
 
@@ -157,17 +157,18 @@ def probability_of_improvement(ours: Values, others: Values) -> Interval:
         >>> probability_of_improvement({"a": [2.0, 3.0]}, {"a": [1.0, 3.0]}).middle
         0.625
     """
-
-    def better(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        x, y = x[..., :, None], y[..., None, :]
-        return ((x > y) + 0.5 * (x == y)).mean((-2, -1))
-
     pairs = [(np.asarray(ours[task], float), np.asarray(others[task], float)) for task in ours]
     draws = [
-        better(_resampled(x, 2 * i), _resampled(y, 2 * i + 1)) for i, (x, y) in enumerate(pairs)
+        _better(_resampled(x, 2 * i), _resampled(y, 2 * i + 1)) for i, (x, y) in enumerate(pairs)
     ]
     low, high = np.quantile(np.mean(draws, 0), [0.025, 0.975])
-    return Interval(float(np.mean([better(x, y) for x, y in pairs])), float(low), float(high))
+    return Interval(float(np.mean([_better(x, y) for x, y in pairs])), float(low), float(high))
+
+
+def _better(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The share of pairs in which the first is better, [..., runs] and [..., others] -> [...]."""
+    x, y = x[..., :, None], y[..., None, :]
+    return ((x > y) + 0.5 * (x == y)).mean((-2, -1))
 
 
 def _resampled(values: np.ndarray, seed: int) -> np.ndarray:
