@@ -67,7 +67,7 @@ WRAPPERS = {
     "minigrid.wrappers": frozenset(_MINIGRID.split()),
     "torchrl.envs": frozenset(_TORCHRL.split()),
     "torchrl.envs.transforms": frozenset(_TORCHRL.split()),
-    "torchrl_tit.tasks": frozenset({"FirstActions"}),
+    "torchrl_tit.tasks": frozenset({"FirstActions", "PreviousStep"}),
 }
 """The wrappers and transforms that a file may name, by their module."""
 

@@ -28,6 +28,10 @@ TASKS: dict[str, tuple[str, dict[str, Any]]] = {
     "processes": ("CartPole-v1", {"vectorization_mode": "async", **SHORT}),
     "a dictionary in processes": (ROBOT, {"vectorization_mode": "async", **SHORT}),
     "memory": ("TMaze-v0", {"corridor_length": 1}),
+    "the previous step": (
+        "TMaze-v0",
+        {"corridor_length": 1, "wrappers": ["torchrl_tit.tasks:PreviousStep"]},
+    ),
     "MiniGrid": ("MiniGrid-Empty-5x5-v0", {"max_steps": 2}),
     "MiniGrid's pixels": (
         "MiniGrid-Empty-5x5-v0",

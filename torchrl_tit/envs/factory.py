@@ -176,7 +176,9 @@ def make_env(
         env, Compose(*transforms), transient_keys=() if keep_histories else ("history",)
     )
     if hide_velocities:
-        env.append_transform(HideVelocities(name))
+        whole = ("observation", "observation")  # beside other observations, such as PreviousStep's
+        keys = [key for key in keys_of(env) if key in ("observation", whole)]
+        env.append_transform(HideVelocities(name, keys))
     env.append_transform(RewardSum())
     env.append_transform(History(num_frames, keys_of(env), padding=padding))
     return env

@@ -1,4 +1,4 @@
-"""Tasks that this package registers with Gymnasium, and a wrapper for MiniGrid's tasks."""
+"""Tasks that this package registers with Gymnasium, and wrappers of tasks."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 
+from torchrl_tit.tasks.previous_step import PreviousStep
 from torchrl_tit.tasks.t_maze import TMaze
 
-__all__ = ["FirstActions", "TMaze"]
+__all__ = ["FirstActions", "PreviousStep", "TMaze"]
 
 gymnasium.register("TMaze-v0", entry_point="torchrl_tit.tasks.t_maze:TMaze")
 for _game in ("asterix", "breakout", "freeway", "seaquest", "space_invaders"):
