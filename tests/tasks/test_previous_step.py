@@ -61,7 +61,7 @@ def test_names_and_actions() -> None:
     task.observation_space = spaces.Dict(a=spaces.Discrete(3))
     assert PreviousStep(task).observation_space["previous_action"].shape == (5,)
     task.action_space = spaces.Sequence(spaces.Discrete(2))
-    with pytest.raises(ValueError, match="cannot observe Sequence"):
+    with pytest.raises(ValueError, match="cannot observe actions of Sequence"):
         PreviousStep(task)
 
 
