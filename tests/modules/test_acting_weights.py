@@ -43,14 +43,14 @@ def more(weights):
 @pytest.mark.parametrize("clears", [True, False])
 @torch.no_grad()
 def test_writes_that_leave_no_trace(clears):
-    """Without a call of clear_cache, older frames keep the tokens of the old weights."""
+    """Without a call of mark_weight_update, older frames keep the tokens of the old weights."""
     backbone, network, shape = make()
     stream = torch.randn(5, 10, *shape)
     with backbone.acting():
         assert_exact(backbone, stream[:, :4])
         change(network)
         if clears:
-            backbone.clear_cache()
+            backbone.mark_weight_update()
         for start in range(1, 6):
             history = stream[:, start : start + 4]
             same = torch.allclose(features(backbone, history), network(history), atol=1e-9)

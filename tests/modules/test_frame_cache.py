@@ -25,7 +25,6 @@ from tests.modules.frames import (
 from tests.numerics import ROUNDING, assert_near
 from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.modules import FrameCache, acting
-from torchrl_tit.modules.acting import clear_caches
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
 
@@ -64,7 +63,7 @@ def test_features_are_those_of_the_full_pass_whatever_comes(name, padding):
                     streams.windows[1, 2] = streams.windows[0, 3]
                 case 4:
                     next(encoder_of(network).parameters()).mul_(1.01)
-                    backbone.clear_cache()
+                    backbone.reset_cache()
                 case 5:  # written in place
                     streams.windows[2, :-1] = streams.windows[2, 1:].clone()
                     assert_exact(backbone, streams.windows)
@@ -183,12 +182,12 @@ def test_copies_are_not_in_acting_mode(copied):
 @pytest.mark.parametrize(
     "clear",
     [
-        Backbone.clear_cache,
-        clear_caches,
+        Backbone.reset_cache,
+        Backbone.mark_weight_update,
         lambda backbone: nn.Sequential(backbone).state_dict(),
         lambda backbone: nn.Sequential(backbone).to(torch.float64),
     ],
-    ids=["clear_cache", "clear_caches", "state_dict", "to"],
+    ids=["reset_cache", "mark_weight_update", "state_dict", "to"],
 )
 def test_the_cache_is_emptied(clear):
     """A run then continues with the bits of one that is resumed from its state dict."""
@@ -367,7 +366,7 @@ def test_compiled_parts(name):
             if start == 3:
                 encoder_of(network).requires_grad_()
                 next(encoder_of(network).parameters()).mul_(1.1)
-                backbone.clear_cache()
+                backbone.reset_cache()
             if start == 4:
                 stream[2, :] = torch.randn_like(stream[2])
             assert_exact(backbone, stream[:, start : start + 4])

@@ -42,7 +42,7 @@ class ActingModule(TensorModule):
         **Weights that change within the context** are noticed if PyTorch counts the write: when a
         state dict is loaded into any module, within ``to_module``, and after most optimizers' step.
         Nothing shows that a fused optimizer stepped, or that weights were written through ``.data``
-        or shared memory: call :meth:`clear_cache` afterwards; otherwise, for the next K - 1 steps,
+        or shared memory: call :meth:`mark_weight_update` afterwards; otherwise, for the next K - 1 steps,
         frames seen before the change keep the tokens of the old weights. There is no need for it
         between two collections, each of which enters a new context, as those of
         :class:`~torchrl_tit.modules.ActingCollector` do.
@@ -62,11 +62,11 @@ class ActingModule(TensorModule):
             ...         td = backbone(TensorDict({"history": frames[:, step : step + 8]}, [5]))
         """
         outer, self._acting = self._acting, self._make_acting()
-        self.clear_cache()
+        self.reset_cache()
         try:
             yield
         finally:
-            self.clear_cache()
+            self.reset_cache()
             self._acting = outer
 
     def compile_parts(self, **options: Any) -> None:
@@ -84,18 +84,22 @@ class ActingModule(TensorModule):
             for network in self._compiled:
                 network.compile(**options)
 
-    def clear_cache(self) -> None:
+    def reset_cache(self) -> None:
         """Discards the tokens that acting mode keeps."""
         for network in self._acting or ():
             network.clear()
 
+    def mark_weight_update(self) -> None:
+        """Discards them because the weights have changed; the names are TorchRL's from 0.15 on."""
+        self.reset_cache()
+
     def state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """Returns the network's state dict, and discards the tokens that acting mode keeps."""
-        self.clear_cache()
+        self.reset_cache()
         return super().state_dict(*args, **kwargs)
 
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
-        self.clear_cache()  # moved or cast
+        self.reset_cache()  # moved or cast
         return super()._apply(*args, **kwargs)
 
     def _make_acting(self) -> list[ActingNetwork] | None:
@@ -159,16 +163,6 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
         yield
 
 
-def clear_caches(policy: Callable[..., Any]) -> None:
-    """Clears the caches of a policy's backbones, after its weights change within ``acting``.
-
-    Args:
-        policy: see :func:`acting`.
-    """
-    for module in _within(policy):
-        module.clear_cache()
-
-
 def _within(policy: Callable[..., Any]) -> list[ActingModule]:
     modules = policy.modules() if isinstance(policy, nn.Module) else ()
     return [module for module in modules if isinstance(module, ActingModule)]
@@ -212,4 +206,5 @@ class ActingCollector(Collector):
     def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
         """Updates the policy's weights; in a worker process, called in another thread."""
         super().update_policy_weights_(*args, **kwargs)
-        clear_caches(self.policy)
+        for module in _within(self.policy):
+            module.mark_weight_update()
