@@ -47,6 +47,17 @@ DEVICE = torch.device(os.environ.get("DEVICE", "meta"))
 COMPUTES = DEVICE.type != "meta"
 
 
+class NothingOnTheCPU(TorchDispatchMode):
+    """Refuses tensors that are made without a device, which a GPU would have to wait for."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        results = func(*args, **(kwargs or {}))
+        for result in results if isinstance(results, list | tuple) else [results]:
+            on_device = not isinstance(result, Tensor) or result.device.type == DEVICE.type
+            assert on_device, f"{func} made {result} on the CPU"
+        return results
+
+
 def check(module: nn.Module, result: Tensor, expected: Tensor) -> None:
     """Compares a result with the CPU's, and takes its gradients."""
     assert (result.device.type, result.shape) == (DEVICE.type, expected.shape)
@@ -86,7 +97,10 @@ def test_networks_read_steps_and_sequences(case: pairs.Pair) -> None:
         backbones = [Backbone(x, keys, padding=padding) for x in (network, there)]
         with set_recurrent_mode(reads != "steps"):
             expected = backbones[0](batch.clone())["features"]
-            check(there, backbones[1](batch.to(DEVICE))["features"], expected)
+            batch = batch.to(DEVICE)
+            with NothingOnTheCPU():
+                result = backbones[1](batch)["features"]
+            check(there, result, expected)
 
 
 @pytest.mark.parametrize("positions", get_args(TemporalPositions))
@@ -97,7 +111,10 @@ def test_outer_blocks_read_tables_of_frames(positions: Any) -> None:
     expected = network.encode_windows([frames], windows)
     network.to(DEVICE)
     windows = windows._replace(rows=windows.rows.to(DEVICE))
-    check(network, network.encode_windows([frames.to(DEVICE)], windows), expected)
+    frames = frames.to(DEVICE)
+    with NothingOnTheCPU():
+        result = network.encode_windows([frames], windows)
+    check(network, result, expected)
 
 
 ACTING = [*((case, 3) for case in pairs.CASES), *((case, 1) for case in CARRIED)]
@@ -117,7 +134,8 @@ def test_policies_act(case: pairs.Pair, frames: int) -> None:
             step = steps[:, time].clone()
             for key, shape in backbone.state_shapes.items():
                 step[key] = torch.zeros(len(step), *shape, device=DEVICE)
-            backbone(step)
+            with NothingOnTheCPU():
+                backbone(step)
             assert step["features"].device.type == DEVICE.type
 
 

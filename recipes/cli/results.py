@@ -50,7 +50,7 @@ def summary(arguments: list[str]) -> None:
     parser = Parser(
         "summary",
         "Print the interquartile mean of each network's returns over all tasks that all of them "
-        "have, normalised by a random policy and the best published PPO, and the probability that "
+        "have, normalized by a random policy and the best published PPO, and the probability that "
         "it improves on the first (arXiv 2108.13264).",
     )
     parser.add_argument("folders", type=Path, nargs="+", help="folders of runs, or tables of runs")

@@ -38,7 +38,7 @@ MEASURES: dict[str, tuple[str, Callable[[np.ndarray], np.floating]]] = {
     "pages of files, MB": ("file_mb", np.mean),
     "open files": ("descriptors", np.mean),
 }
-"""What is fitted: a column, and how the samples of a block are summarised."""
+"""What is fitted: a column, and how the samples of a block are summarized."""
 _BLOCKS = 12
 """Blocks of time whose means are fitted: neighboring samples are not independent."""
 _FOREVER = "1000000000"

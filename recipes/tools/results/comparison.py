@@ -35,7 +35,7 @@ WORDS = (
 )
 """What its columns mean."""
 SUMMARY = (
-    *("network", "tasks", "runs", "interquartile mean of normalised returns [95%]"),
+    *("network", "tasks", "runs", "interquartile mean of normalized returns [95%]"),
     "probability of improvement over the first [95%]",
 )
 """The header of :func:`summarize`."""
@@ -126,7 +126,7 @@ def interquartile_mean(values: Values) -> Interval:
     2108.13264: the interval is a bootstrap of the runs within each task.
 
     Args:
-        values: normalised returns.
+        values: normalized returns.
 
     Example:
         >>> interquartile_mean({("a",): [0.0, 0.4], ("b",): [0.6, 9.0]}).middle
@@ -222,7 +222,7 @@ def read_networks(
     patterns: Sequence[str] = (),
     references: Path | None = None,
 ) -> tuple[dict[str, dict[Task, list[float]]], list[str]]:
-    """Reads the normalised returns of networks on several tasks.
+    """Reads the normalized returns of networks on several tasks.
 
     Args:
         folders: as for ``table``.

@@ -30,7 +30,7 @@ class Interval:
 
 
 def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
-    """Summarises one number per run, as in the tables of results.
+    """Summarizes one number per run, as in the tables of results.
 
     Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv
     2108.13264.
@@ -54,7 +54,7 @@ def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
 
 
 def intervals_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Summarises curves, as :func:`interval_of` does, at every point.
+    """Summarizes curves, as :func:`interval_of` does, at every point.
 
     Args:
         values: float [runs, points].

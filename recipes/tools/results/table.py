@@ -318,7 +318,7 @@ def reported_of(recipe: Recipe) -> tuple[Match | None, tuple[Published, ...]]:
 
 
 def value_of(evaluation: dict[str, Any]) -> float:
-    """The number that a run counts with: the mean return, or the best normalised score."""
+    """The number that a run counts with: the mean return, or the best normalized score."""
     return float(evaluation["score"]["best"] if "score" in evaluation else evaluation["mean"])
 
 

@@ -86,7 +86,7 @@ def test_whole_rollouts_cover_the_steps():
 
 
 @pytest.mark.numerics
-def test_initialisation_is_that_of_stable_baselines3():
+def test_initialization_is_that_of_stable_baselines3():
     model = PPOAlgorithm(SMALL).model
     network: nn.Module = model.backbone.module
     for layer in network.modules():
