@@ -520,5 +520,6 @@ def _check_keys(
     if len(in_keys) != reads or len(out_keys) != writes:
         raise ValueError(
             f"{type(network).__name__} has {reads} inputs and {writes} outputs, but in_keys is "
-            f"{list(in_keys)} and out_keys is {list(out_keys)}: name one key for each"
+            f"{list(in_keys)} and out_keys is {list(out_keys)}: name one key for each "
+            "(torchrl_tit.modules.history_keys lists those of several observations)"
         )
