@@ -109,10 +109,15 @@ def tune(arguments: list[str]) -> None:
     from .train import parse_recipe
 
     recipe, _ = parse_recipe(find_recipe(options.name), typed, f"tune {options.name}")
+    space = load_space(options.space, recipe)
+    given = {word.partition("=")[0].replace("_", "-").replace("--no-", "--") for word in typed}
+    for name in map(option, space):
+        if name in given:
+            fail(f"{name} is searched, so it has no value: leave it out, or out of --space")
     make_algorithm(recipe).check()
     settings = Settings(
         recipe,
-        load_space(options.space, recipe),
+        space,
         seeds=tuple(dict.fromkeys(options.seeds)),
         startup_trials=options.startup_trials,
     )

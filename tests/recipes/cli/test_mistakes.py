@@ -43,6 +43,7 @@ MISTAKES = [
     (f"{BACKBONE}.network enhanced", "did you mean enhanced-tit"),
     ("evaluate nowhere", "is not a run folder"),
     (f"tune {MLP} --out new --seeds 0 -1", "seed must be at least 0, not -1"),
+    (f"tune {MLP} --out new --epochs 4", "--epochs is searched, so it has no value: leave it out"),
     ("play cart", "no agent or folder 'cart': did you mean cartpole"),
     ("play empty", "holds no checkpoint: train the run first"),
     ("play run --episodes 0", "--episodes must be at least 1, not 0"),
