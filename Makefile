@@ -52,7 +52,7 @@ lint: $(VENV)/installed-test  ## Check style, formatting and which modules impor
 types: $(VENV)/installed-test  ## Check types
 	$(BIN)/mypy
 
-ON_DEVICE := tests/test_device.py tests/datasets/test_online.py tests/datasets/test_storages.py tests/envs/test_vector.py
+ON_DEVICE := tests/test_device.py tests/checkpoint/test_codec.py tests/datasets/test_online.py tests/datasets/test_storages.py tests/envs/test_vector.py
 
 unit: $(VENV)/installed-test  ## Run the tests and the examples in docstrings (ARGS="-k history" for some)
 	$(if $(DEVICE),DEVICE=$(DEVICE)) $(PYTEST) --durations 20 -m "not slow" $(ARGS) $(if $(DEVICE),$(ON_DEVICE))

@@ -220,7 +220,7 @@ def torch_device(device: str) -> torch.device:
     try:
         return torch.empty(0, device=device).device
     except (AssertionError, RuntimeError) as error:  # unknown, or not there
-        reason = str(error).splitlines()[0]
+        reason = str(error).splitlines()[0].split(". ")[0]  # the rest lists 50 backends
         raise ValueError(
             f"device is {device!r}, which PyTorch does not find ({reason}): use 'cpu' or 'auto'"
         ) from error

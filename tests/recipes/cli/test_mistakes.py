@@ -23,6 +23,7 @@ MISTAKES = [
     ("train --resume nowhere", "is not a run folder"),
     (f"train {TIT} --env CartPole-v7", "CartPole-v1"),
     (f"train {TIT} --num-envs 3", "num_envs 3 does not divide steps_per_batch 1024"),
+    (f"train {MLP} --device vulkan", "from the 'Vulkan' backend): use 'cpu' or 'auto'"),
     (f"train {TIT} --critic-coeff 0", "critic_coeff must be positive, not 0.0"),
     ("train cql/hopper-medium-v0/mlp --total-steps 9", "runs is --total-updates"),
     ("train dt/hopper-medium-v2/dt --total_updates=9", "its runs is --iterations"),
