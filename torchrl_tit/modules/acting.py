@@ -42,9 +42,9 @@ class ActingModule(TensorModule):
         **Weights that change within the context** are noticed if PyTorch counts the write: when a
         state dict is loaded into any module, within ``to_module``, and after most optimizers' step.
         Nothing shows that a fused optimizer stepped, or that weights were written through ``.data``
-        or shared memory: call :meth:`mark_weight_update` afterwards; otherwise, for the next K - 1 steps,
-        frames seen before the change keep the tokens of the old weights. There is no need for it
-        between two collections, each of which enters a new context, as those of
+        or shared memory: call :meth:`mark_weight_update` afterwards; otherwise, for the next K - 1
+        steps, frames seen before the change keep the tokens of the old weights. There is no need
+        for it between two collections, each of which enters a new context, as those of
         :class:`~torchrl_tit.modules.ActingCollector` do.
 
         The cache (copies of one batch of histories and of its tokens) starts empty. It is discarded

@@ -17,6 +17,7 @@ from datetime import timedelta
 from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from textwrap import fill
 from typing import Any
 
 import imageio.v3 as imageio
@@ -65,6 +66,7 @@ from .table import HEADER, Cell, make_table, to_columns
 _OFTEN = 0.25  # minimum share of batches outside a limit for a metric to be pointed out
 _ROWS = 10  # of the numbers below the learning curves
 _MOST_BOXES = 12
+_WIDEST = 30  # letters in a line below a box
 _MOST_PICTURES = 1500  # of a film: half a minute of CartPole, and a few megabytes at most
 _EXPLAINED = (0, 20, 100)  # steps of an episode
 _SHARP = 160  # dots per inch of explained steps
@@ -394,7 +396,9 @@ def _episode_chart(groups: Sequence[Group]) -> Chart | None:
     figure, axes = new_chart("", groups[0].recipe.offline)
     axes.boxplot([*boxes.values()], showmeans=True, meanline=True)
     places = range(1, len(boxes) + 1)
-    axes.set_xticks(places, [*map(plain, boxes)], rotation=20, ha="right")
+    labels = [fill(plain(name), _WIDEST) for name in boxes]
+    axes.set_xticks(places, labels, rotation=20, ha="right")
+    figure.set_figheight(4 + 0.15 * max(label.count("\n") for label in labels))
     axes.set(xlabel="", ylabel="return of an episode")
     quarters = {name: np.percentile(returns, [25, 50, 75]) for name, returns in boxes.items()}
     texts = [

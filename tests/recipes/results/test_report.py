@@ -137,6 +137,15 @@ def test_what_a_comparison_says(comparison):
     assert f"{number(last)} at step 61,440" in kl.partition("enhanced-tit:")[2]
 
 
+@pytest.mark.filterwarnings("error:constrained_layout not applied")
+def test_long_names_leave_room_for_boxes(tmp_path):
+    fields = {"num_envs": 4, "gamma": 0.97, "gae_lambda": 0.9, "max_grad_norm": 0.7}
+    fields |= {"reward_scale": 0.1, "adam_eps": 1e-6}
+    for of in (TIT, MLP):
+        write_run(tmp_path / of, of, returns=[300.0, 310.0], **fields)
+    report(tmp_path, "--out", tmp_path / "a.html", "--no-pictures")
+
+
 def test_metrics_that_are_not_healthy_are_pointed_out(tmp_path):
     metrics = metrics_of(0)
     metrics["kl_approx"][:20] = 0.05
