@@ -35,7 +35,7 @@ def test_a_transformer_learns_from_normalized_pixels(episodes: image_scale.Episo
     network = memory_networks(image_scale.NUM_FRAMES, patch_size=8)["enhanced-tit"]
     steps, accuracy = image_scale.gradient_steps(
         network,
-        image_scale.PIXELS["normalized by channel"],
+        image_scale.PIXELS["normalised by channel"],
         episodes,
         seed=0,
         limit=400,
