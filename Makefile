@@ -2,7 +2,7 @@
 # and installs again where pyproject.toml, setup.py or constraints.txt have changed since.
 #   make test PYTHON=python3.12       another interpreter
 #   make demo OUT=runs/first          another run folder
-#   make test DEVICE=cuda             on a GPU, what differs there
+#   make test DEVICE=cuda             on a GPU, what differs there; so does make bench
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -95,7 +95,7 @@ soak: $(VENV)/installed-test  ## Watch memory, files and speed of four runs for 
 
 bench: $(VENV)/installed-bench  ## Measure speed against other libraries
 	$(BIN)/python -m pip install --no-deps -r benchmarks/d3rlpy.txt
-	$(ONE_THREAD) $(BIN)/python -m benchmarks $(ARGS)
+	$(ONE_THREAD) $(BIN)/python -m benchmarks $(if $(DEVICE),--device $(DEVICE)) $(ARGS)
 
 # The commands and fields are read from the code; the site is built beside it, with packages of its own.
 docs: $(VENV)/installed-recipes $(VENV)-docs/installed  ## Build the documentation site: build/site/index.html

@@ -21,6 +21,8 @@ BENCHMARKS = [
     "ppo_cartpole",
     "off_policy",
 ]
+ON_DEVICE = ["acting", "segments", "memories"]
+"""The benchmarks that can run on another device than the CPU."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -28,16 +30,24 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser("python -m benchmarks")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(BENCHMARKS)}")
     parser.add_argument("--out", type=folder, help="folder for NAME.md and NAME.json")
+    parser.add_argument(
+        "--device", default="cpu", help=f"device of PyTorch's, for {', '.join(ON_DEVICE)}"
+    )
     options = parser.parse_args(arguments)
     if unknown := set(options.names) - set(BENCHMARKS):
         parser.error(f"unknown benchmark {sorted(unknown)}: choose from {', '.join(BENCHMARKS)}")
-    for name in options.names or BENCHMARKS:
+    names = options.names or (BENCHMARKS if options.device == "cpu" else ON_DEVICE)
+    if options.device != "cpu" and (others := set(names) - set(ON_DEVICE)):
+        parser.error(f"{sorted(others)} run on the CPU only: leave out --device")
+    torch.set_default_device(options.device)
+    for name in names:
         module = importlib.import_module(f"benchmarks.{name}")
         torch.set_num_threads(1)
         torch.manual_seed(0)
         numbers = module.main()
         markdown = f"# {name}\n\n{module.__doc__}\n{summary(numbers)}"
-        publish(name, markdown, numbers, options.out, f"python -m benchmarks {name}")
+        where = "" if options.device == "cpu" else f" --device {options.device}"
+        publish(name, markdown, numbers, options.out, f"python -m benchmarks {name}{where}")
 
 
 if __name__ == "__main__":

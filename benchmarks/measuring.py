@@ -33,13 +33,21 @@ _BESIDE = ["d3rlpy"]
 def milliseconds(step: Callable[[], Any], seconds: float) -> float:
     """Returns the milliseconds that a step takes, measured over at least some seconds.
 
-    It is processor time, which other programs on the machine hardly affect.
+    On a CPU it is processor time, which other programs on the machine hardly affect. On another
+    default device it is time on the clock, until the device has done all that it was given.
     """
-    count, start = 0, time.process_time()
-    while count == 0 or time.process_time() - start < seconds:
+    count, start = 0, _clock()
+    while count == 0 or _clock() - start < seconds:
         step()
         count += 1
-    return 1000 * (time.process_time() - start) / count
+    return 1000 * (_clock() - start) / count
+
+
+def _clock() -> float:
+    if torch.get_default_device().type == "cpu":
+        return time.process_time()
+    torch.accelerator.synchronize()
+    return time.perf_counter()
 
 
 def take_turns(
@@ -139,12 +147,15 @@ def publish(
         "date": datetime.date.today().isoformat(),
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        "device": str(torch.get_default_device()),
         **{
             package: importlib.metadata.version(package)
             for package in [*_PACKAGES, *_BESIDE]
             if find_spec(package.replace("-", "_"))
         },
     }
+    if torch.get_default_device().type != "cpu":
+        facts["peak_memory_bytes"] = str(torch.accelerator.max_memory_allocated())
     listed = ", ".join(f"{key} {value}" for key, value in facts.items())
     markdown += f"\nMeasured with `{command}`: {listed}.\n"
     print(markdown)

@@ -89,6 +89,18 @@ def test_segments_against_full_windows():
     assert all(len(times) == 2 for times in result["ms"].values())
 
 
+def test_on_another_device_nothing_is_on_the_cpu(monkeypatch, capsys):
+    """On "meta", a mixture of devices is refused."""
+    monkeypatch.setattr(measuring, "_clock", iter(range(1000)).__next__)
+    monkeypatch.setattr(torch.optim, "Adam", lambda weights, fused: torch.optim.SGD(weights))
+    with torch.device("meta"):
+        segments.measure(segments.Row(Case("Enhanced", "images", 4, 32), length=16), 1, 0)
+        memories.training("gtrxl", 8)()
+    with pytest.raises(SystemExit):
+        main(["offline", "--device", "cuda"])
+    assert "['offline'] run on the CPU only" in capsys.readouterr().err
+
+
 def test_window_tables_agree_with_copies(monkeypatch):
     numbers = window_tables.main(num_frames=[2, 8], seconds=0)
     for name in ("Enhanced_TIT, K = 8", "GTrXL, K = 2"):
