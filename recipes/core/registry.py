@@ -88,22 +88,21 @@ def register_recipes(*recipes: Recipe) -> None:
         RECIPES.add(recipe, home)
 
 
-for _named in (
-    ANY_TASK_RECIPES,
-    ANY_DATA_RECIPES,
-    ARRAY_RECIPES,
-    NO_VELOCITY_RECIPES,
-    MEMORY_RECIPES,
-    ATARI_RECIPES,
-    MINATAR_RECIPES,
-    SAC_RECIPES,
-    DQN_RECIPES,
-    CQL_RECIPES,
-    OFFLINE_RECIPES,
-    DT_RECIPES,
+for _preset in (
+    *ANY_TASK_RECIPES,
+    *ANY_DATA_RECIPES,
+    *ARRAY_RECIPES,
+    *NO_VELOCITY_RECIPES,
+    *MEMORY_RECIPES,
+    *ATARI_RECIPES,
+    *MINATAR_RECIPES,
+    *SAC_RECIPES,
+    *DQN_RECIPES,
+    *CQL_RECIPES,
+    *OFFLINE_RECIPES,
+    *DT_RECIPES,
 ):
-    for _preset in _named.values():
-        RECIPES.add(_preset, __name__)
+    RECIPES.add(_preset, __name__)
 
 
 def get_recipe(name: str) -> Recipe:
