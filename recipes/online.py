@@ -25,7 +25,7 @@ from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps
 
 from .core.algorithm import Algorithm
 from .core.evaluation import Outcome
-from .core.memory import state_transforms, with_transforms
+from .core.networks import state_transforms
 from .core.ray_cluster import ask_for_machines, check_address, check_room
 from .core.recipe import Recipe
 from .core.task import make_task, seed_copies
@@ -105,8 +105,9 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories, and with the state of a recurrent network."""
-        task = make_task(self.recipe, num_envs, seed, **settings)
-        return with_transforms(task, state_transforms(self.policy))
+        return make_task(
+            self.recipe, num_envs, seed, state=state_transforms(self.policy), **settings
+        )
 
     def size(self, batch: TensorDictBase) -> int:
         """The number of environment steps."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
+from tensordict import TensorDictBase
 from tensordict.nn import (
     AddStateIndependentNormalScale,
     ProbabilisticTensorDictSequential,
@@ -15,11 +17,12 @@ from tensordict.nn import (
 )
 from torch import nn
 from torchrl.data import Bounded, Categorical, TensorSpec
+from torchrl.envs import Compose
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, QValueModule, TanhModule
 
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.frames.observation import Observations, read_observations
-from torchrl_tit.modules import Backbone, history_keys, make_actor
+from torchrl_tit.modules import Backbone, as_sequences, history_keys, make_actor
 from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.modules.sequences import default_observation_keys
@@ -187,6 +190,23 @@ def make_critic(
     )
     in_keys = [key, "action"] if action_dim else [key]
     return TensorDictSequential(*modules, TensorValue(mlp, in_keys=in_keys, out_keys=[out_key]))
+
+
+def state_transforms(policy: nn.Module) -> Compose:
+    """Makes the transforms that carry a policy's state through an environment, if it has one."""
+    backbones = (module for module in policy.modules() if isinstance(module, Backbone))
+    return next((backbone.make_transforms() for backbone in backbones), Compose())
+
+
+def arranging(recipe: Recipe) -> Callable[[TensorDictBase], TensorDictBase] | None:
+    """Returns how a recipe arranges slices of steps for its network, if that carries a state.
+
+    Args:
+        recipe: the settings, with a ``burn_in`` if the network carries a state.
+    """
+    if not recipe.backbone.carries_state:
+        return None
+    return partial(as_sequences, burn_in=getattr(recipe, "burn_in", 0))
 
 
 def is_continuous(spec: TensorSpec) -> bool:
