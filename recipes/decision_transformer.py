@@ -46,9 +46,9 @@ from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 from torchrl_tit.transforms import SequenceHistory
 
 from .core.algorithm import Stateful, Terms, check_without_waiting, storage_device, total_loss
-from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import Outcome
 from .core.networks import normalize_frames
+from .core.recipe import DatasetRecipe
 from .core.task import make_task, task_limit
 from .offline import DatasetAlgorithm, action_error, read_data
 

@@ -51,10 +51,9 @@ from .core.algorithm import (
     storage_device,
     to_networks,
 )
-from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import HeldOut, Outcome
 from .core.networks import arranging, make_backbone, make_critic, state_transforms
-from .core.recipe import SamplesRecipe
+from .core.recipe import DatasetRecipe, SamplesRecipe
 from .core.task import make_task
 
 

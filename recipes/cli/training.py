@@ -50,7 +50,7 @@ def start(
     if init_from is not None:
         weights, report = weights_from(init_from, algorithm)
         say(report)
-    recipe, chosen = name_chosen_encoders(algorithm.recipe, algorithm)
+    recipe, chosen = name_chosen_encoders(algorithm)
     if chosen:
         say(f"frames chosen by kind of observation: {chosen}")
     with Run.create(folder or _make_folder(recipe), recipe, weights) as run:

@@ -254,18 +254,16 @@ def _array_size(observation: Observations) -> int:
     return first.entries
 
 
-def name_chosen_encoders(recipe: Recipe, algorithm: Algorithm[Any]) -> tuple[Recipe, str]:
-    """Adds to a recipe the frame encoders that were chosen by the kinds of observations.
+def name_chosen_encoders(algorithm: Algorithm[Any]) -> tuple[Recipe, str]:
+    """Adds to an algorithm's recipe the frame encoders chosen by the kinds of observations.
 
     The run's recipe.json then records them, and a resumed run keeps them in later versions too.
 
-    Args:
-        recipe: the recipe.
-        algorithm: its algorithm, with the networks.
-
     Returns:
-        The recipe for the run, and a description of what was chosen, which is empty if nothing was.
+        The recipe for the run, which also has what the algorithm took from its data, and a
+        description of what was chosen, which is empty if nothing was.
     """
+    recipe = algorithm.recipe
     modules = algorithm.policy.modules()
     network = next((module for module in modules if isinstance(module, HistoryNetwork)), None)
     chosen = {} if network is None else network.frame_settings

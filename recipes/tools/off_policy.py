@@ -28,10 +28,9 @@ from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.settings.networks import mlp
 
 from ..core.algorithm import storage_device, to_networks
-from ..core.dataset_recipe import DatasetRecipe
 from ..core.networks import is_discrete, make_critic
 from ..core.optional import tqdm
-from ..core.recipe import Recipe
+from ..core.recipe import DatasetRecipe, Recipe
 from ..core.run import Run
 from ..core.runner import load_trained
 from ..offline import DatasetAlgorithm, TransitionAlgorithm, action_values, read_data

@@ -12,8 +12,7 @@ import pytest
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from recipes.core.algorithm import make_algorithm
-from recipes.core.dataset_recipe import DatasetRecipe
-from recipes.core.recipe import LENGTHS, recipe_classes
+from recipes.core.recipe import LENGTHS, DatasetRecipe, recipe_classes
 from recipes.core.registry import RECIPES, get_recipe
 from recipes.ppo import PPO
 from recipes.presets.ppo_atari import ATARI_RECIPES

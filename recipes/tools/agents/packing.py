@@ -18,8 +18,7 @@ from torchrl_tit.agents.folder import CARD, RECIPE, VERSIONS, WEIGHTS
 from torchrl_tit.agents.hub import import_hub
 from torchrl_tit.evaluation_file import EVALUATION
 
-from ...core.dataset_recipe import DatasetRecipe
-from ...core.recipe import Recipe
+from ...core.recipe import DatasetRecipe, Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.run import Run
 from ...core.runner import load_trained

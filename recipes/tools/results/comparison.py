@@ -192,7 +192,10 @@ def read_references(path: Path | None = None) -> dict[str, tuple[float, float]]:
         rows: Iterable[Mapping[str, str]] = read_rows("reference_returns.csv")
         if path is not None:
             rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-        return {row["env"]: (float(row["random"]), float(row["best"])) for row in rows}
+        references = {row["env"]: (float(row["random"]), float(row["best"])) for row in rows}
+        if same := [env for env, (random, best) in references.items() if not best > random]:
+            raise ValueError(f"best must be above random, but is not for {same[0]}")
+        return references
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path} must be a CSV file with the columns env, random and best, and numbers in the "

@@ -13,8 +13,7 @@ from typing import Any
 
 from torchrl_tit.settings.checks import printable
 
-from ...core.dataset_recipe import DatasetRecipe
-from ...core.recipe import Recipe
+from ...core.recipe import DatasetRecipe, Recipe
 from ...core.registry import RECIPES, get_recipe
 from .experiments import changes_of, fields_of
 

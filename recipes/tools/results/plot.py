@@ -22,7 +22,7 @@ from .interval import FEWEST, intervals_of
 NEARLY = 0.9
 """A run that has fewer steps than this share of its longest sibling is left out of bold lines."""
 WINDOW = 5
-"""Batches over which returns of training are averaged in bold lines."""
+"""Points of a curve over which returns of training are averaged in bold lines."""
 _LINES = ("-", "--", ":", "-.")
 _MOST_SINGLE = 9  # more runs would hide the bold lines
 _POINTS = 400  # of a curve; of longer ones, neighbors are averaged
@@ -111,7 +111,7 @@ def plot_run(run: Run) -> None:
     """
     offline = run.recipe.offline
     figure, axes = new_chart(run.recipe.name, offline)
-    name = "evaluations" if offline else f"mean of {WINDOW} batches"
+    name = "evaluations" if offline else "moving average"
     if draw_curves(axes, {name: [curve_of(read_metrics(run))]}, 1 if offline else WINDOW):
         add_legend(figure)
     else:

@@ -361,7 +361,7 @@ def _chart(groups: Sequence[Group], column: str) -> tuple[Chart, dict[str, Curve
     bold = draw_curves(axes, curves, WINDOW if of_batches else 1)
     if len(groups) > 1:
         add_legend(figure)
-    notes = "Thin lines are batches, and bold lines means of five batches. " if of_batches else ""
+    notes = "Bold lines are moving averages. " if of_batches else ""
     values = np.concatenate([curve.values for runs in curves.values() for curve in runs])
     if _cut(axes, values):
         notes += "A few extreme values lie outside the axis. "
