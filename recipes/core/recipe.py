@@ -133,6 +133,11 @@ class Recipe:
         return ()
 
     @property
+    def task_name(self) -> str:
+        """The environment's name; without one, that of the data."""
+        return self.env
+
+    @property
     def unit(self) -> str:
         """The unit of its steps: "updates" offline, else "steps" of the environment."""
         return "updates" if self.offline else "steps"

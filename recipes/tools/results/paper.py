@@ -27,7 +27,7 @@ HEADINGS = {
 }
 """What the paper's tables of results are about, by their numbers."""
 
-_TASK = ("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions")
+TASK = ("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions")
 """The fields that determine which task is learned."""
 _KIND = ("backbone.frame.encoder", "backbone.history.encoder", "backbone.num_frames")
 """The fields that determine which kind of network learns."""
@@ -233,7 +233,7 @@ def has_its_data(recipe: Recipe) -> bool:
 
 def _differences(recipe: Recipe, measured: Recipe, cell: PaperCell) -> dict[str, Any] | None:
     """The fields in which a run differs from how a cell was measured; None for another task."""
-    if any(getattr(recipe, field, None) != getattr(measured, field, None) for field in _TASK):
+    if any(getattr(recipe, field, None) != getattr(measured, field, None) for field in TASK):
         return None
     usual, own = fields_of(measured), fields_of(recipe)
     if any(usual[field] != own[field] for field in _KIND):

@@ -170,8 +170,8 @@ def report(
     for group in groups:
         try:
             found, texts = make_table([data.run.folder for data in group.runs])
-        except ValueError:  # none of the runs is trained and evaluated
-            found, texts = [], [f"{group.label} is not evaluated yet: no run of it is complete."]
+        except ValueError as error:  # none of the runs is trained and evaluated
+            found, texts = [], [f"{group.label} has no results: {error}"]
         cells += found
         notes += texts
     media = _make_media(groups, say) if pictures else Media()
@@ -354,7 +354,7 @@ def _chart(groups: Sequence[Group], column: str) -> tuple[Chart, dict[str, Curve
     """A chart of a metric, and its bold lines."""
     recipe = groups[0].recipe
     words = words_of(recipe.algorithm, column)
-    figure, axes = new_chart("", recipe.offline)
+    figure, axes = new_chart("", recipe)
     axes.set_ylabel("")
     curves = {group.label: [curve_of(one.rows, column) for one in group.runs] for group in groups}
     of_batches = column == "return_mean" and not recipe.offline
@@ -393,7 +393,7 @@ def _episode_chart(groups: Sequence[Group]) -> Chart | None:
         boxes = {k: [x for one in v for x in one["returns"]] for k, v in together.items() if v}
     if not boxes:
         return None
-    figure, axes = new_chart("", groups[0].recipe.offline)
+    figure, axes = new_chart("", groups[0].recipe)
     axes.boxplot([*boxes.values()], showmeans=True, meanline=True)
     places = range(1, len(boxes) + 1)
     labels = [fill(plain(name), _WIDEST) for name in boxes]
@@ -474,7 +474,7 @@ def _description(groups: Sequence[Group]) -> str:
     steps = max(data.steps for group in groups for data in group.runs)
     many = f"{len(groups)} experiments, " if len(groups) > 1 else ""
     return (
-        f"{groups[0].recipe.env}, {' and '.join(algorithms)}: {many}{runs} "
+        f"{groups[0].recipe.task_name}, {' and '.join(algorithms)}: {many}{runs} "
         f"run{'s' * (runs > 1)} of {steps:,} {_unit(groups[0].recipe)}{' each' * (runs > 1)}"
     )
 

@@ -20,7 +20,7 @@ from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import FEWEST, Interval, interval_of
 from .numbers import mean_std, number, numbers
-from .paper import HEADINGS, Match, has_its_data, match, paper_cells, plain_name, read_rows
+from .paper import HEADINGS, TASK, Match, has_its_data, match, paper_cells, plain_name, read_rows
 from .plot import new_figure, plain, save_figure
 
 OTHER = "not in the paper"
@@ -31,11 +31,6 @@ HEADER = (
     *("interquartile mean [95%]", "paper"),
 )
 """The header of :func:`to_columns`."""
-_TASK = (
-    *("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions"),
-    "backbone",
-)
-"""The fields that determine which task is learned, and by which network."""
 
 
 @dataclass(frozen=True)
@@ -309,12 +304,9 @@ def reported_of(recipe: Recipe) -> tuple[Match | None, tuple[Published, ...]]:
     """
     plain = plain_name(recipe.name)
     named = RECIPES.get(recipe.name) or RECIPES.get(plain)
-    found = match(recipe)
-    if named is None or any(getattr(recipe, x, None) != getattr(named, x, None) for x in _TASK):
-        return found, ()
-    if not has_its_data(recipe):
-        return None, ()
-    return found, published_results().get(plain, ())
+    fields = [*TASK, "backbone"] if named and has_its_data(recipe) else []
+    same = all(getattr(recipe, x, None) == getattr(named, x, None) for x in fields)
+    return match(recipe), published_results().get(plain, ()) if fields and same else ()
 
 
 def value_of(evaluation: dict[str, Any]) -> float:
