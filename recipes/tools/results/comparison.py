@@ -15,8 +15,8 @@ from scipy.stats import norm, permutation_test, trim_mean
 
 from ...core.recipe import Recipe
 from .interval import FEWEST, Interval
-from .numbers import mean_std, number
-from .paper import TASK, read_rows
+from .numbers import mean_std, number, read_rows
+from .paper import TASK
 from .table import measure_of, read_evaluations, value_of
 
 Task = tuple[Any, ...]

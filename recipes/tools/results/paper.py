@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +12,7 @@ from torchrl_tit.settings.checks import printable
 from ...core.recipe import DatasetRecipe, Recipe
 from ...core.registry import RECIPES, get_recipe
 from .experiments import changes_of, fields_of
+from .numbers import read_rows
 
 HEADINGS = {
     "1": "table 1: online, images",
@@ -255,9 +252,3 @@ def _differences(recipe: Recipe, measured: Recipe, cell: PaperCell) -> dict[str,
     if is_tit and all(allows(field, usual[field]) for field in rows.keys() & usual.keys()):
         changes = {k: v for k, v in changes.items() if not allows(k, v)}
     return changes
-
-
-def read_rows(file: str) -> Iterator[dict[str, str]]:
-    """Reads a table of reported numbers that lies beside this module."""
-    text = resources.files(__package__).joinpath(file).read_text(encoding="utf-8")
-    yield from csv.DictReader(io.StringIO(text))

@@ -19,8 +19,8 @@ from ...core.registry import RECIPES
 from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import FEWEST, Interval, interval_of
-from .numbers import mean_std, number, numbers
-from .paper import HEADINGS, TASK, Match, has_its_data, match, paper_cells, plain_name, read_rows
+from .numbers import mean_std, number, numbers, read_rows
+from .paper import HEADINGS, TASK, Match, has_its_data, match, paper_cells, plain_name
 from .plot import new_figure, plain, save_figure
 
 OTHER = "not in the paper"
