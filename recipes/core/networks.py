@@ -228,6 +228,23 @@ def describe(spec: TensorSpec) -> str:
     return f"{kind} ({type(spec).__name__}, shape {list(spec.shape)}{within})"
 
 
+def check_actions(recipe: Recipe, spec: TensorSpec, fit: bool, needed: str, instead: str) -> None:
+    """Raises ValueError unless the actions of a recipe's task fit its algorithm.
+
+    Args:
+        recipe: the recipe.
+        spec: spec of an action.
+        fit: whether they do.
+        needed: the actions that the algorithm needs, in words.
+        instead: other recipes, in words.
+    """
+    if not fit:
+        raise ValueError(
+            f"{recipe.algorithm} needs {needed}, but those of {recipe.task_name} are "
+            f"{describe(spec)}: use {instead}"
+        )
+
+
 def _bounded(backbone: Backbone, action_spec: Bounded, key: str) -> list[nn.Module]:
     """A backbone, a linear layer, and a tanh that is scaled to the bounds."""
     linear = nn.Linear(backbone.features_dim, action_spec.shape[0])
