@@ -245,8 +245,12 @@ class Run:
         Raises:
             CheckpointError: if they are damaged.
         """
-        folder = self.folder / _WEIGHTS
-        return load_checkpoint(folder, 0)[1] if checkpoint_steps(folder) else {}
+        return load_checkpoint(self.folder / _WEIGHTS, 0)[1] if self.has_initial_weights else {}
+
+    @property
+    def has_initial_weights(self) -> bool:
+        """Whether it starts from the weights of another run."""
+        return bool(checkpoint_steps(self.folder / _WEIGHTS))
 
     def load_trained(self) -> tuple[int, dict[str, Any]]:
         """Loads the newest checkpoint of a run that has been trained: (step, state).
