@@ -345,6 +345,11 @@ class RecordedRun(Run):
         content = self.read(EVALUATION)
         return None if content is None else parse_evaluation(content, self.folder)
 
+    @property
+    def has_initial_weights(self) -> bool:
+        """Whether it started from the weights of another run."""
+        return b'"initial_weights"' in (self.read("changes") or b"")
+
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:

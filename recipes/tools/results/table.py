@@ -148,7 +148,7 @@ def read_evaluations(
     Returns:
         Experiments in the order of their first runs, with the evaluation of each run, and a note
         for each run that is left out, was evaluated over a different number of episodes than its
-        recipe says, changed its length while schedules followed it, or did not start from scratch.
+        recipe says, or changed its length while schedules followed it.
     """
     evaluations: dict[Path, dict] = {}
     runs, notes = [], []
@@ -175,8 +175,6 @@ def read_evaluations(
             notes.append(f"{run.folder} was evaluated over {episodes} episodes, not {asked}")
         if lengths := run.earlier_lengths():
             notes.append(_earlier_lengths(run, lengths))
-        if run.has_initial_weights:
-            notes.append(f"{run.folder} started from the weights of another run (--init-from)")
         evaluations[run.folder] = evaluation
         runs.append(run)
     return [

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from recipes.cli import main
 from recipes.core.registry import RECIPES
@@ -21,7 +20,6 @@ from recipes.tools.results.table import (
     to_markdown,
 )
 from tests.recipes.results.report_runs import write_run
-from torchrl_tit.checkpoint import save_checkpoint
 from torchrl_tit.settings import Linear
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
@@ -301,8 +299,6 @@ def test_what_differs_from_the_recipe_is_noted(tmp_path):
     """A learning rate that fell to 0 once is not that of a run with the whole length."""
     fewer = {"episodes": 2, "returns": [20.0, 30.0]}
     few = write_run(tmp_path / "few", MLP, 0, [20.0, 30.0], evaluation=fewer)
-    later = write_run(tmp_path / "later", MLP, 2, [20.0], total_steps=3072)
-    save_checkpoint(later / "initial_weights", 0, {"weight": torch.ones(1)})
     folder = write_run(
         tmp_path / "long", MLP, 1, [20.0], evaluation={"steps": 4096}, total_steps=1024
     )
@@ -313,7 +309,6 @@ def test_what_differs_from_the_recipe_is_noted(tmp_path):
         run.lengthen(length)
     assert make_table([tmp_path])[1] == [
         f"{few} was evaluated over 2 episodes, not 100",
-        f"{later} started from the weights of another run (--init-from)",
         f"{folder} changed its length: for decay_learning_rate, total_steps was "
         "2048 until step 1024, 3072 until step 3072",
     ]
