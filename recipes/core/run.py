@@ -303,16 +303,18 @@ class Run:
         """The picture of the learning curve."""
         return self.folder / "learning_curve.png"
 
+    def versions(self) -> dict[str, Any]:
+        """Returns the versions that the run began with; none if they are lost or damaged."""
+        try:
+            return dict(json.loads(self.read("versions.json") or b"{}"))
+        except (OSError, RecursionError, TypeError, ValueError):
+            return {}
+
     def version_changes(self) -> list[str]:
         """Returns how the versions of this process differ from those that the run began with."""
-        path = self.folder / "versions.json"
-        try:
-            before = json.loads(path.read_text(encoding="utf-8"))
-            before.items()
-        except (AttributeError, OSError, RecursionError, ValueError):  # lost or damaged
-            return []
-        now = package_versions()
-        return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
+        before, now = self.versions(), package_versions()
+        changed = [k for k in now if before and before.get(k) != now[k]]
+        return [f"{k} {before.get(k)} -> {now[k]}" for k in changed]
 
 
 class RecordedRun(Run):

@@ -22,7 +22,7 @@ from ...core.recipe import DatasetRecipe, Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.run import Run
 from ...core.runner import load_trained
-from .building import evaluation_of, read_json
+from .building import evaluation_of
 
 
 def pack(
@@ -61,7 +61,6 @@ def pack(
             f"{folder} has no evaluation of its newest checkpoint, that of step {steps}: run "
             f"`evaluate {folder}` first"
         )
-    versions = read_json(folder / "versions.json")
     networks = algorithm.policy
     recipe = without_places(run.recipe)
     if isinstance(recipe, DatasetRecipe):
@@ -73,7 +72,7 @@ def pack(
         name=name,
         source=source or name,
         steps=steps,
-        versions=versions,
+        versions=run.versions(),
         parameters=sum(weight.numel() for weight in networks.parameters()),
     )
     files = {
@@ -81,7 +80,7 @@ def pack(
         RECIPE: recipe_to_json(recipe).encode(),
         WEIGHTS: save(_weights(networks)),
         EVALUATION: _json(evaluation),
-        VERSIONS: _json(versions),
+        VERSIONS: _json(run.versions()),
     }
     return files, steps
 

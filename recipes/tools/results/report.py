@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import io
-import json
 import os
 import re
 import shlex
@@ -74,14 +73,12 @@ _SHARP = 160  # dots per inch of explained steps
 
 @dataclass(frozen=True)
 class RunData:
-    """A run, its metrics, its evaluation and the versions that it began with."""
+    """A run, its metrics and its evaluation."""
 
     run: Run
     rows: list[dict[str, float]]
     evaluation: dict[str, Any] | None
     """None if it is not evaluated yet."""
-    versions: dict[str, Any]
-    """Empty if they are not known."""
 
     @property
     def name(self) -> str:
@@ -222,14 +219,10 @@ def _read(run: Run) -> RunData:
         )
     if "return_mean" not in rows[0]:
         raise ValueError(f"{run.folder / 'metrics.csv'} is damaged: it has no column return_mean")
-    try:
-        versions = dict(json.loads(run.read("versions.json") or b"{}"))
-    except (OSError, RecursionError, TypeError, ValueError):  # the report says so
-        versions = {}
     evaluation = run.read_evaluation()
     if evaluation is not None and "returns" not in evaluation:  # nothing was played
         evaluation = None
-    return RunData(run, rows, evaluation, versions)
+    return RunData(run, rows, evaluation)
 
 
 def _make_media(groups: Sequence[Group], say: Callable[[str], None]) -> Media:
@@ -553,7 +546,7 @@ def _versions(runs: Sequence[RunData]) -> list[tuple[str, str]]:
     """The runs of each set of versions, and these versions."""
     found: dict[str, list[str]] = {}
     for data in runs:
-        text = ", ".join(f"{name} {version}" for name, version in data.versions.items())
+        text = ", ".join(f"{name} {version}" for name, version in data.run.versions().items())
         found.setdefault(text or "not known", []).append(data.run.folder.name)
     return [("all runs" if len(found) == 1 else ", ".join(x), text) for text, x in found.items()]
 
