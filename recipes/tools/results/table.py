@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -14,6 +12,7 @@ from typing import Any
 
 from torchrl_tit.scores import has_reference
 
+from ...core import records
 from ...core.recipe import Recipe
 from ...core.registry import RECIPES
 from ...core.run import Run
@@ -219,10 +218,8 @@ def to_columns(cell: Cell) -> list[str]:
 
 def to_csv(cells: Sequence[Cell]) -> str:
     """Writes cells as CSV, one row each; unknown values are empty, published ones are one text."""
-    buffer = io.StringIO()
     names = [field.name for field in fields(Cell)]
-    writer = csv.DictWriter(buffer, names, lineterminator="\n")
-    writer.writeheader()
+    rows = []
     for cell in cells:
         values = {name: getattr(cell, name) for name in names}
         values["values"] = "; ".join(map(str, cell.values))
@@ -230,8 +227,8 @@ def to_csv(cells: Sequence[Cell]) -> str:
             f"{result.source} {result.mean} ± {result.std} ({result.note}; {result.url})"
             for result in cell.published
         )
-        writer.writerow({k: "" if v != v else v for k, v in values.items()})
-    return buffer.getvalue()
+        rows.append(["" if value != value else value for value in values.values()])
+    return records.to_csv([names, *rows])
 
 
 def plot_table(cells: Sequence[Cell], picture: Path) -> None:
