@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -123,18 +122,13 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
         returns = evaluate(self.make_env, self.policy, episodes, seed=seed)
         return [Outcome(step, returns.tolist())]
 
-    def check(self, **settings: Any) -> None:
-        """As :meth:`Algorithm.check`; a cluster must have room for the collectors.
-
-        Args:
-            **settings: further settings of the task.
-        """
+    def check(self) -> None:
+        """As :meth:`Algorithm.check`; a cluster must have room for the collectors."""
         if (address := self.recipe.ray) is not None:
             check_room(
                 ask_for_machines(address), address, self.recipe.collectors, self.recipe.threads
             )
-        with closing(self.make_env(1, self.recipe.seed, **settings)) as env, torch.no_grad():
-            self.policy(env.reset())
+        super().check()
 
     def close(self) -> None:
         """Closes environments and processes."""

@@ -493,10 +493,10 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         terms["kl_approx"] += terms["mean_ratio"] - 1
         return terms
 
-    def check(self, **settings: Any) -> None:
+    def check(self) -> None:
         """As :meth:`OnlineAlgorithm.check`; a compiler must be there if it is required."""
         check_compiler(self.recipe.compile)
-        super().check(**settings)
+        super().check()
 
     @property
     def _state_keys(self) -> list[str]:
