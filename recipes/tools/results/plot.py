@@ -149,7 +149,7 @@ def _learning_curve(run: Run) -> Curve:
     """The returns of a run; without an environment, the error on held-out episodes."""
     rows, column = read_metrics(run), "return_mean"
     if rows and not run.recipe.env:
-        column = next(name for name in rows[0] if name.startswith("held_out_"))
+        column = next((name for name in rows[0] if name.startswith("held_out_")), column)
     return curve_of(rows, column)
 
 
