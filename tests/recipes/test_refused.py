@@ -122,7 +122,11 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
         {"backbone": lstm(), "slice_length": 4, "burn_in": 17},
         "slice_length 4 and burn_in 17 are longer than the 20 random_steps of 1 env",
     ),
-    (SAC_RECIPE, {"env": "CartPole-v1"}, "sac needs .*, but those of CartPole-v1 are .*: use a ppo recipe"),
+    (
+        SAC_RECIPE,
+        {"env": "CartPole-v1"},
+        "sac needs .*, but those of CartPole-v1 are .*: use a ppo recipe",
+    ),
     (SAC_RECIPE, {"env": "EndlessActions-v0"}, f"sac {BOUNDED}"),
     (SAC_RECIPE, {"env": "UnboundedActions-v0"}, f"sac {BOUNDED}"),
     (
