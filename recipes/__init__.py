@@ -16,7 +16,7 @@ _HOMES = {
     "Algorithm": "core.algorithm",
     "Callback": "core.callback",
     "DatasetAlgorithm": "offline",
-    "DatasetRecipe": "core.dataset_recipe",
+    "DatasetRecipe": "core.recipe",
     "NotFiniteError": "core.algorithm",
     "Outcome": "core.evaluation",
     "Recipe": "core.recipe",

@@ -1,6 +1,6 @@
 """The command line: ``python -m recipes``."""
 
-from .cli import main
+from .cli.main import main
 
 if __name__ == "__main__":
     main()

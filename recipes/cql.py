@@ -24,7 +24,7 @@ from torchrl_tit.settings.numbers import Count, Fraction, Rate, Weight, Widths
 
 from .core.algorithm import Terms, descend
 from .core.compilation import check_compiler, compile_and_time, should_compile
-from .core.networks import describe, is_discrete, make_value_policy
+from .core.networks import check_actions, is_discrete, make_value_policy
 from .core.recipe import Compile
 from .offline import TransitionAlgorithm, TransitionRecipe
 
@@ -134,11 +134,8 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with policy, critics, their targets and the temperature."""
         recipe, spec = self.recipe, self.action_spec
-        if not has_bounds(spec):
-            raise ValueError(
-                f"cql needs continuous actions within bounds, but those of {recipe.task_name} are "
-                f"{describe(spec)}: use a discrete-cql recipe if they are discrete"
-            )
+        instead = "a discrete-cql recipe if they are discrete"
+        check_actions(recipe, spec, has_bounds(spec), "continuous actions within bounds", instead)
         backbone = self.make_backbone(env)
         head = make_squashed_actor(backbone.features_dim, spec)
         self._policy = ProbabilisticTensorDictSequential(backbone, *head).to(self.device)
@@ -251,11 +248,8 @@ class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with the network of the values, the policy, and its target."""
         recipe, spec = self.recipe, self.action_spec
-        if not is_discrete(spec):
-            raise ValueError(
-                f"discrete-cql needs a few discrete actions, but those of {recipe.task_name} are "
-                f"{describe(spec)}: use a cql recipe if they are continuous"
-            )
+        instead = "a cql recipe if they are continuous"
+        check_actions(recipe, spec, is_discrete(spec), "a few discrete actions", instead)
         self._policy = make_value_policy(self.make_backbone(env), spec).to(self.device)
         loss = DelayedDiscreteCQLLoss(self._policy, action_space="categorical")
         loss.make_value_estimator(gamma=recipe.gamma)

@@ -46,9 +46,9 @@ from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 from torchrl_tit.transforms import SequenceHistory
 
 from .core.algorithm import Stateful, Terms, check_without_waiting, storage_device, total_loss
-from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import Outcome
 from .core.networks import normalize_frames
+from .core.recipe import DatasetRecipe
 from .core.task import make_task, task_limit
 from .offline import DatasetAlgorithm, action_error, read_data
 
@@ -254,8 +254,8 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
                 encoder.set_statistics(*episodes.observation_statistics(encoder.samples))
         return episodes.to(storage_device(recipe))
 
-    def make_storage(self, episodes: Episodes) -> SequenceStorage:
-        """Cuts windows out of episodes."""
+    def measured_items(self, episodes: Episodes) -> SequenceStorage:
+        """Cuts windows out of episodes, as in training."""
         recipe = self.recipe
         return SequenceStorage(
             episodes,
@@ -263,10 +263,6 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             return_scale=1.0,
             action_padding=self.action_padding,
         )
-
-    def measured_items(self, episodes: Episodes) -> SequenceStorage:
-        """Cuts windows out of episodes, as in training."""
-        return self.make_storage(episodes)
 
     def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:
         """Compares the predicted actions with the data's, at all steps of the windows."""
@@ -357,7 +353,7 @@ class DTAlgorithm(SequenceAlgorithm[DT]):
 
     def make_buffer(self) -> ReplayBuffer:
         """Reads the data set into a replay buffer of windows."""
-        storage = self.make_storage(self.load_data())
+        storage = self.measured_items(self.load_data())
         return make_replay_buffer(storage, self.recipe.batch_size, seed=self.recipe.seed)
 
     def state(self) -> Mapping[str, Stateful]:

@@ -24,7 +24,7 @@ from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.settings.numbers import Batch, Fraction, Rate, Steps, Weight
 
 from .core.algorithm import Stateful, Terms, descend
-from .core.networks import describe, is_discrete, make_backbone, make_value_policy
+from .core.networks import check_actions, is_discrete, make_backbone, make_value_policy
 from .replay import ReplayAlgorithm, ReplayRecipe
 
 
@@ -106,12 +106,8 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         Actions are random with a probability that falls: see :attr:`behavior`.
         """
         recipe, spec = self.recipe, env.action_spec_unbatched.to(self.device)
-        if not is_discrete(spec):
-            raise ValueError(
-                f"dqn needs a few discrete actions, but those of {recipe.env} are "
-                f"{describe(spec)}: use a {'sac or ' if spec.dtype.is_floating_point else ''}ppo "
-                "recipe"
-            )
+        instead = f"a {'sac or ' if spec.dtype.is_floating_point else ''}ppo recipe"
+        check_actions(recipe, spec, is_discrete(spec), "a few discrete actions", instead)
         mask_key = MASK if recipe.mask_actions else None
         slices = recipe.slice_length > 1
         backbone = make_backbone(recipe.backbone, observation_specs(env), slices=slices)

@@ -16,7 +16,7 @@ from torchrl_tit.datasets import DatasetError, Episodes
 from torchrl_tit.settings.numbers import Inside, Rate, Weight
 
 from .core.algorithm import descend
-from .core.networks import describe, is_continuous, is_discrete, make_cloning_policy
+from .core.networks import check_actions, is_continuous, is_discrete, make_cloning_policy
 from .offline import ActorCriticRecipe, TransitionAlgorithm
 
 _RETURN_RANGE = 1000.0
@@ -69,11 +69,9 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with policy, critics, their targets and the state value."""
         recipe, spec = self.recipe, self.action_spec
-        if not (is_continuous(spec) or is_discrete(spec)):
-            raise ValueError(
-                f"iql needs arrays of continuous actions or a few discrete ones, but those of "
-                f"{recipe.task_name} are {describe(spec)}: use a bc recipe"
-            )
+        fit = is_continuous(spec) or is_discrete(spec)
+        needed = "arrays of continuous actions or a few discrete ones"
+        check_actions(recipe, spec, fit, needed, "a bc recipe")
         # TorchRL's loss hides keys from the critics that the actor does not declare: "observation".
         backbone = self.make_backbone(env, slices=True)
         self._policy = make_cloning_policy(backbone, spec).to(self.device)

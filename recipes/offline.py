@@ -51,11 +51,9 @@ from .core.algorithm import (
     storage_device,
     to_networks,
 )
-from .core.dataset_recipe import DatasetRecipe
 from .core.evaluation import HeldOut, Outcome
-from .core.memory import arranging, state_transforms, with_transforms
-from .core.networks import make_backbone, make_critic
-from .core.recipe import SamplesRecipe
+from .core.networks import arranging, make_backbone, make_critic, state_transforms
+from .core.recipe import DatasetRecipe, SamplesRecipe
 from .core.task import make_task
 
 
@@ -406,9 +404,8 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories, and with the state of a recurrent network."""
-        clips = self.clips_actions
-        task = make_task(self.recipe, num_envs, seed, clip_actions=clips, **settings)
-        return with_transforms(task, state_transforms(self.policy))
+        state, clips = state_transforms(self.policy), self.clips_actions
+        return make_task(self.recipe, num_envs, seed, state=state, clip_actions=clips, **settings)
 
     def make_backbone(self, env: EnvBase, *, slices: bool = False) -> Backbone:
         """Builds the policy's backbone.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
@@ -25,7 +24,7 @@ from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps
 
 from .core.algorithm import Algorithm
 from .core.evaluation import Outcome
-from .core.memory import state_transforms, with_transforms
+from .core.networks import state_transforms
 from .core.ray_cluster import ask_for_machines, check_address, check_room
 from .core.recipe import Recipe
 from .core.task import make_task, seed_copies
@@ -105,8 +104,9 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """Builds the task, with histories, and with the state of a recurrent network."""
-        task = make_task(self.recipe, num_envs, seed, **settings)
-        return with_transforms(task, state_transforms(self.policy))
+        return make_task(
+            self.recipe, num_envs, seed, state=state_transforms(self.policy), **settings
+        )
 
     def size(self, batch: TensorDictBase) -> int:
         """The number of environment steps."""
@@ -122,18 +122,13 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
         returns = evaluate(self.make_env, self.policy, episodes, seed=seed)
         return [Outcome(step, returns.tolist())]
 
-    def check(self, **settings: Any) -> None:
-        """As :meth:`Algorithm.check`; a cluster must have room for the collectors.
-
-        Args:
-            **settings: further settings of the task.
-        """
+    def check(self) -> None:
+        """As :meth:`Algorithm.check`; a cluster must have room for the collectors."""
         if (address := self.recipe.ray) is not None:
             check_room(
                 ask_for_machines(address), address, self.recipe.collectors, self.recipe.threads
             )
-        with closing(self.make_env(1, self.recipe.seed, **settings)) as env, torch.no_grad():
-            self.policy(env.reset())
+        super().check()
 
     def close(self) -> None:
         """Closes environments and processes."""

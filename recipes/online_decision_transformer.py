@@ -189,7 +189,7 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
         recipe = self.recipe
         return OnlineData(
             self.load_data(),
-            self.make_storage,
+            self.measured_items,
             batch_size=recipe.batch_size,
             capacity=recipe.capacity,
             seed=recipe.seed,

@@ -15,7 +15,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import ReplayBuffer
-from torchrl.envs import Compose, EnvBase
+from torchrl.envs import EnvBase
 
 from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_checkpoint
 from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
@@ -31,7 +31,7 @@ from .core.algorithm import (
     storage_device,
     to_networks,
 )
-from .core.memory import arranging, state_transforms, with_transforms
+from .core.networks import arranging, state_transforms
 from .core.recipe import SamplesRecipe
 from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
@@ -129,7 +129,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         random_steps = recipe.random_steps if self.draws_random_steps else 0
         self.collector = self.make_collector(
             self.behavior,
-            partial(_make_envs, state_transforms(self.policy)),
+            partial(make_task, state=state_transforms(self.policy), clip_actions=False),
             step,
             random_steps=max(0, random_steps - step),
         )
@@ -187,11 +187,6 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         Returns:
             A number for each of ``columns``, float [], among others.
         """
-
-
-def _make_envs(state: Compose, recipe: OnlineRecipe, num_envs: int) -> EnvBase:
-    """Builds the environments in which steps are collected."""
-    return with_transforms(make_task(recipe, num_envs, clip_actions=False), state)
 
 
 class BufferState:

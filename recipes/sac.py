@@ -25,7 +25,7 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.numbers import Fraction, Rate, Widths
 
 from .core.algorithm import Terms, descend
-from .core.networks import describe, make_backbone, make_critic
+from .core.networks import check_actions, make_backbone, make_critic
 from .replay import ReplayAlgorithm, ReplayRecipe
 
 
@@ -74,11 +74,9 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with policy, critics, their targets and the temperature."""
         recipe, spec, observation = self.recipe, env.action_spec_unbatched, observation_specs(env)
-        if not has_bounds(spec):
-            raise ValueError(
-                f"sac needs continuous actions within bounds, but {recipe.env} has "
-                f"{describe(spec)} actions: use a ppo recipe"
-            )
+        check_actions(
+            recipe, spec, has_bounds(spec), "continuous actions within bounds", "a ppo recipe"
+        )
         size, slices = spec.shape[0], recipe.slice_length > 1
         backbone = make_backbone(recipe.backbone, observation, slices=slices)
         head = nn.Sequential(nn.Linear(backbone.features_dim, 2 * size), NormalParamExtractor())

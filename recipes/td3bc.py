@@ -16,7 +16,7 @@ from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.settings.numbers import Rate, Steps, Weight
 
 from .core.algorithm import Stateful, Terms, descend
-from .core.networks import describe, make_deterministic_policy
+from .core.networks import check_actions, make_deterministic_policy
 from .offline import ActorCriticRecipe, TransitionAlgorithm
 
 
@@ -62,11 +62,8 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with policy, critics and their targets."""
         recipe, spec = self.recipe, self.action_spec
-        if not has_bounds(spec):
-            raise ValueError(
-                "td3bc needs continuous actions within bounds, but those of "
-                f"{recipe.task_name} are {describe(spec)}: use a bc or iql recipe"
-            )
+        instead = "a bc or iql recipe"
+        check_actions(recipe, spec, has_bounds(spec), "continuous actions within bounds", instead)
         # TorchRL's loss hides keys from the critics that the actor does not declare: "observation".
         backbone = self.make_backbone(env, slices=True)
         self._policy = make_deterministic_policy(backbone, spec).to(self.device)

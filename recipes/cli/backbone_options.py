@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import fields, replace
-from itertools import pairwise
 from typing import Any, TypeVar
 
 from torchrl_tit.settings import NETWORKS, FrameSettings, HistorySettings, Part
@@ -33,8 +32,8 @@ _PER_KEY = "backbone.frames."
 """Prefix of the options for one observation, whose name follows."""
 
 
-def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
-    """Returns the recipe with the network that the arguments name.
+def choose_network(recipe: RecipeT, arguments: list[str]) -> tuple[RecipeT, list[str]]:
+    """Returns the recipe with the network that the arguments name, and the other arguments.
 
     ``--backbone.network`` replaces the network by one of the paper's, with as many frames as
     before. ``--backbone.frame`` and ``--backbone.history`` then replace an encoder. A new encoder
@@ -48,7 +47,7 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
 
     Args:
         recipe: the recipe.
-        arguments: all arguments of the command; unrelated ones are ignored.
+        arguments: all arguments of the command.
 
     Raises:
         ValueError: if a name is missing or unknown; the message suggests the nearest ones.
@@ -56,13 +55,13 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
     Example:
         >>> from recipes.core.registry import get_recipe
         >>> arguments = ["--backbone.frame", "resnet", "--backbone.history", "outer"]
-        >>> recipe = choose_network(get_recipe("ppo/pong/enhanced-tit"), arguments)
+        >>> recipe, _ = choose_network(get_recipe("ppo/pong/enhanced-tit"), arguments)
         >>> recipe.backbone.frame
         ResNetFrames(embed_dim=64)
         >>> recipe.backbone.history.name
         'outer'
     """
-    names = _read(arguments)
+    names, rest = _read(arguments)
     network = recipe.backbone
     if "backbone.network" in names:
         system = NETWORKS[names["backbone.network"]]()
@@ -82,7 +81,7 @@ def choose_network(recipe: RecipeT, arguments: list[str]) -> RecipeT:
             old = frames.get(key, network.frame)
             frames[key] = _with_width_of(old, _replace_part(old, FrameSettings.get(name)))
     network = _draft(network, frames=frames)
-    return _draft(recipe, backbone=network)
+    return _draft(recipe, backbone=network), rest
 
 
 def check_recipe(recipe: RecipeT) -> RecipeT:
@@ -111,23 +110,6 @@ def describe_options(recipe: Recipe) -> str:
     )
 
 
-def without_names(arguments: list[str]) -> list[str]:
-    """Returns the arguments without the options that :func:`choose_network` has read.
-
-    Example:
-        >>> without_names(["--backbone.frame", "inner", "--backbone.history=outer", "--seed", "3"])
-        ['--seed', '3']
-    """
-    words, rest = iter(arguments), []
-    for word in words:
-        option, equals, _ = word.removeprefix("--").partition("=")
-        if not (word.startswith("--") and _choices(option)):
-            rest.append(word)
-        elif not equals:
-            next(words)
-    return rest
-
-
 def _choices(option: str) -> Iterable[str]:
     """The names that an option accepts; empty if there is no such option."""
     if option.startswith(_PER_KEY) and "." not in option.removeprefix(_PER_KEY):
@@ -135,15 +117,21 @@ def _choices(option: str) -> Iterable[str]:
     return _OPTIONS.get(option, ())
 
 
-def _read(arguments: list[str]) -> dict[str, str]:
-    """Reads the options, as ``--option NAME`` or ``--option=NAME``; the last occurrence counts."""
-    names = {}
-    for argument, after in pairwise([*arguments, ""]):
-        option, equals, name = argument.removeprefix("--").partition("=")
+def _read(arguments: list[str]) -> tuple[dict[str, str], list[str]]:
+    """Reads the options, ``--option NAME`` or ``--option=NAME``, of which the last one counts.
+
+    Example:
+        >>> _read(["--backbone.frame", "inner", "--backbone.history=outer", "--seed", "3"])
+        ({'backbone.frame': 'inner', 'backbone.history': 'outer'}, ['--seed', '3'])
+    """
+    names, rest, words = {}, [], iter(arguments)
+    for word in words:
+        option, equals, name = word.removeprefix("--").partition("=")
         choices = _choices(option)
-        if not argument.startswith("--") or not choices:
+        if not word.startswith("--") or not choices:
+            rest.append(word)
             continue
-        name = name if equals else after
+        name = name if equals else next(words, "")
         if not name or name.startswith("-"):
             raise ValueError(f"--{option} needs a name: {nearest('', choices)}")
         failures = load_plugins() if name not in choices else []
@@ -154,7 +142,7 @@ def _read(arguments: list[str]) -> dict[str, str]:
             )
             raise ValueError("; ".join([reason, *failures]))
         names[option] = name
-    return names
+    return names, rest
 
 
 def _keys_with_fields(arguments: list[str]) -> list[str]:

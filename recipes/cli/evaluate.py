@@ -55,6 +55,8 @@ def evaluate(arguments: list[str]) -> None:
         fail(f"--out {options.out} cannot be written: there is no folder {options.out.parent}")
     if options.ope is not None and options.dataset is None:
         fail("--ope estimates returns from data: name them with --dataset FILE")
+    if options.episodes is not None and (options.dataset is not None or not run.recipe.env):
+        fail("--episodes are those that are played: leave it out where data are measured")
     # Only one process at a time may write to the run folder.
     lock: AbstractContextManager[Any] = run if options.out is None else nullcontext()
     with lock:

@@ -29,7 +29,7 @@ COMMANDS = {
     "record": "results:record",
     "report": "results:report",
     "data": "data:data",
-    "examples": "examples:examples",
+    "examples": "named_recipes:examples",
 }
 """The commands by name, each a "module:function" of this package."""
 

@@ -45,8 +45,7 @@ def sweep(arguments: list[str]) -> None:
     from ..tools.sweeps.sweep import make_jobs, run_jobs
     from ..tools.wandb_metrics import check_wandb
 
-    if options.wandb is not None:
-        check_wandb(options.wandb)
+    check_wandb(options.wandb)
     jobs = [
         replace(job, wandb=options.wandb or "")
         for job in make_jobs(options.names, options.seeds, options.out)

@@ -20,7 +20,7 @@ from ..core.recipe import LENGTHS, Recipe
 from ..core.registry import find_recipe
 from ..core.trust import allow_names
 from .arguments import Parser, add_machine_options, fail, option, parse_fields, program
-from .backbone_options import check_recipe, choose_network, describe_options, without_names
+from .backbone_options import check_recipe, choose_network, describe_options
 
 WANDB_HELP = "Project of Weights & Biases that metrics are sent to, beside CSV and TensorBoard."
 
@@ -74,10 +74,10 @@ def parse_recipe(
     if not {"-h", "--help"}.isdisjoint(arguments):
         load_plugins()  # their parts are choices too
     _check_length(recipe, arguments)
-    recipe = choose_network(recipe, arguments)
+    recipe, rest = choose_network(recipe, arguments)
     parsed = parse_fields(
         [("recipe", Annotated[type(recipe), tyro.conf.arg(name="")], recipe), *beside],
-        without_names(arguments),
+        rest,
         command,
         f"{getdoc(type(recipe))}\n\n{describe_options(recipe)}",
     )

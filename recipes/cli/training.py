@@ -21,6 +21,7 @@ from ..core.networks import name_chosen_encoders
 from ..core.recipe import Recipe
 from ..core.run import Run
 from ..tools.results.plot import plot_run
+from ..tools.wandb_metrics import WandbMetrics, check_wandb
 from .arguments import note, option, override, program, say
 from .evaluate import one_line
 
@@ -41,7 +42,7 @@ def start(
         init_from: the run whose weights to start from, if any.
         wandb: the project of Weights & Biases that metrics are sent to, if any.
     """
-    _check_wandb(wandb)
+    check_wandb(wandb)
     algorithm = make_algorithm(recipe)
     algorithm.check()
     if algorithm.recipe.env_settings != recipe.env_settings:
@@ -50,7 +51,7 @@ def start(
     if init_from is not None:
         weights, report = weights_from(init_from, algorithm)
         say(report)
-    recipe, chosen = name_chosen_encoders(algorithm.recipe, algorithm)
+    recipe, chosen = name_chosen_encoders(algorithm)
     if chosen:
         say(f"frames chosen by kind of observation: {chosen}")
     with Run.create(folder or _make_folder(recipe), recipe, weights) as run:
@@ -74,7 +75,7 @@ def resume(
             recipe's if None.
         wandb: as in :func:`start`.
     """
-    _check_wandb(wandb)
+    check_wandb(wandb)
     with Run.open(folder) as run:
         if lengths:
             _lengthen(run, lengths)
@@ -82,13 +83,6 @@ def resume(
         if changes := run.version_changes():
             note(f"versions changed since the start: {'; '.join(changes)}")
         _finish(run, wandb)
-
-
-def _check_wandb(project: str | None) -> None:
-    if project is not None:
-        from ..tools.wandb_metrics import check_wandb  # an extra
-
-        check_wandb(project)
 
 
 def _lengthen(run: Run, lengths: Mapping[str, int]) -> None:
@@ -121,8 +115,6 @@ def _finish(run: Run, wandb: str | None) -> None:
         with ExitStack() as stack:
             callbacks: list[Callback] = [] if recipe.offline else [UnusedFrames(recipe)]
             if wandb is not None:
-                from ..tools.wandb_metrics import WandbMetrics  # an extra
-
                 callbacks.append(stack.enter_context(closing(WandbMetrics(run, wandb))))
             runner.train(recipe, run, callbacks)
             evaluation = runner.evaluate(run, callbacks=callbacks)

@@ -11,8 +11,7 @@ import torch
 
 from torchrl_tit.scores import has_reference, normalized_score, normalized_spread
 
-from .dataset_recipe import DatasetRecipe
-from .recipe import Recipe
+from .recipe import DatasetRecipe, Recipe
 
 
 @dataclass(frozen=True)

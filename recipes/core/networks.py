@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
+from tensordict import TensorDictBase
 from tensordict.nn import (
     AddStateIndependentNormalScale,
     ProbabilisticTensorDictSequential,
@@ -15,11 +17,12 @@ from tensordict.nn import (
 )
 from torch import nn
 from torchrl.data import Bounded, Categorical, TensorSpec
+from torchrl.envs import Compose
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, QValueModule, TanhModule
 
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.frames.observation import Observations, read_observations
-from torchrl_tit.modules import Backbone, history_keys, make_actor
+from torchrl_tit.modules import Backbone, as_sequences, history_keys, make_actor
 from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.modules.sequences import default_observation_keys
@@ -189,6 +192,23 @@ def make_critic(
     return TensorDictSequential(*modules, TensorValue(mlp, in_keys=in_keys, out_keys=[out_key]))
 
 
+def state_transforms(policy: nn.Module) -> Compose:
+    """Makes the transforms that carry a policy's state through an environment, if it has one."""
+    backbones = (module for module in policy.modules() if isinstance(module, Backbone))
+    return next((backbone.make_transforms() for backbone in backbones), Compose())
+
+
+def arranging(recipe: Recipe) -> Callable[[TensorDictBase], TensorDictBase] | None:
+    """Returns how a recipe arranges slices of steps for its network, if that carries a state.
+
+    Args:
+        recipe: the settings, with a ``burn_in`` if the network carries a state.
+    """
+    if not recipe.backbone.carries_state:
+        return None
+    return partial(as_sequences, burn_in=getattr(recipe, "burn_in", 0))
+
+
 def is_continuous(spec: TensorSpec) -> bool:
     """Whether actions are arrays of floats."""
     return spec.dtype.is_floating_point and spec.ndim == 1
@@ -206,6 +226,23 @@ def describe(spec: TensorSpec) -> str:
     if isinstance(spec, Bounded):
         within = f", from {spec.space.low.tolist()} to {spec.space.high.tolist()}"
     return f"{kind} ({type(spec).__name__}, shape {list(spec.shape)}{within})"
+
+
+def check_actions(recipe: Recipe, spec: TensorSpec, fit: bool, needed: str, instead: str) -> None:
+    """Raises ValueError unless the actions of a recipe's task fit its algorithm.
+
+    Args:
+        recipe: the recipe.
+        spec: spec of an action.
+        fit: whether they do.
+        needed: the actions that the algorithm needs, in words.
+        instead: other recipes, in words.
+    """
+    if not fit:
+        raise ValueError(
+            f"{recipe.algorithm} needs {needed}, but those of {recipe.task_name} are "
+            f"{describe(spec)}: use {instead}"
+        )
 
 
 def _bounded(backbone: Backbone, action_spec: Bounded, key: str) -> list[nn.Module]:
@@ -234,18 +271,16 @@ def _array_size(observation: Observations) -> int:
     return first.entries
 
 
-def name_chosen_encoders(recipe: Recipe, algorithm: Algorithm[Any]) -> tuple[Recipe, str]:
-    """Adds to a recipe the frame encoders that were chosen by the kinds of observations.
+def name_chosen_encoders(algorithm: Algorithm[Any]) -> tuple[Recipe, str]:
+    """Adds to an algorithm's recipe the frame encoders chosen by the kinds of observations.
 
     The run's recipe.json then records them, and a resumed run keeps them in later versions too.
 
-    Args:
-        recipe: the recipe.
-        algorithm: its algorithm, with the networks.
-
     Returns:
-        The recipe for the run, and a description of what was chosen, which is empty if nothing was.
+        The recipe for the run, which also has what the algorithm took from its data, and a
+        description of what was chosen, which is empty if nothing was.
     """
+    recipe = algorithm.recipe
     modules = algorithm.policy.modules()
     network = next((module for module in modules if isinstance(module, HistoryNetwork)), None)
     chosen = {} if network is None else network.frame_settings

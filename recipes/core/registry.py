@@ -1,11 +1,16 @@
-"""The named recipes: the paper's experiments as data, and those of users' packages."""
+"""Recipes by name, the paper's and those of users' packages, and recipes in files."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
+from torchrl_tit.settings.checks import nearest
+from torchrl_tit.settings.imports import import_allowed
 from torchrl_tit.settings.parts import Names
 
 from ..presets.any_data import ANY_DATA_RECIPES
@@ -22,7 +27,6 @@ from ..presets.ppo_no_velocity import NO_VELOCITY_RECIPES
 from ..presets.preset import Preset
 from ..presets.sac import SAC_RECIPES
 from .recipe import Recipe, get_recipe_class
-from .recipe_file import is_recipe_file, recipe_from_file
 from .recipe_json import recipe_from_json
 from .records import find_records
 
@@ -88,22 +92,21 @@ def register_recipes(*recipes: Recipe) -> None:
         RECIPES.add(recipe, home)
 
 
-for _named in (
-    ANY_TASK_RECIPES,
-    ANY_DATA_RECIPES,
-    ARRAY_RECIPES,
-    NO_VELOCITY_RECIPES,
-    MEMORY_RECIPES,
-    ATARI_RECIPES,
-    MINATAR_RECIPES,
-    SAC_RECIPES,
-    DQN_RECIPES,
-    CQL_RECIPES,
-    OFFLINE_RECIPES,
-    DT_RECIPES,
+for _preset in (
+    *ANY_TASK_RECIPES,
+    *ANY_DATA_RECIPES,
+    *ARRAY_RECIPES,
+    *NO_VELOCITY_RECIPES,
+    *MEMORY_RECIPES,
+    *ATARI_RECIPES,
+    *MINATAR_RECIPES,
+    *SAC_RECIPES,
+    *DQN_RECIPES,
+    *CQL_RECIPES,
+    *OFFLINE_RECIPES,
+    *DT_RECIPES,
 ):
-    for _preset in _named.values():
-        RECIPES.add(_preset, __name__)
+    RECIPES.add(_preset, __name__)
 
 
 def get_recipe(name: str) -> Recipe:
@@ -148,6 +151,61 @@ def find_recipe(name: str) -> Recipe:
             records, run = found
             return recipe_from_json(records.read(run, path.name) or b"", path)
         return recipe_from_json(path.read_bytes(), path)
-    if is_recipe_file(name):
-        return recipe_from_file(name)
-    return get_recipe(name)
+    if not is_recipe_file(name):
+        return get_recipe(name)
+    recipes = recipes_from_file(name)
+    if len(recipes) > 1:
+        raise ValueError(f"{name} defines {len(recipes)} recipes: name {' or '.join(recipes)}")
+    return next(iter(recipes.values()))
+
+
+def is_recipe_file(source: str) -> bool:
+    """Whether a name on the command line is a Python file, or ``FILE:NAME`` of a recipe in one.
+
+    Example:
+        >>> is_recipe_file("my_recipes.py:small"), is_recipe_file("ppo/cartpole/mlp")
+        (True, False)
+    """
+    return source.endswith(".py") or ".py:" in source
+
+
+def recipes_from_file(source: str) -> dict[str, Recipe]:
+    """Runs a Python file and takes the recipes that it defines.
+
+    These are its variables that are recipes, and the entries of those that are dictionaries of
+    recipes; names that begin with "_" are left out. A recipe without a name is given that of its
+    variable or entry.
+
+    Args:
+        source: a Python file, or ``FILE:NAME`` of one of its recipes.
+
+    Returns:
+        Each recipe by the source that identifies it, ``FILE:NAME``.
+
+    Raises:
+        ImportError: if there is no such file, it is not Python, or it raises.
+        ValueError: if it defines no recipe, or none of that name.
+    """
+    file, _, name = source.partition(".py:")
+    file = file if file.endswith(".py") else f"{file}.py"
+    recipes = dict(_recipes(import_allowed(file)))
+    if not recipes:
+        raise ValueError(
+            f"{file} defines no recipe: assign one, such as PPO(...), or a dictionary of recipes, "
+            "to a variable"
+        )
+    if name and name not in recipes:
+        raise ValueError(f"{file} defines no recipe {name!r}: {nearest(name, recipes)}")
+    return {
+        f"{file}:{key}": recipe if recipe.name else replace(recipe, name=key)
+        for key, recipe in recipes.items()
+        if not name or key == name
+    }
+
+
+def _recipes(module: ModuleType) -> Iterator[tuple[str, Recipe]]:
+    for name, value in vars(module).items():
+        values: dict[Any, Any] = value if isinstance(value, dict) else {name: value}
+        for key, recipe in values.items() if not name.startswith("_") else ():
+            if isinstance(recipe, Recipe):
+                yield key, recipe

@@ -245,8 +245,12 @@ class Run:
         Raises:
             CheckpointError: if they are damaged.
         """
-        folder = self.folder / _WEIGHTS
-        return load_checkpoint(folder, 0)[1] if checkpoint_steps(folder) else {}
+        return load_checkpoint(self.folder / _WEIGHTS, 0)[1] if self.has_initial_weights else {}
+
+    @property
+    def has_initial_weights(self) -> bool:
+        """Whether it starts from the weights of another run."""
+        return bool(checkpoint_steps(self.folder / _WEIGHTS))
 
     def load_trained(self) -> tuple[int, dict[str, Any]]:
         """Loads the newest checkpoint of a run that has been trained: (step, state).
@@ -299,16 +303,18 @@ class Run:
         """The picture of the learning curve."""
         return self.folder / "learning_curve.png"
 
+    def versions(self) -> dict[str, Any]:
+        """Returns the versions that the run began with; none if they are lost or damaged."""
+        try:
+            return dict(json.loads(self.read("versions.json") or b"{}"))
+        except (OSError, RecursionError, TypeError, ValueError):
+            return {}
+
     def version_changes(self) -> list[str]:
         """Returns how the versions of this process differ from those that the run began with."""
-        path = self.folder / "versions.json"
-        try:
-            before = json.loads(path.read_text(encoding="utf-8"))
-            before.items()
-        except (AttributeError, OSError, RecursionError, ValueError):  # lost or damaged
-            return []
-        now = package_versions()
-        return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before.get(k) != now[k]]
+        before, now = self.versions(), package_versions()
+        changed = [k for k in now if before and before.get(k) != now[k]]
+        return [f"{k} {before.get(k)} -> {now[k]}" for k in changed]
 
 
 class RecordedRun(Run):
@@ -340,6 +346,11 @@ class RecordedRun(Run):
         """Reads and checks the run's evaluation; None if there is none."""
         content = self.read(EVALUATION)
         return None if content is None else parse_evaluation(content, self.folder)
+
+    @property
+    def has_initial_weights(self) -> bool:
+        """Whether it started from the weights of another run."""
+        return b'"initial_weights"' in (self.read("changes") or b"")
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import inspect
 from typing import Any
 
 import numpy as np
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase
 
 from torchrl_tit.envs import make_env, time_limit
 
@@ -17,7 +17,12 @@ _PARAMETERS = inspect.signature(make_env).parameters
 
 
 def make_task(
-    recipe: Recipe, num_envs: int = 1, seed: int | None = None, **settings: Any
+    recipe: Recipe,
+    num_envs: int = 1,
+    seed: int | None = None,
+    *,
+    state: Compose | None = None,
+    **settings: Any,
 ) -> EnvBase:
     """Builds a recipe's task, with histories of as many frames as its network reads.
 
@@ -25,6 +30,8 @@ def make_task(
         recipe: the settings.
         num_envs: number of environments, which are stepped side by side.
         seed: seed of the first environment.
+        state: the transforms that carry a network's state; see
+            :func:`~recipes.core.networks.state_transforms`.
         **settings: further settings of :func:`~torchrl_tit.envs.make_env` and of the task, which
             override those of the recipe.
 
@@ -54,7 +61,8 @@ def make_task(
         **recipe.task_settings,
         **settings,
     }
-    return make_env(recipe.env, num_envs, seed=seed, **values)
+    env = make_env(recipe.env, num_envs, seed=seed, **values)
+    return env.append_transform(state) if state else env
 
 
 def seed_copies(env: EnvBase, seed: int, step: int = 0, first: int = 0) -> EnvBase:

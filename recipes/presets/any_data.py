@@ -8,7 +8,7 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import decision_transformer, dt_tit, mlp
 
 from .ppo_settings import reliable_tit
-from .preset import BC, CQL, DT, IQL, TD3BC, DiscreteCQL, Preset
+from .preset import BC, CQL, DT, IQL, TD3BC, DiscreteCQL, Preset, of_networks
 
 _NETWORKS: dict[str, Network] = {
     "mlp": mlp(hidden_dim=256, activation="relu"),
@@ -27,7 +27,6 @@ _CQL: dict[str, Any] = {
     "critic_hidden": (256, 256),
     "temperature_learning_rate": 1e-3,
 }
-_ALGORITHMS = {"bc": BC, "iql": IQL, "td3bc": TD3BC, "cql": CQL, "discrete-cql": DiscreteCQL}
 _DT: dict[str, Any] = {
     "dataset": "",
     "iterations": 20,
@@ -36,21 +35,12 @@ _DT: dict[str, Any] = {
     "warmup_updates": 1000,
 }
 
-ANY_DATA_RECIPES: dict[str, Preset] = {
-    recipe.name: recipe
-    for recipe in [
-        *(
-            make(
-                name=f"{algorithm}/{network}",
-                backbone=backbone,
-                **_SETTINGS,
-                **(_CQL if algorithm == "cql" else {}),
-            )
-            for algorithm, make in _ALGORITHMS.items()
-            for network, backbone in _NETWORKS.items()
-        ),
-        DT(name="dt/dt", backbone=decision_transformer(), **_DT),
-        DT(name="dt/dt-tit", backbone=dt_tit(), **_DT),
-    ]
-}
+ANY_DATA_RECIPES: list[Preset] = [
+    *of_networks(BC, "bc", _NETWORKS, **_SETTINGS),
+    *of_networks(IQL, "iql", _NETWORKS, **_SETTINGS),
+    *of_networks(TD3BC, "td3bc", _NETWORKS, **_SETTINGS),
+    *of_networks(CQL, "cql", _NETWORKS, **_SETTINGS, **_CQL),
+    *of_networks(DiscreteCQL, "discrete-cql", _NETWORKS, **_SETTINGS),
+    *of_networks(DT, "dt", {"dt": decision_transformer(), "dt-tit": dt_tit()}, **_DT),
+]
 """``ALGORITHM/mlp`` and ``ALGORITHM/enhanced-tit``, ``dt/dt`` and ``dt/dt-tit``."""

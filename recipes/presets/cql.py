@@ -6,8 +6,8 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.encoders import Activation
 from torchrl_tit.settings.networks import enhanced_tit, mlp, nature_cnn
 
-from .ppo_atari import ATARI_RECIPES
-from .preset import CQL, DiscreteCQL, Preset
+from .ppo_atari import TIT_PROTOCOL
+from .preset import CQL, DiscreteCQL, Preset, of_networks
 
 # Task name: environment and entries of an observation. The paper evaluated in D4RL's own
 # environments, MuJoCo's v2; v4 is closest to it.
@@ -58,54 +58,45 @@ def _continuous() -> list[Preset]:
                 # and always encodes positions.
                 "enhanced-tit-paper": _tit("halfcheetah-medium", observation_dim, True),
             }
-            recipes += [
-                CQL(
-                    name=f"cql/{data}-v0/{network}",
-                    dataset=f"{data}-v0",
-                    env=env,
-                    conservative_weight=5.0 if data.endswith("replay") else 10.0,
-                    backbone=backbone,
-                )
-                for network, backbone in networks.items()
-            ]
+            recipes += of_networks(
+                CQL,
+                f"cql/{data}-v0",
+                networks,
+                dataset=f"{data}-v0",
+                env=env,
+                conservative_weight=5.0 if data.endswith("replay") else 10.0,
+            )
     return recipes
 
 
 def _discrete() -> list[Preset]:
     """The paper ran no discrete task offline; the data are those of docs/datasets.md."""
-    cartpole = DiscreteCQL(
-        name="discrete-cql/cartpole-mixed/mlp",
+    cartpole = of_networks(
+        DiscreteCQL,
+        "discrete-cql/cartpole-mixed",
+        {"mlp": mlp(activation="relu"), "enhanced-tit": enhanced_tit(patch_size=2)},
         dataset="data/cartpole/mixed.hdf5",
         env="CartPole-v1",
-        backbone=mlp(activation="relu"),
         batch_size=64,
         total_updates=10_000,
         evaluation_episodes=20,
     )
-    pong = DiscreteCQL(
-        name="discrete-cql/pong-mixed/nature-cnn",
+    pong = of_networks(
+        DiscreteCQL,
+        "discrete-cql/pong-mixed",
+        {"nature-cnn": nature_cnn(4), "enhanced-tit": TIT_PROTOCOL["enhanced-tit"]},
         dataset="data/pong/mixed.hdf5",
         env="ALE/Pong-v5",
         padding="constant",
-        backbone=nature_cnn(4),
         batch_size=32,
         learning_rate=1e-4,
         total_updates=20_000,
         evaluation_interval=4_000,
         evaluation_episodes=5,
     )
-    images = ATARI_RECIPES["ppo/pong/enhanced-tit-protocol"].fields["backbone"]
-    return [
-        cartpole,
-        cartpole.replace(
-            name="discrete-cql/cartpole-mixed/enhanced-tit",
-            backbone=enhanced_tit(patch_size=2),
-        ),
-        pong,
-        pong.replace(name="discrete-cql/pong-mixed/enhanced-tit", backbone=images),
-    ]
+    return cartpole + pong
 
 
-CQL_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in (*_discrete(), *_continuous())}
+CQL_RECIPES: list[Preset] = [*_discrete(), *_continuous()]
 """``cql/DATASET/mlp``, ``enhanced-tit`` (the authors' code) and ``enhanced-tit-paper`` (the paper's
 table) for D4RL's data of version 0, and ``discrete-cql/...`` for collected data."""

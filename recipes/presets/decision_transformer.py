@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torchrl_tit.settings.networks import decision_transformer, dt_tit
 
-from .preset import DT, ODT, Preset
+from .preset import DT, ODT, Preset, of_networks
 
 # Task name: environment and target returns (arXiv 2106.01345, appendix). D4RL's data are from v2 of
 # the tasks; v4 is closer to it than v5.
@@ -16,20 +16,17 @@ _TASKS = {
 
 
 def _offline() -> list[Preset]:
+    networks = {
+        "dt": decision_transformer(),
+        "dt-tit": dt_tit(),
+        "dt-tit-paper": dt_tit(position_encoding=True),  # which the authors' code leaves out
+    }
     return [
-        DT(
-            name=f"dt/{task}-{kind}-v2/{network}",
-            dataset=f"{task}-{kind}-v2",
-            env=env,
-            target_returns=target_returns,
-            backbone=backbone,
-        )
+        recipe
         for task, (env, target_returns) in _TASKS.items()
-        for kind in ("medium", "medium-replay")
-        for network, backbone in (
-            ("dt", decision_transformer()),
-            ("dt-tit", dt_tit()),
-            ("dt-tit-paper", dt_tit(position_encoding=True)),  # which the authors' code leaves out
+        for data in (f"{task}-medium-v2", f"{task}-medium-replay-v2")
+        for recipe in of_networks(
+            DT, f"dt/{data}", networks, dataset=data, env=env, target_returns=target_returns
         )
     ]
 
@@ -38,24 +35,23 @@ def _online() -> list[Preset]:
     recipes = []
     for dataset in ("hopper-medium-v2", "hopper-medium-replay-v2"):
         for network, make_network in (("odt", decision_transformer), ("odt-tit", dt_tit)):
-            recipes += [
-                ODT(
-                    name=f"odt/{dataset}/{network}",
-                    dataset=dataset,
-                    env="Hopper-v4",
-                    target_returns=(3600.0,),
-                    online_return=7200.0,
-                    backbone=make_network(
-                        embed_dim=512, num_blocks=4, num_heads=4, timestep_embedding=False
-                    ),
+            recipe = ODT(
+                name=f"odt/{dataset}/{network}",
+                dataset=dataset,
+                env="Hopper-v4",
+                target_returns=(3600.0,),
+                online_return=7200.0,
+                backbone=make_network(
+                    embed_dim=512, num_blocks=4, num_heads=4, timestep_embedding=False
                 ),
+            )
+            recipes += [
+                recipe,
                 # Small runs, which a CPU finishes in minutes: a smaller network that learns faster,
                 # has target returns that occur in the data, and reads as many frames when it acts
                 # as in training.
-                ODT(
+                recipe.replace(
                     name=f"odt/{dataset}/{network}-small",
-                    dataset=dataset,
-                    env="Hopper-v4",
                     target_returns=(3000.0,),
                     online_return=3200.0,
                     backbone=make_network(
@@ -75,5 +71,5 @@ def _online() -> list[Preset]:
     return recipes
 
 
-DT_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in [*_offline(), *_online()]}
+DT_RECIPES: list[Preset] = [*_offline(), *_online()]
 """``dt/DATASET/dt``, ``dt-tit``, ``dt-tit-paper`` for D4RL's sets of version 2, and ``odt/...``."""

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 from torchrl_tit.settings.networks import enhanced_tit, mlp, nature_cnn
 
-from .ppo_atari import ATARI_RECIPES
-from .preset import DQN, Preset
+from .ppo_atari import TIT_PROTOCOL
+from .preset import DQN, Preset, of_networks
 
 
 def _named() -> list[Preset]:
-    cartpole = DQN(
-        name="dqn/cartpole/mlp",
+    cartpole, cartpole_tit = of_networks(
+        DQN,
+        "dqn/cartpole",
+        {
+            "mlp": mlp(hidden_dim=256, activation="relu"),
+            "enhanced-tit": enhanced_tit(patch_size=2),
+        },
         env="CartPole-v1",
-        backbone=mlp(hidden_dim=256, activation="relu"),
         num_envs=8,
         total_steps=50_000,
         random_steps=1024,
@@ -30,11 +34,12 @@ def _named() -> list[Preset]:
         exploration_fraction=0.16,
         target_interval=128,
     )
-    pong = DQN(
-        name="dqn/pong/nature-cnn",
+    pong = of_networks(
+        DQN,
+        "dqn/pong",
+        {"nature-cnn": nature_cnn(4), "enhanced-tit": TIT_PROTOCOL["enhanced-tit"]},
         env="ALE/Pong-v5",
         padding="constant",
-        backbone=nature_cnn(4),
         num_envs=8,
         total_steps=10_000_000,
         random_steps=80_000,
@@ -48,20 +53,8 @@ def _named() -> list[Preset]:
         target_interval=250,
         clip_rewards=True,
     )
-    return [
-        cartpole,
-        cartpole.replace(
-            name="dqn/cartpole/enhanced-tit",
-            backbone=enhanced_tit(patch_size=2),
-            learning_rate=5e-4,
-        ),
-        pong,
-        pong.replace(
-            name="dqn/pong/enhanced-tit",
-            backbone=ATARI_RECIPES["ppo/pong/enhanced-tit-protocol"].fields["backbone"],
-        ),
-    ]
+    return [cartpole, cartpole_tit.replace(learning_rate=5e-4), *pong]
 
 
-DQN_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in _named()}
+DQN_RECIPES: list[Preset] = _named()
 """``dqn/TASK/NETWORK``."""

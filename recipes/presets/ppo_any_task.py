@@ -23,11 +23,8 @@ _ALGORITHMS = {
     "-gsde": (SmoothPPO, "Pendulum-v1"),  # smooth noise, for continuous actions
 }
 
-ANY_TASK_RECIPES: dict[str, Preset] = {
-    f"ppo/{network}{ending}": make(
-        name=f"ppo/{network}{ending}", env=env, backbone=backbone, **PPO_SETTINGS
-    )
+ANY_TASK_RECIPES: list[Preset] = [
+    make(name=f"ppo/{network}{ending}", env=env, backbone=backbone, **PPO_SETTINGS)
     for ending, (make, env) in _ALGORITHMS.items()
     for network, backbone in _NETWORKS.items()
-}
-"""The recipes by name."""
+]

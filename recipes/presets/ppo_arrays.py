@@ -61,5 +61,4 @@ def _named() -> list[Preset]:
     return recipes
 
 
-ARRAY_RECIPES: dict[str, Preset] = {recipe.name: recipe for recipe in _named()}
-"""The recipes by name."""
+ARRAY_RECIPES: list[Preset] = _named()

@@ -18,7 +18,7 @@ from torchrl_tit.settings.networks import (
 )
 
 from .ppo_settings import PICTURE_SETTINGS, PICTURE_TIT, enhanced_tit_of_pictures
-from .preset import PPO, ContrastivePPO, Preset
+from .preset import PPO, ContrastivePPO, Preset, of_networks
 
 # Game: environment and steps. The paper ran each for 10,000,000 steps.
 _GAMES = {
@@ -47,10 +47,11 @@ _PROTOCOL: dict[str, Any] = {
     "ffn_dropout_inner": 0.1,
     "ffn_dropout_outer": 0.1,
 }
-_TIT_PROTOCOL: dict[str, Network] = {
+TIT_PROTOCOL: dict[str, Network] = {
     "vanilla-tit": vanilla_tit(4, **PICTURE_TIT, **_PROTOCOL),
     **enhanced_tit_of_pictures(4, "none", **_PROTOCOL),
 }
+"""TIT as in the paper, by name."""
 
 
 def _named(game: str) -> list[Preset]:
@@ -84,28 +85,23 @@ def _named(game: str) -> list[Preset]:
     }
     tit = protocol.replace(minibatch_size=64)  # the authors' code; the paper names only 256
     recipes |= {
-        f"{name}-protocol": tit.replace(backbone=network) for name, network in _TIT_PROTOCOL.items()
+        f"{name}-protocol": tit.replace(backbone=network) for name, network in TIT_PROTOCOL.items()
     }
     return [recipe.replace(name=f"ppo/{game}/{name}") for name, recipe in recipes.items()]
 
 
 # An agent that remembers where the ball was knows where it is (arXiv 1507.06527, section 5).
-_FLICKERING = {
-    f"ppo/pong-flickering/{network}": PPO(
-        name=f"ppo/pong-flickering/{network}",
-        env="ALE/Pong-v5",
-        env_settings=("blank_probability=0.5",),
-        total_steps=2_000_000,
-        backbone=backbone,
-        **PICTURE_SETTINGS,
-    )
-    for network, backbone in {
+_FLICKERING = of_networks(
+    PPO,
+    "ppo/pong-flickering",
+    {
         "nature-cnn": nature_cnn(4),
         "enhanced-tit-k16": enhanced_tit_of_pictures(16, **_PATCHES)["enhanced-tit"],
-    }.items()
-}
+    },
+    env="ALE/Pong-v5",
+    env_settings=("blank_probability=0.5",),
+    total_steps=2_000_000,
+    **PICTURE_SETTINGS,
+)
 
-ATARI_RECIPES: dict[str, Preset] = {
-    recipe.name: recipe for game in _GAMES for recipe in _named(game)
-} | _FLICKERING
-"""The recipes by name."""
+ATARI_RECIPES: list[Preset] = [*(x for game in _GAMES for x in _named(game)), *_FLICKERING]

@@ -25,7 +25,7 @@ from torchrl_tit.settings import (
 )
 
 from .ppo_settings import STEADY_PPO_SETTINGS, reliable_tit
-from .preset import PPO, Preset
+from .preset import PPO, Preset, of_networks
 
 MEMORY_SETTINGS: dict[str, Any] = STEADY_PPO_SETTINGS | {
     "num_envs": 16,
@@ -107,45 +107,42 @@ def memory_networks(num_frames: int, *, patch_size: int | None = None) -> dict[s
     }
 
 
-MEMORY_RECIPES: dict[str, Preset] = (
-    {
-        f"ppo/tmaze-{length}/{network}": PPO(
-            name=f"ppo/tmaze-{length}/{network}",
+def _named() -> list[Preset]:
+    recipes = []
+    for length, total_steps in _T_MAZES.items():
+        recipes += of_networks(
+            PPO,
+            f"ppo/tmaze-{length}",
+            memory_networks(length + 1),
             env="TMaze-v0",
             env_settings=(f"corridor_length={length}", "end_when_behind=True"),
             total_steps=total_steps,
-            backbone=backbone,
             **_t_maze_settings(length),
         )
-        for length, total_steps in _T_MAZES.items()
-        for network, backbone in memory_networks(length + 1).items()
-    }
-    | {
-        f"ppo/repeat-previous-{difficulty}/{network}": PPO(
-            name=f"ppo/repeat-previous-{difficulty}/{network}",
+    for difficulty, total_steps in _REPEATS.items():
+        recipes += of_networks(
+            PPO,
+            f"ppo/repeat-previous-{difficulty}",
+            memory_networks(32),
             env=f"popgym-RepeatPrevious{difficulty.title()}-v0",
             total_steps=total_steps,
-            backbone=backbone,
             **MEMORY_SETTINGS,
         )
-        for difficulty, total_steps in _REPEATS.items()
-        for network, backbone in memory_networks(32).items()
-    }
-    | {
-        # As in arXiv 2505.15040: a view of 3 x 3 tiles, and episodes are truncated after 96 steps.
-        # `max_steps=96` would truncate them too, but a step would then cost 0.9 / 96 of the reward
-        # instead of 0.9 / 245 on S7, and looking at the cue would not pay. A patch is a tile.
-        f"ppo/memory-s{size}/{network}": PPO(
-            name=f"ppo/memory-s{size}/{network}",
+    # As in arXiv 2505.15040: a view of 3 x 3 tiles, and episodes are truncated after 96 steps.
+    # `max_steps=96` would truncate them too, but a step would then cost 0.9 / 96 of the reward
+    # instead of 0.9 / 245 on S7, and looking at the cue would not pay. A patch is a tile.
+    for size, total_steps in _MINIGRIDS.items():
+        recipes += of_networks(
+            PPO,
+            f"ppo/memory-s{size}",
+            memory_networks(32, patch_size=8),
             env=f"MiniGrid-MemoryS{size}-v0",
             env_settings=("agent_view_size=3", "max_episode_steps=96"),
             wrappers=VIEW,
             total_steps=total_steps,
-            backbone=backbone,
             **MEMORY_SETTINGS,
         )
-        for size, total_steps in _MINIGRIDS.items()
-        for network, backbone in memory_networks(32, patch_size=8).items()
-    }
-)
-"""The recipes by name."""
+    return recipes
+
+
+MEMORY_RECIPES: list[Preset] = _named()

@@ -8,7 +8,7 @@ from torchrl_tit.settings import Network, StackedCNN
 from torchrl_tit.settings.networks import nature_cnn
 
 from .ppo_settings import PICTURE_SETTINGS, enhanced_tit_of_pictures
-from .preset import PPO, Preset
+from .preset import PPO, Preset, of_networks
 
 _GAMES = ("Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders")
 _NETWORKS: dict[str, Network] = {
@@ -17,18 +17,11 @@ _NETWORKS: dict[str, Network] = {
     **enhanced_tit_of_pictures(4, patch_size=2),
 }
 
-MINATAR_RECIPES: dict[str, Preset] = {
-    name: PPO(
-        name=name,
-        env=f"MinAtar/{game}-v1",
-        image_layout="HWC",  # up to ten channels
-        total_steps=1_000_000,
-        backbone=backbone,
-        **PICTURE_SETTINGS,
-    )
+MINATAR_RECIPES: list[Preset] = [
+    # Images have up to ten channels.
+    recipe.replace(env=f"MinAtar/{game}-v1", image_layout="HWC", total_steps=1_000_000)
     for game in _GAMES
-    for network, backbone in _NETWORKS.items()
-    if "-wo-" not in network or game in ("Asterix", "Breakout")
-    for name in [f"ppo/minatar-{game.lower()}/{network}"]
-}
-"""The recipes by name; the ablations of Enhanced_TIT on two games."""
+    for recipe in of_networks(PPO, f"ppo/minatar-{game.lower()}", _NETWORKS, **PICTURE_SETTINGS)
+    if "-wo-" not in recipe.name or game in ("Asterix", "Breakout")
+]
+"""The ablations of Enhanced_TIT are on two games."""

@@ -9,7 +9,7 @@ from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
 from .ppo_settings import STEADY_PPO_SETTINGS, reliable_tit
-from .preset import PPO, Preset
+from .preset import PPO, Preset, of_networks
 
 _TASKS = {
     "cartpole": ("CartPole-v1", 100_000),
@@ -26,16 +26,8 @@ _NETWORKS: dict[str, Network] = {
     "enhanced-tit-wo-outer-k8": enhanced_tit(8, outer=False, patch_size=None),
 }
 
-NO_VELOCITY_RECIPES: dict[str, Preset] = {
-    f"ppo/{task}-no-velocity/{network}": PPO(
-        name=f"ppo/{task}-no-velocity/{network}",
-        env=env,
-        total_steps=total_steps,
-        hide_velocities=True,
-        backbone=backbone,
-        **STEADY_PPO_SETTINGS,
-    )
+NO_VELOCITY_RECIPES: list[Preset] = [
+    recipe.replace(env=env, total_steps=total_steps, hide_velocities=True)
     for task, (env, total_steps) in _TASKS.items()
-    for network, backbone in _NETWORKS.items()
-}
-"""The recipes by name."""
+    for recipe in of_networks(PPO, f"ppo/{task}-no-velocity", _NETWORKS, **STEADY_PPO_SETTINGS)
+]

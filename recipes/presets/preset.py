@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
+
+from torchrl_tit.settings import Network
 
 
 class Preset:
@@ -32,6 +35,23 @@ class Preset:
     def replace(self, **fields: Any) -> Preset:
         """Returns a copy with other values of some fields."""
         return Preset(self.algorithm, **{**self.fields, **fields})
+
+
+def of_networks(
+    make: Callable[..., Preset], task: str, networks: Mapping[str, Network], **fields: Any
+) -> list[Preset]:
+    """Returns a recipe for each network, which is called ``TASK/NETWORK``.
+
+    Args:
+        make: the algorithm, one of those below.
+        task: what the names begin with, such as ppo/cartpole.
+        networks: the networks by name.
+        **fields: the fields that all of them have.
+    """
+    return [
+        make(name=f"{task}/{name}", backbone=network, **fields)
+        for name, network in networks.items()
+    ]
 
 
 PPO, ContrastivePPO, NovelPPO, SmoothPPO, SAC, DQN, CQL, DiscreteCQL, BC, IQL, TD3BC, DT, ODT = (

@@ -4,22 +4,12 @@ from __future__ import annotations
 
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
-from .preset import SAC, Preset
+from .preset import SAC, Preset, of_networks
 
 # The whole observation is one patch, as docs/results/classic_control.md found for PPO.
-SAC_RECIPES: dict[str, Preset] = {
-    recipe.name: recipe
-    for recipe in (
-        SAC(
-            name="sac/hopper/mlp",
-            env="Hopper-v5",
-            backbone=mlp(hidden_dim=256, activation="relu"),
-        ),
-        SAC(
-            name="sac/hopper/enhanced-tit",
-            env="Hopper-v5",
-            backbone=enhanced_tit(patch_size=None, embed_dim=64),
-        ),
-    )
+_NETWORKS = {
+    "mlp": mlp(hidden_dim=256, activation="relu"),
+    "enhanced-tit": enhanced_tit(patch_size=None, embed_dim=64),
 }
-"""The recipes by name."""
+
+SAC_RECIPES: list[Preset] = of_networks(SAC, "sac/hopper", _NETWORKS, env="Hopper-v5")

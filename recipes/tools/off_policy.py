@@ -28,10 +28,9 @@ from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.settings.networks import mlp
 
 from ..core.algorithm import storage_device, to_networks
-from ..core.dataset_recipe import DatasetRecipe
 from ..core.networks import is_discrete, make_critic
 from ..core.optional import tqdm
-from ..core.recipe import Recipe
+from ..core.recipe import DatasetRecipe, Recipe
 from ..core.run import Run
 from ..core.runner import load_trained
 from ..offline import DatasetAlgorithm, TransitionAlgorithm, action_values, read_data
@@ -41,6 +40,7 @@ UPDATES = {"fqe": 20_000, "wis": 2000}
 LOG_PROBS = "action_log_probs"
 """A field of HDF5 files: the logarithm of the probability with which each action was taken, [N]."""
 _TAU = 0.02  # a value reaches back 1 / (1 - gamma) steps, each of which takes 1 / tau updates
+_BATCH = 256  # transitions in a gradient step, drawn with replacement
 _AT_ONCE = 1000  # states in which the policy acts
 _RESAMPLED = 2000  # times that the bootstrap draws episodes
 
@@ -237,7 +237,7 @@ def clone(behavior: TensorDictModuleBase, items: HistoryStorage, updates: int) -
                 error = _surprise(behavior, test, "mean").item()
             if error < lowest:
                 lowest, best = error, copy.deepcopy(behavior.state_dict())
-        index = rest[torch.randint(len(rest), (256,), device=items.device)]
+        index = rest[torch.randint(len(rest), (_BATCH,), device=items.device)]
         loss = _surprise(behavior, to_networks(items.get(index), device), "mean")
         optimizer.zero_grad()
         loss.backward()
@@ -313,7 +313,6 @@ def fit_q(
     *,
     gamma: float,
     updates: int,
-    batch_size: int = 256,
     learning_rate: float = 3e-4,
 ) -> Callable[[Tensor], Tensor]:
     """Fits a critic to the values of a policy, which is called once for each item.
@@ -325,7 +324,6 @@ def fit_q(
         items: transitions.
         gamma: discount factor.
         updates: gradient steps of Adam.
-        batch_size: transitions in each, drawn with replacement.
         learning_rate: learning rate.
 
     Returns:
@@ -345,7 +343,7 @@ def fit_q(
     pairs = list(zip(target.parameters(), critic.parameters(), strict=True))
     optimizer = torch.optim.Adam(critic.parameters(), lr=learning_rate, fused=True)
     for _ in tqdm.trange(updates, unit=" updates", desc="fitted Q evaluation", leave=False):
-        index = torch.randint(len(items), (batch_size,), device=items.device)
+        index = torch.randint(len(items), (_BATCH,), device=items.device)
         batch = draw(index)
         outcome = batch["next"]
         goal = td0_return_estimate(

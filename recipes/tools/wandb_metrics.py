@@ -93,8 +93,10 @@ class WandbMetrics(Callback):
         self._logger.experiment.finish()
 
 
-def check_wandb(project: str) -> None:
+def check_wandb(project: str | None) -> None:
     """Raises ValueError if metrics cannot be sent to a project, before anything starts."""
+    if project is None:
+        return
     if importlib.util.find_spec("wandb") is None:
         raise ValueError(f"--wandb needs wandb: {install('wandb')}")
     if not project or any(letter in project for letter in "/\\#?%:"):

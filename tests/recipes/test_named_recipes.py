@@ -12,8 +12,7 @@ import pytest
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 
 from recipes.core.algorithm import make_algorithm
-from recipes.core.dataset_recipe import DatasetRecipe
-from recipes.core.recipe import LENGTHS, recipe_classes
+from recipes.core.recipe import LENGTHS, DatasetRecipe, recipe_classes
 from recipes.core.registry import RECIPES, get_recipe
 from recipes.ppo import PPO
 from recipes.presets.ppo_atari import ATARI_RECIPES
@@ -42,7 +41,8 @@ GAMES = {
     "breakout": "ALE/Breakout-v5", "mspacman": "ALE/MsPacman-v5", "pong": "ALE/Pong-v5",
     "spaceinvaders": "ALE/SpaceInvaders-v5",
 }  # fmt: skip
-PICTURES = {**ATARI_RECIPES, **MINATAR_RECIPES}
+PICTURES = [recipe.name for recipe in (*ATARI_RECIPES, *MINATAR_RECIPES)]
+MEMORIES = [recipe.name for recipe in MEMORY_RECIPES]
 PAPERS = ("-protocol", "-paper", "-tuned")
 """How the names of recipes end that have the paper's settings."""
 ABLATED = ["enhanced-tit", *(f"enhanced-tit-wo-{part}" for part in ("dense", "inner", "outer"))]
@@ -204,7 +204,7 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
         if type(recipe) is PPO
         and not name.endswith(PAPERS)
         and name not in PICTURES
-        and name not in MEMORY_RECIPES
+        and name not in MEMORIES
     ]
     assert len({recipe.env for recipe in recipes}) == 7  # the paper's
     one = PPO(env="one", backbone=mlp(), **PPO_SETTINGS)
@@ -259,14 +259,14 @@ def test_all_tit_networks_differ_only_in_frames_and_positions() -> None:
     assert networks == {enhanced_tit(patch_size="auto", patch_weights="own")}
 
 
-TASKS_OF_MEMORY = sorted({name.rpartition("/")[0] for name in MEMORY_RECIPES})
+TASKS_OF_MEMORY = sorted({name.rpartition("/")[0] for name in MEMORIES})
 
 
 @pytest.mark.parametrize("task", TASKS_OF_MEMORY)
 def test_recipes_of_memory_differ_in_the_memory_alone(task: str) -> None:
     pytest.importorskip("minigrid")
     pytest.importorskip("popgym")
-    recipes = [get_recipe(name) for name in MEMORY_RECIPES if name.startswith(f"{task}/")]
+    recipes = [get_recipe(name) for name in MEMORIES if name.startswith(f"{task}/")]
     frames: set[Any] = {recipe.backbone.frame for recipe in recipes}
     assert all(isinstance(frame, Inner) for frame in frames)
     assert len({replace(frame, every_block=False) for frame in frames}) == 1

@@ -17,7 +17,6 @@ from recipes.core.registry import RECIPES
 from recipes.core.run import Run
 from recipes.core.runner import evaluate
 from recipes.ppo import PPO
-from recipes.presets.ppo_atari import ATARI_RECIPES
 from torchrl_tit import load_agent
 
 ROOT = Path(__file__).parents[2]
@@ -41,8 +40,8 @@ def test_a_recipe_of_each_algorithm_and_network_loads(which):
     written = json.loads(WRITTEN[which])
     recipe = recipe_from_json(WRITTEN[which], "recipe.json")
     # What the version before wrote is what is named so today; on games, with the paper's settings.
-    protocol = f"{recipe.name}-protocol"
-    now = RECIPES[protocol if protocol in ATARI_RECIPES else recipe.name]
+    games = isinstance(recipe, PPO) and recipe.env.startswith("ALE/")
+    now = RECIPES[f"{recipe.name}-protocol" if games else recipe.name]
     recipe = replace(recipe, name=now.name)
     assert recipe.backbone == now.backbone
     assert (recipe.algorithm, recipe.env) == (written["algorithm"], written["env"])

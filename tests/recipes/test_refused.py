@@ -67,7 +67,7 @@ REPLAY: dict[str, Any] = {"backbone": SMALL, "random_steps": 20, "steps_per_batc
 SAC_RECIPE = SAC(env="Pendulum-v1", critic_hidden=(16,), batch_size=8, **REPLAY)
 DQN_RECIPE = DQN(env="CartPole-v1", batch_size=8, **REPLAY)
 ONE_STEP = "lstm carries a state and learns from sequences, but slice_length is 1"
-BOUNDED = r"needs continuous actions within bounds, but .*\(.*shape \[2\].*\)"
+BOUNDED = r"needs continuous actions within bounds, but those of .*\(.*shape \[2\].*\)"
 
 REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
     (PPO_RECIPE, {**COLLECTORS, "num_envs": 3, "steps_per_batch": 63}, "collectors 2 does not div"),
@@ -122,7 +122,11 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
         {"backbone": lstm(), "slice_length": 4, "burn_in": 17},
         "slice_length 4 and burn_in 17 are longer than the 20 random_steps of 1 env",
     ),
-    (SAC_RECIPE, {"env": "CartPole-v1"}, "sac needs .*, but CartPole-v1 has .*: use a ppo recipe"),
+    (
+        SAC_RECIPE,
+        {"env": "CartPole-v1"},
+        "sac needs .*, but those of CartPole-v1 are .*: use a ppo recipe",
+    ),
     (SAC_RECIPE, {"env": "EndlessActions-v0"}, f"sac {BOUNDED}"),
     (SAC_RECIPE, {"env": "UnboundedActions-v0"}, f"sac {BOUNDED}"),
     (

@@ -73,8 +73,7 @@ def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
     recipe = _acting(run.recipe, evaluation, device)
     # Loading sets the number of PyTorch's threads, which is up to the caller here.
     steps, algorithm, _ = load_trained(run, replace(recipe, threads=torch.get_num_threads()))
-    versions = read_json(folder / "versions.json")
-    return _agent(str(folder), run.recipe, algorithm, steps, evaluation, versions)
+    return _agent(str(folder), run.recipe, algorithm, steps, evaluation, run.versions())
 
 
 def evaluation_of(folder: Path, steps: int | None) -> dict[str, Any]:
@@ -83,15 +82,6 @@ def evaluation_of(folder: Path, steps: int | None) -> dict[str, Any]:
         evaluation = read_evaluation(folder)
         if evaluation is not None and evaluation["steps"] == steps:
             return evaluation
-    return {}
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """Reads a JSON object that a run wrote; empty if it is missing or damaged."""
-    with suppress(OSError, ValueError):
-        found = json.loads(file.read_bytes())
-        if isinstance(found, dict):
-            return found
     return {}
 
 

@@ -18,12 +18,11 @@ from torchrl_tit.agents.folder import CARD, RECIPE, VERSIONS, WEIGHTS
 from torchrl_tit.agents.hub import import_hub
 from torchrl_tit.evaluation_file import EVALUATION
 
-from ...core.dataset_recipe import DatasetRecipe
-from ...core.recipe import Recipe
+from ...core.recipe import DatasetRecipe, Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.run import Run
 from ...core.runner import load_trained
-from .building import evaluation_of, read_json
+from .building import evaluation_of
 
 
 def pack(
@@ -62,7 +61,6 @@ def pack(
             f"{folder} has no evaluation of its newest checkpoint, that of step {steps}: run "
             f"`evaluate {folder}` first"
         )
-    versions = read_json(folder / "versions.json")
     networks = algorithm.policy
     recipe = without_places(run.recipe)
     if isinstance(recipe, DatasetRecipe):
@@ -74,7 +72,7 @@ def pack(
         name=name,
         source=source or name,
         steps=steps,
-        versions=versions,
+        versions=run.versions(),
         parameters=sum(weight.numel() for weight in networks.parameters()),
     )
     files = {
@@ -82,7 +80,7 @@ def pack(
         RECIPE: recipe_to_json(recipe).encode(),
         WEIGHTS: save(_weights(networks)),
         EVALUATION: _json(evaluation),
-        VERSIONS: _json(versions),
+        VERSIONS: _json(run.versions()),
     }
     return files, steps
 

@@ -15,8 +15,8 @@ from scipy.stats import norm, permutation_test, trim_mean
 
 from ...core.recipe import Recipe
 from .interval import FEWEST, Interval
-from .numbers import mean_std, number
-from .paper import read_rows
+from .numbers import mean_std, number, read_rows
+from .paper import TASK
 from .table import measure_of, read_evaluations, value_of
 
 Task = tuple[Any, ...]
@@ -43,10 +43,6 @@ _LEVEL, _POWER = 0.05, 0.8
 _RESAMPLES = 2_000
 _PERMUTATIONS = 10_000
 _LEAST_RUNS = 4  # of 3 against 3, no permutation test is below 0.05
-_OF_TASK = (
-    *("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions"),
-    "dataset",
-)
 
 
 @dataclass(frozen=True)
@@ -192,7 +188,10 @@ def read_references(path: Path | None = None) -> dict[str, tuple[float, float]]:
         rows: Iterable[Mapping[str, str]] = read_rows("reference_returns.csv")
         if path is not None:
             rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
-        return {row["env"]: (float(row["random"]), float(row["best"])) for row in rows}
+        references = {row["env"]: (float(row["random"]), float(row["best"])) for row in rows}
+        if same := [env for env, (random, best) in references.items() if not best > random]:
+            raise ValueError(f"best must be above random, but is not for {same[0]}")
+        return references
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
             f"{path} must be a CSV file with the columns env, random and best, and numbers in the "
@@ -260,7 +259,7 @@ def read_networks(
             [x / 100 for x in values] if scored else normalize(values, settings.env, returns)
         )
     if not networks:
-        raise ValueError("no evaluated run")
+        raise ValueError("; ".join(["no evaluated run", *notes]))
     if missing := [name for name, found in networks.items() if not found]:
         raise ValueError(f"no evaluated run of {missing[0]}")
     common = set.intersection(*({*found} for found in networks.values()))
@@ -280,7 +279,7 @@ def read_networks(
 
 def task_of(settings: Recipe) -> Task:
     """The fields that determine what is learned."""
-    return tuple(getattr(settings, name, None) for name in _OF_TASK)
+    return tuple(getattr(settings, name, None) for name in (*TASK, "dataset"))
 
 
 def summarize(networks: Mapping[str, Values]) -> list[list[str]]:

@@ -10,6 +10,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+from torchrl_tit.agents.folder import is_agent
 from torchrl_tit.settings.checks import printable
 
 from ...core.metrics import parse_metrics
@@ -28,7 +29,8 @@ class Experiment:
     name: str
     """The recipe's name; the first run's folder if it has none."""
     changes: str
-    """Fields in which the runs differ from the recipe of that name, with the runs' values."""
+    """Fields in which the runs differ from the recipe of that name, with the runs' values, and
+    whether they started from the weights of another run."""
     runs: tuple[Run, ...]
 
     @property
@@ -62,7 +64,8 @@ def _runs_below(folder: Path) -> list[Run]:
     if (found := find_records(folder)) is not None:
         records, below = found
         return [RecordedRun(records, run) for run in records.below(below)]
-    runs = [Run.open(path.parent) for path in folder.rglob("recipe.json")]
+    found_in = (path.parent for path in folder.rglob("recipe.json"))
+    runs = [Run.open(path) for path in found_in if not is_agent(path)]
     for records in (Records(path.parent) for path in folder.rglob(TABLE)):
         runs += [RecordedRun(records, run) for run in records.rows]
     return sorted(runs, key=lambda run: run.folder)
@@ -70,6 +73,8 @@ def _runs_below(folder: Path) -> list[Run]:
 
 def group_runs(runs: Iterable[Run]) -> list[Experiment]:
     """Groups runs of the same settings, ignoring seed and machine.
+
+    Those that started from the weights of another run have a group of their own.
 
     Args:
         runs: the runs.
@@ -81,9 +86,9 @@ def group_runs(runs: Iterable[Run]) -> list[Experiment]:
     Raises:
         ValueError: if two runs have the same settings and seed.
     """
-    groups: dict[Recipe, dict[int, Run]] = {}
+    groups: dict[tuple[Recipe, bool], dict[int, Run]] = {}
     for run in runs:
-        seeds = groups.setdefault(experiment_of(run.recipe), {})
+        seeds = groups.setdefault((experiment_of(run.recipe), run.has_initial_weights), {})
         same = seeds.setdefault(run.recipe.seed, run)
         if same is not run:
             raise ValueError(
@@ -93,13 +98,14 @@ def group_runs(runs: Iterable[Run]) -> list[Experiment]:
             )
     own: dict[str, Recipe] = {}
     experiments = []
-    for settings, seeds in groups.items():
+    for (settings, moved), seeds in groups.items():
         first = next(iter(seeds.values()))
         name, changes = str(first.folder), ""
         if settings.name:
             name = settings.name
             named = RECIPES.get(name) or own.setdefault(name, settings)
             changes = changed_fields(named, settings)
+        changes = ", ".join([changes] * bool(changes) + ["weights of another run"] * moved)
         experiments.append(Experiment(settings, name, changes, tuple(seeds.values())))
     return experiments
 

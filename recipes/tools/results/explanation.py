@@ -295,35 +295,28 @@ def explain_policy(
     check_explanation(out, step, max_steps)
     first = step or 0
     steps = range(first, first + 1) if out.suffix == ".png" else range(max_steps or sys.maxsize)
-    shown = 0
     explainer = Explainer(policy, **explanation)
     with (
         closing(make_rendered(make_env, name)) as env,
         new_film(out, env.base_env.render_fps) as pictures,
     ):
-
-        def show(number: int, step: ExplainedStep, page: np.ndarray) -> None:
-            nonlocal shown
-            pictures.append_data(page)
-            shown += 1
-
         count = explain_episode(
             env,
             explainer,
             name,
             steps,
-            show,
+            lambda number, step, page: pictures.append_data(page),
             title=title or str(name),
             seed=seed,
             actions=actions,
         )
-        if not shown:
+        if count <= first:
             played = f"of seed {seed}" if actions is None else "of the data"
             raise ValueError(
                 f"the episode {played} has {count} steps, so there is no step {first}: "
                 f"choose one below {count}"
             )
-    return shown
+    return min(count, steps.stop) - first
 
 
 def check_explanation(out: Path, step: int | None, max_steps: int | None) -> None:

@@ -87,10 +87,12 @@ def take_picture(env: Any, name: str | Path) -> Any:
     try:
         return env.base_env.render()[0]  # transforms have no pictures
     except Exception as error:  # each task has its own renderer, with its own errors
-        raise ValueError(
-            f"{name} cannot be rendered: {str(error).rstrip('.')}; for MuJoCo without a "
-            "screen, set the environment variable MUJOCO_GL to egl or osmesa"
-        ) from error
+        hint = (
+            "; for MuJoCo without a screen, set the environment variable MUJOCO_GL to egl or osmesa"
+        )
+        ours = isinstance(error, ValueError)  # there is nothing to render
+        reason = f"{str(error).rstrip('.')}{'' if ours else hint}"
+        raise ValueError(f"{name} cannot be rendered: {reason}") from error
 
 
 @contextmanager

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
 
 from ...core.recipe import Recipe, get_recipe_class
+from .numbers import read_rows
 
 _TARGET = re.compile(r"return_-?[\d.]+(e[+-]?\d+)?")
 _TIMES = " * "
@@ -115,15 +112,8 @@ def limit(formula: str, recipe: Recipe) -> float | None:
 @cache
 def _read() -> dict[tuple[str, str], MetricWords]:
     """All descriptions, by algorithm (empty for all of them) and column."""
-    text = resources.files(__package__).joinpath("metrics.csv").read_text(encoding="utf-8")
-    return {
-        (algorithm, words.column): words
-        for algorithms, words in _rows(csv.DictReader(io.StringIO(text)))
-        for algorithm in algorithms
-    }
-
-
-def _rows(rows: Iterable[dict[str, str]]) -> Iterable[tuple[list[str], MetricWords]]:
-    for row in rows:
-        algorithms = row.pop("algorithms").split() or [""]
-        yield algorithms, MetricWords(**row)
+    found = {}
+    for row in read_rows("metrics.csv"):
+        for algorithm in row.pop("algorithms").split() or [""]:
+            found[algorithm, row["column"]] = MetricWords(**row)
+    return found

@@ -1,8 +1,14 @@
-"""Numbers for people: three significant digits, and the same decimals side by side."""
+"""Numbers for people: three significant digits, and the same decimals side by side.
+
+And the tables of numbers that come with this package.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from importlib import resources
 from math import floor, isfinite, log10
 from statistics import fmean, stdev
 
@@ -61,3 +67,9 @@ def mean_std(values: Sequence[float]) -> str:
     if len(values) == 1:
         return number(values[0])
     return " ± ".join(numbers([fmean(values), stdev(values)]))
+
+
+def read_rows(file: str) -> Iterator[dict[str, str]]:
+    """Reads a CSV file that lies beside this module."""
+    text = resources.files(__package__).joinpath(file).read_text(encoding="utf-8")
+    yield from csv.DictReader(io.StringIO(text))

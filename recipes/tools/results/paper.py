@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from torchrl_tit.settings.checks import printable
 
-from ...core.dataset_recipe import DatasetRecipe
-from ...core.recipe import Recipe
+from ...core.recipe import DatasetRecipe, Recipe
 from ...core.registry import RECIPES, get_recipe
 from .experiments import changes_of, fields_of
+from .numbers import read_rows
 
 HEADINGS = {
     "1": "table 1: online, images",
@@ -28,7 +24,7 @@ HEADINGS = {
 }
 """What the paper's tables of results are about, by their numbers."""
 
-_TASK = ("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions")
+TASK = ("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions")
 """The fields that determine which task is learned."""
 _KIND = ("backbone.frame.encoder", "backbone.history.encoder", "backbone.num_frames")
 """The fields that determine which kind of network learns."""
@@ -234,7 +230,7 @@ def has_its_data(recipe: Recipe) -> bool:
 
 def _differences(recipe: Recipe, measured: Recipe, cell: PaperCell) -> dict[str, Any] | None:
     """The fields in which a run differs from how a cell was measured; None for another task."""
-    if any(getattr(recipe, field, None) != getattr(measured, field, None) for field in _TASK):
+    if any(getattr(recipe, field, None) != getattr(measured, field, None) for field in TASK):
         return None
     usual, own = fields_of(measured), fields_of(recipe)
     if any(usual[field] != own[field] for field in _KIND):
@@ -256,9 +252,3 @@ def _differences(recipe: Recipe, measured: Recipe, cell: PaperCell) -> dict[str,
     if is_tit and all(allows(field, usual[field]) for field in rows.keys() & usual.keys()):
         changes = {k: v for k, v in changes.items() if not allows(k, v)}
     return changes
-
-
-def read_rows(file: str) -> Iterator[dict[str, str]]:
-    """Reads a table of reported numbers that lies beside this module."""
-    text = resources.files(__package__).joinpath(file).read_text(encoding="utf-8")
-    yield from csv.DictReader(io.StringIO(text))

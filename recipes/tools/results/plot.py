@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from torchrl_tit.files import write_bytes_atomic
 
+from ...core.recipe import Recipe
 from ...core.run import Run
 from .experiments import Experiment, common_part, read_metrics
 from .interval import FEWEST, intervals_of
@@ -22,7 +23,7 @@ from .interval import FEWEST, intervals_of
 NEARLY = 0.9
 """A run that has fewer steps than this share of its longest sibling is left out of bold lines."""
 WINDOW = 5
-"""Batches over which returns of training are averaged in bold lines."""
+"""Points of a curve over which returns of training are averaged in bold lines."""
 _LINES = ("-", "--", ":", "-.")
 _MOST_SINGLE = 9  # more runs would hide the bold lines
 _POINTS = 400  # of a curve; of longer ones, neighbors are averaged
@@ -110,9 +111,9 @@ def plot_run(run: Run) -> None:
         run: a run folder with metrics.
     """
     offline = run.recipe.offline
-    figure, axes = new_chart(run.recipe.name, offline)
-    name = "evaluations" if offline else f"mean of {WINDOW} batches"
-    if draw_curves(axes, {name: [curve_of(read_metrics(run))]}, 1 if offline else WINDOW):
+    figure, axes = new_chart(run.recipe.name, run.recipe)
+    name = "evaluations" if offline else "moving average"
+    if draw_curves(axes, {name: [_learning_curve(run)]}, 1 if offline else WINDOW):
         add_legend(figure)
     else:
         axes.text(0.5, 0.5, "no episode has ended", ha="center", transform=axes.transAxes)
@@ -130,28 +131,35 @@ def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: 
     Raises:
         ValueError: if there is no return to draw.
     """
-    offline = experiments[0].settings.offline
+    recipe = experiments[0].settings
     common = common_part([experiment.name for experiment in experiments])
-    figure, axes = new_chart(title or common.rstrip("/"), offline)
+    figure, axes = new_chart(title or common.rstrip("/"), recipe)
     curves = {
-        experiment.label.removeprefix(common): [
-            curve_of(read_metrics(run)) for run in experiment.runs
-        ]
+        experiment.label.removeprefix(common): [*map(_learning_curve, experiment.runs)]
         for experiment in experiments
     }
-    if not draw_curves(axes, curves, 1 if offline else WINDOW):
+    if not draw_curves(axes, curves, 1 if recipe.offline else WINDOW):
         folders = ", ".join(str(run.folder) for one in experiments for run in one.runs)
         raise ValueError(f"there is nothing to draw: no episode has ended in {folders}")
     add_legend(figure)
     save_figure(figure, picture)
 
 
-def new_chart(title: str, offline: bool) -> tuple[Figure, Axes]:
-    """Returns a figure with axes for returns over the steps."""
+def _learning_curve(run: Run) -> Curve:
+    """The returns of a run; without an environment, the error on held-out episodes."""
+    rows, column = read_metrics(run), "return_mean"
+    if rows and not run.recipe.env:
+        column = next((name for name in rows[0] if name.startswith("held_out_")), column)
+    return curve_of(rows, column)
+
+
+def new_chart(title: str, recipe: Recipe) -> tuple[Figure, Axes]:
+    """Returns a figure with axes for the learning curves of a recipe."""
     figure = new_figure((7, 4))
     axes = figure.add_subplot()
-    steps, episodes = ("gradient", "evaluation") if offline else ("environment", "training")
-    axes.set(title=plain(title), xlabel=f"{steps} steps", ylabel=f"return of {episodes} episodes")
+    steps, episodes = ("gradient", "evaluation") if recipe.offline else ("environment", "training")
+    what = f"return of {episodes} episodes" if recipe.env else "error on held-out episodes"
+    axes.set(title=plain(title), xlabel=f"{steps} steps", ylabel=what)
     axes.grid(alpha=0.3)
     return figure, axes
 

@@ -59,12 +59,14 @@ def _record(name: str, run: Run, commit: str) -> Record:
     if not metrics:
         raise ValueError(f"{run.folder} has no metrics yet: train it first, or leave it out")
     named = RECIPES.get(run.recipe.name)
+    changes = changes_of(named, run.recipe) if named else {}
+    changes |= {"initial_weights": True} if run.has_initial_weights else {}
     recipe, found = _read(run, "recipe.json"), run.read_evaluation() or {}
     settings = {field: value for field, value in recipe.items() if field != "seed"}
     row = {
         "run": name,
         "recipe": run.recipe.name,
-        "changes": _dumps(changes_of(named, run.recipe) if named else {}),
+        "changes": _dumps(changes),
         "seed": str(run.recipe.seed),
         "settings": hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12],
         "ended": _ended(metrics),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import html
 import io
-import json
 import os
 import re
 import shlex
@@ -74,14 +73,12 @@ _SHARP = 160  # dots per inch of explained steps
 
 @dataclass(frozen=True)
 class RunData:
-    """A run, its metrics, its evaluation and the versions that it began with."""
+    """A run, its metrics and its evaluation."""
 
     run: Run
     rows: list[dict[str, float]]
     evaluation: dict[str, Any] | None
     """None if it is not evaluated yet."""
-    versions: dict[str, Any]
-    """Empty if they are not known."""
 
     @property
     def name(self) -> str:
@@ -170,8 +167,8 @@ def report(
     for group in groups:
         try:
             found, texts = make_table([data.run.folder for data in group.runs])
-        except ValueError:  # none of the runs is trained and evaluated
-            found, texts = [], [f"{group.label} is not evaluated yet: no run of it is complete."]
+        except ValueError as error:  # none of the runs is trained and evaluated
+            found, texts = [], [f"{group.label} has no results: {error}"]
         cells += found
         notes += texts
     media = _make_media(groups, say) if pictures else Media()
@@ -222,14 +219,10 @@ def _read(run: Run) -> RunData:
         )
     if "return_mean" not in rows[0]:
         raise ValueError(f"{run.folder / 'metrics.csv'} is damaged: it has no column return_mean")
-    try:
-        versions = dict(json.loads(run.read("versions.json") or b"{}"))
-    except (OSError, RecursionError, TypeError, ValueError):  # the report says so
-        versions = {}
     evaluation = run.read_evaluation()
     if evaluation is not None and "returns" not in evaluation:  # nothing was played
         evaluation = None
-    return RunData(run, rows, evaluation, versions)
+    return RunData(run, rows, evaluation)
 
 
 def _make_media(groups: Sequence[Group], say: Callable[[str], None]) -> Media:
@@ -354,14 +347,14 @@ def _chart(groups: Sequence[Group], column: str) -> tuple[Chart, dict[str, Curve
     """A chart of a metric, and its bold lines."""
     recipe = groups[0].recipe
     words = words_of(recipe.algorithm, column)
-    figure, axes = new_chart("", recipe.offline)
+    figure, axes = new_chart("", recipe)
     axes.set_ylabel("")
     curves = {group.label: [curve_of(one.rows, column) for one in group.runs] for group in groups}
     of_batches = column == "return_mean" and not recipe.offline
     bold = draw_curves(axes, curves, WINDOW if of_batches else 1)
     if len(groups) > 1:
         add_legend(figure)
-    notes = "Thin lines are batches, and bold lines means of five batches. " if of_batches else ""
+    notes = "Bold lines are moving averages. " if of_batches else ""
     values = np.concatenate([curve.values for runs in curves.values() for curve in runs])
     if _cut(axes, values):
         notes += "A few extreme values lie outside the axis. "
@@ -393,7 +386,7 @@ def _episode_chart(groups: Sequence[Group]) -> Chart | None:
         boxes = {k: [x for one in v for x in one["returns"]] for k, v in together.items() if v}
     if not boxes:
         return None
-    figure, axes = new_chart("", groups[0].recipe.offline)
+    figure, axes = new_chart("", groups[0].recipe)
     axes.boxplot([*boxes.values()], showmeans=True, meanline=True)
     places = range(1, len(boxes) + 1)
     labels = [fill(plain(name), _WIDEST) for name in boxes]
@@ -474,7 +467,7 @@ def _description(groups: Sequence[Group]) -> str:
     steps = max(data.steps for group in groups for data in group.runs)
     many = f"{len(groups)} experiments, " if len(groups) > 1 else ""
     return (
-        f"{groups[0].recipe.env}, {' and '.join(algorithms)}: {many}{runs} "
+        f"{groups[0].recipe.task_name}, {' and '.join(algorithms)}: {many}{runs} "
         f"run{'s' * (runs > 1)} of {steps:,} {_unit(groups[0].recipe)}{' each' * (runs > 1)}"
     )
 
@@ -553,7 +546,7 @@ def _versions(runs: Sequence[RunData]) -> list[tuple[str, str]]:
     """The runs of each set of versions, and these versions."""
     found: dict[str, list[str]] = {}
     for data in runs:
-        text = ", ".join(f"{name} {version}" for name, version in data.versions.items())
+        text = ", ".join(f"{name} {version}" for name, version in data.run.versions().items())
         found.setdefault(text or "not known", []).append(data.run.folder.name)
     return [("all runs" if len(found) == 1 else ", ".join(x), text) for text, x in found.items()]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -14,13 +12,14 @@ from typing import Any
 
 from torchrl_tit.scores import has_reference
 
+from ...core import records
 from ...core.recipe import Recipe
 from ...core.registry import RECIPES
 from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import FEWEST, Interval, interval_of
-from .numbers import mean_std, number, numbers
-from .paper import HEADINGS, Match, has_its_data, match, paper_cells, plain_name, read_rows
+from .numbers import mean_std, number, numbers, read_rows
+from .paper import HEADINGS, TASK, Match, has_its_data, match, paper_cells, plain_name
 from .plot import new_figure, plain, save_figure
 
 OTHER = "not in the paper"
@@ -31,11 +30,6 @@ HEADER = (
     *("interquartile mean [95%]", "paper"),
 )
 """The header of :func:`to_columns`."""
-_TASK = (
-    *("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions"),
-    "backbone",
-)
-"""The fields that determine which task is learned, and by which network."""
 
 
 @dataclass(frozen=True)
@@ -224,10 +218,8 @@ def to_columns(cell: Cell) -> list[str]:
 
 def to_csv(cells: Sequence[Cell]) -> str:
     """Writes cells as CSV, one row each; unknown values are empty, published ones are one text."""
-    buffer = io.StringIO()
     names = [field.name for field in fields(Cell)]
-    writer = csv.DictWriter(buffer, names, lineterminator="\n")
-    writer.writeheader()
+    rows = []
     for cell in cells:
         values = {name: getattr(cell, name) for name in names}
         values["values"] = "; ".join(map(str, cell.values))
@@ -235,8 +227,8 @@ def to_csv(cells: Sequence[Cell]) -> str:
             f"{result.source} {result.mean} ± {result.std} ({result.note}; {result.url})"
             for result in cell.published
         )
-        writer.writerow({k: "" if v != v else v for k, v in values.items()})
-    return buffer.getvalue()
+        rows.append(["" if value != value else value for value in values.values()])
+    return records.to_csv([names, *rows])
 
 
 def plot_table(cells: Sequence[Cell], picture: Path) -> None:
@@ -309,12 +301,9 @@ def reported_of(recipe: Recipe) -> tuple[Match | None, tuple[Published, ...]]:
     """
     plain = plain_name(recipe.name)
     named = RECIPES.get(recipe.name) or RECIPES.get(plain)
-    found = match(recipe)
-    if named is None or any(getattr(recipe, x, None) != getattr(named, x, None) for x in _TASK):
-        return found, ()
-    if not has_its_data(recipe):
-        return None, ()
-    return found, published_results().get(plain, ())
+    fields = [*TASK, "backbone"] if named and has_its_data(recipe) else []
+    same = all(getattr(recipe, x, None) == getattr(named, x, None) for x in fields)
+    return match(recipe), published_results().get(plain, ()) if fields and same else ()
 
 
 def value_of(evaluation: dict[str, Any]) -> float:

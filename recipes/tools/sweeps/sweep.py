@@ -22,8 +22,7 @@ from ...core.algorithm import make_algorithm
 from ...core.interrupt import raise_on_signals
 from ...core.networks import name_chosen_encoders
 from ...core.recipe import Recipe
-from ...core.recipe_file import is_recipe_file, recipes_from_file
-from ...core.registry import RECIPES, find_recipe
+from ...core.registry import RECIPES, find_recipe, is_recipe_file, recipes_from_file
 from ...core.run import Run
 from ...core.trust import allow_names
 
@@ -126,7 +125,7 @@ def make_jobs(patterns: Iterable[str], seeds: Iterable[int], out: Path) -> list[
         allow_names(recipe)
         algorithm = make_algorithm(recipe)
         algorithm.check()
-        recipe, _ = name_chosen_encoders(recipe, algorithm)
+        recipe, _ = name_chosen_encoders(algorithm)
         for seed in dict.fromkeys(seeds):
             folder = out / recipe.name / f"seed-{seed}"
             job = Job(replace(recipe, seed=seed), folder, source)

@@ -283,7 +283,7 @@ class _Trial:
         except ValueError as error:  # values that do not fit together
             self._explain(str(error))
             return
-        chosen, _ = name_chosen_encoders(recipe, algorithm)
+        chosen, _ = name_chosen_encoders(algorithm)
         file = search.folder / f"trial-{trial.number}.json"
         self.jobs = [
             Job(replace(chosen, seed=seed), self.folder / f"seed-{seed}", source=str(file))

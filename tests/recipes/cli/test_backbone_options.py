@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import fields, replace
+from typing import Any
 
 import pytest
 
@@ -27,9 +28,14 @@ PONG = get_recipe("ppo/pong/enhanced-tit")
 CARTPOLE = get_recipe("ppo/cartpole/enhanced-tit")
 
 
+def choose(recipe: Any, words: list[str]) -> Any:
+    chosen, _ = choose_network(recipe, words)
+    return chosen
+
+
 def test_a_pair_takes_over_what_the_recipe_chose():
     chosen = ["--backbone.frame", "resnet", "--backbone.history=outer", "--num-envs", "4"]
-    recipe = choose_network(PONG, chosen)
+    recipe = choose(PONG, chosen)
     assert recipe.backbone.frame == ResNetFrames(embed_dim=64)
     paired = PONG.backbone.history
     assert isinstance(paired, PairedOuter)
@@ -42,36 +48,34 @@ def test_a_pair_takes_over_what_the_recipe_chose():
 
 def test_defaults_and_fields_of_another_type_are_not_taken_over():
     lstm = get_recipe("ppo/cartpole-no-velocity/lstm")  # a tanh layer of 64
-    assert choose_network(lstm, ["--backbone.frame", "inner"]).backbone.frame == Inner(embed_dim=64)
+    assert choose(lstm, ["--backbone.frame", "inner"]).backbone.frame == Inner(embed_dim=64)
     mlp = get_recipe("ppo/cartpole/mlp")
-    assert choose_network(mlp, ["--backbone.history", "outer"]).backbone.history == Outer()
+    assert choose(mlp, ["--backbone.history", "outer"]).backbone.history == Outer()
 
 
 def test_the_same_encoder_stays_as_it_is():
-    recipe = choose_network(
-        PONG, ["--backbone.frame", "inner", "--backbone.history", "paired-outer"]
-    )
+    recipe = choose(PONG, ["--backbone.frame", "inner", "--backbone.history", "paired-outer"])
     assert recipe == PONG
 
 
 def test_a_network_by_name_reads_as_many_frames_as_before():
-    assert choose_network(PONG, ["--backbone.network", "catformer"]).backbone == catformer(4)
+    assert choose(PONG, ["--backbone.network", "catformer"]).backbone == catformer(4)
     both = ["--backbone.frame", "flat", "--backbone.network", "catformer"]  # in any order
-    assert choose_network(PONG, both).backbone == replace(catformer(4), frame=Flat())
+    assert choose(PONG, both).backbone == replace(catformer(4), frame=Flat())
 
 
 def test_one_of_several_observations():
     words = ["--backbone.frames.image", "nature-cnn", "--backbone.frames.arm/left=linear"]
-    backbone = choose_network(PONG, words).backbone
+    backbone = choose(PONG, words).backbone
     # The widths of tokens are the same.
     expected = {"image": NatureCNNFrames(embed_dim=64), "arm/left": Linear(embed_dim=64)}
     assert backbone.frames == expected
     assert replace(backbone, frames={}) == PONG.backbone
     again = replace(PONG, backbone=backbone)
-    assert choose_network(again, ["--backbone.frames.image=inner"]).backbone.frames == {
+    assert choose(again, ["--backbone.frames.image=inner"]).backbone.frames == {
         **expected, "image": Inner(embed_dim=64)
     }  # fmt: skip
-    only_a_field = choose_network(PONG, ["--backbone.frames.image.patch-size", "3"])
+    only_a_field = choose(PONG, ["--backbone.frames.image.patch-size", "3"])
     assert only_a_field.backbone.frames == {"image": PONG.backbone.frame}
 
 
@@ -91,11 +95,11 @@ def test_fields_of_one_of_several_observations(monkeypatch, capsys):
 
 def test_every_name_is_a_choice():
     for name in NETWORKS:
-        assert choose_network(PONG, ["--backbone.network", name]).backbone.num_frames == 4
+        assert choose(PONG, ["--backbone.network", name]).backbone.num_frames == 4
     for name, part in FrameSettings.registered.items():
-        assert type(choose_network(PONG, ["--backbone.frame", name]).backbone.frame) is part
+        assert type(choose(PONG, ["--backbone.frame", name]).backbone.frame) is part
     for name, part in HistorySettings.registered.items():
-        assert type(choose_network(PONG, ["--backbone.history", name]).backbone.history) is part
+        assert type(choose(PONG, ["--backbone.history", name]).backbone.history) is part
 
 
 def test_a_pair_trains_and_resumes(tmp_path, capsys):

@@ -43,6 +43,7 @@ MISTAKES = [
     (f"{BACKBONE}.history decision-transformer", "use a dt or odt recipe"),
     (f"{BACKBONE}.network enhanced", "did you mean enhanced-tit"),
     ("evaluate nowhere", "is not a run folder"),
+    ("evaluate run --dataset a.hdf5 --episodes 3", "--episodes are those that are played"),
     (f"tune {MLP} --out new --seeds 0 -1", "seed must be at least 0, not -1"),
     (f"tune {MLP} --out new --epochs 4", "--epochs is searched, so it has no value: leave it out"),
     ("play cart", "no agent or folder 'cart': did you mean cartpole"),

@@ -252,7 +252,7 @@ def test_every_recipe_for_any_data_builds_what_it_needs(tmp_path):
         True: log_machine(tmp_path / "log.hdf5"),
         False: log_machine(tmp_path / "discrete.hdf5", actions=np.arange(200) % 3),
     }
-    for name in ANY_DATA_RECIPES:
+    for name in (recipe.name for recipe in ANY_DATA_RECIPES):
         data_of_kind = str(data["discrete" not in name])
         recipe: Any = get_recipe(name)
         algorithm = make_algorithm(replace(recipe, dataset=data_of_kind))

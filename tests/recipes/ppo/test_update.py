@@ -14,9 +14,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 
 from recipes.coberl import ContrastivePPO
-from recipes.core.flat_parameters import FlatParameters
 from recipes.core.metrics import read_metrics
-from recipes.ppo import PPO, Minibatch, PPOAlgorithm
+from recipes.ppo import PPO, FlatParameters, Minibatch, PPOAlgorithm
 from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import named, prepared
 from tests.recipes.small import Batches, train

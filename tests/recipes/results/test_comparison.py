@@ -99,12 +99,14 @@ def test_what_cannot_be_summarized(tasks, capsys):
     write_run(tasks / "more", "ppo/cartpole/mlp", 0, [1.0], epochs=5)
     write_run(tasks / "own" / "a", "ppo/enhanced-tit", 0, [1.0], env="Taxi-v4")
     (tasks / "bad.csv").write_text("env,random\nCartPole-v1,0\n")
+    (tasks / "flat.csv").write_text("env,random,best\nCartPole-v1,5,5\n")
     only = [str(tasks / "cartpole")]
     for words, message in {
         (str(tasks / "more"), *only): "mlp has two settings on CartPole-v1",
         (str(tasks / "own"),): "no reference returns for Taxi-v4: give a CSV file",
         (*only, "--networks", "lstm"): "no evaluated run of lstm",
         (*only, "--references", str(tasks / "bad.csv")): "bad.csv must be a CSV file with the",
+        (*only, "--references", str(tasks / "flat.csv")): "is not for CartPole-v1",
         (str(tasks / "mountaincar"), str(tasks / "cartpole" / "mlp")): "no task has runs of all",
     }.items():
         assert message in fails(capsys, "summary", *words)

@@ -10,10 +10,11 @@ import pytest
 from recipes.core import registry
 from recipes.core.algorithm import make_algorithm
 from recipes.core.recipe import Recipe
+from recipes.core.recipe_json import recipe_to_json
 from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 from recipes.ppo import PPO
-from recipes.tools.results.experiments import group_runs
+from recipes.tools.results.experiments import find_runs, group_runs
 from recipes.tools.results.metric_words import known_columns, limit, to_markdown, words_of
 from torchrl_tit.settings.networks import mlp, nature_cnn
 
@@ -28,6 +29,16 @@ def test_whatever_their_seed_and_machine(tmp_path):
         ("a", (one, other)),
         ("a (learning_rate 0.1)", (third,)),
     ]
+
+
+def test_agents_made_of_runs_are_no_runs(tmp_path):
+    for name in ("run", "agent"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "recipe.json").write_text(recipe_to_json(RECIPE))
+    (tmp_path / "agent" / "agent.json").write_text("{}")
+    assert [run.folder.name for run in find_runs([tmp_path])] == ["run"]
+    with pytest.raises(ValueError, match="holds no run folder"):
+        find_runs([tmp_path / "agent"])
 
 
 def test_changes_are_those_from_the_recipe_of_that_name(tmp_path):

@@ -19,6 +19,7 @@ from recipes.tools.results.plot import (
 )
 from recipes.tools.results.table import Cell, plot_table
 from tests.recipes.results.report_runs import write_run
+from tests.recipes.small import TINY
 
 TWO = {"step": [1, 2], "time": [0, 1], "return_mean": [1.0, 3.0]}
 
@@ -68,7 +69,7 @@ def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, figures):
 def test_bold_lines_are_interquartile_means_of_runs_that_are_as_far():
     steps = np.arange(1.0, 11)
     runs = [Curve(steps, steps * factor) for factor in (1.0, 2.0, 3.0, 4.0, 30.0)]
-    _, axes = new_chart("", offline=False)
+    _, axes = new_chart("", TINY)
     bold = draw_curves(axes, {"a": [*runs, Curve(steps[:8], steps[:8])], "none": []})
     assert bold.keys() == {"a"}
     assert np.allclose(bold["a"].values, 3 * steps)
@@ -77,14 +78,14 @@ def test_bold_lines_are_interquartile_means_of_runs_that_are_as_far():
     assert labels[-1] == "a (5 runs)"
     band = np.asarray(axes.collections[0].get_paths()[0].vertices)
     assert band[:, 1].max() <= 300
-    _, axes = new_chart("", offline=False)
+    _, axes = new_chart("", TINY)
     bold = draw_curves(axes, {"a": runs[:4]})
     assert np.allclose(bold["a"].values, 2.5 * steps)
     assert not axes.collections  # too few for a band
 
 
 def test_runs_with_other_steps_are_interpolated_and_returns_averaged():
-    _, axes = new_chart("", offline=False)
+    _, axes = new_chart("", TINY)
     runs = [Curve(np.array([0.0, 10]), np.array([0.0, 10])), Curve(np.array([2.0, 9]), np.ones(2))]
     bold = draw_curves(axes, {"a": runs})["a"]
     assert (bold.steps[0], bold.steps[-1]) == (2, 9)
@@ -109,6 +110,14 @@ def test_a_run_of_one_batch_is_seen(values, tmp_path, figures):
     point = values == [2.0]
     assert [line.get_marker() for line in axes.lines[-1:]] == ["o"] * point
     assert [text.get_text() for text in axes.texts] == ["no episode has ended"] * (not point)
+
+
+def test_without_an_environment_the_error_on_held_out_episodes_is_drawn(tmp_path, figures):
+    metrics = {"step": [1, 2], "return_mean": [np.nan] * 2, "held_out_action_error": [0.5, 0.25]}
+    plot_run(Run.open(write_run(tmp_path / "run", "bc/mlp", metrics=metrics)))
+    (axes,) = figures[0].axes
+    assert axes.get_ylabel() == "error on held-out episodes"
+    assert [*axes.lines[-1].get_ydata()] == [0.5, 0.25]
 
 
 def test_a_legend_names_what_is_drawn(tmp_path, figures):

@@ -5,6 +5,7 @@ import json
 import lzma
 
 import pytest
+import torch
 
 from recipes.cli import main
 from recipes.core import records
@@ -15,6 +16,7 @@ from recipes.tools.results.experiments import find_runs, read_metrics
 from recipes.tools.results.recording import record_runs
 from recipes.tools.results.table import make_table
 from tests.recipes.results.report_runs import metrics_of, write_run
+from torchrl_tit.checkpoint import save_checkpoint
 
 MLP = "ppo/cartpole/mlp"
 
@@ -50,6 +52,17 @@ def test_a_table_is_read_as_the_folders_are(runs, tmp_path):
     assert find_recipe(str(out / "wide" / "recipe.json")) == find_runs([runs / "wide"])[0].recipe
     with pytest.raises(ValueError, match="holds no run folder and no table of runs"):
         find_runs([out / "narrow"])
+
+
+def test_runs_from_the_weights_of_others_are_apart(tmp_path):
+    write_run(tmp_path / "runs" / "scratch", MLP, 2, [500.0])
+    moved = write_run(tmp_path / "runs" / "moved", MLP, 2, [400.0], metrics=metrics_of(2, 50))
+    save_checkpoint(moved / "initial_weights", 0, {"weight": torch.ones(1)})
+    record_runs([tmp_path / "runs"], tmp_path / "page")
+    for folder in ("runs", "page"):
+        cells, _ = make_table([tmp_path / folder])
+        found = {(cell.changes, cell.mean) for cell in cells}
+        assert found == {("", 500.0), ("weights of another run", 400.0)}
 
 
 def test_each_metric_that_is_kept_has_four_digits(runs, tmp_path):

@@ -159,7 +159,7 @@ def test_metrics_that_are_not_healthy_are_pointed_out(tmp_path):
     assert "kl_approx</code> was above 0.02 in 33% of the batches" in found
     assert "explained_variance" not in found
     assert "gradient_norm" not in found
-    assert "is not evaluated yet" in page.text
+    assert "has no results: no evaluated run in" in page.text
 
 
 def test_a_run_that_is_not_as_far_is_named(tmp_path):

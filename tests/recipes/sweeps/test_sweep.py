@@ -19,7 +19,7 @@ from recipes.core.run import Run
 from recipes.tools.results.plot import plot_run
 from recipes.tools.sweeps import sweep
 from tests.recipes.commands import Command, fails
-from tests.recipes.small import TINY
+from tests.recipes.small import BC, TINY, make, make_dt
 from tests.recipes.sweeps.sweep_runs import begin, fork_worker
 
 
@@ -81,6 +81,20 @@ def test_a_run_whose_frame_encoders_were_chosen_by_kind_is_the_sweeps(tmp_path, 
     monkeypatch.setattr(training, "_finish", lambda *_: None)
     main(job.arguments())
     assert Run.open(job.folder).recipe.backbone.frames
+    assert sweep.make_jobs([str(file)], [0], tmp_path) == [job]
+
+
+@pytest.mark.parametrize("recipe_of", [partial(make, BC), partial(make_dt, target_returns=())])
+def test_a_run_whose_data_say_what_the_recipe_does_not_is_the_sweeps(
+    recipe_of, tmp_path, monkeypatch
+):
+    file = tmp_path / "recipe.json"
+    recipe = replace(recipe_of(tmp_path, env=""), name="mine/logs")
+    file.write_text(recipe_to_json(recipe))
+    [job] = sweep.make_jobs([str(file)], [0], tmp_path)
+    monkeypatch.setattr(training, "_finish", lambda *_: None)
+    main(job.arguments())
+    assert Run.open(job.folder).recipe.env_settings
     assert sweep.make_jobs([str(file)], [0], tmp_path) == [job]
 
 
