@@ -47,22 +47,24 @@ def test_velocities_are_hidden_beside_it() -> None:
 
 
 class Named(gymnasium.Env):
-    """A task with two observations and an action of two parts."""
+    """A task with an observation of a name and an action."""
 
-    observation_space = spaces.Dict(a=spaces.Discrete(3), previous_reward=spaces.Discrete(2))
-    action_space = spaces.MultiDiscrete([2, 3])
+    def __init__(self, name: str, action: spaces.Space) -> None:
+        self.observation_space = spaces.Dict({name: spaces.Discrete(2)})
+        self.action_space = action
 
 
 def test_names_and_actions() -> None:
     """Names that the task already has, and actions of no fixed size, are refused."""
+    parts = spaces.MultiDiscrete([2, 3])
     with pytest.raises(ValueError, match="already has an observation 'previous_reward'"):
-        PreviousStep(Named())
-    task = Named()
-    task.observation_space = spaces.Dict(a=spaces.Discrete(3))
-    assert PreviousStep(task).observation_space["previous_action"].shape == (5,)
-    task.action_space = spaces.Sequence(spaces.Discrete(2))
+        PreviousStep(Named("previous_reward", parts))
+    seen = PreviousStep(Named("a", parts)).observation_space
+    assert isinstance(seen, spaces.Dict)
+    shapes = {name: space.shape for name, space in seen.items()}
+    assert shapes == {"a": (), "previous_action": (5,), "previous_reward": (1,)}
     with pytest.raises(ValueError, match="cannot observe actions of Sequence"):
-        PreviousStep(task)
+        PreviousStep(Named("a", spaces.Sequence(spaces.Discrete(2))))
 
 
 def test_a_file_may_name_it() -> None:

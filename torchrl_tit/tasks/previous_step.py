@@ -8,7 +8,6 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import NDArray
 
 
 class PreviousStep(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
@@ -75,7 +74,7 @@ class PreviousStep(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs)
         several = isinstance(self.env.observation_space, spaces.Dict)
         return seen if several else {"observation": seen}
 
-    def _add(self, seen: Any, action: NDArray, reward: SupportsFloat) -> dict[str, Any]:
+    def _add(self, seen: Any, action: Any, reward: SupportsFloat) -> dict[str, Any]:
         added = {
             "previous_action": np.asarray(action, np.float32),
             "previous_reward": np.array([float(reward)], np.float32),
