@@ -34,8 +34,12 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-demo: $(VENV)/installed-recipes  ## Train Enhanced_TIT with PPO on CartPole-v1 (about 5 minutes) into runs/
-	$(BIN)/python -m recipes train ppo/cartpole/enhanced-tit --out $(OUT) $(ARGS)
+DEMO := ppo/cartpole-no-velocity/enhanced-tit
+demo: $(VENV)/installed-recipes  ## Train TIT on CartPole without velocities, with one frame and with eight (3 minutes)
+	for frames in 1 8; do \
+	  $(BIN)/python -m recipes train $(DEMO)-k$$frames --total-steps 60000 --out $(OUT)/k$$frames $(ARGS) || exit; \
+	done
+	$(BIN)/python -m recipes compare $(OUT)/k* --out $(OUT)/demo.png
 
 demo-memory: $(VENV)/installed-recipes  ## Train four frames and TIT on a maze that only memory solves (about 3 minutes)
 	$(BIN)/python -m recipes sweep ppo/tmaze-10/frames-4 ppo/tmaze-10/enhanced-tit \
