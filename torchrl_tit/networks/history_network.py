@@ -439,7 +439,7 @@ def masked_predictions(
 
 
 def weights_dtype(network: nn.Module) -> torch.dtype:
-    """Returns the float type of a network's weights.
+    """Returns the float type of a network's weights; of one without weights, PyTorch's default.
 
     It does not use ``parameters()``, which is empty if TorchRL's losses have replaced parameters
     with plain tensors (target weights, a stack of critics).
@@ -448,7 +448,8 @@ def weights_dtype(network: nn.Module) -> torch.dtype:
     # Asked at every step: in the head, a few layers, a weight is found several times faster.
     parts = (getattr(network, "head", network), network)
     weights = (getattr(x, name, None) for name in names for part in parts for x in part.modules())
-    return next(weight.dtype for weight in weights if isinstance(weight, Tensor))
+    types = (weight.dtype for weight in weights if isinstance(weight, Tensor))
+    return next(types, torch.get_default_dtype())
 
 
 def _check_dtype(history: Tensor, observation: Observation, dtype: torch.dtype) -> None:
