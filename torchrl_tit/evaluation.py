@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import Any
 
@@ -17,6 +17,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_tit.layers.standardize import widest_float
 from torchrl_tit.modules import acting
+from torchrl_tit.networks.building import evaluating
 
 _WATCHER: ContextVar[Callable[[int], Any] | None] = ContextVar("watcher", default=None)
 
@@ -225,8 +226,7 @@ def _acting(
 ) -> Iterator[None]:
     """Acts without gradients, and restores all modes and random generators at the end."""
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-    modules = list(policy.modules()) if isinstance(policy, nn.Module) else []
-    modes = [module.training for module in modules]
+    mode = evaluating(policy) if isinstance(policy, nn.Module) else nullcontext()
     python_state, numpy_state = random.getstate(), np.random.get_state()
     devices = range(torch.cuda.device_count())
     try:
@@ -234,15 +234,12 @@ def _acting(
             torch.random.fork_rng(devices),
             torch.no_grad(),
             set_exploration_type(exploration),
+            mode,
             acting(policy),  # encodes the newest frames only
         ):
             # Makes sampled actions reproducible.
             torch.manual_seed(seed)
-            if isinstance(policy, nn.Module):
-                policy.eval()
             yield
     finally:
-        for module, mode in zip(modules, modes, strict=True):
-            module.training = mode
         random.setstate(python_state)
         np.random.set_state(numpy_state)
