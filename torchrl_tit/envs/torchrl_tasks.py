@@ -16,6 +16,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.names import load_wrappers
+from torchrl_tit.envs.spaces import end_flags
 from torchrl_tit.envs.torchrl_specs import TensorReader, action_spec
 from torchrl_tit.settings.choices import ImageLayout, VectorizationMode
 
@@ -73,13 +74,11 @@ class TorchRLTask(EnvBase):
             if found != mask:
                 raise ValueError(f'The task\'s "{MASK}" has {found} entries, not {mask}.')
             entries[MASK] = Binary(mask, shape=(mask,), dtype=torch.bool)
-        flag = Categorical(2, shape=(1,), dtype=torch.bool)
-        flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
         place = (lambda x: x) if self.device is None else (lambda x: x.to(self.device))
         self.observation_spec = place(Composite(entries))
         self.action_spec = place(spec)
         self.reward_spec = place(Unbounded((1,), dtype=torch.float32))
-        self.done_spec = place(Composite(flags))
+        self.done_spec = place(end_flags())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self._carried is not None
