@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -28,7 +28,6 @@ def evaluate(
     episodes: int = 100,
     *,
     seed: int = 0,
-    reward_key: NestedKey = "reward",
     shrink: bool = False,
     deterministic: bool = True,
 ) -> Tensor:
@@ -50,7 +49,6 @@ def evaluate(
         policy: writes the action into the tensordict. It acts in evaluation mode.
         episodes: number of episodes.
         seed: seed of the first episode.
-        reward_key: key of the reward in "next".
         shrink: whether the policy is called only for environments whose first episode is still
             running, which saves time if episodes differ in length. The policy must accept batches
             of any size and keep no state from step to step.
@@ -79,10 +77,10 @@ def evaluate(
         raise ValueError(f"episodes must be at least 1, not {episodes}")
     with _acting(policy, seed, deterministic):
         if isinstance(env, EnvBase):
-            return _play_all(env, policy, episodes, seed, reward_key, shrink)
+            return _play_all(env, policy, episodes, seed, shrink)
         made = env(episodes)
         try:
-            return _play_all(made, policy, episodes, seed, reward_key, shrink)
+            return _play_all(made, policy, episodes, seed, shrink)
         finally:
             made.close()
 
@@ -117,12 +115,11 @@ def _play_all(
     policy: Callable[[TensorDictBase], TensorDictBase],
     episodes: int,
     seed: int,
-    reward_key: NestedKey,
     shrink: bool,
 ) -> Tensor:
     """Computes the return of each episode, [episodes]; each environment runs one at a time."""
     starts = range(seed, seed + episodes, env.batch_size.numel())
-    returns = [_play(env, policy, start, reward_key, shrink) for start in starts]
+    returns = [_play(env, policy, start, shrink) for start in starts]
     return torch.cat(returns)[:episodes]
 
 
@@ -130,7 +127,6 @@ def _play(
     env: EnvBase,
     policy: Callable[[TensorDictBase], TensorDictBase],
     seed: int,
-    reward_key: NestedKey,
     shrink: bool,
 ) -> Tensor:
     """Computes the return of one episode in each environment, float64 [N]."""
@@ -144,7 +140,7 @@ def _play(
         step, tensordict = env.step_and_maybe_reset(acted)
         outcome = step["next"]
         # An environment whose episode has ended starts another one, which does not count.
-        reward = outcome[reward_key].flatten().masked_fill(~playing, 0)
+        reward = outcome["reward"].flatten().masked_fill(~playing, 0)
         check_rewards(reward)
         game_over = outcome.get("game_over", None)
         if game_over is None:
