@@ -18,10 +18,10 @@ from torchrl_tit.layers.gaussian_head import GaussianHead
 from torchrl_tit.modules.backbone import Backbone
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import HistoryNetwork
+from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.numbers import Size
 
 ActionSpace = Literal["continuous", "gaussian", "discrete"]
-
-_ACTION_SPACES = ("continuous", "gaussian", "discrete")
 
 
 class DTHead(nn.Module):
@@ -43,14 +43,11 @@ class DTHead(nn.Module):
         torch.Size([8, 20, 3])
     """
 
+    @checked_arguments
     def __init__(
-        self, features_dim: int, action_dim: int, action_space: ActionSpace = "continuous"
+        self, features_dim: Size, action_dim: Size, action_space: ActionSpace = "continuous"
     ) -> None:
         super().__init__()
-        if action_space not in _ACTION_SPACES:
-            raise ValueError(
-                f"unknown action_space {action_space!r}: choose one of {_ACTION_SPACES}"
-            )
         self.action_space = action_space
         self.layers: nn.Module
         if action_space == "gaussian":

@@ -392,15 +392,22 @@ def build_trunk(
         observation: shape or spec of an observation, or of each by name if there are several.
         action_dim: entries of an action, for history encoders that read actions.
     """
-    return HistoryNetwork(
-        frames_by_kind(settings, observation),
-        settings.history,
-        observation_shape=observation,
-        num_frames=settings.num_frames,
-        head=settings.head,
-        initialization=settings.initialization,
-        action_dim=action_dim,
-    )
+    return HistoryNetwork(**arguments_of(settings, observation, action_dim))
+
+
+def arguments_of(
+    settings: settings.Network, observation: Observations, action_dim: int | None = None
+) -> dict[str, Any]:
+    """Returns the arguments of :class:`HistoryNetwork` for a network that settings describe."""
+    return {
+        "frame": frames_by_kind(settings, observation),
+        "history": settings.history,
+        "observation_shape": observation,
+        "num_frames": settings.num_frames,
+        "head": settings.head,
+        "initialization": settings.initialization,
+        "action_dim": action_dim,
+    }
 
 
 def masked_predictions(
