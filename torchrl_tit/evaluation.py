@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import Any
 
@@ -75,14 +75,13 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, not {episodes}")
-    with _acting(policy, seed, deterministic):
-        if isinstance(env, EnvBase):
-            return _play_all(env, policy, episodes, seed, shrink)
-        made = env(episodes)
-        try:
-            return _play_all(made, policy, episodes, seed, shrink)
-        finally:
-            made.close()
+    with (
+        _acting(policy, seed, deterministic),
+        nullcontext(env) if isinstance(env, EnvBase) else closing(env(episodes)) as played,
+    ):
+        starts = range(seed, seed + episodes, played.batch_size.numel())
+        returns = [_play(played, policy, start, shrink) for start in starts]
+        return torch.cat(returns)[:episodes]
 
 
 @contextmanager
@@ -108,19 +107,6 @@ def watching_episodes(ended: Callable[[int], Any]) -> Iterator[None]:
         yield
     finally:
         _WATCHER.reset(token)
-
-
-def _play_all(
-    env: EnvBase,
-    policy: Callable[[TensorDictBase], TensorDictBase],
-    episodes: int,
-    seed: int,
-    shrink: bool,
-) -> Tensor:
-    """Computes the return of each episode, [episodes]; each environment runs one at a time."""
-    starts = range(seed, seed + episodes, env.batch_size.numel())
-    returns = [_play(env, policy, start, shrink) for start in starts]
-    return torch.cat(returns)[:episodes]
 
 
 def _play(
