@@ -31,7 +31,7 @@ def test_settings_may_have_any_name():
     assert env.render_fps == 5
     for task, setting in (("TMaze-v0", "mode"), ("TMaze-v0", "wraps"), ("ALE/Pong-v5", "speed")):
         with pytest.raises(ValueError, match=f"cannot be made: .*'{setting}'"):
-            make_env(task, **{setting: 1})
+            make_env(task, **{setting: 1})  # type: ignore[arg-type]
 
 
 def test_gymnasium_wrappers_in_order():

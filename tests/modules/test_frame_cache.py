@@ -262,7 +262,7 @@ def test_dropout_within_attention_draws_for_every_frame():
     """`nn.MultiheadAttention` and recurrent layers have dropout without a module for it."""
     for dropout, count in ((0.5, 20), (0.0, 5)):
         layer = nn.MultiheadAttention(4, 1, dropout=dropout, batch_first=True)
-        seen = []
+        seen: list[int] = []
 
         class Encoder(nn.Module):
             def __init__(self, layer=layer):

@@ -132,8 +132,9 @@ def build(part, observation=(4,)):
 
 
 def test_a_network_without_weights_reads_floats_of_the_default_type():
-    plain = {"head": settings.Head(features_dim=None), "num_frames": 3}
-    network = build_network(Network(frame=settings.Flat(), history=MeanHistory(), **plain), (4,))
+    head = settings.Head(features_dim=None)
+    plain = Network(frame=settings.Flat(), history=MeanHistory(), head=head, num_frames=3)
+    network = build_network(plain, (4,))
     history = torch.rand(5, 3, 4)
     assert torch.equal(network(history), history.mean(1))
     assert torch.equal(
