@@ -21,7 +21,6 @@ from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_tit.analysis.targets import evaluating
 from torchrl_tit.datasets import (
     DatasetError,
     Episodes,
@@ -37,6 +36,7 @@ from torchrl_tit.envs import make_env, observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.modules import Backbone
+from torchrl_tit.networks.building import evaluating
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount

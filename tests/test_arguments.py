@@ -348,7 +348,7 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: discrete_cql(loss_function="l3"), "'loss_function' is 'l3', not one of"),
     (lambda: MaskedDTLoss(torch.nn.Linear(1, 1), reduction="no"), "'reduction' is 'no'"),
     (lambda: LikelihoodBCLoss(5), "actor_network must be a policy with get_dist, not 5"),
-    (lambda: contrast(temperature=NAN), "temperature must be positive and finite, not nan"),
+    (lambda: contrast(temperature=NAN), "temperature must be positive, not nan"),
     (lambda: contrast(width=5), r"encodings and predictions must be \[N, K, D\]"),
     (lambda: contrast(mask=torch.ones(2, 3)), "mask must be bool, not torch.float32"),
     (lambda: EnhancedTIT(4), "observation_shape 4 is not that of an array"),

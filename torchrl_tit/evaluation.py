@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_tit.layers.standardize import widest_float
 from torchrl_tit.modules import acting
+from torchrl_tit.networks.building import evaluating
 
 _WATCHER: ContextVar[Callable[[int], Any] | None] = ContextVar("watcher", default=None)
 
@@ -27,7 +28,6 @@ def evaluate(
     episodes: int = 100,
     *,
     seed: int = 0,
-    reward_key: NestedKey = "reward",
     shrink: bool = False,
     deterministic: bool = True,
 ) -> Tensor:
@@ -49,7 +49,6 @@ def evaluate(
         policy: writes the action into the tensordict. It acts in evaluation mode.
         episodes: number of episodes.
         seed: seed of the first episode.
-        reward_key: key of the reward in "next".
         shrink: whether the policy is called only for environments whose first episode is still
             running, which saves time if episodes differ in length. The policy must accept batches
             of any size and keep no state from step to step.
@@ -76,14 +75,13 @@ def evaluate(
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, not {episodes}")
-    with _acting(policy, seed, deterministic):
-        if isinstance(env, EnvBase):
-            return _play_all(env, policy, episodes, seed, reward_key, shrink)
-        made = env(episodes)
-        try:
-            return _play_all(made, policy, episodes, seed, reward_key, shrink)
-        finally:
-            made.close()
+    with (
+        _acting(policy, seed, deterministic),
+        nullcontext(env) if isinstance(env, EnvBase) else closing(env(episodes)) as played,
+    ):
+        starts = range(seed, seed + episodes, played.batch_size.numel())
+        returns = [_play(played, policy, start, shrink) for start in starts]
+        return torch.cat(returns)[:episodes]
 
 
 @contextmanager
@@ -111,25 +109,10 @@ def watching_episodes(ended: Callable[[int], Any]) -> Iterator[None]:
         _WATCHER.reset(token)
 
 
-def _play_all(
-    env: EnvBase,
-    policy: Callable[[TensorDictBase], TensorDictBase],
-    episodes: int,
-    seed: int,
-    reward_key: NestedKey,
-    shrink: bool,
-) -> Tensor:
-    """Computes the return of each episode, [episodes]; each environment runs one at a time."""
-    starts = range(seed, seed + episodes, env.batch_size.numel())
-    returns = [_play(env, policy, start, reward_key, shrink) for start in starts]
-    return torch.cat(returns)[:episodes]
-
-
 def _play(
     env: EnvBase,
     policy: Callable[[TensorDictBase], TensorDictBase],
     seed: int,
-    reward_key: NestedKey,
     shrink: bool,
 ) -> Tensor:
     """Computes the return of one episode in each environment, float64 [N]."""
@@ -143,7 +126,7 @@ def _play(
         step, tensordict = env.step_and_maybe_reset(acted)
         outcome = step["next"]
         # An environment whose episode has ended starts another one, which does not count.
-        reward = outcome[reward_key].flatten().masked_fill(~playing, 0)
+        reward = outcome["reward"].flatten().masked_fill(~playing, 0)
         check_rewards(reward)
         game_over = outcome.get("game_over", None)
         if game_over is None:
@@ -225,8 +208,7 @@ def _acting(
 ) -> Iterator[None]:
     """Acts without gradients, and restores all modes and random generators at the end."""
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-    modules = list(policy.modules()) if isinstance(policy, nn.Module) else []
-    modes = [module.training for module in modules]
+    mode = evaluating(policy) if isinstance(policy, nn.Module) else nullcontext()
     python_state, numpy_state = random.getstate(), np.random.get_state()
     devices = range(torch.cuda.device_count())
     try:
@@ -234,15 +216,12 @@ def _acting(
             torch.random.fork_rng(devices),
             torch.no_grad(),
             set_exploration_type(exploration),
+            mode,
             acting(policy),  # encodes the newest frames only
         ):
             # Makes sampled actions reproducible.
             torch.manual_seed(seed)
-            if isinstance(policy, nn.Module):
-                policy.eval()
             yield
     finally:
-        for module, mode in zip(modules, modes, strict=True):
-            module.training = mode
         random.setstate(python_state)
         np.random.set_state(numpy_state)

@@ -13,7 +13,7 @@ from torchrl_tit.modules import ActingCollector
 from torchrl_tit.modules.frame_tables import table_of_first
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.transforms import frames_before
-from torchrl_tit.windows import Windows, find_windows
+from torchrl_tit.windows import Windows, find_windows, take
 
 
 class FrameCollector(ActingCollector):
@@ -143,8 +143,7 @@ class Rollout:
             Frames, [N * (K - 1 + T), *observation_shape] of each observation, and windows on them,
             [N, T, K].
         """
-        newest = Windows(self.newest[steps], None)
-        observations = [newest.gather(frames) for frames in self.frames]
+        observations = [take(frames, self.newest[steps]) for frames in self.frames]
         first = self.histories(steps[:, 0])
         return table_of_first(first, observations, self.is_init[steps], self.padding)[:2]
 

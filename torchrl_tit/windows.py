@@ -70,13 +70,24 @@ class Windows(NamedTuple):
         Returns:
             [..., K, *frame], a copy.
         """
-        # On a CPU, index_select is several times faster than indexing.
-        windows = frames.index_select(0, self.rows.flatten())
-        windows = windows.view(*self.rows.shape, *frames.shape[1:])
+        windows = take(frames, self.rows)
         if self.missing is None:
             return windows
         missing = self.missing.view(*self.missing.shape, *[1] * (frames.ndim - 1))
         return windows.masked_fill(missing, 0)
+
+
+def take(table: Tensor, rows: Tensor) -> Tensor:
+    """Gathers rows of a table with ``index_select``, on a CPU several times faster than indexing.
+
+    Args:
+        table: [R, *entry].
+        rows: int64 [...].
+
+    Returns:
+        [..., *entry], a copy.
+    """
+    return table.index_select(0, rows.flatten()).view((*rows.shape, *table.shape[1:]))
 
 
 def find_windows(newest: Tensor, oldest: Tensor, num_frames: int, padding: Padding) -> Windows:

@@ -20,11 +20,11 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.value.functional import td0_return_estimate
 
-from torchrl_tit.analysis.targets import evaluating
 from torchrl_tit.datasets import DatasetError, Episodes, HistoryStorage
 from torchrl_tit.datasets.hdf5_files import damage_named, find, open_hdf5
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.frames import NormalizedFrames
+from torchrl_tit.networks.building import evaluating
 from torchrl_tit.settings.networks import mlp
 
 from ..core.algorithm import storage_device, to_networks

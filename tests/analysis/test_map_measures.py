@@ -65,7 +65,7 @@ def test_change() -> None:
 
 
 def test_bad_input() -> None:
-    with pytest.raises(ValueError, match="a background is 'place' or 'color', not 'sky'"):
+    with pytest.raises(ValueError, match="field 'background' is 'sky', not one of"):
         find_objects(torch.zeros(2, 4, 4), background="sky")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"frames have the shape \[4, 4\]"):
         find_objects(torch.zeros(4, 4))

@@ -115,6 +115,8 @@ def test_a_trailing_unfinished_episode_is_separate(arrays: Transitions) -> None:
     observations = whole["observations"].astype(np.float64)
     np.testing.assert_allclose(mean, observations.mean(0), rtol=1e-6)
     np.testing.assert_allclose(std, observations.std(0), rtol=1e-6)
+    with pytest.raises(DatasetError, match="no observations of finished episodes"):
+        select_episodes(data, torch.tensor([len(data.lengths) - 1])).observation_statistics()
     # Without next observations, its last step is never drawn.
     del cut["next_observations"], whole["next_observations"]
     kept = HistoryStorage(episodes_from_arrays(**cut), unfinished="keep")

@@ -75,7 +75,7 @@ def test_processes_that_fail_print_one_line(own_modules, monkeypatch):
     with pytest.raises(
         SystemExit, match=r"ValueError: no module .* registers the task 'Signpost-v0'"
     ):
-        gymnasium_tasks._task("Signpost-v0", (), home=-1, uses_mujoco=False)
+        gymnasium_tasks._task("Signpost-v0", (), -1, False)
 
     def end(*args, **kwargs):
         raise ConnectionResetError

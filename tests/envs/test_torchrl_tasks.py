@@ -1,7 +1,9 @@
 """Any TorchRL environment is a task, with the keys and kinds of our environments."""
 
+import numpy as np
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from torchrl.data import (
     Binary,
     Bounded,
@@ -18,6 +20,7 @@ from torchrl.envs import EnvBase, GymEnv
 from tests.envs.tasks import Corridor
 from tests.envs.test_spaces import kinds
 from tests.transforms.streams import assert_histories
+from torchrl_tit.agents.acting import Actor
 from torchrl_tit.envs import make_env
 from torchrl_tit.envs.torchrl_specs import TensorReader, action_spec
 
@@ -113,6 +116,37 @@ def test_an_action_that_is_not_a_number_is_refused(clip):
     env = make_env("torchrl.envs:PendulumEnv", 2, seed=0, clip_actions=clip)
     with pytest.raises(ValueError, match=r"the action \[nan\] is not a number"):
         env.step(env.reset().set("action", torch.tensor([[1.0], [torch.nan]])))
+
+
+@pytest.mark.parametrize(
+    "found",
+    [
+        Bounded(-1, 1, (2, 3)),
+        OneHot(3),
+        MultiOneHot([2, 3]),
+        MultiCategorical([2, 3]),
+        Binary(3, shape=(2, 3)),
+    ],
+    ids=lambda spec: type(spec).__name__,
+)
+def test_actions_of_several_copies_are_converted_at_once(found):
+    spec, write = action_spec(found, clip=True)
+    actions = 3 * spec.rand((4,)) if spec.dtype.is_floating_point else spec.rand((4,))
+    written = write(actions)
+    assert torch.equal(written, torch.stack([write(action) for action in actions]))
+    assert found.expand(4, *found.shape).is_in(written)
+
+
+def test_an_agent_acts_on_a_machine_in_the_tasks_own_form():
+    """The environment of which it takes the form has never begun."""
+    policy = TensorDictModule(
+        lambda x: 9 * x.sign(), in_keys=[("observation", "th")], out_keys=["action"]
+    )
+    actor = Actor(
+        policy, lambda n: make_env("torchrl.envs:PendulumEnv", n, observation_keys=["th", "thdot"])
+    )
+    state = {"th": np.array([[0.5], [-0.5]]), "thdot": np.zeros((2, 1))}
+    assert actor.act(state).tolist() == [[2.0], [-2.0]]
 
 
 def test_masks():

@@ -18,6 +18,22 @@ class OutOfTune(gymnasium.Wrapper):
         raise RuntimeError("no strings")
 
 
+class Tuned(gymnasium.Wrapper):
+    """Takes settings that the functions which pass them on have, too."""
+
+    def __init__(self, env: gymnasium.Env, name: str, kind: str) -> None:
+        super().__init__(env)
+        self.metadata = {**env.metadata, "render_fps": len(name + kind)}
+
+
+def test_settings_may_have_any_name():
+    env = make_env("CartPole-v1", wrappers=[f"{__name__}:Tuned(name='lute', kind='F')"])
+    assert env.render_fps == 5
+    for task, setting in (("TMaze-v0", "mode"), ("TMaze-v0", "wraps"), ("ALE/Pong-v5", "speed")):
+        with pytest.raises(ValueError, match=f"cannot be made: .*'{setting}'"):
+            make_env(task, **{setting: 1})  # type: ignore[arg-type]
+
+
 def test_gymnasium_wrappers_in_order():
     pixels = make_env(
         MINIGRID,
@@ -70,7 +86,7 @@ def test_names_in_modules():
             ["torchrl.envs:StepCounter", FLATTEN],
             "FlattenObservation' stands after a TorchRL transform",
         ),
-        ("ALE/Pong-v5", [FLATTEN], "usual preprocessing"),
+        ("ALE/Pong-v5", [FLATTEN], "read in one way"),
     ],
 )
 def test_one_line_says_what_is_wrong(name, wrappers, words):

@@ -258,6 +258,30 @@ def test_active_dropout_draws_for_every_frame():
             assert frames.take() == count
 
 
+def test_dropout_within_attention_draws_for_every_frame():
+    """`nn.MultiheadAttention` and recurrent layers have dropout without a module for it."""
+    for dropout, count in ((0.5, 20), (0.0, 5)):
+        layer = nn.MultiheadAttention(4, 1, dropout=dropout, batch_first=True)
+        seen: list[int] = []
+
+        class Encoder(nn.Module):
+            def __init__(self, layer=layer):
+                super().__init__()
+                self.layer = layer
+
+            def forward(self, frames, seen=seen):
+                seen.append(frames[..., 0].numel())
+                tokens = frames.reshape(-1, 1, 4)
+                return self.layer(tokens, tokens, tokens)[0].reshape(*frames.shape[:-1], 1, 4)
+
+        cache, frames = FrameCache(Encoder(), observation_ndim=1), torch.randn(5, 5, 4)
+        with torch.no_grad():
+            cache(frames[:, :-1])
+            seen.clear()
+            cache(frames[:, 1:])
+        assert sum(seen) == count
+
+
 def test_training_mode_without_dropout_keeps():
     backbone, network, shape = make()
     network.train()

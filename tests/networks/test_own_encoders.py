@@ -77,6 +77,14 @@ class SilentPast(HistoryEncoder):
         super().__init__(shape, out_features=8)
 
 
+class MeanPast(HistoryEncoder):
+    def __init__(self, settings, shape):
+        super().__init__(shape, out_features=shape.width)
+
+    def forward(self, tokens):
+        return tokens.mean((-3, -2))
+
+
 class NoEncoder(nn.Module):
     def __init__(self, settings, shape):
         super().__init__()
@@ -108,6 +116,11 @@ class SilentHistory(HistorySettings, name="tests-silent", builds=f"{__name__}:Si
 
 
 @dataclass(frozen=True, kw_only=True)
+class MeanHistory(HistorySettings, name="tests-mean", builds=f"{__name__}:MeanPast"):
+    pass
+
+
+@dataclass(frozen=True, kw_only=True)
 class OtherHistory(HistorySettings, name="tests-other", builds=f"{__name__}:NoEncoder"):
     pass
 
@@ -116,6 +129,17 @@ def build(part, observation=(4,)):
     frame = part if isinstance(part, FrameSettings) else settings.Linear()
     history = part if isinstance(part, HistorySettings) else settings.Outer(num_blocks=1)
     return build_network(Network(frame=frame, history=history, num_frames=3), observation)
+
+
+def test_a_network_without_weights_reads_floats_of_the_default_type():
+    head = settings.Head(features_dim=None)
+    plain = Network(frame=settings.Flat(), history=MeanHistory(), head=head, num_frames=3)
+    network = build_network(plain, (4,))
+    history = torch.rand(5, 3, 4)
+    assert torch.equal(network(history), history.mean(1))
+    assert torch.equal(
+        network((255 * history).byte()), (255 * history).byte().float().div(255).mean(1)
+    )
 
 
 @pytest.mark.parametrize("wrong", ["", "needs numbers"])

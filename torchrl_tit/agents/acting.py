@@ -13,11 +13,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import Compose, EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_tit.analysis.targets import evaluating
 from torchrl_tit.envs.given import Feed, GivenTask
+from torchrl_tit.networks.building import evaluating
 
 _READ = ("observation", "action_mask")
 
@@ -105,7 +105,7 @@ class Actor:
 
     def _start(self, observation: Any) -> None:
         """Builds the environment for as many copies as there are observations."""
-        base, transforms = _parts(self._make_env)
+        base, transforms = parts_of(self._make_env)
         self._specs = _specs(base)
         spec = self._specs["observation"]
         several = isinstance(spec, Composite)
@@ -175,11 +175,11 @@ def make_given_env(make_env: Callable[[int], EnvBase], feed: Feed, num_envs: int
         >>> agent.policy(env.reset())["action"].shape
         torch.Size([1])
     """
-    return _given(*_parts(make_env), feed, num_envs)
+    return _given(*parts_of(make_env), feed, num_envs)
 
 
-def _parts(make_env: Callable[[int], EnvBase]) -> tuple[EnvBase, Transform]:
-    """An environment that is closed, and its transforms, which can join another."""
+def parts_of(make_env: Callable[..., EnvBase]) -> tuple[EnvBase, Compose]:
+    """Returns an environment that is closed, and its transforms, which can join another."""
     with closing(make_env(1)) as made:
         base, transforms = made.base_env, made.transform
         transforms.reset_parent()
@@ -191,6 +191,6 @@ def _specs(base: EnvBase) -> dict[str, TensorSpec]:
     return {key: x for key, x in base.observation_spec_unbatched.items() if key in _READ}
 
 
-def _given(base: EnvBase, transforms: Transform, feed: Feed, num_envs: int) -> EnvBase:
+def _given(base: EnvBase, transforms: Compose, feed: Feed, num_envs: int) -> EnvBase:
     task = GivenTask(_specs(base), base.action_spec_unbatched, feed, num_envs, device=base.device)
     return TransformedEnv(task, transforms)

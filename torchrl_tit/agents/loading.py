@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +17,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import Compose, EnvBase
 
-from torchrl_tit.agents.acting import Actor
+from torchrl_tit.agents.acting import Actor, parts_of
 from torchrl_tit.agents.folder import AgentError, is_agent, read_agent
 from torchrl_tit.agents.hub import PREFIX, download
 from torchrl_tit.settings import resolve
@@ -111,10 +110,7 @@ class TrainedAgent:
             >>> env.rollout(10, agent.policy)["action"].shape
             torch.Size([10])
         """
-        with closing(self.make_env(1)) as env:
-            transforms = env.transform
-            transforms.reset_parent()
-        return transforms
+        return parts_of(self.make_env)[1]
 
     def evaluate(self, episodes: int | None = None, *, seed: int | None = None) -> Tensor:
         """Plays whole episodes with the most likely actions, as the agent's evaluation did.

@@ -17,10 +17,10 @@ from torchrl_tit.analysis.targets import (
     as_batch,
     check_gradient,
     compute_target,
-    evaluating,
     find_network,
     gradients,
 )
+from torchrl_tit.networks.building import evaluating
 
 
 def grad_cam(

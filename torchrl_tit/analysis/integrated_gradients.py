@@ -15,13 +15,13 @@ from torchrl_tit.analysis.targets import (
     as_batch,
     check_gradient,
     compute_target,
-    evaluating,
     find_backbone,
     find_network,
     run_policy,
 )
 from torchrl_tit.extras import install
 from torchrl_tit.layers.images import bytes_to_floats
+from torchrl_tit.networks.building import evaluating
 
 
 def integrated_gradients(

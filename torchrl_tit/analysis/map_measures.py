@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchrl_tit.settings.checks import checked_arguments
+
 Background = Literal["place", "color"]
 _SYMBOLS = 25
 
 
+@checked_arguments
 def find_objects(
     frames: Tensor, *, background: Background = "place", tolerance: float = 0.04
 ) -> Tensor:
@@ -37,8 +40,6 @@ def find_objects(
         >>> find_objects(frames).nonzero()
         tensor([[1, 2, 3]])
     """
-    if background not in get_args(Background):
-        raise ValueError(f"a background is 'place' or 'color', not {background!r}")
     if frames.ndim not in (3, 4):
         raise ValueError(f"frames have the shape {list(frames.shape)}, not [T, H, W] or with C")
     images = frames if frames.ndim == 4 else frames.unsqueeze(1)

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Literal, TypeAlias
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictModule,
-    TensorDictModuleBase,
-    TensorDictSequential,
-)
+from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 from torch import Tensor, distributions, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
 from torchrl_tit.modules import Backbone
-from torchrl_tit.modules.backbone import trunks_of
+from torchrl_tit.modules.acting import modules_in_order, trunks_of
 from torchrl_tit.networks import HistoryNetwork
 
 Target: TypeAlias = Literal["action", "value"] | Callable[[TensorDictBase], Tensor]
@@ -86,7 +81,7 @@ def run_policy(
     """
     outputs, distribution = tensordict.copy(), None
     with set_exploration_type(ExplorationType.DETERMINISTIC), set_recurrent_mode(False):
-        for module in _parts(policy):
+        for module in modules_in_order(policy):
             if isinstance(module, ProbabilisticTensorDictModule):
                 distribution = module.get_dist(outputs)
             outputs = module(outputs)
@@ -134,18 +129,6 @@ def compute_target(
     return values.gather(-1, action.reshape(-1, 1)).squeeze(-1)
 
 
-@contextmanager
-def evaluating(policy: nn.Module) -> Iterator[None]:
-    """Switches dropout off, and restores each module's mode at the end."""
-    modes = [(module, module.training) for module in policy.modules()]
-    try:
-        policy.eval()
-        yield
-    finally:
-        for module, mode in modes:
-            module.training = mode
-
-
 def as_batch(tensordict: TensorDictBase) -> TensorDictBase:
     """Returns states with one batch dimension, [N].
 
@@ -164,16 +147,6 @@ def check_gradient(value: Tensor, target: Target) -> None:
     if not value.requires_grad:
         name = target if isinstance(target, str) else getattr(target, "__name__", "the target")
         raise ValueError(f"{name} does not depend on what the network reads: choose another target")
-
-
-def _parts(policy: nn.Module) -> Iterator[TensorDictModuleBase]:
-    """The modules of a policy, in order."""
-    if isinstance(policy, TensorDictSequential):
-        for module in policy.module:
-            yield from _parts(module)
-    else:
-        assert isinstance(policy, TensorDictModuleBase | ProbabilisticTensorDictModule)
-        yield policy
 
 
 def gradients(value: Tensor, inputs: list[Tensor]) -> list[Tensor | None]:

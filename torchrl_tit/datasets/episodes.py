@@ -132,10 +132,16 @@ class Episodes:
             Mean and population standard deviation, float32 [*sample] each, for
             :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`. The deviation of a constant
             entry of an array is 1, with a warning, so that it is not amplified if it changes later.
+
+        Raises:
+            DatasetError: if there are none, because no episode is finished or all sets are empty.
         """
         count, total = 0, torch.zeros((), dtype=torch.float64)
         for chunk in map(samples, self._observations()):
             count, total = count + len(chunk), total + chunk.double().sum(0)
+        if not count:
+            problem = "has no observations of finished episodes, so they have no mean: record more."
+            raise DatasetError(self.source, problem)
         mean = total / count
         squares = torch.zeros_like(mean)
         for chunk in map(samples, self._observations()):

@@ -58,11 +58,7 @@ def make_replay_buffer(
         >>> buffer.sample()["next", "history"].shape
         torch.Size([8, 3, 2])
     """
-    if batch_size % slice_length:
-        raise ValueError(
-            f"A batch of {batch_size} steps cannot be divided into slices of {slice_length}; "
-            f"choose a slice_length that divides it."
-        )
+    _check_divides(slice_length, batch_size)
     return ReplayBuffer(
         storage=storage,
         writer=ImmutableDatasetWriter(),
@@ -107,10 +103,9 @@ class ConsecutiveSampler(RandomSampler):
         (torch.Size([3, 4]), torch.Size([3, 4, 3, 1]))
     """
 
-    def __init__(self, slice_length: int) -> None:
+    @checked_arguments
+    def __init__(self, slice_length: Batch) -> None:
         super().__init__()
-        if slice_length < 1:
-            raise ValueError(f"slice_length must be at least 1, not {slice_length}")
         self.slice_length = slice_length
 
     def sample(
@@ -123,11 +118,7 @@ class ConsecutiveSampler(RandomSampler):
                 from the newest step to the oldest.
             batch_size: total number of steps.
         """
-        if batch_size % self.slice_length:
-            raise ValueError(
-                f"A batch of {batch_size} steps cannot be divided into slices of "
-                f"{self.slice_length}; choose a slice_length that divides it."
-            )
+        _check_divides(self.slice_length, batch_size)
         steps, *envs = storage.shape or (0,)
         if steps < self.slice_length:
             raise ValueError(
@@ -143,3 +134,11 @@ class ConsecutiveSampler(RandomSampler):
         offsets = torch.arange(self.slice_length, device=device) + storage.oldest
         time = (draw(steps - self.slice_length + 1) + offsets) % steps
         return (time, *(draw(size).expand_as(time) for size in envs)) if envs else time, {}
+
+
+def _check_divides(slice_length: int, batch_size: int) -> None:
+    if batch_size % slice_length:
+        raise ValueError(
+            f"A batch of {batch_size} steps cannot be divided into slices of {slice_length}; "
+            f"choose a slice_length that divides it."
+        )

@@ -19,7 +19,7 @@ from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Frames, Positive, Real
-from torchrl_tit.windows import find_windows
+from torchrl_tit.windows import find_windows, take
 
 Entries = dict[NestedKey, Tensor]
 TimeLimits = Literal["keep", "drop"]
@@ -351,19 +351,6 @@ def nest(entries: Entries, shape: torch.Size) -> TensorDict:
             group = group.setdefault(each, {})
         group[name] = value
     return TensorDict(nested, shape)
-
-
-def take(table: Tensor, rows: Tensor) -> Tensor:
-    """Gathers rows with ``index_select``, which is several times faster than indexing.
-
-    Args:
-        table: [R, *entry].
-        rows: int64 [...].
-
-    Returns:
-        [..., *entry].
-    """
-    return table.index_select(0, rows.flatten()).view((*rows.shape, *table.shape[1:]))
 
 
 def expand_right(mask: Tensor, values: Tensor) -> Tensor:

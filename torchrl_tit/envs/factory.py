@@ -132,12 +132,12 @@ def make_env(
         "device": device,
     }
     env: EnvBase
+    if (not name or is_atari(name)) and (wraps or observation_keys or mask_actions):
+        raise ValueError(
+            f"{name or 'a task without a name'} has one observation, read in one way: it takes no "
+            "gymnasium.Wrapper (only TorchRL transforms), observation_keys or mask_actions"
+        )
     if not name:
-        if wraps or observation_keys or mask_actions:
-            raise ValueError(
-                "a task without a name has one observation and nothing to wrap: it takes no "
-                "gymnasium.Wrapper, observation_keys or mask_actions"
-            )
         kwargs.pop("render_mode", None)  # its render() says that there is nothing to see
         try:
             env = make_unknown_task(num_envs, clip_actions=clip_actions, device=device, **kwargs)
@@ -147,11 +147,6 @@ def make_env(
         if vectorization_mode == "async":
             raise ValueError(
                 f"{name} runs in threads, side by side; leave vectorization_mode at 'sync'."
-            )
-        if wraps or observation_keys or mask_actions:
-            raise ValueError(
-                f"{name} has the usual preprocessing and one observation: it takes no "
-                "gymnasium.Wrapper (only TorchRL transforms), observation_keys or mask_actions."
             )
         env = AtariEnv(make_games(name, num_envs, **kwargs), device=device)
     else:
@@ -301,7 +296,7 @@ def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
         The games.
 
     Raises:
-        ValueError: if the name is unknown, or ale-py is missing.
+        ValueError: if the name or a setting is unknown, or ale-py is missing.
 
     Example:
         >>> make_games("ALE/Pong-v5").single_observation_space
@@ -314,4 +309,7 @@ def make_games(name: str, num_envs: int = 1, **kwargs: Any) -> AtariGames:
     gymnasium.register_envs(ale_py)
     if name not in gymnasium.registry:
         raise unknown(name)
-    return AtariGames(gymnasium.registry[name].kwargs["game"], num_envs, **kwargs)
+    try:
+        return AtariGames(gymnasium.registry[name].kwargs["game"], num_envs, **kwargs)
+    except TypeError as error:  # no such setting
+        raise ValueError(f"Task {name!r} cannot be made: {error}") from error

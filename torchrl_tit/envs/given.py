@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box, Discrete, Space
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.actions import ActionWriter
-from torchrl_tit.envs.spaces import array_spec
+from torchrl_tit.envs.spaces import array_spec, end_flags
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.numbers import Size
 
@@ -59,12 +59,10 @@ class GivenTask(EnvBase):
     ) -> None:
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.feed, self.action_writer = feed, action_writer
-        flag = Categorical(2, shape=(1,), dtype=torch.bool)
-        flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
         self.observation_spec = self._copies(Composite(dict(observation_spec)))
         self.action_spec = self._copies(action_spec)
         self.reward_spec = self._copies(Unbounded((1,), dtype=torch.float32))
-        self.done_spec = self._copies(Composite(flags))
+        self.done_spec = self._copies(end_flags())
 
     def _copies(self, spec: TensorSpec) -> TensorSpec:
         spec = spec.expand(*self.batch_size, *spec.shape).clone()

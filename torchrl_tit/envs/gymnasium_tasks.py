@@ -26,9 +26,11 @@ _HAS_SCREEN = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"
 
 
 def make_gymnasium_tasks(
-    name: str, num_envs: int, mode: VectorizationMode, wraps: Sequence[Wrap], **kwargs: Any
+    name: str, num_envs: int, mode: VectorizationMode, wraps: Sequence[Wrap], /, **kwargs: Any
 ) -> gymnasium.vector.VectorEnv:
     """Makes a vector environment of a Gymnasium task, by a name that :func:`find_task` returned.
+
+    Here and below, arguments are positional, because the task's settings may have the same names.
 
     Raises:
         ValueError: if Gymnasium cannot make it, or cannot make it in a separate process.
@@ -54,7 +56,7 @@ def make_gymnasium_tasks(
         ) from error
 
 
-def make_unchecked(name: str, **kwargs: Any) -> gymnasium.Env:
+def make_unchecked(name: str, /, **kwargs: Any) -> gymnasium.Env:
     """Makes one task as Gymnasium does, without its checker and its advice to use a newer version.
 
     The checker costs time in each step, and the tests check the specs instead. Older versions are
@@ -70,7 +72,7 @@ def make_unchecked(name: str, **kwargs: Any) -> gymnasium.Env:
 
 
 def _task(
-    name: str, wraps: Sequence[Wrap], home: int, uses_mujoco: bool, **kwargs: Any
+    name: str, wraps: Sequence[Wrap], home: int, uses_mujoco: bool, /, **kwargs: Any
 ) -> gymnasium.Env:
     """Makes one copy, in the process that steps it; ``home`` is the main process."""
     if os.getpid() == home:
@@ -96,7 +98,7 @@ def _register(name: str) -> None:
         raise ValueError("; ".join([reason, *failures]))
 
 
-def _make(name: str, wraps: Sequence[Wrap], uses_mujoco: bool, **kwargs: Any) -> gymnasium.Env:
+def _make(name: str, wraps: Sequence[Wrap], uses_mujoco: bool, /, **kwargs: Any) -> gymnasium.Env:
     if uses_mujoco:
         show_mujoco_warnings_once()
     try:

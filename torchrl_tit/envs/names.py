@@ -154,15 +154,11 @@ def load_wrappers(names: Sequence[str]) -> tuple[list[Wrap], list[Transform]]:
                 "first, since they are inside."
             )
         else:
-            wraps.append(partial(_wrapped, kind, name, arguments))
+            wraps.append(partial(_called, kind, name, **arguments))
     return wraps, transforms
 
 
-def _wrapped(kind: Any, name: str, arguments: dict[str, Any], env: gymnasium.Env) -> gymnasium.Env:
-    return _called(kind, name, env, **arguments)
-
-
-def _called(kind: Any, name: str, *values: Any, **arguments: Any) -> Any:
+def _called(kind: Any, name: str, /, *values: Any, **arguments: Any) -> Any:
     try:
         return kind(*values, **arguments)
     except Exception as error:  # a wrapper can raise anything

@@ -12,12 +12,7 @@ import torch
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple
 from numpy.typing import NDArray
 from tensordict import NestedKey
-from torchrl.data import (
-    Composite,
-    MultiCategorical,
-    TensorSpec,
-    Unbounded,
-)
+from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK
@@ -220,6 +215,13 @@ def _without_group(key: NestedKey, specs: Composite) -> TensorSpec:
 def group(specs: dict[str, TensorSpec]) -> TensorSpec:
     """Returns the only spec, or a `Composite` of several."""
     return next(iter(specs.values())) if len(specs) == 1 else Composite(specs)
+
+
+def end_flags(*batch: int) -> Composite:
+    """The specs of "done", "terminated" and "truncated", bool [*batch, 1] each."""
+    flag = Categorical(2, shape=(*batch, 1), dtype=torch.bool)
+    names = ("done", "terminated", "truncated")
+    return Composite({name: flag.clone() for name in names}, shape=batch)
 
 
 def categories_spec(sizes: Sequence[int]) -> MultiCategorical:

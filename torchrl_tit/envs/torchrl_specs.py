@@ -21,7 +21,7 @@ from torchrl.data import (
 )
 
 from torchrl_tit.envs.action_masks import MASK
-from torchrl_tit.envs.actions import box_action_spec, refuse_nan
+from torchrl_tit.envs.actions import box_action_spec
 from torchrl_tit.envs.spaces import (
     array_spec,
     categories_spec,
@@ -103,7 +103,8 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
             unbounded.
 
     Returns:
-        The spec of our action, and the function that converts it to the environment's.
+        The spec of our action, and the function that converts ours, [*batch, *spec], to the
+        environment's.
 
     Raises:
         ValueError: if the action is of an unsupported kind.
@@ -114,27 +115,29 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
         ('Categorical', tensor([False, False,  True]))
     """
     sizes, shape, dtype = _sizes(found), found.shape, found.dtype
+    spec: TensorSpec
+
+    def shaped(action: Tensor) -> Tensor:
+        return action.reshape((*action.shape[: action.ndim - spec.ndim], *shape)).to(dtype)
+
+    def one_hot(action: Tensor) -> Tensor:
+        batch = action.shape[: action.ndim - spec.ndim]
+        choices = zip(action.reshape(*batch, len(sizes)).unbind(-1), sizes, strict=True)
+        vectors = [x.unsqueeze(-1) == torch.arange(n, device=x.device) for x, n in choices]
+        return torch.cat(vectors, -1).reshape(*batch, *shape).to(dtype)
+
     if isinstance(found, Binary):
         spec = Binary(shape.numel(), shape=(shape.numel(),), dtype=torch.int8)
-        return spec, lambda action: action.reshape(shape).to(dtype)
+        return spec, shaped
     if sizes:
         spec = Categorical(sizes[0]) if len(sizes) == 1 else categories_spec(sizes)
-        if not isinstance(found, OneHot | MultiOneHot):
-            return spec, lambda action: action.reshape(shape).to(dtype)
-        theirs = found.to_categorical_spec()
-        return spec, lambda action: theirs.to_one_hot(action.reshape(theirs.shape)).to(dtype)
+        return spec, one_hot if isinstance(found, OneHot | MultiOneHot) else shaped
     if _is_array(found) and dtype.is_floating_point:
         bounded = isinstance(found, Bounded)
         low = found.space.low if bounded else torch.full(shape, -torch.inf)
         high = found.space.high if bounded else torch.full(shape, torch.inf)
         spec = box_action_spec(low.reshape(-1).numpy(), high.reshape(-1).numpy(), clip=clip)
-
-        def bring(action: Tensor) -> Tensor:
-            refuse_nan(action)
-            action = action.reshape(shape).to(dtype)
-            return action.clamp(low, high) if clip else action
-
-        return spec, bring
+        return spec, lambda x: shaped(x).clamp(low, high) if clip else shaped(x)
     raise ValueError(
         f"Actions of the kind {type(found).__name__} {list(shape)} ({dtype}) are not supported, "
         "only floats, Categorical, MultiCategorical, OneHot, MultiOneHot and Binary."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import partial
 from typing import Any
 
@@ -15,8 +16,10 @@ from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, StepCounter, 
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.envs.actions import refuse_nan
 from torchrl_tit.envs.names import load_wrappers
-from torchrl_tit.envs.torchrl_specs import TensorReader, action_spec
+from torchrl_tit.envs.spaces import end_flags
+from torchrl_tit.envs.torchrl_specs import Convert, TensorReader, action_spec
 from torchrl_tit.settings.choices import ImageLayout, VectorizationMode
 
 
@@ -64,7 +67,9 @@ class TorchRLTask(EnvBase):
         )
         spec, write = action_spec(env.action_spec, clip=clip_actions)
         super().__init__(device=env.device, batch_size=torch.Size([]))
-        self._env, self._read, self._write = env, read, write
+        self._env, self._read = env, read
+        self.action_writer = write
+        """Converts actions, [*batch, *action_spec], to those of the environment."""
         self._carried: TensorDictBase | None = None  # what the environment reads next
         entries = {"observation": read.spec}
         if read.mask_key is not None:
@@ -73,17 +78,18 @@ class TorchRLTask(EnvBase):
             if found != mask:
                 raise ValueError(f'The task\'s "{MASK}" has {found} entries, not {mask}.')
             entries[MASK] = Binary(mask, shape=(mask,), dtype=torch.bool)
-        flag = Categorical(2, shape=(1,), dtype=torch.bool)
-        flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
         place = (lambda x: x) if self.device is None else (lambda x: x.to(self.device))
         self.observation_spec = place(Composite(entries))
         self.action_spec = place(spec)
         self.reward_spec = place(Unbounded((1,), dtype=torch.float32))
-        self.done_spec = place(Composite(flags))
+        self.done_spec = place(end_flags())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         assert self._carried is not None
-        self._carried.set(self._env.action_key, self._write(tensordict["action"]))
+        action = tensordict["action"]
+        if action.is_floating_point():
+            refuse_nan(action)
+        self._carried.set(self._env.action_key, self.action_writer(action))
         stepped = self._env.step(self._carried)
         outcome = stepped["next"]
         self._carried = self._env.step_mdp(stepped)
@@ -140,6 +146,9 @@ class TorchRLTask(EnvBase):
 
 class _SeededCopies(BatchedEnvBase):
     """Copies whose resets take a seed: copy i gets ``seed + i``, or entry i of a sequence."""
+
+    action_writer: Convert
+    """That of a copy, see :class:`TorchRLTask`."""
 
     def _reset(
         self,
@@ -227,10 +236,13 @@ def make_torchrl_tasks(
         torch.Size([2, 3])
     """
     copy = partial(_copy, make, name, tuple(wrappers), task_settings, reading)
-    copy().close()  # so that errors are raised here, not in other processes
+    with closing(copy()) as made:  # so that errors are raised here, not in other processes
+        writer = made.action_writer
     kind = SerialTasks if vectorization_mode == "sync" else ParallelTasks
     # Without num_threads, TorchRL lowers the number of threads of this process, too.
-    return kind(num_envs, copy, device=device, num_threads=torch.get_num_threads())
+    tasks = kind(num_envs, copy, device=device, num_threads=torch.get_num_threads())
+    tasks.action_writer = writer
+    return tasks
 
 
 def _copy(
@@ -239,7 +251,7 @@ def _copy(
     wrappers: tuple[str, ...],
     settings: dict[str, Any],
     reading: dict[str, Any],
-) -> EnvBase:
+) -> TorchRLTask:
     """Makes one copy, in the process that steps it."""
     wraps, transforms = load_wrappers(wrappers)
     if wraps:

@@ -11,12 +11,12 @@ import torch
 from gymnasium.vector import AutoresetMode
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK, ActionMasks
 from torchrl_tit.envs.actions import ActionWriter, refuse_nan
-from torchrl_tit.envs.spaces import ObservationReader
+from torchrl_tit.envs.spaces import ObservationReader, end_flags
 from torchrl_tit.settings.choices import ImageLayout
 
 
@@ -114,12 +114,10 @@ class GymVectorEnv(EnvBase):
             entries[MASK] = Binary(masks.shape[-1], shape=masks.shape, dtype=torch.bool)
         observation = Composite(entries, shape=(n,)).clone()
         action = write.spec.expand(n, *write.spec.shape).clone()
-        flag = Categorical(2, shape=(n, 1), dtype=torch.bool, device=self.device)
-        flags = {name: flag.clone() for name in ("done", "terminated", "truncated")}
         self.observation_spec = observation if device is None else observation.to(device)
         self.action_spec = action if device is None else action.to(device)
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32, device=self.device)
-        self.done_spec = Composite(flags, shape=(n,), device=self.device)
+        self.done_spec = end_flags(n) if device is None else end_flags(n).to(device)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         stepped = tensordict.get("_step", None)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -21,7 +21,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Transform
 from torchrl.modules import QValueModule
 
-from torchrl_tit.modules.backbone import Backbone, trunks_of
+from torchrl_tit.modules.acting import modules_in_order, trunks_of
+from torchrl_tit.modules.backbone import Backbone
 from torchrl_tit.modules.distributions import IndependentBernoulli
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.choices import Padding
@@ -170,21 +171,17 @@ class ActionHead(nn.Module):
 
     Args:
         modules: all modules of a policy after its backbone, in order.
-        action_key: key of the action.
 
     Raises:
         ValueError: if none of them writes the action.
     """
 
-    def __init__(
-        self, modules: Sequence[TensorDictModuleBase], action_key: NestedKey = "action"
-    ) -> None:
+    def __init__(self, modules: Sequence[TensorDictModuleBase]) -> None:
         super().__init__()
-        self.action_key = unravel_key(action_key)
-        if not any(self.action_key in map(unravel_key, module.out_keys) for module in modules):
-            raise ValueError(f"the policy writes no {action_key!r} behind its backbone")
+        if not any("action" in map(unravel_key, module.out_keys) for module in modules):
+            raise ValueError("the policy writes no 'action' behind its backbone")
         # A critic, for example, is left out.
-        used = TensorDictSequential(*modules).select_subsequence(out_keys=[self.action_key])
+        used = TensorDictSequential(*modules).select_subsequence(out_keys=["action"])
         self.reads: set[NestedKey] = {unravel_key(key) for key in used.in_keys}
         """Keys that the modules read: features, masks."""
         *layers, last = used.module
@@ -239,7 +236,7 @@ class ActionHead(nn.Module):
                 tensordict.set(key, tensordict.get(key) + scale * noise)
             with set_interaction_type(InteractionType.DETERMINISTIC):
                 tensordict = self.choice(tensordict)
-        return tensordict.get(self.action_key)
+        return tensordict.get("action")
 
 
 @dataclass(frozen=True)
@@ -275,7 +272,7 @@ def read_parts(policy: nn.Module, env: EnvBase) -> Parts:
     Raises:
         ValueError: if it is not such a policy, or has unknown inputs.
     """
-    backbone, *modules = _leaves(policy)
+    backbone, *modules = modules_in_order(policy)
     if not isinstance(backbone, Backbone):
         raise ValueError(
             f"the policy begins with {type(backbone).__name__}, but only one that begins with a "
@@ -326,15 +323,6 @@ def read_parts(policy: nn.Module, env: EnvBase) -> Parts:
         action=Entry(tuple(action.shape), action.dtype),
         sequence=sequences[0] if sequences else None,
     )
-
-
-def _leaves(module: nn.Module) -> Iterator[TensorDictModuleBase]:
-    if isinstance(module, TensorDictSequential):
-        for part in module.module:
-            yield from _leaves(part)
-    else:
-        assert isinstance(module, TensorDictModuleBase)
-        yield module
 
 
 def _last_name(key: NestedKey) -> str:

@@ -24,16 +24,24 @@ READ_SLICES: dict[Read, slice] = {
 }
 
 
-def check_heads(embed_dim: int, num_heads: int) -> None:
-    """Raises ValueError unless a number of heads divides the width."""
-    if num_heads < 1 or embed_dim % num_heads:
-        raise ValueError(
-            f"the width {embed_dim} cannot be split over {num_heads} attention heads: "
-            "choose a number of heads that divides embed_dim"
-        )
+class _Heads(nn.Module):
+    """What attention layers share: heads that divide the width."""
+
+    def __init__(self, embed_dim: int, num_heads: int) -> None:
+        super().__init__()
+        if num_heads < 1 or embed_dim % num_heads:
+            raise ValueError(
+                f"the width {embed_dim} cannot be split over {num_heads} attention heads: "
+                "choose a number of heads that divides embed_dim"
+            )
+        self.num_heads = num_heads
+
+    def split_heads(self, x: Tensor) -> Tensor:
+        """[..., S, D] -> [..., heads, S, D / heads]."""
+        return x.unflatten(-1, (self.num_heads, -1)).transpose(-3, -2)
 
 
-class SelfAttention(nn.Module):
+class SelfAttention(_Heads):
     """Multi-head scaled dot-product self-attention (arXiv 2212.14538, section "Inner Transformer").
 
     Has the same parameters, names and results as :class:`torch.nn.MultiheadAttention` with
@@ -73,11 +81,9 @@ class SelfAttention(nn.Module):
         positions: TemporalPositions = "none",
         num_frames: int = 1,
     ) -> None:
-        super().__init__()
-        check_heads(embed_dim, num_heads)
+        super().__init__(embed_dim, num_heads)
         if positions == "relative" and not causal:
             raise ValueError("relative positions are distances to the past: choose causal=True")
-        self.num_heads = num_heads
         self.causal = causal
         self.in_proj_weight = nn.Parameter(torch.empty(3 * embed_dim, embed_dim))
         self.in_proj_bias = nn.Parameter(torch.empty(3 * embed_dim))
@@ -255,10 +261,6 @@ class SelfAttention(nn.Module):
         length = x.shape[1]
         return self.rotary(query, length, positions), self.rotary(key, length), value
 
-    def split_heads(self, x: Tensor) -> Tensor:
-        """[..., S, D] -> [..., heads, S, D / heads]."""
-        return x.unflatten(-1, (self.num_heads, -1)).transpose(-3, -2)
-
     def _mask(self, x: Tensor, mask: Tensor | None, causal: bool) -> Tensor | None:
         """The bias added to the scores, float [..., S, S], or their mask, bool [..., S, S].
 
@@ -281,7 +283,7 @@ class SelfAttention(nn.Module):
         return scores.softmax(dim=-1)
 
 
-class RelativeSelfAttention(nn.Module):
+class RelativeSelfAttention(_Heads):
     r"""Multi-head self-attention with relative position encodings.
 
     Step i weighs step j by the softmax over j of
@@ -310,9 +312,7 @@ class RelativeSelfAttention(nn.Module):
     index: Tensor
 
     def __init__(self, embed_dim: int, num_heads: int, num_frames: int) -> None:
-        super().__init__()
-        check_heads(embed_dim, num_heads)
-        self.num_heads = num_heads
+        super().__init__(embed_dim, num_heads)
         self.head_dim = embed_dim // num_heads
         self.query_key_value = nn.Linear(embed_dim, 3 * embed_dim, bias=False)
         self.distance_key = nn.Linear(embed_dim, embed_dim, bias=False)  # W_R
@@ -369,10 +369,6 @@ class RelativeSelfAttention(nn.Module):
     def project(self, x: Tensor, start: int, stop: int) -> Tensor:
         """Applies the projections from ``start`` to ``stop`` of (query, key, value) at once."""
         return F.linear(x, self.query_key_value.weight[start * x.shape[-1] : stop * x.shape[-1]])
-
-    def split_heads(self, x: Tensor) -> Tensor:
-        """[..., S, D] -> [..., heads, S, D / heads]."""
-        return x.unflatten(-1, (self.num_heads, -1)).transpose(-3, -2)
 
     def window_scores(
         self, query: Tensor, key: Tensor, oldest_key: Tensor, back: Tensor, num_frames: int

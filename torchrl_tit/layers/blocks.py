@@ -9,7 +9,7 @@ from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.attention import READ_SLICES, Read, RelativeSelfAttention, SelfAttention
 from torchrl_tit.layers.window_attention import attend_windows
 from torchrl_tit.settings.encoders import Activation, TemporalPositions
-from torchrl_tit.windows import Windows
+from torchrl_tit.windows import Windows, take
 
 
 class TransformerBlock(nn.Module):
@@ -275,4 +275,4 @@ def _ffn(width: int, hidden: int, activation: Activation, dropout: float) -> nn.
 
 def _newest(x: Tensor, windows: Windows) -> Tensor:
     """The newest token of windows [N, T, K] on a table [R, D] -> [N, T, D]."""
-    return Windows(windows.rows[..., -1], None).gather(x)
+    return take(x, windows.rows[..., -1])

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchrl_tit.layers.attention import RelativeSelfAttention, SelfAttention
-from torchrl_tit.windows import Windows
+from torchrl_tit.windows import Windows, take
 
 _LARGEST_SPAN = 16
 """Rows of a sequence per frame of a window, up to which one product of all pairs is faster."""
@@ -45,11 +45,11 @@ def attend_windows(
     within = (back >= 0) & (back < num_frames - padded.sum(-1, keepdim=True))
 
     per_head = attention.split_heads  # [N, S, D] -> [N, heads, S, D / heads]
-    oldest, newest = (Windows(windows.rows[..., frame], None) for frame in (0, -1))
+    oldest, newest = windows.rows[..., 0], windows.rows[..., -1]
     keys, values = attention.project(x, 1, 3).chunk(2, dim=-1)  # [R, D]
-    oldest_key, oldest_value = (per_head(oldest.gather(table)) for table in (keys, values))
+    oldest_key, oldest_value = (per_head(take(table, oldest)) for table in (keys, values))
     key, value = (per_head(table[: count * span].view(count, span, -1)) for table in (keys, values))
-    query = per_head(attention.project(newest.gather(x), 0, 1))  # [N, heads, T, D / heads]
+    query = per_head(attention.project(take(x, newest), 0, 1))  # [N, heads, T, D / heads]
     scores, padding = attention.window_scores(query, key, oldest_key, back, num_frames)
     seen = torch.cat([within, padded], dim=-1).unsqueeze(1)
     weights = torch.cat([scores, padding], dim=-1).masked_fill(~seen, -math.inf).softmax(dim=-1)

@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import Collector
 
@@ -136,6 +137,24 @@ def trunks_of(network: nn.Module) -> dict[str, HistoryNetwork]:
     if isinstance(network, TwoTrunks):
         return {"policy_": network.policy, "value_": network.value}
     return {"": network} if isinstance(network, HistoryNetwork) else {}
+
+
+def modules_in_order(policy: nn.Module) -> Iterator[TensorDictModuleBase]:
+    """Yields the modules of a policy in the order in which it calls them.
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule
+        >>> double = TensorDictModule(lambda x: 2 * x, in_keys=["x"], out_keys=["x"])
+        >>> nested = TensorDictSequential(double, TensorDictSequential(double, double))
+        >>> len(list(modules_in_order(nested)))
+        3
+    """
+    if isinstance(policy, TensorDictSequential):
+        for module in policy.module:
+            yield from modules_in_order(module)
+    else:
+        assert isinstance(policy, TensorDictModuleBase)
+        yield policy
 
 
 @contextmanager

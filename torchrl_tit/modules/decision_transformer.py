@@ -14,14 +14,52 @@ from tensordict.utils import unravel_key
 from torch import Tensor, distributions, nn
 from torchrl.modules import OneHotCategorical, TanhNormal
 
-from torchrl_tit.layers.gaussian_head import GaussianHead
 from torchrl_tit.modules.backbone import Backbone
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.networks import HistoryNetwork
+from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.numbers import Size
 
 ActionSpace = Literal["continuous", "gaussian", "discrete"]
 
-_ACTION_SPACES = ("continuous", "gaussian", "discrete")
+_LOG_STD_MIN, _LOG_STD_MAX = -5.0, 2.0
+
+
+class GaussianHead(nn.Module):
+    """Mean and standard deviation of each entry of an action, before a tanh squashes it.
+
+    Zheng et al., "Online Decision Transformer", arXiv 2202.05607, and its authors' code: two linear
+    layers with orthogonal initialization; a tanh keeps the logarithm of the standard deviation
+    between -5 and 2.
+
+    Args:
+        in_features: size F of the features.
+        action_dim: entries A of an action.
+
+    Example:
+        >>> import torch
+        >>> mean, std = GaussianHead(64, 3)(torch.randn(8, 20, 64))
+        >>> mean.shape, bool(((std > 0.006) & (std < 7.4)).all())
+        (torch.Size([8, 20, 3]), True)
+    """
+
+    def __init__(self, in_features: int, action_dim: int) -> None:
+        super().__init__()
+        self.mean = nn.Linear(in_features, action_dim)
+        self.log_std = nn.Linear(in_features, action_dim)
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Initializes the weights orthogonally and the biases with zeros."""
+        for layer in (self.mean, self.log_std):
+            nn.init.orthogonal_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Float [..., F] -> mean and standard deviation, float [..., A] each."""
+        middle, half = (_LOG_STD_MAX + _LOG_STD_MIN) / 2, (_LOG_STD_MAX - _LOG_STD_MIN) / 2
+        log_std = middle + half * self.log_std(features).tanh()
+        return self.mean(features), log_std.exp()
 
 
 class DTHead(nn.Module):
@@ -43,14 +81,11 @@ class DTHead(nn.Module):
         torch.Size([8, 20, 3])
     """
 
+    @checked_arguments
     def __init__(
-        self, features_dim: int, action_dim: int, action_space: ActionSpace = "continuous"
+        self, features_dim: Size, action_dim: Size, action_space: ActionSpace = "continuous"
     ) -> None:
         super().__init__()
-        if action_space not in _ACTION_SPACES:
-            raise ValueError(
-                f"unknown action_space {action_space!r}: choose one of {_ACTION_SPACES}"
-            )
         self.action_space = action_space
         self.layers: nn.Module
         if action_space == "gaussian":

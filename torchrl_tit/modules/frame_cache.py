@@ -41,7 +41,7 @@ class FrameCache:
 
     Args:
         encoder: maps observations [..., *observation_shape] to tokens [..., *token_shape], each
-            independently of the others; its only randomness is ``nn.Dropout``.
+            independently of the others; its only randomness is the dropout of PyTorch's modules.
         observation_ndim: number of dimensions of an observation.
         encode_newest: encodes the newest frame of each window; the encoder itself by default, or
             the compiled encoder.

@@ -20,7 +20,6 @@ from torchrl.modules import (
 )
 
 from torchrl_tit.layers import init_orthogonal_
-from torchrl_tit.layers.gaussian_head import ClampedGaussianHead
 from torchrl_tit.modules.action_specs import (
     action_shape,
     check_bounds,
@@ -215,6 +214,34 @@ def make_value(features_dim: Size, *, in_key: NestedKey = "features") -> ValueOp
     """
     value = _Linear(features_dim, 1, gain=1.0)
     return TensorValue(value, in_keys=[in_key], out_keys=[beside(in_key, "state_value")])
+
+
+class ClampedGaussianHead(nn.Module):
+    """Mean and standard deviation of each entry of an action, before a tanh squashes it.
+
+    Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905, and their
+    code: two linear layers with PyTorch's default initialization; the logarithm of the standard
+    deviation is clamped to -20..2.
+
+    Args:
+        in_features: size F of the features.
+        action_dim: entries A of an action.
+
+    Example:
+        >>> import torch
+        >>> mean, std = ClampedGaussianHead(64, 3)(torch.randn(8, 64))
+        >>> mean.shape, std.shape
+        (torch.Size([8, 3]), torch.Size([8, 3]))
+    """
+
+    def __init__(self, in_features: int, action_dim: int) -> None:
+        super().__init__()
+        self.mean = nn.Linear(in_features, action_dim)
+        self.log_std = nn.Linear(in_features, action_dim)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Float [..., F] -> mean and standard deviation, float [..., A] each."""
+        return self.mean(features), self.log_std(features).clamp(-20.0, 2.0).exp()
 
 
 class _Parts(NamedTuple):

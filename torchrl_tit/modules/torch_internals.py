@@ -13,8 +13,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
-from torch.nn.modules.batchnorm import _BatchNorm
-from torch.nn.modules.dropout import _DropoutNd
+
+_BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
+_DROPOUTS = (
+    *(nn.Dropout, nn.Dropout1d, nn.Dropout2d, nn.Dropout3d),
+    *(nn.AlphaDropout, nn.FeatureAlphaDropout),
+)
 
 
 def is_transformed() -> bool:
@@ -43,7 +47,7 @@ def is_recorded(tensor: Tensor) -> bool:
         or torch.jit.is_tracing()
         or type(tensor) is not Tensor  # a fake tensor
         or tensor.is_meta
-        or forward_ad._current_level >= 0
+        or forward_ad.unpack_dual(tensor).tangent is not None
         or (tensor.is_cuda and torch.cuda.is_current_stream_capturing())
     )
 
@@ -87,8 +91,12 @@ class Weights:
 
 def mode_dependent(module: nn.Module) -> list[nn.Module]:
     """Returns the parts of a module that compute something else in training mode."""
-    return [
-        part
-        for part in module.modules()
-        if isinstance(part, _BatchNorm) or (isinstance(part, _DropoutNd) and part.p > 0)
-    ]
+    return [part for part in module.modules() if _depends_on_mode(part)]
+
+
+def _depends_on_mode(part: nn.Module) -> bool:
+    if isinstance(part, _DROPOUTS):
+        return part.p > 0
+    if isinstance(part, nn.MultiheadAttention | nn.RNNBase):  # without a module for their dropout
+        return part.dropout > 0
+    return isinstance(part, _BATCH_NORMS)

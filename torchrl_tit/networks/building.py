@@ -160,7 +160,7 @@ def _check_output(
     if zeros.is_meta:
         return
     inputs = f"zeros of shape {tuple(zeros.shape)}"
-    with _evaluating(encoder), torch.no_grad():
+    with evaluating(encoder), torch.random.fork_rng(devices=[]), torch.no_grad():
         try:
             output = encoder(zeros)
         except Exception as error:
@@ -176,13 +176,21 @@ def _reason(error: Exception) -> str:
 
 
 @contextmanager
-def _evaluating(module: nn.Module) -> Iterator[None]:
-    """Switches dropout off, and leaves batch statistics and random generators unchanged."""
-    modes = {child: child.training for child in module.modules()}
+def evaluating(module: nn.Module) -> Iterator[None]:
+    """Puts a module into evaluation mode, and restores the mode of each of its parts at the end.
+
+    Example:
+        >>> dropout = nn.Dropout()
+        >>> with evaluating(dropout):
+        ...     dropout.training
+        False
+        >>> dropout.training
+        True
+    """
+    modes = {part: part.training for part in module.modules()}
     module.eval()
     try:
-        with torch.random.fork_rng(devices=[]):
-            yield
+        yield
     finally:
-        for child, training in modes.items():
-            child.training = training
+        for part, training in modes.items():
+            part.training = training

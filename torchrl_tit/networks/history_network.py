@@ -392,15 +392,22 @@ def build_trunk(
         observation: shape or spec of an observation, or of each by name if there are several.
         action_dim: entries of an action, for history encoders that read actions.
     """
-    return HistoryNetwork(
-        frames_by_kind(settings, observation),
-        settings.history,
-        observation_shape=observation,
-        num_frames=settings.num_frames,
-        head=settings.head,
-        initialization=settings.initialization,
-        action_dim=action_dim,
-    )
+    return HistoryNetwork(**arguments_of(settings, observation, action_dim))
+
+
+def arguments_of(
+    settings: settings.Network, observation: Observations, action_dim: int | None = None
+) -> dict[str, Any]:
+    """Returns the arguments of :class:`HistoryNetwork` for a network that settings describe."""
+    return {
+        "frame": frames_by_kind(settings, observation),
+        "history": settings.history,
+        "observation_shape": observation,
+        "num_frames": settings.num_frames,
+        "head": settings.head,
+        "initialization": settings.initialization,
+        "action_dim": action_dim,
+    }
 
 
 def masked_predictions(
@@ -439,7 +446,7 @@ def masked_predictions(
 
 
 def weights_dtype(network: nn.Module) -> torch.dtype:
-    """Returns the float type of a network's weights.
+    """Returns the float type of a network's weights; of one without weights, PyTorch's default.
 
     It does not use ``parameters()``, which is empty if TorchRL's losses have replaced parameters
     with plain tensors (target weights, a stack of critics).
@@ -448,7 +455,8 @@ def weights_dtype(network: nn.Module) -> torch.dtype:
     # Asked at every step: in the head, a few layers, a weight is found several times faster.
     parts = (getattr(network, "head", network), network)
     weights = (getattr(x, name, None) for name in names for part in parts for x in part.modules())
-    return next(weight.dtype for weight in weights if isinstance(weight, Tensor))
+    types = (weight.dtype for weight in weights if isinstance(weight, Tensor))
+    return next(types, torch.get_default_dtype())
 
 
 def _check_dtype(history: Tensor, observation: Observation, dtype: torch.dtype) -> None:

@@ -10,8 +10,12 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from torchrl_tit.frames.observation import Observations
-from torchrl_tit.networks.by_kind import frames_by_kind
-from torchrl_tit.networks.history_network import HistoryNetwork, TwoTrunks, build_trunk
+from torchrl_tit.networks.history_network import (
+    HistoryNetwork,
+    TwoTrunks,
+    arguments_of,
+    build_trunk,
+)
 from torchrl_tit.settings import Network, networks
 
 __all__ = [
@@ -65,15 +69,7 @@ class NamedNetwork(_Named, HistoryNetwork):
     ) -> None:
         given = {} if num_frames is None else {"num_frames": num_frames}
         settings = self.describe(**given, **hyperparameters)
-        super().__init__(
-            frames_by_kind(settings, observation_shape),
-            settings.history,
-            observation_shape=observation_shape,
-            num_frames=settings.num_frames,
-            head=settings.head,
-            initialization=settings.initialization,
-            action_dim=action_dim,
-        )
+        super().__init__(**arguments_of(settings, observation_shape, action_dim))
 
 
 class VanillaTIT(NamedNetwork, describe=networks.vanilla_tit):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.numbers import Positive
 
+
+@checked_arguments
 def contrastive_prediction_loss(
-    encodings: Tensor, predictions: Tensor, mask: Tensor, *, temperature: float = 0.1
+    encodings: Tensor, predictions: Tensor, mask: Tensor, *, temperature: Positive = 0.1
 ) -> Tensor:
     r"""Contrasts the predictions of masked steps with the encodings of all steps of a batch.
 
@@ -47,8 +49,6 @@ def contrastive_prediction_loss(
         >>> bool(right < 0.01 < wrong)
         True
     """
-    if not 0 < temperature < math.inf:
-        raise ValueError(f"temperature must be positive and finite, not {temperature}")
     if not encodings.shape == predictions.shape or mask.shape != encodings.shape[:2]:
         raise ValueError(
             f"encodings and predictions must be [N, K, D] and mask [N, K], not "

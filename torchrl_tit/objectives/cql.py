@@ -372,8 +372,8 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         self,
         value_network: Any,
         *,
-        loss_function: Literal["l1", "l2", "smooth_l1"] = "l2",
-        reduction: Literal["none", "mean", "sum"] | None = "mean",
+        loss_function: Distance = "l2",
+        reduction: Reduction | None = "mean",
         **settings: Any,
     ) -> None:
         super().__init__(

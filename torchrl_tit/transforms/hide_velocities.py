@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Composite
 from torchrl.envs.transforms import ObservationTransform
 
 VELOCITIES: dict[str, list[int]] = {
@@ -73,15 +73,9 @@ class HideEntries(ObservationTransform):
             ValueError: if an entry to hide does not exist, or none would be left.
         """
         for key in self.in_keys:
-            observation_spec[key] = self._spec(observation_spec[key])
+            spec = observation_spec[key]
+            observation_spec[key] = spec[..., self._seen(spec.shape[-1])]
         return observation_spec
-
-    def _spec(self, spec: TensorSpec) -> TensorSpec:
-        seen = self._seen(spec.shape[-1])
-        if isinstance(spec, Bounded):
-            low, high = spec.space.low[..., seen], spec.space.high[..., seen]
-            return Bounded(low, high, low.shape, dtype=spec.dtype, device=spec.device)
-        return spec[..., seen]
 
     def _seen(self, size: int) -> list[int]:
         """Returns the indices of the entries that are left."""

@@ -492,27 +492,37 @@ def find_histories(
     return find_windows(rows, oldest, num_frames, padding)
 
 
+def same_observations(left: TensorDictBase, right: TensorDictBase) -> Tensor:
+    """Whether all entries of observations [...] are the same, NaN included; bool [...].
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> x = TensorDict({"observation": torch.tensor([[1.0, torch.nan], [2.0, 0.0]])}, [2])
+        >>> same_observations(x, x), same_observations(x[:1], x[1:])
+        (tensor([True, True]), tensor([False]))
+    """
+    same = torch.ones(left.shape, dtype=torch.bool, device=left.device)
+    for key, ours in left.items(True, True):
+        theirs = right[key]
+        equal = (ours == theirs) | ((ours != ours) & (theirs != theirs))
+        same &= equal.unsqueeze(-1).flatten(left.ndim).all(-1)
+    return same
+
+
 def _breaks(
     steps: TensorDictBase, keys: Sequence[NestedKey], starts: Tensor, known: bool
 ) -> Tensor:
     """Where a step does not follow the one before, bool [*B, T]."""
     breaks = torch.zeros_like(starts)
-    time = steps.ndim - 1
-    pairs = [(steps.get(key), steps.get(unravel_key(("next", key)), None)) for key in keys]
-    if any(following is None for _, following in pairs):
+    if any(steps.get(unravel_key(("next", key)), None) is None for key in keys):
         if not known or (steps.ndim == 1 and steps.names[0] != "time"):
             raise ValueError(
                 "nothing tells where slices of these steps begin: store the next observations too, "
                 'or reshape the steps to [slices, steps] and store ("next", "done")'
             )
         return breaks
-    for now, following in pairs:
-        now, after = (
-            now.narrow(time, 1, now.shape[time] - 1),
-            following.narrow(time, 0, now.shape[time] - 1),
-        )
-        differs = (now != after) & ((now == now) | (after == after))  # NaN differs from itself
-        breaks[..., 1:] |= differs.unsqueeze(-1).flatten(time + 1).any(-1)
+    now, following = steps.select(*keys), steps["next"].select(*keys)
+    breaks[..., 1:] = ~same_observations(now[..., 1:], following[..., :-1])
     inside = ~starts
     if (breaks & inside).sum() > (inside.sum() / 2):
         raise ValueError(

@@ -24,8 +24,9 @@ from torchrl_tit.analysis import (
     outer_attention,
 )
 from torchrl_tit.analysis.layers import image_layers
-from torchrl_tit.analysis.targets import evaluating, find_network, histories_of, run_policy
+from torchrl_tit.analysis.targets import find_network, histories_of, run_policy
 from torchrl_tit.evaluation import evaluate
+from torchrl_tit.networks.building import evaluating
 
 from .explained_page import Choice, ExplainedStep, Page, Seen
 from .film import FILMS, make_rendered, new_film, take_picture

@@ -20,9 +20,10 @@ from torch import Tensor
 from torchrl_tit.agents import TrainedAgent
 from torchrl_tit.analysis import Target, inner_attention, outer_weights
 from torchrl_tit.analysis.layers import patch_grid
-from torchrl_tit.analysis.targets import evaluating, find_network, histories_of
+from torchrl_tit.analysis.targets import find_network, histories_of
 from torchrl_tit.files import whole_or_not_at_all
 from torchrl_tit.networks import HistoryNetwork
+from torchrl_tit.networks.building import evaluating
 
 from .explained_page import Seen, as_picture, lay_over
 from .explanation import Explainer, MapKind, play_steps

@@ -215,7 +215,7 @@ def test_bad_settings_in_one_line(tmp_path, capsys):
         (data, "--env-settings", "low=[-1]", "high=[1]"): r"one row has the shape \[2\], but in",
         (data, "--env-settings", "observation_shape=5", "low=1", "high=2"): "its spaces: .*'int'",
         (data, "--env-settings", "speed=3"): "consists of its spaces: .*'speed'",
-        (data, "--wrappers", "gymnasium.wrappers:ClipAction"): "nothing to wrap",
+        (data, "--wrappers", "gymnasium.wrappers:ClipAction"): "read in one way",
     }.items():
         assert re.search(message, fails(capsys, *words, *further))
     with pytest.raises(ValueError, match="needs an environment"):
