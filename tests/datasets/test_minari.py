@@ -323,12 +323,3 @@ def test_targets_that_cannot_be_written(
     with pytest.raises(ValueError, match="'Hoper-v5' cannot be made"):
         write_minari(episodes, tmp_path / "b-v0", "Hoper-v5")
     assert [path.name for path in tmp_path.iterdir()] == ["a-v0"]
-
-
-def test_a_truncation_within_an_episode_is_refused(rolled: Transitions, folder: Path) -> None:
-    make_walk(rolled)
-    with h5py.File(folder / "main_data.hdf5", "a") as file:
-        file["episode_1/truncations"][0] = True
-    start = spans(rolled)[1][0]
-    with pytest.raises(DatasetError, match=f"row {start}: ends the episode, but more steps follow"):
-        load_episodes(NAME)
