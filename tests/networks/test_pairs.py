@@ -382,20 +382,6 @@ def test_vmap_over_stacked_parameters(case: Pair) -> None:
     torch.testing.assert_close(torch.vmap(call)(*state), expected)
 
 
-@pytest.mark.filterwarnings("ignore:There is a performance drop")
-@pytest.mark.parametrize("kind", ["attention_dropout", "ffn_dropout"])
-@pytest.mark.parametrize("part", ["inner", "outer"])
-def test_vmap_drops_differently_for_each(kind: str, part: str) -> None:
-    dropout: dict[str, Any] = {f"{kind}_{part}": 0.5}
-    modules = [EnhancedTIT((5,), 3, patch_size=2, **dropout) for _ in range(2)]
-    modules[1].load_state_dict(modules[0].state_dict())
-    history = torch.randn(4, 3, 5)
-    first, second = torch.vmap(
-        lambda p, b: functional_call(modules[0], (p, b), (history,)), randomness="different"
-    )(*stack_module_state(modules))
-    assert not torch.allclose(first, second)
-
-
 def test_two_trunks_read_sequences_and_act_apart() -> None:
     case = ("flat", "d2rl", "several")
     network = build(case, trunks="separate").double()

@@ -138,20 +138,6 @@ def test_outputs_and_gradients(network: str, case: str) -> None:
 
 
 @pytest.mark.parametrize("network", NETWORKS)
-def test_memory_layout_does_not_matter(network: str) -> None:
-    shape, num_frames, settings = CASES["wide image of three channels"]
-    ours, _ = make_pair(network, shape, num_frames, **settings)
-    history = torch.randn(3, num_frames, *shape)
-    expected = ours(history)
-    channels_last = history.permute(0, 1, 3, 4, 2).contiguous().permute(0, 1, 4, 2, 3)
-    step_last = history.movedim(1, -1).contiguous().movedim(-1, 1)
-    window = torch.randn(3, num_frames + 3, *shape)[:, 2:-1].copy_(history)
-    for other in (channels_last, step_last, window):
-        assert not other.is_contiguous()
-        assert_near(ours(other), expected)
-
-
-@pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("leading", [(), (2, 3), (0,)])
 @pytest.mark.parametrize(
     "case", ["array, K=1", "array, K=4", "three blocks", "shared blocks", "image", "P = D"]
@@ -186,19 +172,6 @@ def test_attention_maps(network: str, leading: tuple[int, ...], case: str) -> No
             num_frames,
         )
         assert not weights.triu(1).any(), "a step sees a later one"
-
-
-def test_usual_pass_computes_no_attention_maps(monkeypatch: pytest.MonkeyPatch) -> None:
-    tit = EnhancedTIT((8, 8), 3, patch_size=4)
-
-    def never(*_: object, **__: object) -> None:
-        raise AssertionError("attention weights were computed")
-
-    for name in ("weights", "_weights"):
-        monkeypatch.setattr(f"torchrl_tit.layers.attention.SelfAttention.{name}", never)
-    tit(torch.randn(2, 3, 8, 8))
-    with pytest.raises(AssertionError, match="were computed"):
-        tit.attention_maps(torch.randn(2, 3, 8, 8))
 
 
 @pytest.mark.parametrize("network", ["vanilla", "enhanced"])
