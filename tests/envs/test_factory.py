@@ -117,13 +117,3 @@ def test_each_warning_is_shown_once(
         env.close()
     assert sum(MESSAGE in record.getMessage() for record in caplog.records) == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_a_handler_of_the_users_own_stays(
-    handler: Callable[[Callable[[str], None] | None], None],
-) -> None:
-    seen: list[str] = []
-    own = seen.append
-    handler(own)
-    make_env("Hopper-v5").close()
-    assert mujoco.get_mju_user_warning() is own

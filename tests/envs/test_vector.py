@@ -93,16 +93,6 @@ def test_a_partial_reset_keeps_the_others(num_frames):
         assert not torch.equal(after[key][1], before[key][1])
 
 
-def test_what_was_written_is_never_written_again():
-    env = make_env("CartPole-v1", 2, seed=0, num_frames=3)
-    root, kept = env.reset(), []
-    for _ in range(30):
-        step, root = env.step_and_maybe_reset(env.rand_action(root))
-        kept.append((step, step.clone()))
-    for written, copy in kept:
-        assert_close(written, copy, 0, 0)
-
-
 def test_actions_are_clipped_on_their_way_only():
     env = make_env("Pendulum-v1", 1, clip_actions=True)
     root = env.reset(seed=0).set("action", torch.full((1, 1), 7.0))

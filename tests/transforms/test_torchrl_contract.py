@@ -123,13 +123,3 @@ def test_sequences_are_made_in_environments_only() -> None:
     buffer.extend(stored)
     with pytest.raises(NotImplementedError, match="SequenceHistory"):
         buffer.sample()
-
-
-@pytest.mark.parametrize("name", ONLINE)
-def test_copies_join_other_environments(name: str) -> None:
-    env = transformed(name)
-    env.rollout(4)
-    copy = env.transform.clone()
-    assert copy is not env.transform
-    assert copy.parent is None
-    check_env_specs(TransformedEnv(task(), copy))
