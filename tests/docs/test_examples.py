@@ -45,24 +45,6 @@ def test_gradients_reach_the_backbone_and_targets_follow(example, short, dropout
     )
 
 
-@pytest.mark.parametrize(
-    ("example", "short"), [(sac, {"steps": 50}), (iql, {"updates": 3})], ids=["sac", "iql"]
-)
-def test_critics_are_stacked_and_start_as_they_were_built(example, short):
-    loss = example.main(**short)
-    stacked = {
-        name: parameter
-        for name, parameter in loss.named_parameters()
-        if name.startswith("qvalue_network_params") and "frame_encoder" in name
-    }
-    assert all(parameter.shape[0] == 2 for parameter in stacked.values())
-    assert any(not torch.equal(parameter[0], parameter[1]) for parameter in stacked.values())
-    layers = [w for name, w in stacked.items() if "ffn" in name and name.endswith("weight")]
-    assert layers
-    for layer in layers:  # drawn anew, they would be spread more than twice as far
-        assert layer.std().item() == pytest.approx(0.02, rel=0.1)
-
-
 @pytest.mark.parametrize("dropout", [0.0, 0.1])
 def test_ppo_trains_the_backbone_before_its_heads(dropout):
     backbone, loss = ppo.main(steps=512, dropout=dropout)
