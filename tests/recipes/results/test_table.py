@@ -314,14 +314,6 @@ def test_what_differs_from_the_recipe_is_noted(tmp_path):
     ]
 
 
-def test_runs_without_schedules_may_have_any_length(tmp_path):
-    name = "ppo/cartpole/vanilla-tit-protocol"
-    run = Run.open(write_run(tmp_path / "run", name, 0, [20.0], total_steps=2048))
-    run.save(2048, {"networks": {}})
-    run.lengthen(4096)
-    assert run.earlier_lengths() == []
-
-
 @pytest.mark.parametrize("text", ["[[1024]]", "1024", '[["many", 1024]]', ""])
 def test_damaged_lengths_are_named(tmp_path, text):
     folder = write_run(tmp_path / "run", MLP, 0, [20.0])
