@@ -10,7 +10,6 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from recipes.cli import main
@@ -204,27 +203,6 @@ def test_a_damaged_or_older_recipe_is_named(text, reason, tmp_path, capsys):
     assert contents(run.folder) == before
 
 
-def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(run):
-    recipe = replace(SMALL, total_steps=192, steps_per_batch=96, checkpoint_interval=10**6)
-    with run:
-        runner.train(recipe, run)
-    assert latest_step(run.checkpoints) == 224
-
-
-def test_no_episode_ends_at_all(tmp_path):
-    run = train(replace(SMALL, env="Pendulum-v1"), tmp_path / "run")
-    rows = read_metrics(run.folder / "metrics.csv")
-    assert [row["episodes"] for row in rows] == [0, 0]
-    assert np.isnan([row["return_mean"] for row in rows]).all()
-    plot_run(run)
-    assert run.curve.read_bytes().startswith(b"\x89PNG")
-
-
-def test_fewer_steps_than_a_batch_are_one_batch(tmp_path):
-    run = train(replace(SMALL, total_steps=1), tmp_path / "run")
-    assert latest_step(run.checkpoints) == 64
-
-
 @pytest.mark.parametrize(
     ("poison", "message"),
     [
@@ -309,22 +287,6 @@ def test_of_two_that_begin_at_once_one_gets_the_folder(tmp_path, monkeypatch):
     Run.create(folder, SMALL)
     assert refused
     assert Run.open(folder).recipe == SMALL
-
-
-def test_the_second_looks_again_once_it_has_the_folder(tmp_path, monkeypatch):
-    folder, checks = tmp_path / "run", list[object]()
-    check = Run.check_new
-
-    def made_meanwhile(path):
-        check(path)
-        if not checks:  # after the first look, another process makes the run
-            checks.append(path)
-            Run.create(folder, replace(SMALL, seed=1))
-
-    monkeypatch.setattr(Run, "check_new", made_meanwhile)
-    with pytest.raises(FileExistsError, match="exists already"):
-        Run.create(folder, SMALL)
-    assert Run.open(folder).recipe.seed == 1
 
 
 def test_a_run_in_use_is_evaluated_into_another_file_only(tmp_path, capsys):

@@ -211,18 +211,6 @@ def test_every_entry_of_an_action_must_reach_as_far_as_the_heads(tmp_path):
         make_algorithm(make_dt(tmp_path, env="tests/Lopsided-v0"))
 
 
-def test_whole_atari_games_need_as_many_time_steps(tmp_path):
-    pytest.importorskip("ale_py")
-    settings: dict[str, Any] = {"env": "ALE/Pong-v5", "action_space": "discrete"}
-    recipe = make_dt(tmp_path, backbone=dt_tit(**SMALL_DT, patch_size=42), **settings)
-    with pytest.raises(ValueError, match="Pong-v5 have up to 27000 steps, but max_ep_len is 1000"):
-        make_algorithm(recipe)
-    backbone = dt_tit(**SMALL_DT, patch_size=42, max_ep_len=27_000)
-    algorithm = make_algorithm(make_dt(tmp_path, backbone=backbone, **settings))
-    state = algorithm.make_env(2).reset()
-    assert algorithm.policy(state)["action"].shape == (2,)
-
-
 def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):
     """The last one, which the data break off in, is left out."""
     arrays = roll(max_episode_steps=15)

@@ -25,7 +25,7 @@ optuna = pytest.importorskip("optuna")
 
 from recipes.tools.sweeps import tune  # noqa: E402
 from recipes.tools.sweeps.search_space import load_space, with_values  # noqa: E402
-from recipes.tools.sweeps.tune import Search, Settings, importances, why_no_importances  # noqa: E402
+from recipes.tools.sweeps.tune import Search, Settings  # noqa: E402
 
 RECIPE = replace(TINY, name="ppo/cartpole/mine", backbone=mlp(), total_steps=256)
 SPACE: dict[str, Any] = {
@@ -361,21 +361,3 @@ def test_fields_are_options_and_a_missing_table_of_importances_is_explained(
     assert recipe.backbone.history.name == "lstm"
     assert "other settings" in fails(capsys, *words(files, 2))  # without these fields
     assert "--evn" in fails(capsys, *words(files, 2), "--evn", "Acrobot-v1")
-
-
-@pytest.mark.parametrize("value", [lambda rate: 100 * rate, lambda rate: 1.0])
-def test_the_field_that_decides_is_the_most_important(value):
-    study = optuna.create_study(direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
-    for _ in range(30):
-        trial = study.ask()
-        rate = trial.suggest_float("learning_rate", 0, 1)
-        trial.suggest_int("epochs", 1, 9)
-        study.tell(trial, value(rate))
-    shares = importances(study)
-    if value(0) == value(1):
-        assert shares == {}
-        assert why_no_importances(study) == "all complete trials have the same value"
-        return
-    assert list(shares) == ["learning_rate", "epochs"]
-    assert shares["learning_rate"] > 0.6
-    assert sum(shares.values()) == pytest.approx(1)
