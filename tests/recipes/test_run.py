@@ -29,10 +29,7 @@ from torchrl_tit.checkpoint import latest_step
 from torchrl_tit.settings.networks import enhanced_tit
 
 SMALL = replace(
-    TINY,
-    name="ppo/cartpole/small",
-    backbone=enhanced_tit(embed_dim=8, features_dim=8),
-    num_envs=2,
+    TINY, name="ppo/cartpole/small", backbone=enhanced_tit(embed_dim=8, features_dim=8), num_envs=2
 )
 LONG = replace(SMALL, total_steps=64 * 400)
 BACKBONE = settings_to_dict(SMALL.backbone)
@@ -168,7 +165,6 @@ def test_a_damaged_list_of_imports_does_not_hide_the_reason(tmp_path):
     [
         {"env": "Acrobot-v1"},
         {"backbone": {**BACKBONE, "frame": {"encoder": "inner", "embed_dim": 16}}},
-        {"backbone": {**BACKBONE, "frame": {"encoder": "linear", "embed_dim": 8}}},
         {"backbone": {**BACKBONE, "trunks": "separate"}},
         {"backbone": {**BACKBONE, "num_frames": 2}},  # whose weights would fit
     ],
@@ -187,8 +183,8 @@ def test_an_edited_recipe_that_no_longer_fits_changes_nothing(fields, run, capsy
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        *((text, "") for text in (b"\xff\xfe{", b"[" * 100_000, b"{}", b"null", b"", b"[]", b"{")),
-        *((b'{"algorithm": %s}' % text, "") for text in (b"1", b'["ppo"]')),
+        *((text, "") for text in (b"\xff\xfe{", b"[" * 100_000, b"{}", b"[]")),
+        (b'{"algorithm": ["ppo"]}', ""),
         (b'{"algorithm": "ppo", "backbone": {"network": "enhanced-tit"}}', "unknown field"),
     ],
 )
@@ -208,7 +204,6 @@ def test_a_damaged_or_older_recipe_is_named(text, reason, tmp_path, capsys):
     [
         ({"critic_coeff": float("inf")}, "loss_critic became inf"),
         ({"learning_rate": 1e30}, "weights became (inf|nan)"),
-        ({"learning_rate": 1e30, "minibatch_size": 64}, "weights became (inf|nan)"),  # at the end
     ],
 )
 def test_what_explodes_is_never_saved(poison, message, tmp_path):

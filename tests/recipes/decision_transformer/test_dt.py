@@ -17,13 +17,7 @@ from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
 from recipes.decision_transformer import check_data
 from tests.datasets.rollouts import roll, write
-from tests.recipes.small import (
-    SMALL_DT,
-    make_algorithm,
-    make_dt,
-    make_odt,
-    train,
-)
+from tests.recipes.small import SMALL_DT, make_algorithm, make_dt, make_odt, train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import (
     SequenceStorage,
