@@ -7,12 +7,7 @@ import pytest
 import torch
 
 from benchmarks import cue_attention
-from benchmarks.cue_attention import (
-    Decision,
-    main,
-    measure_decisions,
-    to_markdown,
-)
+from benchmarks.cue_attention import Decision, main, measure_decisions, to_markdown
 from recipes.ppo import PPO
 from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit

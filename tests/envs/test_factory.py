@@ -19,10 +19,7 @@ from torchrl_tit.settings.imports import import_allowed
         ("CartPole-v7", "'CartPole-v7'; did you mean .*CartPole-v1"),
         ("cartpole-v1", "'cartpole-v1'; did you mean .*CartPole-v1"),
         ("Hoper-v5", "'Hoper-v5'; did you mean Hopper-v5"),
-        (
-            "xyzzy",
-            "'xyzzy'; .* of a module of yours is module:Name-v0, an Atari game ALE/Pong-v5",
-        ),
+        ("xyzzy", "'xyzzy'; .* of a module of yours is module:Name-v0, an Atari game ALE/Pong-v5"),
     ],
 )
 def test_unknown_names(name, words):

@@ -14,15 +14,7 @@ from torchrl.envs.utils import check_env_specs
 from tests.envs.reference import wrapped
 from torchrl_tit.envs import GymVectorEnv, make_env
 
-WRITTEN = (
-    "observation",
-    "history",
-    "episode_reward",
-    "reward",
-    "terminated",
-    "truncated",
-    "done",
-)
+WRITTEN = ("observation", "history", "episode_reward", "reward", "terminated", "truncated", "done")
 
 
 def vector(mode=AutoresetMode.DISABLED):

@@ -3,14 +3,7 @@
 import pytest
 import torch
 from torch.nn import functional as F
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
-    Composite,
-    MultiCategorical,
-    Unbounded,
-)
+from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategorical, Unbounded
 
 from torchrl_tit import settings
 from torchrl_tit.frames import Observation, read_observation, read_observations

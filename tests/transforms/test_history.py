@@ -7,10 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
-from torchrl.envs import (
-    Compose,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.transforms.streams import StreamEnv, assert_histories
