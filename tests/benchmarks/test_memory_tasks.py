@@ -11,11 +11,9 @@ from benchmarks import memory_tasks, memory_variants
 from benchmarks.measuring import read_rows
 from benchmarks.memory_pictures import main
 from benchmarks.memory_tasks import EPISODES, Successes
-from recipes.core import runner
 from recipes.core.algorithm import make_algorithm
 from recipes.core.recipe_json import recipe_to_json
 from recipes.core.registry import find_recipe, get_recipe
-from recipes.core.run import Run
 
 NAME = "ppo/tmaze-10/frames-4"
 SHORT: dict[str, Any] = {
@@ -63,26 +61,6 @@ def test_training_ends_where_the_task_is_solved(short, tmp_path, monkeypatch):
     assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
 
 
-def test_a_stopped_run_goes_on(short, tmp_path):
-    recipe = memory_tasks.find_recipe(NAME)
-
-    class Stopped(Exception):
-        pass
-
-    class Stop(Successes):
-        def saved(self, step):
-            if step == 256:
-                raise Stopped
-
-    with Run.create(tmp_path / "run", recipe) as run, pytest.raises(Stopped):
-        runner.train(recipe, run, [Stop(run.folder / "successes.csv", 0, 0.0)])
-    memory_tasks.measure(recipe, tmp_path / "run", 0.0)
-    memory_tasks.measure(recipe, tmp_path / "whole", 0.0)
-    stopped, whole = (read_rows(tmp_path / name / "successes.csv") for name in ("run", "whole"))
-    assert [row["step"] for row in stopped] == [row["step"] for row in whole]
-    assert stopped[:2] == whole[:2]  # then with new episodes
-
-
 def test_when_nine_in_ten_are_reached(tmp_path):
     successes = Successes(tmp_path / "successes.csv", 0, 0.0)
     # Over the last three batches: 70, 80, 89 and 90 %.
@@ -91,21 +69,6 @@ def test_when_nine_in_ten_are_reached(tmp_path):
     successes.batches.append((6, 40, 36))
     assert successes.reached() == 6
     assert EPISODES == 500
-
-
-def test_the_table_has_a_row_a_recipe():
-    columns = memory_tasks.COLUMNS
-    rows = [
-        ["a", "0", "9", "500", "1000", "1.0", "0.5"],
-        ["b", "0", "7", "500", "", "0.4", "0.2"],
-        ["a", "1", "9", "500", "3000", "0.8", "0.5"],
-        ["b", "1", "7", "500", "2000", "0.4", "0.2"],
-    ]
-    table = memory_tasks.to_markdown([dict(zip(columns, row, strict=True)) for row in rows])
-    assert table.splitlines()[2:] == [
-        "| a | 9 | 2 | 0.9 | 0.5 | 2 |",
-        "| b | 7 | 2 | 0.4 | 0.2 | 2, not by 1 of 2 |",
-    ]
 
 
 LARGER = ("frames-32", "tiles-of-28-pixels")

@@ -147,15 +147,16 @@ def test_a_gaussian_is_its_mean_and_standard_deviation_times_noise():
     assert outputs["action"][1] == 2  # clipped as on the way to the task
 
 
-def test_a_policy_that_differs_is_noticed():
+@pytest.mark.parametrize(("factor", "by"), [(1 + 1e-4, r"\d\.\de-0"), (torch.nan, "inf")])
+def test_a_policy_that_differs_is_noticed(factor, by):
     policy, task = make_policy()
     program = program_of(policy, task)
 
     def run(inputs):
         outputs = program(inputs)
-        return {**outputs, "logits": outputs["logits"] * (1 + 1e-4)}
+        return {**outputs, "logits": outputs["logits"] * factor}
 
-    with pytest.raises(NotTheSameError, match=r"differs from the live one by \d\.\de-0"):
+    with pytest.raises(NotTheSameError, match=f"differs from the live one by {by}"):
         compare(run, program, policy, task(COPIES))
 
 
