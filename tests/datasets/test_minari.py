@@ -251,7 +251,7 @@ def _retype(field: str, add: float, dtype: type) -> Callable[[h5py.Group], None]
         (_set("observations", 3, np.inf), "field '(next_)?observations', row {[23]}: is inf"),
         (_set("actions", 1, -2.0), "field 'actions', row {1}: is -2.0, but the task's"),
         (_set("terminations", 0, True), "field 'terminals', row {0}: ends the episode, but"),
-        (_set("truncations", 0, True), "field 'timeouts', row {0}: ends the episode, but"),
+        (_set("truncations", 0, True), "field 'terminals', row {0}: ends the episode, but"),
         (
             _retype("rewards", 1e300, np.float64),
             "episode 1: field 'rewards': has the dtype float64",
