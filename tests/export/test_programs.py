@@ -147,14 +147,20 @@ def test_a_gaussian_is_its_mean_and_standard_deviation_times_noise():
     assert outputs["action"][1] == 2  # clipped as on the way to the task
 
 
-@pytest.mark.parametrize(("factor", "by"), [(1 + 1e-4, r"\d\.\de-0"), (torch.nan, "inf")])
-def test_a_policy_that_differs_is_noticed(factor, by):
-    policy, task = make_policy()
+@pytest.mark.parametrize(
+    ("name", "output", "factor", "by"),
+    [
+        ("CartPole-v1", "logits", 1 + 1e-4, r"\d\.\de-0"),
+        ("Pendulum-v1", "action", torch.nan, "inf"),
+    ],
+)
+def test_a_policy_that_differs_is_noticed(name, output, factor, by):
+    policy, task = make_policy(name)
     program = program_of(policy, task)
 
     def run(inputs):
         outputs = program(inputs)
-        return {**outputs, "logits": outputs["logits"] * factor}
+        return {**outputs, output: outputs[output] * factor}
 
     with pytest.raises(NotTheSameError, match=f"differs from the live one by {by}"):
         compare(run, program, policy, task(COPIES))
