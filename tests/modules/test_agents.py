@@ -48,7 +48,7 @@ def test_agents_are_read_as_if_alone(make: Any) -> None:
     tit = EnhancedTIT((2,), num_frames=4, temporal_positions="learned").double()
     randomize(tit)
     rollout = env.rollout(27, break_when_any_done=False)  # episodes end after 20
-    batch = rollout.apply(lambda x: x.double() if x.is_floating_point() else x)
+    batch: Any = rollout.apply(lambda x: x.double() if x.is_floating_point() else x)
     batch = torch.stack([batch[0, :22], batch[1, 5:]])  # where episodes begin at another step
     assert batch[HISTORY].shape == (2, 22, 3, 4, 2)
     together, alone = Backbone(tit, [HISTORY]), Backbone(tit)
