@@ -120,7 +120,10 @@ def test_nothing_depends_on_checkpoints_and_evaluations(kind: str, tmp_path: Pat
 
 def starts_of(batch: Any) -> list[tuple[float, ...]]:
     """The first observation of each copy."""
-    return [tuple(start.tolist()) for start in batch["observation"][:, 0]]
+    observation = batch["observation"]
+    if not isinstance(observation, torch.Tensor):
+        observation = torch.cat([*observation.values()], -1)
+    return [tuple(start.tolist()) for start in observation[:, 0]]
 
 
 @pytest.mark.parametrize("kind", KINDS)
