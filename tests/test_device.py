@@ -79,10 +79,10 @@ PADDINGS: list[Any] = ["same", "constant"]
 READS = ["steps", *PADDINGS, "observations", *(["histories"] if COMPUTES else [])]
 # TorchRL's GRUModule looks whether an episode begins.
 MEMORIES = ("lstm", "mingru", "gated-deltanet", "mamba2", *(["gru"] if COMPUTES else []))
-CARRIED = [case for case in pairs.CASES if case[1] in MEMORIES]
+CARRIED = [case for case in pairs.APART if case[1] in MEMORIES]
 
 
-@pairs.every_case
+@pairs.apart
 def test_networks_read_steps_and_sequences(case: pairs.Pair) -> None:
     network = pairs.build(case)
     there = copy.deepcopy(network).to(DEVICE)
@@ -117,7 +117,7 @@ def test_outer_blocks_read_tables_of_frames(positions: Any) -> None:
     check(network, result, expected)
 
 
-ACTING = [*((case, 3) for case in pairs.CASES), *((case, 1) for case in CARRIED)]
+ACTING = [*((case, 3) for case in pairs.APART), *((case, 1) for case in CARRIED)]
 
 
 @pytest.mark.parametrize(("case", "frames"), ACTING, ids=str)
@@ -153,12 +153,7 @@ def test_maps_and_masked_predictions() -> None:
     assert {x.device.type for x in [*maps.inner, *maps.outer, targets]} == {DEVICE.type}
 
 
-MASKABLE = [
-    Categorical(3),
-    OneHot(3),
-    MultiCategorical([2, 3]),
-    MultiOneHot([2, 3]),
-]
+MASKABLE = [Categorical(3), OneHot(3), MultiCategorical([2, 3]), MultiOneHot([2, 3])]
 # Whether a mask allows an action is checked by its values.
 HEADS = [(spec, False) for spec in [*MASKABLE, Binary(4), Unbounded((2, 3))]]
 HEADS += [(spec, True) for spec in MASKABLE if COMPUTES]

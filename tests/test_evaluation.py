@@ -198,19 +198,3 @@ def test_a_reward_that_is_not_finite_is_named(now):
 
 def go(tensordict):
     return tensordict.set("action", torch.zeros(tensordict.shape, dtype=torch.int64))
-
-
-@pytest.mark.parametrize("mode", ["sync", "async"])
-def test_the_number_of_threads_stays(mode, monkeypatch):
-    """TorchRL raises it when it closes copies of its environments."""
-    monkeypatch.setattr("torchrl._THREAD_POOL_INIT", 4)
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        env = make_env("torchrl.envs:PendulumEnv", 2, max_episode_steps=2, vectorization_mode=mode)
-        evaluate(env, lambda step: env.rand_action(step), episodes=2)
-        assert torch.get_num_threads() == 2
-        env.close()
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)

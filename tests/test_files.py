@@ -39,10 +39,7 @@ def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     message = r"notes.txt cannot be written: .*missing$"
     with pytest.raises(FileNotFoundError, match=message):
         files.write_text_atomic(target, "new")
-    with (
-        pytest.raises(FileNotFoundError, match=message),
-        files.whole_or_not_at_all(target),
-    ):
+    with pytest.raises(FileNotFoundError, match=message), files.whole_or_not_at_all(target):
         raise AssertionError("nothing is made")
 
 

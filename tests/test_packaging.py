@@ -17,7 +17,6 @@ import yaml
 from packaging.requirements import Requirement
 from packaging.utils import NormalizedName, canonicalize_name
 
-from docs.tools import release
 from torchrl_tit.extras import EXTRAS
 
 ROOT = Path(__file__).parents[1]
@@ -142,39 +141,6 @@ def test_version_is_the_same_everywhere(metadata: Message) -> None:
     assert {metadata["Version"], citation["version"], newest[1]} == {PROJECT["version"]}
 
 
-def test_workflows_call_targets_that_there_are() -> None:
-    targets = {*re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)}
-    called = set()
-    for path in (ROOT / ".github" / "workflows").glob("*.yml"):
-        for job in yaml.safe_load(path.read_text())["jobs"].values():
-            runs = [step["run"] for step in job["steps"] if "run" in step]
-            called |= {run.split()[1] for run in runs if run.startswith("make ")}
-    assert called == {"test", "docs", "release"}
-    assert called <= targets
-
-
-def test_notes_of_a_release_are_its_section_of_the_changelog() -> None:
-    changelog = "# Changelog\n\n## [0.2.0] - unreleased\n\nnew\n\n## [0.1.0] - 2026\n\nold\n"
-    assert release.notes(changelog, "0.2.0") == "new\n"
-    assert release.notes(changelog, "0.1.0") == "old\n"
-    with pytest.raises(ValueError, match=r"no section \[0.3.0\]"):
-        release.notes(changelog, "0.3.0")
-
-
-def test_a_release_names_what_it_leaves_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in (f"torchrl_tit-{PROJECT['version']}-py3-none-any.whl", "torchrl_tit.tar.gz"):
-        (tmp_path / name).touch()
-    monkeypatch.delenv("PROJECT_URL", raising=False)
-    with pytest.raises(SystemExit, match="none of python0 can be used"):
-        release.main([str(tmp_path), "--pythons", "python0"])
-    printed = capsys.readouterr().out
-    for words in ("python0: there is no such program", "tests of the sdist", "addresses"):
-        assert re.search(rf"^skipped: .*{words}", printed, re.MULTILINE), words
-    assert (tmp_path / "notes.md").stat().st_size > 1000
-
-
 def test_every_direct_dependency_is_pinned_within_its_range() -> None:
     lines = (ROOT / "constraints.txt").read_text().splitlines()
     pins = dict(line.split("==") for line in lines if line and not line.startswith("#"))
@@ -201,13 +167,6 @@ def test_no_module_imports_recipes_by_its_name_in_a_clone(folder: str) -> None:
     names = re.compile(r"(torchrl_tit\.)?recipes\b")
 
     assert [(p, name) for p, name in _absolute_imports(folder) if names.match(name)] == []
-
-
-def test_the_library_requires_no_more_than_it_needs() -> None:
-    assert {Requirement(r).name for r in PROJECT["dependencies"]} == {
-        *("torch", "torchrl", "tensordict", "gymnasium", "mujoco", "imageio", "numpy"),
-        *("safetensors", "msgspec"),
-    }
 
 
 def test_every_package_of_an_extra_is_known_by_it() -> None:

@@ -11,8 +11,6 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from recipes.bc import BC
-from recipes.cli import main
 from recipes.iql import IQL
 from recipes.offline import with_spaces
 from recipes.ppo import PPO
@@ -101,13 +99,6 @@ def test_missing_values_are_held(tmp_path):
         agent.act(np.zeros(4))
 
 
-def test_several_observations(tmp_path):
-    agent = made("blackjack", tmp_path)
-    action = agent.act({"0": [12], "1": [3], "2": [0]})
-    assert action in (0, 1)
-    agent.act(None)
-
-
 def test_an_agent_without_an_environment(tmp_path):
     recipe = IQL(
         dataset=str(log_machine(tmp_path / "log.hdf5", actions=np.full((200, 2), [0.0, 70.0]))),
@@ -148,14 +139,3 @@ def test_a_file_acts_as_its_agent(tmp_path, name):
             found = exported.act(frames, reward=1.0)
             assert found.dtype == expected.dtype
             np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
-
-
-def test_a_file_of_an_agent_without_an_environment(tmp_path):
-    pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnxscript")
-    recipe = BC(dataset=str(log_machine(tmp_path / "log.hdf5")), backbone=tit(3), total_updates=2)
-    run, file = train(with_spaces(recipe), tmp_path / "run"), tmp_path / "agent.onnx"
-    main(["export", str(run.folder), "--out", str(file), "--step-by-step"])
-    agent, exported = load_agent(run.folder), runpy.run_path(str(EXAMPLE))["Agent"](str(file))
-    for frame in np.random.default_rng(0).normal(size=(6, 5)):
-        np.testing.assert_allclose(exported.act(frame), agent.act(frame), rtol=1e-3, atol=1e-5)

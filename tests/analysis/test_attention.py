@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
-from torch.nn import functional as F
 
 from tests.analysis.policies import IMAGE, IMAGE_NETWORKS
 from tests.numerics import assert_near
 from torchrl_tit.analysis import inner_attention, map_attention, outer_attention, roll_out
-from torchrl_tit.layers.attention import SelfAttention
 from torchrl_tit.networks import DecisionTransformer, HistoryNetwork, build_network
 from torchrl_tit.networks.history_network import TwoTrunks
-from torchrl_tit.settings.networks import enhanced_tit, mlp
+from torchrl_tit.settings.networks import mlp
 
 pytestmark = pytest.mark.numerics
 
@@ -92,28 +88,6 @@ def test_decision_transformer() -> None:
         assert not weights.triu(1).any(), "a step reads a later one"
 
 
-@pytest.mark.usefixtures("float64")
-def test_decision_transformers_weights_are_those_that_it_uses() -> None:
-    network = DecisionTransformer((4,), action_dim=2, num_frames=3, embed_dim=8, num_blocks=1)
-    network.eval()
-    attention = network.history_encoder.get_submodule("blocks.0.attention")
-    assert isinstance(attention, SelfAttention)
-    seen: list[Any] = []
-    attention.register_forward_hook(lambda module, inputs, output: seen.append((inputs, output)))
-    inputs = [torch.randn(1, 3, 4), torch.randn(1, 3, 2), torch.randn(1, 3, 1)]
-    inputs.append(torch.arange(3).unsqueeze(0))
-    network(*inputs)
-    (((x, _, mask), output),) = seen
-    assert mask.tril().equal(mask)
-    weights = attention.weights(x, mask)[:, 0]  # of the only head
-    values = F.linear(x, attention.in_proj_weight[16:], attention.in_proj_bias[16:])
-    assert_near(attention.out_proj(weights @ values)[:, -1:].detach(), output.detach())
-    # Return, state and action of the first two steps, return and state of the newest one.
-    newest = weights[0, -1].detach()
-    expected = torch.stack([newest[:3].sum(), newest[3:6].sum(), newest[6:].sum()])
-    assert_near(outer_attention(network, *inputs)[0, 0, 0], expected)
-
-
 def test_networks_without_attention() -> None:
     with pytest.raises(ValueError, match="no attention over the parts of an observation"):
         inner_attention(build("resnet"), torch.rand(3, *IMAGE))
@@ -127,9 +101,3 @@ def test_networks_without_attention() -> None:
     assert isinstance(trunks, TwoTrunks)
     with pytest.raises(ValueError, match="MLP has no attention over time"):
         outer_attention(trunks.policy, torch.rand(1, 4))
-
-
-def test_arrays_have_a_row_of_patches() -> None:
-    network = build_network(enhanced_tit(2, patch_size=2), (5,))
-    assert isinstance(network, HistoryNetwork)
-    assert map_attention(network, torch.rand(2, 5))["observation"].shape == (2, 1, 3)

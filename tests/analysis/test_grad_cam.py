@@ -18,11 +18,10 @@ from tests.analysis.policies import (
     make_policy,
 )
 from tests.numerics import assert_near
-from torchrl_tit.analysis import count_flows, grad_cam, map_attention
+from torchrl_tit.analysis import grad_cam
 from torchrl_tit.analysis.layers import image_layers
 from torchrl_tit.analysis.targets import find_network, run_policy
 from torchrl_tit.frames.inner import InnerTransformer
-from torchrl_tit.frames.normalized import NormalizedFrames
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
 pytestmark = pytest.mark.numerics
@@ -89,16 +88,6 @@ def test_against_captum(name: str) -> None:
         assert_near(maps.detach(), expected.detach().reshape(maps.shape))
 
 
-def test_a_frame_that_is_not_seen_has_an_empty_map() -> None:
-    # The newest frame of a network without time: the others cannot matter.
-    network = enhanced_tit(1, patch_size=12, embed_dim=8, features_dim=8)
-    policy, states = make_policy(network, IMAGE), make_images(2, frames=1)
-    assert grad_cam(policy, states)["observation"].any()
-    with torch.no_grad():  # as while acting
-        one = grad_cam(policy, states[1])["observation"]
-    assert_near(one, grad_cam(policy, states)["observation"][1:])
-
-
 def test_two_trunks_several_observations_and_frozen_weights() -> None:
     network = enhanced_tit(2, patch_size="auto", embed_dim=8, features_dim=8)
     observation = {"pixels": (3, 24, 24), "state": (4,)}
@@ -112,22 +101,6 @@ def test_two_trunks_several_observations_and_frozen_weights() -> None:
         assert maps["pixels"].any()
 
 
-def test_continuous_actions_are_explained_by_their_size() -> None:
-    network = enhanced_tit(1, patch_size=12, embed_dim=8, features_dim=8)
-    states = make_images(2, frames=1).exclude("action")
-    for policy in (
-        make_policy(network, IMAGE, continuous=True),
-        make_deterministic_policy(network, IMAGE),
-    ):
-        maps = grad_cam(policy, states, relu=False)["observation"]
-
-        def size(outputs: Any) -> Tensor:
-            return outputs["action"].abs().sum(-1)
-
-        assert maps.any()
-        assert_near(maps, grad_cam(policy, states, target=size, relu=False)["observation"])
-
-
 def test_layers_by_name() -> None:
     policy, states = make_policy(IMAGE_NETWORKS["enhanced"], IMAGE), make_images(1)
     usual = image_layers(find_network(policy))["observation"].name
@@ -137,18 +110,6 @@ def test_layers_by_name() -> None:
     first = grad_cam(policy, states, layer=usual.replace("1.norm1", "0.norm1"))["observation"]
     assert first.shape == named.shape
     assert not torch.allclose(first, named)
-
-
-def test_normalised_frames() -> None:
-    policy, states = make_policy(IMAGE_NETWORKS["enhanced"], IMAGE), make_images(1)
-    states["history"] = states["history"].float() / 255
-    maps = grad_cam(policy, states)["observation"]
-    network = find_network(policy)
-    network.frame_encoders["observation"] = NormalizedFrames(network.frames[0])  # by 0 and 1
-    assert_near(grad_cam(policy, states)["observation"], maps)
-    shares = map_attention(network, states["history"])["observation"]
-    assert shares.shape == maps.shape
-    assert count_flows(network).spatial == 6
 
 
 @pytest.mark.parametrize(

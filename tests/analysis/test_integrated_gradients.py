@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import MultiCategorical
 
-from tests.analysis.policies import ACTIONS, make_deterministic_policy, make_policy
+from tests.analysis.policies import ACTIONS, make_policy
 from tests.numerics import assert_near
 from torchrl_tit.analysis import integrated_gradients
 from torchrl_tit.analysis.targets import compute_target
@@ -65,27 +65,6 @@ def test_baselines_and_chosen_actions() -> None:
     assert not integrated_gradients(policy, states, baselines=same)["observation"].any()
     one = integrated_gradients(policy, states[0])["observation"]
     assert_near(one, integrated_gradients(policy, states)["observation"][:1])
-
-
-@pytest.mark.usefixtures("float64")
-def test_continuous_actions() -> None:
-    pytest.importorskip("captum")
-    network = NETWORKS["enhanced"]
-    for policy in (
-        make_policy(network, OBSERVATION, continuous=True),
-        make_deterministic_policy(network, OBSERVATION),
-    ):
-        states = make_states(network)
-        shares = integrated_gradients(policy, states, steps=500)["observation"]
-        sizes = [
-            policy.eval()(states.clone().set("history", factor * states["history"]))["action"]
-            .detach()
-            .abs()
-            .sum(-1)
-            for factor in (0, 1)
-        ]
-        # The size of an action has a corner where an entry changes its sign.
-        torch.testing.assert_close(shares.sum((1, 2)), sizes[1] - sizes[0], rtol=0, atol=1e-2)
 
 
 def test_bytes_count_as_the_network_reads_them() -> None:

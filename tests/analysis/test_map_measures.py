@@ -31,15 +31,6 @@ def test_objects_have_another_color_than_the_ground() -> None:
     assert not find_objects(frames).any(), "nothing moves"
 
 
-def test_symbols_that_differ_by_one_are_objects() -> None:
-    frames = torch.ones(3, 4, 4, dtype=torch.uint8)  # floor of MiniGrid
-    frames[1, 2, 3] = 2  # a wall
-    frames[:, 0, 0] = 10  # an agent that stands still
-    assert find_objects(frames).nonzero().tolist() == [[1, 2, 3]]
-    frames[:] = 0
-    assert not find_objects(frames).any()
-
-
 def test_share_on_objects() -> None:
     objects = torch.zeros(2, 12, 12, dtype=torch.bool)
     objects[0, :6, :3] = True  # half of a cell, of four

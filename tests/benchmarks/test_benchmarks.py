@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -59,15 +57,6 @@ def test_acting(case):
     ratios = measuring.ratios(row["straightforward_ms"], row["ours_ms"])
     assert row["ours_ratios"] == ratios
     assert len(row.get("ours_growth", [])) == 2 * (case.num_frames == 4)
-
-
-def test_windows_move_on_and_start_anew():
-    case = CASES[0]
-    windows = acting.make_windows(case, 14)
-    for before, after in pairwise(windows):
-        assert torch.equal(before[1:, 1:], after[1:, :-1])
-    assert torch.equal(windows[10][0, :3], windows[10][0, 3:].expand(3, -1))  # a new episode
-    assert not torch.equal(windows[9][0, 1:], windows[10][0, :-1])
 
 
 def test_segments_hold_the_windows_that_the_peers_read():
@@ -153,22 +142,6 @@ def test_bytes_of_what_is_stored():
     ours, stacked = history_windows.bytes_per_step(stream, 4)
     assert stacked == pytest.approx(8 * 84 * 84, rel=0.01)
     assert ours == pytest.approx(84 * 84, rel=0.02)
-
-
-def test_operations_of_matrix_products_are_counted():
-    a = torch.randn(3, 5, requires_grad=True)
-    b = torch.randn(5, 7, requires_grad=True)
-    # The product, and one more for the gradient of each factor.
-    assert measuring.count_flops(lambda: (a @ b).sum().backward()) == 3 * 2 * 3 * 5 * 7
-    assert measuring.peak_flops(16, 16, 16) > 0
-
-
-def test_programs_take_turns():
-    order: list[str] = []
-    steps = {name: partial(order.append, name) for name in "ab"}
-    times = measuring.take_turns(steps, rounds=2, seconds=0)
-    assert order == list("ababab")  # the first pair warms up
-    assert [len(values) for values in times.values()] == [2, 2]
 
 
 def test_rows_are_measured_once(tmp_path, capsys):

@@ -8,10 +8,9 @@ from typing import Any
 import pytest
 
 from benchmarks.figure_claims import FigureClaims, main, measure_figure_claims, to_markdown
-from recipes.core.run import Run
 from recipes.ppo import PPO
 from tests.recipes.untrained import untrained
-from torchrl_tit.settings.networks import enhanced_tit, mlp, resnet
+from torchrl_tit.settings.networks import enhanced_tit, resnet
 
 TIT: dict[str, Any] = {"patch_size": 8, "embed_dim": 8, "num_blocks": 1, "features_dim": 8}
 
@@ -91,20 +90,3 @@ def test_tables():
     assert attention.splitlines()[0] == "| recipe | runs | -2 steps | -1 steps | newest |"
     assert "| tit | 2 | 0.4 | 0.1 | 0.5 |" in attention
     assert "cnn" not in attention
-
-
-def test_bad_input(runs, tmp_path, capsys):
-    def error(*words):
-        with pytest.raises(SystemExit):
-            main([str(word) for word in words])
-        return capsys.readouterr().err
-
-    assert "steps must be at least 2" in error(runs[0].folder, "--steps", 1)
-    assert "is not a run folder" in error(tmp_path)
-    (tmp_path / "file").touch()
-    assert "is a file: name a folder" in error(runs[0].folder, "--out", tmp_path / "file")
-    recipe = PPO(env="CartPole-v1", backbone=mlp())
-    assert "reads no image that Grad-CAM can map" in error(
-        untrained(tmp_path / "run", recipe).folder
-    )
-    assert "holds no checkpoint" in error(Run.create(tmp_path / "empty", recipe).folder)

@@ -20,16 +20,6 @@ def episodes() -> image_scale.Episodes:
     return image_scale.Episodes(400)
 
 
-def test_an_episode_ends_in_front_of_one_of_two_objects(episodes: image_scale.Episodes) -> None:
-    assert episodes.histories.shape == (400, image_scale.NUM_FRAMES)
-    assert 0.4 < episodes.matches.mean() < 0.6
-    ends = episodes.histories[:, -1].unique()
-    assert len(ends) == 4  # a ball or a key, to the left or to the right
-    # The last picture alone does not tell whether it is the cue; the first ones with it do.
-    for end in ends:
-        assert 0.2 < episodes.matches[episodes.histories[:, -1] == end].mean() < 0.8
-
-
 def test_a_transformer_learns_from_normalized_pixels(episodes: image_scale.Episodes) -> None:
     torch.manual_seed(0)
     network = memory_networks(image_scale.NUM_FRAMES, patch_size=8)["enhanced-tit"]
@@ -42,21 +32,6 @@ def test_a_transformer_learns_from_normalized_pixels(episodes: image_scale.Episo
         held_out=128,
     )
     assert accuracy >= 0.97, f"{accuracy} after {steps} steps"
-
-
-@pytest.mark.parametrize(
-    ("words", "reason"),
-    [
-        (["--out", "new.csv", "--episodes", "512"], "--episodes must be above 512"),
-        (["--out", "new.csv", "--limit", "0"], "--limit at least 1"),
-    ],
-)
-def test_mistakes_are_one_line(
-    words: list[str], reason: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit):
-        image_scale.main(words)
-    assert reason in capsys.readouterr().err
 
 
 def test_a_row_for_each_network_scale_and_seed(

@@ -9,13 +9,11 @@ import pytest
 
 from benchmarks import memory_tasks, memory_variants
 from benchmarks.measuring import read_rows
-from benchmarks.memory_pictures import main, plot_curves, plot_lengths
+from benchmarks.memory_pictures import main
 from benchmarks.memory_tasks import EPISODES, Successes
-from recipes.core import runner
 from recipes.core.algorithm import make_algorithm
 from recipes.core.recipe_json import recipe_to_json
 from recipes.core.registry import find_recipe, get_recipe
-from recipes.core.run import Run
 
 NAME = "ppo/tmaze-10/frames-4"
 SHORT: dict[str, Any] = {
@@ -63,46 +61,6 @@ def test_training_ends_where_the_task_is_solved(short, tmp_path, monkeypatch):
     assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
 
 
-def test_training_goes_on_if_the_most_likely_actions_fail(short, tmp_path, monkeypatch):
-    monkeypatch.setattr(memory_tasks, "EPISODES", 20)
-    shares, evaluate = iter([0.97, 0.98]), runner.evaluate
-
-    def checked(run, recipe=None):
-        evaluation = evaluate(run, recipe)
-        if recipe is not None:
-            assert recipe.evaluation_seed == memory_tasks.VALIDATION_SEED
-            right = round(100 * next(shares))
-            evaluation["returns"] = [1.0] * right + [-3.0] * (100 - right)
-        return evaluation
-
-    monkeypatch.setattr(runner, "evaluate", checked)
-    memory_tasks.main([NAME, "--seeds", "0", "--threshold", "-2", "--out", str(tmp_path)])
-    [row] = read_rows(tmp_path / "runs.csv")
-    assert (row["steps"], row["success"]) == ("512", "1.0")  # twice as many episodes
-    batches = read_rows(tmp_path / NAME / "seed-0" / "successes.csv")
-    assert [int(batch["step"]) for batch in batches] == [128, 256, 384, 512]
-
-
-def test_a_stopped_run_goes_on(short, tmp_path):
-    recipe = memory_tasks.find_recipe(NAME)
-
-    class Stopped(Exception):
-        pass
-
-    class Stop(Successes):
-        def saved(self, step):
-            if step == 256:
-                raise Stopped
-
-    with Run.create(tmp_path / "run", recipe) as run, pytest.raises(Stopped):
-        runner.train(recipe, run, [Stop(run.folder / "successes.csv", 0, 0.0)])
-    memory_tasks.measure(recipe, tmp_path / "run", 0.0)
-    memory_tasks.measure(recipe, tmp_path / "whole", 0.0)
-    stopped, whole = (read_rows(tmp_path / name / "successes.csv") for name in ("run", "whole"))
-    assert [row["step"] for row in stopped] == [row["step"] for row in whole]
-    assert stopped[:2] == whole[:2]  # then with new episodes
-
-
 def test_when_nine_in_ten_are_reached(tmp_path):
     successes = Successes(tmp_path / "successes.csv", 0, 0.0)
     # Over the last three batches: 70, 80, 89 and 90 %.
@@ -111,21 +69,6 @@ def test_when_nine_in_ten_are_reached(tmp_path):
     successes.batches.append((6, 40, 36))
     assert successes.reached() == 6
     assert EPISODES == 500
-
-
-def test_the_table_has_a_row_a_recipe():
-    columns = memory_tasks.COLUMNS
-    rows = [
-        ["a", "0", "9", "500", "1000", "1.0", "0.5"],
-        ["b", "0", "7", "500", "", "0.4", "0.2"],
-        ["a", "1", "9", "500", "3000", "0.8", "0.5"],
-        ["b", "1", "7", "500", "2000", "0.4", "0.2"],
-    ]
-    table = memory_tasks.to_markdown([dict(zip(columns, row, strict=True)) for row in rows])
-    assert table.splitlines()[2:] == [
-        "| a | 9 | 2 | 0.9 | 0.5 | 2 |",
-        "| b | 7 | 2 | 0.4 | 0.2 | 2, not by 1 of 2 |",
-    ]
 
 
 LARGER = ("frames-32", "tiles-of-28-pixels")
@@ -184,41 +127,6 @@ def make_run(tmp_path):
 
 def drawn(axes):
     return {str(line.get_label()): np.asarray(line.get_data()) for line in axes.lines}
-
-
-def test_a_run_that_ended_keeps_its_last_value(make_run):
-    runs = [make_run("ppo/memory-s7/lstm", *run) for run in enumerate([SOON, LATER] * 3)]
-    [axes] = plot_curves(runs).axes
-    assert axes.get_title() == "memory-s7"
-    [(label, (steps, values))] = drawn(axes).items()
-    assert label == "lstm (6)"
-    assert np.allclose(steps[[0, -1]], [0.1, 0.4])  # thousands
-    assert np.allclose(values[[0, -1]], [0.5, 0.5])  # in the end, 1 and 0
-    assert np.allclose(np.interp([0.15, 0.3], steps, values), [0.75, 0.75], atol=0.01)
-    band = np.asarray(axes.collections[0].get_paths()[0].vertices)
-    assert (band[:, 1].min(), band[:, 1].max()) == (0, 1)
-
-
-def test_a_panel_a_task_and_a_color_a_network(make_run):
-    names = ["ppo/memory-s9/lstm", "ppo/memory-s7/lstm", "ppo/memory-s7/enhanced-tit"]
-    panels = plot_curves([make_run(name, 0, SOON) for name in names]).axes
-    assert [axes.get_title() for axes in panels] == ["memory-s7", "memory-s9"]
-    lines = [[(str(x.get_label()), x.get_color()) for x in axes.lines] for axes in panels]
-    assert lines == [[("enhanced-tit (1)", "C0"), ("lstm (1)", "C1")], [("lstm (1)", "C1")]]
-
-
-def test_means_in_order_of_length_and_a_mark_a_seed(tmp_path):
-    (tmp_path / "runs.csv").write_text(ROWS)
-    [axes] = plot_lengths(tmp_path / "runs.csv").axes
-    lines = [(line.get_label(), np.asarray(line.get_data()).tolist()) for line in axes.lines[1:]]
-    names = [name for name, _ in lines if not str(name).startswith("_")]
-    assert names == ["enhanced-tit", "lstm"]  # the first line is a guess
-    [(_, [[first], _]), _, (_, [places, means]), (_, ten), (_, fifty)] = lines
-    assert means == [1.0, 0.5]
-    assert np.allclose(places, [10, 50], rtol=0.1)
-    assert ten == [[places[0]], [1.0]]
-    assert fifty == [[places[1]] * 2, [0.4, 0.6]]
-    assert first < 10 < places[0]  # side by side
 
 
 def test_the_command(make_run, tmp_path, capsys):

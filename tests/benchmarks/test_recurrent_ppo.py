@@ -1,12 +1,11 @@
 """What RecurrentPPO reaches on MiniGrid-Memory is written as each run ends, and not run twice."""
 
 import pytest
-import torch
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Discrete
 
 pytest.importorskip("minigrid")
 
-from benchmarks import memory_tasks, recurrent_ppo, sb3_returns
+from benchmarks import recurrent_ppo, sb3_returns
 from benchmarks.measuring import read_rows
 
 
@@ -35,53 +34,6 @@ def test_a_row_a_run_and_none_twice(settings, short, tmp_path, monkeypatch, caps
     assert capsys.readouterr().out.startswith(f"7 0 256 {settings} ")
     monkeypatch.setattr(recurrent_ppo, "measure", lambda *_: pytest.fail("measured again"))
     recurrent_ppo.main(words)
-
-
-def test_training_ends_where_the_task_is_solved(short, monkeypatch):
-    evaluate_policy = recurrent_ppo.evaluate_policy
-    shares = iter([0.5, 1.0])
-    seeds = []
-
-    def evaluated(agent, envs, episodes, **settings):
-        """Returns what the last evaluation really gives; before it, half fail, and then none."""
-        seeds.append(envs._seeds[0])
-        returns, lengths = evaluate_policy(agent, envs, episodes, **settings)
-        if (share := next(shares, None)) is not None:
-            returns = [1.0 if i < share * episodes else -2.0 for i in range(episodes)]
-        return returns, lengths
-
-    monkeypatch.setattr(recurrent_ppo, "evaluate_policy", evaluated)
-    monkeypatch.setattr(memory_tasks, "EPISODES", 4)
-    monkeypatch.setattr(memory_tasks, "WINDOW", 4)
-    monkeypatch.setattr(recurrent_ppo, "THRESHOLD", -1.0)  # all returns are at least 0
-    batches = []
-
-    class Progress(recurrent_ppo.Progress):
-        def _on_training_end(self):
-            batches.extend(self.successes.batches)
-
-    monkeypatch.setattr(recurrent_ppo, "Progress", Progress)
-    row = recurrent_ppo.measure(7, 0, 5_000, "default", 2)
-    cells = dict(zip(recurrent_ppo.COLUMNS, row, strict=True))
-    assert [step for step, _, _ in batches] == [128 * (i + 1) for i in range(len(batches))]
-    assert batches[-1][0] < 5_000
-    # Four episodes succeed, but not the most likely actions; then four others, and these.
-    [fourth] = [i for i in range(len(batches)) if sum(n for _, n, _ in batches[:i]) < 4][-1:]
-    assert cells["steps_to_0.9"] == batches[fourth][0]
-    assert sum(episodes for _, episodes, _ in batches[fourth + 1 : -1]) < 4
-    assert len(batches) > fourth + 1
-    assert seeds == [memory_tasks.VALIDATION_SEED] * 2 + [recurrent_ppo.EVALUATION_SEED]
-    assert cells["steps"] == batches[-1][0]
-    assert cells["success"] == 1
-
-
-def test_pixels_are_normalized_by_channel():
-    space = Box(0, 1, (3, 24, 24))
-    pixels = torch.rand(64, 3, 24, 24) * torch.tensor([1.0, 0.2, 0.5])[:, None, None]
-    first = recurrent_ppo.Tiles(space, normalize=True).layers[0](pixels)
-    assert first.mean((0, 2, 3)).abs().max() < 1e-4
-    assert (first.std((0, 2, 3)) - 1).abs().max() < 1e-2
-    assert torch.equal(recurrent_ppo.Tiles(space).layers[0](pixels), pixels)
 
 
 def test_the_environment_is_that_of_the_recipes():

@@ -160,8 +160,7 @@ def test_metadata_survive(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.parametrize("jpeg", [True, False])
-@pytest.mark.parametrize("shape", [(40, 48, 3), (40, 48)])
+@pytest.mark.parametrize(("shape", "jpeg"), [((40, 48, 3), True), ((40, 48), False)])
 def test_images_and_discrete_actions(shape: tuple[int, ...], jpeg: bool, tmp_path: Path) -> None:
     """Images as Minari stores and decodes them; what we write is lossless."""
     frames = np.random.default_rng(0).integers(0, 256, (3, 4, *shape), dtype=np.uint8)
@@ -184,7 +183,7 @@ def test_images_and_discrete_actions(shape: tuple[int, ...], jpeg: bool, tmp_pat
     assert (load_episodes(tmp_path / "again-v0").rows == episodes.rows).all()
 
 
-@pytest.mark.parametrize("damage", [lambda x: x[:20], lambda x: x * 0, "size"])
+@pytest.mark.parametrize("damage", [lambda x: x[:20], "size"])
 def test_images_that_cannot_be_decoded(damage: Any, folder: Path) -> None:
     steps = {"actions": [0], "rewards": [0.0], "terminations": [True], "truncations": [False]}
     spaces: dict[str, Any] = {
@@ -252,6 +251,7 @@ def _retype(field: str, add: float, dtype: type) -> Callable[[h5py.Group], None]
         (_set("observations", 3, np.inf), "field '(next_)?observations', row {[23]}: is inf"),
         (_set("actions", 1, -2.0), "field 'actions', row {1}: is -2.0, but the task's"),
         (_set("terminations", 0, True), "field 'terminals', row {0}: ends the episode, but"),
+        (_set("truncations", 0, True), "field 'terminals', row {0}: ends the episode, but"),
         (
             _retype("rewards", 1e300, np.float64),
             "episode 1: field 'rewards': has the dtype float64",
@@ -323,12 +323,3 @@ def test_targets_that_cannot_be_written(
     with pytest.raises(ValueError, match="'Hoper-v5' cannot be made"):
         write_minari(episodes, tmp_path / "b-v0", "Hoper-v5")
     assert [path.name for path in tmp_path.iterdir()] == ["a-v0"]
-
-
-def test_a_truncation_within_an_episode_is_refused(rolled: Transitions, folder: Path) -> None:
-    make_walk(rolled)
-    with h5py.File(folder / "main_data.hdf5", "a") as file:
-        file["episode_1/truncations"][0] = True
-    start = spans(rolled)[1][0]
-    with pytest.raises(DatasetError, match=f"row {start}: ends the episode, but more steps follow"):
-        load_episodes(NAME)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
-from torch.utils._pytree import tree_leaves
-from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
+from torchrl.data import ReplayBuffer, SliceSampler
 
 from recipes.replay import BufferState
 from tests.datasets.several import MOST_FRAMES, newest, play_several
@@ -114,18 +111,6 @@ def test_is_init_and_episode() -> None:
         assert len(pairs) == len(ours.unique())
 
 
-def test_each_frame_is_kept_once() -> None:
-    steps = play_several(3, STEPS, 8, "same")
-    buffer = make(3, 3 * STEPS, 8)
-    for batch in without_histories(steps).split(20, 1):
-        buffer.extend(batch)
-    ends = int(steps["next", "done"].sum()) + int((~steps["next", "done"][:, STEPS // 3 - 1]).sum())
-    assert buffer.storage.num_end_frames == ends > 20
-    leaves = [x for x in tree_leaves(buffer.storage.state_dict()) if isinstance(x, Tensor)]
-    images = [x for x in leaves if x.dtype == torch.uint8]
-    assert sum(len(x) for x in images) == 3 * STEPS + ends + 3
-
-
 def test_one_observation_and_single_steps() -> None:
     """Frames that are not equal to themselves; steps that are added one by one."""
     frames = torch.zeros(6, 2)
@@ -208,19 +193,6 @@ def test_no_slice_leads_from_the_newest_step_to_the_oldest() -> None:
         assert set(drawn.flatten().tolist()) == set(range(15, 25))
 
 
-def test_an_empty_buffer_starts_anew() -> None:
-    buffer = make(3, 30, 4)
-    steps = play_several(3, STEPS, 4, "same")
-    for _ in range(2):
-        buffer.extend(without_histories(steps))
-        assert_items(buffer.storage.get(slice(None)), newest(steps, STEPS, 30))
-        buffer.empty()
-        assert len(buffer) == buffer.storage.num_end_frames == 0
-    other = make(3, 30, 4)
-    other.load_state_dict(buffer.state_dict())
-    assert len(other) == 0
-
-
 @pytest.mark.parametrize("envs", [None, 2])
 def test_an_episode_that_a_resume_cut_off_stays_cut_off(envs: int | None, tmp_path: Path) -> None:
     """Also where the new episode begins with the very observation that the old one lacked."""
@@ -251,19 +223,6 @@ def test_an_episode_that_a_resume_cut_off_stays_cut_off(envs: int | None, tmp_pa
         assert copy["next", "history"][4].flatten().tolist() == [1, 1, 1]
         assert copy["history"][5].flatten().tolist() == [0, 0, 1]
         assert not copy["next", "terminated"].any()
-
-
-def test_torchrl_does_not_say_that_it_made_a_table(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It would say so on the standard output, of commands that are read by programs."""
-    caplog.set_level(logging.INFO, "torchrl")
-    monkeypatch.setattr(logging.getLogger("torchrl"), "handlers", [caplog.handler])
-    steps = without_histories(play_several(3, 12, 2, "same"))
-    make(3, 31, 2).extend(steps)
-    assert not caplog.records
-    ReplayBuffer(storage=LazyTensorStorage(31, ndim=2)).extend(steps)
-    assert "Initialized LazyTensorStorage" in caplog.text
 
 
 def test_what_is_refused() -> None:

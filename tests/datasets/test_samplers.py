@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -21,7 +20,6 @@ from torchrl.data import (
     SliceSamplerWithoutReplacement,
     TensorDictReplayBuffer,
 )
-from torchrl.envs import RenameTransform
 
 from tests.datasets.rollouts import Transitions
 from tests.datasets.several import play_several
@@ -32,7 +30,6 @@ from torchrl_tit.datasets import (
     OnlineHistoryStorage,
     episodes_from_arrays,
 )
-from torchrl_tit.windows import Windows
 
 Make = Callable[..., ReplayBuffer]
 
@@ -177,37 +174,6 @@ def test_indices_are_those_of_torchrls_storages(make: Make, index: Any) -> None:
     assert (found == expected).all()
     steps = storage[index]
     assert (steps == expected.select(*steps.keys(True, True))).all()
-
-
-def test_finding_episodes_gathers_no_frames(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nor does what a slice sampler asks about the steps it drew."""
-    buffer = make(sampler=SliceSampler(slice_len=2))
-    buffer.sample()  # the sampler looks at one item, to find out what there is
-    gathered: list[int] = []
-    gather = Windows.gather
-
-    def counted(windows: Windows, frames: Tensor) -> Tensor:
-        gathered.append(windows.rows.numel())
-        return gather(windows, frames)
-
-    monkeypatch.setattr(Windows, "gather", counted)
-    batch = buffer.sample()
-    assert set(gathered) == {24 * 3}
-    steps = buffer.storage[:]
-    assert steps.batch_size == buffer.storage.shape
-    assert {"observation", "history"}.isdisjoint([*steps.keys(), *steps["next"].keys()])
-    assert {"episode", "is_init", "action"} < set(batch.keys()) & set(steps.keys())
-
-
-def test_transforms_and_their_batches(make: Make) -> None:
-    rename = RenameTransform(["history"], ["past"])
-    buffer = make(transform=rename)
-    buffer.append_transform(lambda batch: batch.set("twice", 2 * batch["next", "reward"]))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        batch = buffer.sample()
-    assert "history" not in batch.keys()  # noqa: SIM118 (a tensordict)
-    assert torch.equal(batch["twice"], 2 * batch["next", "reward"])
 
 
 def drawn(sampler: ConsecutiveSampler, storage: Any) -> Tensor:

@@ -13,7 +13,6 @@ from recipes.cli.main import COMMANDS
 from recipes.core.recipe import Recipe
 from recipes.core.registry import RECIPES
 from torchrl_tit.settings import FrameSettings, HistorySettings
-from torchrl_tit.settings.numbers import Batch, Positive, Real, Width
 
 ROOT = Path(__file__).parents[2]
 
@@ -80,21 +79,6 @@ def test_fields(pages):
     for line in lines:
         if line.startswith("| `"):
             assert len(line.split(" | ")[3]) > 10, f"no words about {line}"
-
-
-@pytest.mark.parametrize(
-    ("kind", "words"),
-    [
-        (Width, "integer from 1 to 65536"),
-        (Batch, "integer from 1"),
-        (Positive, "number above 0"),
-        (Real, "number"),
-        (Width | None, "integer from 1 to 65536, or nothing"),
-        (tuple[str, ...], "several of: text"),
-    ],
-)
-def test_what_a_field_takes(kind, words):
-    assert reference.takes(kind) == words
 
 
 def test_every_public_name_is_documented(pages):

@@ -14,7 +14,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -81,16 +80,6 @@ def act_without_torch(folder: Path) -> None:
     assert checksum == hashlib.sha256((folder / "machine.onnx").read_bytes()).hexdigest()
     assert facts.startswith("bc/enhanced-tit 2 ")
     assert re.fullmatch(r"p50 \d+\.\d\d ms, p99 \d+\.\d\d ms", latency)
-
-
-def test_k_of_the_script_stands_in_one_place():
-    namespace: dict[str, Any] = {}
-    script = "".join(
-        code for _, _, code in blocks(ROOT / "docs" / "tutorials" / "torchrl-script.md")
-    )
-    assert script.count("K = 4\n") == 1
-    exec(compile(script.replace("K = 4\n", "K = 16\n"), "torchrl-script.md", "exec"), namespace)
-    assert namespace["tit"].num_frames == 16
 
 
 def test_no_two_pages_write_one_run():

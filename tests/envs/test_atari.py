@@ -152,14 +152,6 @@ def test_games_are_cut_off():
     env.close()
 
 
-def test_no_ops_are_drawn_from_1_on():
-    games = AtariGames("pong", 1, noop_max=3)
-    noops = [int(games.reset(seed=0)[1]["noops"][0])]
-    noops += [int(games.reset()[1]["noops"][0]) for _ in range(30)]
-    assert set(noops) == {1, 2, 3}
-    games.close()
-
-
 def test_a_flickering_game_is_the_same_game():
     plain, flickering = AtariGames("pong", 2), AtariGames("pong", 2, blank_probability=0.5)
     blank = []
@@ -200,26 +192,6 @@ def test_evaluation_counts_whole_games():
                 image, _ = games.reset(options={"reset_mask": terminated})
         assert lives == 3
         assert returns[i] == points > 0
-    games.close()
-
-
-def test_points_between_two_lives_are_of_the_game():
-    games = AtariGames("breakout", 1)
-    games.reset(seed=0)
-    (emulator,) = games._emulators[0]
-    receive = emulator.recv
-
-    def paying():
-        image, _, *others = receive()
-        return image, np.ones(1), *others
-
-    emulator.recv = paying
-    points, terminated = 0, False
-    while not terminated:
-        _, rewards, (terminated,), _, info = games.step(np.array([LEFT]))
-        points += rewards[0]
-    # No action, fire and action 2 led to the next life.
-    assert info["game_return"] == points + 3
     games.close()
 
 

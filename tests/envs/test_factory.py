@@ -19,10 +19,7 @@ from torchrl_tit.settings.imports import import_allowed
         ("CartPole-v7", "'CartPole-v7'; did you mean .*CartPole-v1"),
         ("cartpole-v1", "'cartpole-v1'; did you mean .*CartPole-v1"),
         ("Hoper-v5", "'Hoper-v5'; did you mean Hopper-v5"),
-        (
-            "xyzzy",
-            "'xyzzy'; .* of a module of yours is module:Name-v0, an Atari game ALE/Pong-v5",
-        ),
+        ("xyzzy", "'xyzzy'; .* of a module of yours is module:Name-v0, an Atari game ALE/Pong-v5"),
     ],
 )
 def test_unknown_names(name, words):
@@ -117,13 +114,3 @@ def test_each_warning_is_shown_once(
         env.close()
     assert sum(MESSAGE in record.getMessage() for record in caplog.records) == 1
     assert not list(tmp_path.iterdir())
-
-
-def test_a_handler_of_the_users_own_stays(
-    handler: Callable[[Callable[[str], None] | None], None],
-) -> None:
-    seen: list[str] = []
-    own = seen.append
-    handler(own)
-    make_env("Hopper-v5").close()
-    assert mujoco.get_mju_user_warning() is own

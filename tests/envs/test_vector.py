@@ -14,15 +14,7 @@ from torchrl.envs.utils import check_env_specs
 from tests.envs.reference import wrapped
 from torchrl_tit.envs import GymVectorEnv, make_env
 
-WRITTEN = (
-    "observation",
-    "history",
-    "episode_reward",
-    "reward",
-    "terminated",
-    "truncated",
-    "done",
-)
+WRITTEN = ("observation", "history", "episode_reward", "reward", "terminated", "truncated", "done")
 
 
 def vector(mode=AutoresetMode.DISABLED):
@@ -91,16 +83,6 @@ def test_a_partial_reset_keeps_the_others(num_frames):
     for key in ("observation", "history", "episode_reward"):
         assert torch.equal(after[key][[0, 2]], before[key][[0, 2]])
         assert not torch.equal(after[key][1], before[key][1])
-
-
-def test_what_was_written_is_never_written_again():
-    env = make_env("CartPole-v1", 2, seed=0, num_frames=3)
-    root, kept = env.reset(), []
-    for _ in range(30):
-        step, root = env.step_and_maybe_reset(env.rand_action(root))
-        kept.append((step, step.clone()))
-    for written, copy in kept:
-        assert_close(written, copy, 0, 0)
 
 
 def test_actions_are_clipped_on_their_way_only():

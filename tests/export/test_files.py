@@ -40,11 +40,7 @@ OURS = ("torchrl_tit", "recipes", "torchrl", "tensordict")
 
 
 @pytest.mark.parametrize(
-    ("example", "without"),
-    [
-        ("act_from_pt2.py", OURS),
-        ("act_from_onnx.py", (*OURS, "torch")),
-    ],
+    ("example", "without"), [("act_from_pt2.py", OURS), ("act_from_onnx.py", (*OURS, "torch"))]
 )
 def test_the_examples_play_the_episode_that_the_policy_plays(example, without, tmp_path):
     if "onnx" in example:

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
-from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
-from torch import Tensor, nn
-from torchrl.data import Unbounded
+from torch import Tensor
 
-from recipes.novelty import Novelty
 from torchrl_tit import settings
-from torchrl_tit.analysis import count_flows, integrated_gradients, map_attention
+from torchrl_tit.analysis import map_attention
 from torchrl_tit.datasets import episodes_from_arrays
 from torchrl_tit.frames import NormalizedFrames
-from torchrl_tit.modules import Backbone, make_value
-from torchrl_tit.networks import EnhancedTIT, HistoryNetwork
+from torchrl_tit.networks import HistoryNetwork
 
 ENTITIES, ENTRIES, SEATS = 3, 4, 5
 
@@ -101,75 +94,6 @@ def test_statistics_are_those_of_all_entities() -> None:
         normal = frames.normalize(many)
         assert torch.equal(normal[..., -1] > 0.9, many[..., -1] > 0)
     assert running.count == len(rows)
-
-
-def test_padding_is_nothing_new() -> None:
-    network = settings.Network(frame=settings.Entities(), history=settings.MLP(), num_frames=1)
-    novelty = Novelty(network, Unbounded((SEATS, ENTRIES)))
-    _, many = observations(1, 6)
-    other = torch.where(many[..., -1:] > 0, many, torch.zeros(())).float()
-    for width in (0.0, 0.5):
-        cells = [novelty.cells([x], width) for x in (many.float(), other)]
-        assert torch.equal(*cells)
-
-
-def test_flows_and_attributions() -> None:
-    network = HistoryNetwork(
-        settings.Entities(),
-        settings.PairedOuter(),
-        observation_shape=(SEATS, ENTRIES),
-        num_frames=2,
-    )
-    assert count_flows(network) == count_flows(EnhancedTIT((SEATS,), num_frames=2))
-    policy = TensorDictSequential(Backbone(network.double()), make_value(64).double())
-    _, many = observations(3, 2)
-    many = many.nan_to_num()
-    state = TensorDict({"history": many, "action": torch.zeros(3)}, [3])
-    shares = integrated_gradients(policy, state, target="value", steps=128)["observation"]
-    zeros = torch.cat([0 * many[..., :-1], many[..., -1:]], -1)
-    values = [policy(TensorDict({"history": x}, [3]))["state_value"] for x in (many, zeros)]
-    difference = (values[0] - values[1]).squeeze(-1)
-    assert (shares.flatten(1).sum(1) - difference).norm() < 0.02 * difference.norm()
-
-
-def build(frame: Any, hidden: int) -> nn.Module:
-    torch.manual_seed(0)
-    layers = settings.MLP(hidden_dim=hidden, activation="relu")
-    network = HistoryNetwork(frame, layers, observation_shape=(8, 3))
-    return nn.Sequential(network, nn.Linear(network.features_dim, 1))
-
-
-def unexplained(network: nn.Module, updates: int = 100) -> float:
-    """The share of a variance that is left: of the distance to the nearest of up to 8 points."""
-    generator = torch.Generator().manual_seed(0)
-    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
-    errors, targets = [], []
-    for update in range(updates):
-        sets = 2 * torch.rand(128, 8, 3, generator=generator) - 1
-        present = (
-            torch.rand(128, 8, generator=generator).argsort(1) <= torch.arange(128)[:, None] % 8
-        )
-        sets = torch.cat([sets[..., :2], torch.ones(128, 8, 1)], -1) * present.unsqueeze(-1)
-        distances = sets[..., :2].norm(dim=-1).masked_fill(~present, torch.inf)
-        target = distances.min(1, keepdim=True).values
-        error = network(sets.unsqueeze(1)) - target
-        optimizer.zero_grad()
-        error.square().mean().backward()
-        optimizer.step()
-        if update >= updates - 20:
-            errors.append(error.detach())
-            targets.append(target)
-    return (torch.cat(errors).square().mean() / torch.cat(targets).var()).item()
-
-
-def test_it_learns_what_an_mlp_on_the_padded_vector_does_not() -> None:
-    """With fewer weights; it is wrong by a fraction of what the MLP is wrong by."""
-    entities = build(settings.Entities(num_blocks=1), hidden=64)
-    mlp = build(settings.Flat(), hidden=256)
-    sizes = [sum(p.numel() for p in network.parameters()) for network in (entities, mlp)]
-    assert sizes[0] < sizes[1]
-    assert unexplained(entities) < 0.3
-    assert unexplained(mlp) > 0.5
 
 
 @pytest.mark.parametrize("shape", [(3, 8, 8), (5, 1)])

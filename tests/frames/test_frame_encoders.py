@@ -12,7 +12,6 @@ from tests.networks.reference import randomize
 from torchrl_tit import settings
 from torchrl_tit.frames.cnn import CNNFrameEncoder
 from torchrl_tit.frames.flat import Flat
-from torchrl_tit.frames.inner import InnerTransformer
 from torchrl_tit.frames.linear import LinearFrameEncoder
 from torchrl_tit.frames.normalized import NormalizedFrames
 from torchrl_tit.layers.patches import ArrayPatchEmbedding
@@ -132,20 +131,3 @@ def test_each_patch_has_weights_of_its_own(patch_size: int) -> None:
         patch = padded[..., index * patch_size : (index + 1) * patch_size].flatten(1)
         expected = patch @ embedding.weight[index].flatten(1).t() + embedding.bias[index]
         torch.testing.assert_close(tokens[:, index], expected)
-
-
-def test_own_weights_tell_sizes_of_an_entry_apart() -> None:
-    """After the LayerNorm, a shared patch of one number is little more than its sign."""
-    torch.manual_seed(0)
-
-    def distance(patch_weights: str) -> float:
-        """Between the normalized tokens of 1 and 2, relative to that of 1 and -1."""
-        inner = settings.Inner(patch_weights=patch_weights).build((4,))  # type: ignore[arg-type]
-        assert isinstance(inner, InnerTransformer)
-        values = torch.tensor([[1.0], [2.0], [-1.0]]).expand(3, 4)
-        patches = inner.patch_embedding(values.unsqueeze(1))
-        one, two, minus = inner.blocks[0].norm1(patches)  # type: ignore[operator]
-        return ((one - two).norm() / (one - minus).norm()).item()
-
-    assert distance("shared") < 0.05
-    assert distance("own") > 0.15

@@ -3,14 +3,7 @@
 import pytest
 import torch
 from torch.nn import functional as F
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
-    Composite,
-    MultiCategorical,
-    Unbounded,
-)
+from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategorical, Unbounded
 
 from torchrl_tit import settings
 from torchrl_tit.frames import Observation, read_observation, read_observations
@@ -73,14 +66,6 @@ def test_a_patch_is_a_linear_layer_on_the_one_hot_vectors_of_its_entries(patch_s
         used = torch.cat([torch.full((n,), i in entries) for i, n in enumerate(COUNTS)])
         expected = (one_hot(x) * used).double() @ embedding.embedding.weight
         torch.testing.assert_close(tokens[:, patch], expected)
-
-
-def test_class_tokens_tell_every_category_apart() -> None:
-    encoder = build_frame(settings.Inner(embed_dim=8), OBSERVATION).double()
-    x = torch.cartesian_prod(*map(torch.arange, COUNTS))
-    tokens = encoder(x.unsqueeze(1)).flatten(1)
-    assert len(tokens.detach().round(decimals=6).unique(dim=0)) == len(x) == 60
-    assert [maps.shape[-1] for maps in encoder.attention_maps(x)] == [4, 4]
 
 
 @pytest.mark.parametrize(

@@ -64,19 +64,6 @@ def test_it_is_the_equations_of_the_paper_with_their_gradients() -> None:
     )
 
 
-def test_attention_sees_the_past_and_tells_its_steps_apart() -> None:
-    encoder = make(num_tokens=2, num_blocks=1)
-    randomize(encoder)
-    tokens = torch.randn(3, 2, FRAMES, 2, WIDTH)
-    (weights,) = encoder.attention_maps(tokens)
-    assert weights.shape == (3, 2, 2, FRAMES, FRAMES)
-    assert torch.equal(weights, weights.tril())
-    assert_near(weights.sum(-1), torch.ones(3, 2, 2, FRAMES))
-    assert encoder(tokens).shape == (3, 2, WIDTH)
-    past_swapped = tokens[:, :, [1, 0, 2, 3]]
-    assert (encoder(past_swapped) - encoder(tokens)).abs().amax(-1).min() > 1e-4
-
-
 def test_gates_start_near_the_identity_and_survive_initialization() -> None:
     tokens = torch.randn(2, FRAMES, 1, WIDTH)
     newest = tokens[:, -1, 0]

@@ -47,15 +47,6 @@ def test_several_tokens_become_one_by_a_linear_layer(choices: HistorySettings) -
         torch.testing.assert_close(ours, theirs)
 
 
-def test_masked_predictions_of_several_tokens_compare_the_one_made_of_them() -> None:
-    shape = HistoryShape(num_frames=3, num_tokens=2, width=8)
-    coberl = settings.CoBERL(num_heads=2, hidden_dim=5).build(shape)
-    tokens = torch.randn(4, 3, 2, 8)
-    encodings, predictions = coberl.predict_masked(tokens, torch.rand(4, 3) < 0.5)
-    torch.testing.assert_close(encodings, coberl.one_token(tokens))
-    assert predictions.shape == (4, 3, 8)
-
-
 RECURRENT: dict[str, tuple[Any, Any]] = {
     "lstm": (settings.LSTM(hidden_dim=5), nn.LSTM),
     "gru": (settings.GRU(hidden_dim=5), nn.GRU),

@@ -226,27 +226,3 @@ def test_a_new_memory_forgets_over_short_and_long_spans(name: str) -> None:
     else:
         rates = nn.functional.softplus(mixer.rate_bias) * mixer.log_a.exp()
     near(rates, torch.logspace(-3, -0.301, len(rates)))
-
-
-@every_memory
-def test_it_learns_to_recall_what_it_saw_first(name: str) -> None:
-    """The sign at the first of 20 steps, in sequences of two episodes."""
-    frame, encoder = nn.Linear(2, D), MEMORIES[name].build(HistoryShape(1, 1, D))
-    head = nn.Linear(D, 1)
-    weights = [*frame.parameters(), *encoder.parameters(), *head.parameters()]
-    optimizer = torch.optim.Adam(weights, lr=1e-2)
-    is_init = torch.zeros(16, 40, 1, dtype=torch.bool)
-    is_init[:, [0, 20]] = True
-    state = {key: torch.zeros(16, *size) for key, size in encoder.state_shapes.items()}
-    for _ in range(150):
-        signs = torch.randint(2, (16, 2)).double()
-        x = torch.randn(16, 2, 20, 2)
-        x[..., 1], x[:, :, 0, 0] = 0, 2 * signs - 1
-        x[:, :, 0, 1] = 1  # this is what to remember
-        outputs, _ = read(encoder, frame(x.flatten(1, 2)).unsqueeze(2), state, is_init)
-        logits = head(outputs[:, [19, 39]]).squeeze(-1)
-        loss = nn.functional.binary_cross_entropy_with_logits(logits, signs)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert loss < 0.1

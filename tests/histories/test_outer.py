@@ -40,24 +40,6 @@ def test_a_chained_block_reads_its_token_and_the_block_before(share: bool) -> No
     assert len(chained.blocks) == (1 if share else 3)
 
 
-def test_the_chain_goes_one_way() -> None:
-    """Past tokens of a block reach the newest output of every later block, and of no earlier."""
-    chained = make(settings.ChainedOuter(num_heads=2))
-    paired = make(settings.PairedOuter(num_heads=2))
-    paired.load_state_dict(chained.state_dict())
-    tokens = torch.randn(1, FRAMES, 3, WIDTH, requires_grad=True)
-    for encoder, reached in ((chained, [1, 2]), (paired, [1])):
-        outputs = encoder(tokens).unflatten(-1, (3, WIDTH))
-        for index in range(3):
-            (gradient,) = torch.autograd.grad(
-                (outputs[:, index] * torch.linspace(-1, 1, WIDTH)).sum(), tokens, retain_graph=True
-            )
-            assert bool(gradient[:, 0, 1].any()) == (index in reached)
-    one = torch.randn(2, FRAMES, 1, WIDTH)
-    alone = [make(c, 1) for c in (settings.ChainedOuter(), settings.PairedOuter())]
-    assert_near(*(encoder(one) for encoder in alone))
-
-
 KINDS: dict[str, Any] = {
     "outer": settings.Outer,
     "paired-outer": settings.PairedOuter,

@@ -10,11 +10,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.networks.reference_baselines import (
-    ReferenceCatformer,
-    ReferenceResNet,
-    ReferenceTrunks,
-)
+from tests.networks.reference_baselines import ReferenceCatformer, ReferenceResNet, ReferenceTrunks
 from tests.numerics import assert_near
 from torchrl_tit.interop import from_official
 

@@ -129,13 +129,6 @@ def test_prefix_masks_and_what_lies_outside(variant: str, prefix: str) -> None:
     assert_same(from_official(config, params), reference, config["observation_shape"])
 
 
-def test_dropout_settings_are_taken_and_act_while_training() -> None:
-    config, reference = make("enhanced", "dropout")
-    network = from_official(config, parameters(reference)).train()
-    x = torch.randn(8, 4)
-    assert not torch.equal(network(x), network(x))
-
-
 @both_variants
 def test_missing_left_over_and_misshaped_parameters(variant: str) -> None:
     config, reference = make(variant, "array")
@@ -159,26 +152,6 @@ def test_missing_left_over_and_misshaped_parameters(variant: str) -> None:
     message = error(**{"ln1.bias": None, "ln2.bias": torch.zeros(3)})
     assert "missing head.0.bias; " in message or "; missing head.0.bias" in message
     assert "head.3.bias has shape (3,) instead of (12,)" in message
-
-
-@pytest.mark.parametrize(
-    "setting", ["num_blocks", "embed_dim", "features_dim", "patch_size", "ffn_expansion_inner"]
-)
-@both_variants
-def test_config_that_does_not_fit_the_parameters(variant: str, setting: str) -> None:
-    config, reference = make(variant, "array")
-    config[setting] *= 2
-    with pytest.raises(ValueError, match="the parameters do not fit the config: "):
-        from_official(config, parameters(reference))
-
-
-def test_shared_and_separate_blocks_at_once() -> None:
-    config, shared = make("enhanced", "array", share_blocks=True)
-    _, separate = make("enhanced", "array")
-    with pytest.raises(
-        ValueError, match=r"2 parameters for frame_encoders\.observation\.blocks\.0\.norm1\.bias"
-    ):
-        from_official(config, parameters(shared) | parameters(separate))
 
 
 @pytest.mark.parametrize("config", [{}, {"kind": "TIT"}])

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import sys
-import warnings
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call, stack_module_state
 
 from tests.networks.reference import randomize
 from tests.numerics import assert_near
@@ -111,38 +107,3 @@ def test_dropout_leaves_the_mean_as_it_is(length: int, read: Any) -> None:
     error = (many.mean(0) - expected[0]).abs()
     assert (many.std(0) > 1e-3).all()
     assert (error < 6 * many.std(0) / 20_000**0.5).all()
-
-
-def test_one_position_attends_to_itself_under_dropout() -> None:
-    """A weight of 1, dropped with the probability p in each head, or scaled by 1 / (1 - p)."""
-    attention = SelfAttention(8, 2, causal=True, dropout=0.4)
-    attention.out_proj = nn.Identity()  # type: ignore[assignment]
-    x = torch.randn(2000, 1, 8)
-    value = attention.eval()(x).unflatten(-1, (2, 4))
-    heads = attention.train()(x).unflatten(-1, (2, 4))
-    dropped = (heads == 0).all(-1)
-    torch.testing.assert_close(heads[~dropped], value[~dropped] / 0.6, rtol=1e-4, atol=1e-6)
-    assert dropped.float().mean().item() == pytest.approx(0.4, abs=0.03)
-    assert not torch.equal(dropped[..., 0], dropped[..., 1])
-
-
-def call_two_as_one(dropout: float) -> None:
-    layers = [SelfAttention(4, 1, dropout=dropout) for _ in range(2)]
-    weights, buffers = stack_module_state(list(layers))
-    x = torch.randn(3, 5, 4)
-
-    def call(weights: dict[str, Tensor], buffers: dict[str, Tensor]) -> Tensor:
-        return functional_call(layers[0], (weights, buffers), (x,))
-
-    with warnings.catch_warnings(record=True) as seen:
-        torch.vmap(call, randomness="different")(weights, buffers)
-    sys.exit(len(seen))
-
-
-@pytest.mark.parametrize("dropout", [0.0, 0.1])
-def test_no_warning(dropout: float) -> None:
-    """In a process of its own, as pytest has filters of its own."""
-    process = multiprocessing.Process(target=call_two_as_one, args=(dropout,))
-    process.start()
-    process.join()
-    assert process.exitcode == 0

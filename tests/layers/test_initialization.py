@@ -13,7 +13,6 @@ from torchrl_tit.layers import (
     ArrayPatchEmbedding,
     ImagePatchEmbedding,
     SelfAttention,
-    init_normal_,
     init_orthogonal_,
 )
 from torchrl_tit.networks import EnhancedTIT, VanillaTIT
@@ -64,14 +63,6 @@ def test_networks_start_as_the_authors(
         assert_normal(parameter, 0.02)
 
 
-def test_normal_covers_embeddings_and_leaves_convolutions() -> None:
-    embedding, conv = nn.Embedding(50, 64), nn.Conv2d(3, 8, 3)
-    before = {name: p.detach().clone() for name, p in conv.named_parameters()}
-    init_normal_(nn.Sequential(embedding, conv), std=0.1)
-    assert_normal(embedding.weight, 0.1)
-    assert all(torch.equal(p, before[name]) for name, p in conv.named_parameters())
-
-
 @KINDS
 @SHAPES
 @pytest.mark.parametrize("gain", [math.sqrt(2), 0.01])
@@ -97,25 +88,3 @@ def test_orthogonal(kind: type[Any], shape: tuple[int, ...], patch_size: int, ga
     # Array patches, input projections, LayerNorms, class token and positions stay.
     for name, parameter in network.named_parameters():
         assert torch.equal(parameter, before[name]) == (name not in changed), name
-
-
-@pytest.mark.parametrize(
-    ("ours", "theirs"),
-    [
-        (ArrayPatchEmbedding(12, 4, 32, channels=3), nn.Conv1d(3, 32, 4, 4, bias=False)),
-        (ImagePatchEmbedding(3, (8, 8), 4, 32), nn.Conv2d(3, 32, 4, 4, bias=False)),
-        (SelfAttention(32, 4), nn.MultiheadAttention(32, 4)),
-    ],
-)
-def test_layers_draw_what_pytorch_draws(ours: Any, theirs: Any) -> None:
-    torch.manual_seed(1)
-    ours.reset_parameters()
-    torch.manual_seed(1)
-    if isinstance(theirs, nn.MultiheadAttention):
-        theirs._reset_parameters()
-        assert torch.equal(ours.in_proj_weight, theirs.in_proj_weight)
-        assert not ours.out_proj.bias.any()
-        assert_uniform(ours.out_proj.weight, 1 / math.sqrt(32))
-    else:
-        theirs.reset_parameters()
-        assert torch.equal(ours.weight, theirs.weight)

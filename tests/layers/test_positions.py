@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.networks.reference import randomize
 from tests.numerics import assert_near
-from torchrl_tit.layers import SelfAttention, TransformerBlock
+from torchrl_tit.layers import SelfAttention
 from torchrl_tit.settings import TemporalPositions
 
 pytestmark = [pytest.mark.numerics, pytest.mark.usefixtures("float64")]
@@ -85,23 +85,3 @@ def test_gradients_are_those_of_the_equation(kind: TemporalPositions, read: Any)
     actual = torch.autograd.grad((attention(x[None], read)[0] * probe).sum(), inputs)
     expected = torch.autograd.grad((written_out(attention, x)[0][positions] * probe).sum(), inputs)
     assert_near(list(actual), list(expected))
-
-
-@each_kind
-def test_only_the_distance_counts(kind: TemporalPositions) -> None:
-    """Steps whose past is hidden compute what they compute two steps earlier."""
-    attention = make(kind)
-    x = torch.randn(3, STEPS, WIDTH)
-    seen = torch.ones(STEPS, STEPS, dtype=torch.bool).tril()
-    seen[2:, :2] = False
-    later = attention(x, mask=seen)[:, 2:]
-    assert_near(later, attention(x[:, 2:]))
-    # Without positions two steps in the other order give the same; distances tell them apart.
-    swapped = attention(x[:, [1, 0, 2, 3, 4]], "last")
-    assert (swapped - attention(x, "last")).abs().max() > 1e-3
-
-
-@pytest.mark.parametrize("kind", ["none", "learned", "rotary"])
-def test_only_relative_positions_have_weights(kind: TemporalPositions) -> None:
-    block = TransformerBlock(8, 2, causal=True, positions=kind, num_frames=4)
-    assert list(block.state_dict()) == list(TransformerBlock(8, 2, causal=True).state_dict())

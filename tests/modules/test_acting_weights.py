@@ -97,31 +97,6 @@ def test_weights_that_to_module_swaps_are_used(mode):
                 assert_exact(backbone, stream[:, start : start + 4])
 
 
-@torch.inference_mode()
-def test_weights_of_inference_mode_are_used():
-    backbone, network, shape = make()
-    stream = torch.randn(5, 9, *shape)
-    with backbone.acting():
-        for start in range(4):
-            assert_exact(backbone, stream[:, start : start + 4])
-            for parameter in network.parameters():
-                parameter.add_(0.1)
-
-
-@pytest.mark.parametrize("part", ["history_encoder", "head"])
-def test_nothing_after_the_frame_encoder_is_kept(part):
-    backbone, network, shape = make()
-    frames = CountedFrames(network)
-    stream = torch.randn(5, 8, *shape)
-    with backbone.acting(), torch.no_grad():
-        for start in range(4):
-            frames.take()
-            acted = features(backbone, stream[:, start : start + 4])
-            assert frames.take() == (5 if start else 20)
-            assert_near(acted, network(stream[:, start : start + 4]))
-            change(network.get_submodule(part))
-
-
 class Count(nn.Module):
     """Counts the frames that are encoded at each step, and calls a function at one of them."""
 

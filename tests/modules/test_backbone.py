@@ -7,12 +7,10 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import set_skip_existing
 from torch import nn
-from torchrl.modules import set_recurrent_mode
 
 from tests.modules.frames import CountedFrames
 from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT, VanillaTIT
-from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.networks import MLP, HistoryNetwork, TwoTrunks, build_network
 from torchrl_tit.settings import NETWORKS, Flat, Inner, Linear, Outer, PairedOuter
 
@@ -88,26 +86,6 @@ def test_entries_by_keyword_and_by_position():
     assert_near(backbone(**entries), tuple(td[key] for key in backbone.out_keys))
 
 
-@pytest.mark.parametrize("in_recurrent_mode", [True, False])
-@torch.no_grad()
-def test_sequences_by_keyword_and_out_of_place(in_recurrent_mode):
-    network = EnhancedTIT((4,), 2)
-    backbone = Backbone(network, padding="same")
-    frames = torch.randn(3, 7, 4)
-    entries = {
-        "history": frames.unfold(1, 2, 1).transpose(-1, -2).clone(),
-        "observation": frames[:, 1:],
-        "is_init": torch.zeros(3, 6, 1, dtype=torch.bool),
-    }
-    out = TensorDict(batch_size=[3, 6])
-    with set_recurrent_mode(in_recurrent_mode):
-        features = backbone(**entries)
-        assert backbone(TensorDict(entries, [3, 6]), tensordict_out=out) is out
-    assert_near(features, network(entries["history"]))
-    assert_near(out["features"], features)
-    assert set(out.keys()) == {"features"}
-
-
 def test_keys_are_fixed():
     backbone = Backbone(EnhancedTIT((4,)))
     backbone.in_keys, backbone.out_keys = ["history"], ["features"]
@@ -115,38 +93,6 @@ def test_keys_are_fixed():
         with pytest.raises(AttributeError, match=f"^{name} of a backbone cannot .* build another"):
             setattr(backbone, name, ["other"])
     assert (backbone.in_keys, backbone.out_keys) == (["history"], ["features"])
-
-
-@pytest.mark.parametrize(("name", "num_frames"), [("enhanced-tit", 3), ("lstm", 3), ("lstm", 1)])
-@pytest.mark.parametrize("trunks", ["shared", "separate"])
-@torch.no_grad()
-def test_hooks_on_the_network_are_called_while_acting(name, num_frames, trunks):
-    network = build_network(NETWORKS[name](num_frames), (4,), trunks=trunks)
-    backbone = Backbone(network, out_keys=["a"] if trunks == "shared" else ["a", "b"])
-    each = trunks_of(network).values()
-    whole = {network, *each}
-    parts = {part for trunk in each for part in (*trunk.children(), *trunk.frames)}
-    called = []
-    for module in whole | parts:
-        module.register_forward_pre_hook(lambda module, x: called.append((module, x)))
-        module.register_forward_hook(lambda module, x, y: called.append((module, y)))
-    stream = torch.randn(5, 8, 4)
-    states = {key: torch.zeros(5, *size) for key, size in backbone.state_shapes.items()}
-    td = TensorDict({**states, "is_init": torch.zeros(5, 1, dtype=torch.bool)}, [5])
-
-    def calls(start):
-        called.clear()
-        backbone(td.set("history", stream[:, start : start + num_frames]))
-        return list(called)
-
-    expected = [calls(start) for start in range(4)]
-    with backbone.acting():
-        for start in range(4):
-            acted = calls(start)
-            assert {module for module, _ in acted} == {module for module, _ in expected[start]}
-            assert_near(
-                [x for m, x in acted if m in whole], [x for m, x in expected[start] if m in whole]
-            )
 
 
 @pytest.mark.parametrize(

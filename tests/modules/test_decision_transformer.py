@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import Compose, GymEnv, TargetReturn, TransformedEnv
+from torchrl.envs import Compose, TargetReturn, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from tests.networks.reference import randomize
@@ -147,15 +147,6 @@ def test_acting_keeps_tokens_and_changes_nothing(network_class):
     assert resets > 6
 
 
-def test_one_hot_environment_without_a_batch():
-    env = TransformedEnv(
-        GymEnv("CartPole-v1"), Compose(TargetReturn(500.0), SequenceHistory(num_frames=5))
-    )
-    actor = make_dt_actor(*make_network((4,), 2, space="discrete"), one_hot=True)
-    steps = env.rollout(10, actor)
-    assert (steps["action"].sum(-1) == 1).all()
-
-
 def test_evaluation_side_by_side_equals_one_after_another():
     actor = make_dt_actor(*make_network())
 
@@ -212,13 +203,3 @@ def test_the_features_of_every_frame_are_not_kept():
     with pytest.raises(ValueError, match="PairedOuterTransformer encodes the newest frame only"):
         Backbone(EnhancedTIT(observation_shape=(4,)), every_frame=True)
     assert torch.equal(features, network.every_frame(*(batch[name] for name in NAMES)))
-
-
-def test_autocast_of_every_frame():
-    network, _ = make_network()
-    batch = make_batch()
-    names = list(NAMES)
-    plain = Backbone(network, names, every_frame=True)(batch.clone())["features"]
-    cast = Backbone(network, names, autocast=torch.bfloat16, every_frame=True)(batch)["features"]
-    assert cast.dtype == torch.float32
-    assert 1e-5 < (cast - plain).norm() / plain.norm() < 0.05

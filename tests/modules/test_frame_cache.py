@@ -8,9 +8,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torch._subclasses import FakeTensorMode
-from torch.autograd import forward_ad
-from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from tests.modules.frames import (
     NETWORKS,
@@ -282,15 +279,6 @@ def test_dropout_within_attention_draws_for_every_frame():
         assert sum(seen) == count
 
 
-def test_training_mode_without_dropout_keeps():
-    backbone, network, shape = make()
-    network.train()
-    frames = CountedFrames(network)
-    with backbone.acting():
-        fill(backbone, torch.randn(5, 8, *shape))
-        assert frames.take() == 20 + 5
-
-
 def test_vmap_over_histories_and_over_weights():
     backbone, network, shape = make()
     with backbone.acting():
@@ -314,18 +302,6 @@ def test_vmap_over_histories_and_over_weights():
         assert_exact(backbone, history)
 
 
-def test_forward_mode_derivatives():
-    backbone, network, shape = make()
-    with backbone.acting(), sdpa_kernel(SDPBackend.MATH):  # the fused kernel has none
-        history = fill(backbone, torch.randn(5, 8, *shape))
-        tangent = torch.randn_like(history)
-        full = torch.func.jvp(network, (history,), (tangent,))[1]
-        with forward_ad.dual_level():
-            dual = forward_ad.make_dual(history, tangent)
-            _, acted = forward_ad.unpack_dual(features(backbone, dual))
-        assert_near(acted, full)
-
-
 @pytest.mark.parametrize("record", ["export", "strict export", "compile", "jit"])
 @pytest.mark.filterwarnings("ignore::torch.jit.TracerWarning", "ignore::DeprecationWarning")
 def test_a_recorded_backbone_is_the_whole_network(record):
@@ -346,18 +322,6 @@ def test_a_recorded_backbone_is_the_whole_network(record):
             history = stream[:, start : start + 4]
             assert_near(recorded(history), network(history))
         assert cache_of(backbone) is kept
-
-
-def test_tensors_without_values_pass_through():
-    backbone, network, shape = make()
-    encoder, window = encoder_of(network), torch.randn(5, 4, *shape)
-    cache = FrameCache(encoder, len(shape))
-    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
-        assert cache(mode.from_tensor(window)).shape == (5, 4, 2, 16)
-    assert cache._kept is None
-    network.to("meta")
-    with backbone.acting():
-        assert features(backbone, window.to("meta")).shape == (5, 8)
 
 
 def test_autocast_and_float32_do_not_share_tokens():

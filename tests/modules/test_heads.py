@@ -7,8 +7,6 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import nn
 from torch.nn import functional as F
 from torch.nn.functional import one_hot
 from torchrl.data import (
@@ -23,14 +21,9 @@ from torchrl.data import (
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
 from torchrl.modules.distributions.utils import rsample_and_log_prob
-from torchrl.objectives import ClipPPOLoss
 
 from tests.numerics import assert_near
-from torchrl_tit import Backbone
 from torchrl_tit.modules import make_actor, make_squashed_actor, make_value
-from torchrl_tit.modules.tensor_module import TensorModule
-from torchrl_tit.networks import build_network
-from torchrl_tit.settings import NETWORKS
 
 pytestmark = pytest.mark.numerics
 
@@ -175,49 +168,6 @@ def test_a_batched_spec_that_does_not_tell_is_refused(spec):
     assert act(make_actor(16, spec, batch_dims=1), features(8))["action"].shape == (8, 2)
 
 
-@pytest.mark.parametrize("name", MASKABLE)
-def test_ppo_loss_with_masks(name):
-    """One log-probability a step; gradients are finite, and 0 for what is never allowed."""
-    spec, sizes, settings = DISCRETE[name]
-    actor = spread(make_actor(16, spec, mask_key="action_mask", **settings))
-    td = features(6)
-    td["action_mask"] = some_mask(6, sizes)
-    forbidden = sizes[0] - 1 if sizes[0] > 1 else None
-    if forbidden is not None:
-        td["action_mask"][:, forbidden] = False
-        td["action_mask"][:, 0] = True
-    td = act(actor, td).detach()
-    td["advantage"], td["value_target"] = torch.randn(6, 1), torch.randn(6, 1)
-    loss = ClipPPOLoss(
-        actor,
-        make_value(16),
-        entropy_coeff=0.1,
-        functional=False,
-        log_explained_variance=False,
-    )
-    with torch.no_grad():
-        for parameter in actor.parameters():
-            parameter.mul_(1.1)
-    terms = loss(td)
-    expected = (td["action_log_prob"] - actor.get_dist(td).log_prob(td["action"])).mean()
-    assert_near(terms["kl_approx"], expected.detach())
-    (terms["loss_objective"] + terms["loss_entropy"]).backward()
-    weight = next(actor.parameters()).grad
-    assert weight.isfinite().all()
-    assert weight.any()
-    if forbidden is not None:
-        assert not weight[forbidden].any()
-
-
-def test_vmap_and_compile():
-    spec, sizes, _ = DISCRETE["multi-one-hot"]
-    actor = make_actor(16, spec, mask_key="action_mask")
-    td = act(actor, features(6).set("action_mask", some_mask(6, sizes)))
-    assert_near(torch.vmap(actor.log_prob)(td), td["action_log_prob"])
-    compiled = torch.compile(actor.log_prob, backend="eager")
-    assert_near(compiled(td), td["action_log_prob"])
-
-
 def test_a_row_without_any_action_is_refused():
     actor = make_actor(16, MultiCategorical([2, 3]), mask_key=("agent", "mask"))
     mask = torch.ones(4, 5, dtype=torch.bool)
@@ -236,57 +186,6 @@ def test_value_and_keys():
     assert make_actor(16, Categorical(2), in_key="policy", action_key="move")(td)["move"].shape == (
         5,
     )
-
-
-@pytest.mark.parametrize("trunks", ["shared", "separate"])
-def test_policies_write_without_a_search(trunks, monkeypatch):
-    keys = ["policy", "value"] if trunks == "separate" else ["policy"]
-    backbone = Backbone(build_network(NETWORKS["mlp"](2), (4,), trunks=trunks), out_keys=keys)
-    heads = [
-        make_actor(64, MultiCategorical([2, 3]), in_key="policy"),
-        make_squashed_actor(64, Bounded(-1, 1, (3,)), in_key="policy", action_key="squashed"),
-        make_value(64, in_key=keys[-1]),
-    ]
-
-    def search(*args: object, **kwargs: object) -> None:
-        raise AssertionError("TensorDict looks for data frames")
-
-    monkeypatch.setattr(TensorDict, "from_any", search)
-    td = TensorDictSequential(backbone, *heads)(TensorDict({"history": torch.randn(5, 2, 4)}, [5]))
-    assert td["squashed"].shape == (5, 3)
-
-
-@pytest.mark.parametrize("out_keys", [["y"], ["y", "z"], ["_", "z"], [("deep", "y"), "z"]])
-def test_writes_what_tensordict_writes(out_keys):
-    def network(x: torch.Tensor):
-        return x + 1 if len(out_keys) == 1 else (x + 1, x * 2)
-
-    td = TensorDict(x=torch.arange(3.0), batch_size=[3])
-    written = [
-        module(network, in_keys=["x"], out_keys=out_keys)(td.clone())
-        for module in (TensorModule, TensorDictModule)
-    ]
-    assert set(written[0].keys(True)) == set(written[1].keys(True))
-    assert (written[0] == written[1]).all()
-
-
-def test_what_is_no_tensor_is_left_to_tensordict():
-    module = TensorModule(lambda x: {"a": x}, in_keys=["x"], out_keys=["y"])
-    td = module(TensorDict(x=torch.arange(3.0), batch_size=[3]))
-    assert td["y", "a"].tolist() == [0, 1, 2]
-    wrong = TensorModule(nn.Identity(), in_keys=["x"], out_keys=["y", "z"])
-    with pytest.raises(RuntimeError, match="out_keys"):
-        wrong(td)
-
-
-def test_out_of_place():
-    module = TensorModule(nn.Identity(), in_keys=["x"], out_keys=["y"], inplace=False)
-    td = TensorDict(x=torch.arange(3.0), batch_size=[3])
-    assert set(module(td).keys()) == {"y"}
-    other = TensorDict(batch_size=[3])
-    TensorModule(nn.Identity(), in_keys=["x"], out_keys=["y"])(td, tensordict_out=other)
-    assert set(other.keys()) == {"y"}
-    assert "y" not in td
 
 
 LOW, HIGH = torch.tensor([-1.0, 0.0]), torch.tensor([1.0, 10.0])

@@ -7,12 +7,10 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import InitTracker
 from torchrl.modules import set_recurrent_mode
-from torchrl.objectives.value import GAE
 
 from tests.modules.frames import CountedFrames
 from tests.networks.test_pairs import (
@@ -30,7 +28,7 @@ from tests.networks.test_pairs import (
 from tests.numerics import assert_near
 from torchrl_tit import Backbone, EnhancedTIT, settings
 from torchrl_tit.envs import make_env
-from torchrl_tit.modules import history_keys, make_value
+from torchrl_tit.modules import history_keys
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.choices import Padding
 
@@ -160,18 +158,6 @@ def test_compiles_without_a_graph_break(pair: Pair) -> None:
     torch.compiler.reset()
 
 
-def test_bfloat16_autocast() -> None:
-    network = build(CASE)
-    td = sequences(CASE, "same").apply(lambda x: x.float() if x.is_floating_point() else x)
-    expected = Backbone(network, autocast=torch.bfloat16)(td.clone())["features"]
-    features = read(Backbone(network, padding="same", autocast=torch.bfloat16), td.clone())
-    assert features.dtype == torch.float32
-    torch.testing.assert_close(features, expected, rtol=0, atol=2e-2)
-    exact = Backbone(network)(td)["features"]
-    assert not torch.equal(features, exact)
-    assert (features - exact).abs().mean() < 2e-2
-
-
 def rollout_of(num_frames: int, padding: Padding) -> TensorDictBase:
     env = make_env("CartPole-v1", 3, num_frames=num_frames, padding=padding, seed=0)
     torch.manual_seed(0)
@@ -204,24 +190,6 @@ def test_flat_batches_of_a_slice_sampler(padding: Padding) -> None:
     starts = flat["is_init"].sum()
     assert (~valid).sum() == 3 * (50 - starts)
     assert_near(features[valid.squeeze(-1)], expected[valid.squeeze(-1)])
-
-
-def test_gae_reads_whole_rollouts() -> None:
-    rollout = rollout_of(4, "same")
-    network = EnhancedTIT((4,), 4).double()
-    critic = make_value(network.features_dim).double()
-
-    def advantages(backbone: Backbone) -> Tensor:
-        value = TensorDictSequential(backbone, critic)
-        gae = GAE(gamma=0.9, lmbda=0.9, value_network=value, deactivate_vmap=True)
-        with set_recurrent_mode(True):
-            return gae(rollout.clone())["advantage"]
-
-    expected = advantages(Backbone(network))  # selects histories alone, so reads single steps
-    counted = CountedFrames(network)
-    actual = advantages(Backbone(network, observation_keys="observation"))
-    assert_near(actual, expected)
-    assert counted.take() < 2 * 3 * 60 * 4
 
 
 def test_every_frame_and_leading_dimensions() -> None:

@@ -7,14 +7,7 @@ import torch
 from torchrl.data import MultiCategorical
 
 from torchrl_tit.networks import HistoryNetwork, build_network, chosen_by_kind, frames_by_kind
-from torchrl_tit.settings import (
-    NETWORKS,
-    Flat,
-    Inner,
-    Linear,
-    NatureCNNFrames,
-    ResNetFrames,
-)
+from torchrl_tit.settings import NETWORKS, Flat, Inner, Linear, NatureCNNFrames, ResNetFrames
 from torchrl_tit.settings.networks import catformer, enhanced_tit, mlp, nature_cnn
 
 DIRECTION = MultiCategorical([4])

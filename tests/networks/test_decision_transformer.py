@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from tests.networks.reference import randomize
 from torchrl_tit.histories.decision_transformer import DecisionTransformer as Encoder
-from torchrl_tit.layers import GPT2Block
 from torchrl_tit.modules import DTHead
 from torchrl_tit.modules.decision_transformer import ActionSpace
 from torchrl_tit.networks import DTTIT, DecisionTransformer, HistoryNetwork
@@ -115,18 +114,6 @@ def test_the_newest_step_alone_equals_the_last_of_all(case: str) -> None:
     torch.testing.assert_close(network.encode_history(tokens, *others, mask), features)
 
 
-def test_only_the_newest_step_of_the_last_block_is_computed() -> None:
-    predictor, inputs = make("dt"), make_inputs("dt", 2)
-    computed: list[int] = []
-    for block in predictor.encoder.blocks:
-        block.get_submodule("ffn").register_forward_pre_hook(
-            lambda module, args: computed.append(args[0].shape[1])
-        )
-    predictor.network(*inputs)
-    predictor.network.every_frame(*inputs)
-    assert computed == [14, 1, 14, 5]  # return, state and action of five steps, but for the last
-
-
 def test_action_heads() -> None:
     continuous = make("dt")(*make_inputs("dt", 4)).abs()
     assert continuous.max() < 1
@@ -180,25 +167,6 @@ def test_tokens_are_dropped_before_the_blocks() -> None:
     predictor.encoder.blocks.eval()
     predictor.encoder.dropout.train()
     assert not torch.equal(predictor(*inputs), predictor(*inputs))
-
-
-@pytest.mark.parametrize("part", ["attention", "ffn"])
-def test_both_residuals_of_a_block_are_dropped(part: str) -> None:
-    torch.manual_seed(0)
-    block = GPT2Block(8, 2, 16, dropout=0.25).double()
-    randomize(block)
-    other = block.ffn.get_submodule("2") if part == "attention" else block.attention.out_proj
-    for parameter in other.parameters():
-        nn.init.zeros_(parameter)
-    block.attention.dropout.p = 0.0
-    x = torch.randn(2000, 2, 8, dtype=torch.float64)
-    mask = torch.ones(2, 2, dtype=torch.bool).tril()
-    with torch.no_grad():
-        kept = block.eval()(x, mask) - x
-        update = block.train()(x, mask) - x
-    dropped = update == 0
-    assert abs(dropped.double().mean() - 0.25) < 0.02
-    torch.testing.assert_close(update[~dropped], kept[~dropped] / 0.75, rtol=1e-6, atol=1e-9)
 
 
 def test_wrong_shapes_and_types_are_named() -> None:

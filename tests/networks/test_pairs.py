@@ -102,12 +102,12 @@ OF_KINDS: dict[Pair, Any] = {
 }
 CASES: dict[Pair, Any] = {pair: shape_of(pair) for pair in PAIRS} | OF_KINDS
 every_case = pytest.mark.parametrize("case", CASES, ids="+".join)
-# Tracing takes seconds, and the two encoders of a pair are traced apart: each history encoder once
-# (on one token in tests/modules/test_sequences.py), and each frame encoder once.
-TRACED: list[Pair] = [("flat" if h in STACKED else "inner", h) for h in HISTORIES]
-TRACED += [(f, "outer") for f in FRAMES if f != "inner"]
-TRACED += [("inner", "paired-outer", "categories"), ("resnet", "mlp", "several")]
-traced_cases = pytest.mark.parametrize("case", TRACED, ids="+".join)
+# What concerns the two encoders of a pair apart: each history encoder once (traced on one token in
+# tests/modules/test_sequences.py), and each frame encoder once.
+APART: list[Pair] = [("flat" if h in STACKED else "inner", h) for h in HISTORIES]
+APART += [(f, "outer") for f in FRAMES if f != "inner"]
+APART += [("inner", "paired-outer", "categories"), ("resnet", "mlp", "several")]
+apart = pytest.mark.parametrize("case", APART, ids="+".join)
 
 
 def build(case: Pair, seed: int = 0, num_frames: int = NUM_FRAMES, **fields: Any) -> Any:
@@ -208,7 +208,7 @@ def test_every_frame_matters_and_gradients_are_finite(case: Pair) -> None:
             assert same.all(0).tolist() == [k != step for k in range(NUM_FRAMES)]
 
 
-@every_case
+@apart
 @torch.no_grad()
 def test_leading_dimensions_are_free(case: Pair) -> None:
     network, inputs = network_of(case), inputs_of(case, 2, 3)
@@ -218,7 +218,7 @@ def test_leading_dimensions_are_free(case: Pair) -> None:
     assert network(*inputs_of(case, 0)).shape == (0, 4)
 
 
-@pytest.mark.parametrize("case", PAIRS, ids="+".join)
+@pytest.mark.parametrize("case", [case for case in APART if len(case) == 2], ids="+".join)
 @torch.no_grad()
 def test_bytes_are_divided_by_255(case: Pair) -> None:
     network, (history, *context) = network_of(case), inputs_of(case, 2)
@@ -268,7 +268,7 @@ def test_acting_with_kept_frames_equals_the_full_pass(case: Pair) -> None:
     assert backbone.keeps_frames == ("several" in case or case[0] != "flat")
 
 
-@every_case
+@apart
 @torch.no_grad()
 def test_copies_compute_the_same_and_are_apart(case: Pair) -> None:
     network, fresh, inputs = network_of(case), build(case, seed=1).double(), inputs_of(case, 2)
@@ -286,7 +286,7 @@ def test_copies_compute_the_same_and_are_apart(case: Pair) -> None:
     assert torch.equal(network(*inputs), expected)
 
 
-@traced_cases
+@apart
 @torch.no_grad()
 def test_other_float_types_stay_close(case: Pair) -> None:
     network, inputs = network_of(case), inputs_of(case, 8)
@@ -305,7 +305,7 @@ def test_other_float_types_stay_close(case: Pair) -> None:
     assert 1e-5 < error(features) < 0.1  # it did run in bfloat16
 
 
-@traced_cases
+@apart
 @torch.no_grad()
 def test_export(case: Pair) -> None:
     network, inputs = network_of(case), inputs_of(case, 2)
@@ -313,7 +313,7 @@ def test_export(case: Pair) -> None:
     torch.testing.assert_close(exported(*inputs), network(*inputs))
 
 
-@traced_cases
+@apart
 @pytest.mark.usefixtures("_fresh_compiler")
 def test_compile_in_one_graph(case: Pair) -> None:
     """The backward pass once for each history encoder: tracing it takes as long again."""
@@ -380,20 +380,6 @@ def test_vmap_over_stacked_parameters(case: Pair) -> None:
 
     expected = torch.stack([network(*inputs) for network in networks])
     torch.testing.assert_close(torch.vmap(call)(*state), expected)
-
-
-@pytest.mark.filterwarnings("ignore:There is a performance drop")
-@pytest.mark.parametrize("kind", ["attention_dropout", "ffn_dropout"])
-@pytest.mark.parametrize("part", ["inner", "outer"])
-def test_vmap_drops_differently_for_each(kind: str, part: str) -> None:
-    dropout: dict[str, Any] = {f"{kind}_{part}": 0.5}
-    modules = [EnhancedTIT((5,), 3, patch_size=2, **dropout) for _ in range(2)]
-    modules[1].load_state_dict(modules[0].state_dict())
-    history = torch.randn(4, 3, 5)
-    first, second = torch.vmap(
-        lambda p, b: functional_call(modules[0], (p, b), (history,)), randomness="different"
-    )(*stack_module_state(modules))
-    assert not torch.allclose(first, second)
 
 
 def test_two_trunks_read_sequences_and_act_apart() -> None:

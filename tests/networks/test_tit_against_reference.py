@@ -11,12 +11,7 @@ from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from tests.networks.reference import (
-    ReferenceTIT,
-    copy_parameters,
-    matched_parameters,
-    randomize,
-)
+from tests.networks.reference import ReferenceTIT, copy_parameters, matched_parameters, randomize
 from tests.numerics import assert_near
 from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, VanillaTIT
 
@@ -33,14 +28,8 @@ NETWORKS: dict[str, dict[str, Any]] = {
 # Name: observation shape, number of frames K, hyperparameters.
 CASES: dict[str, tuple[tuple[int, ...], int, dict[str, Any]]] = {
     "array, K=1": ((4,), 1, {}),
-    "array, K=2": ((4,), 2, {"num_heads_inner": 2, "num_heads_outer": 4}),
     "array, K=4": ((5,), 4, {"num_heads_inner": 4, "num_heads_outer": 2}),
-    "array of one entry": ((1,), 2, {}),
-    "P divides D": ((8,), 2, {"patch_size": 4}),
     "D=11, P=4": ((11,), 2, {"patch_size": 4}),
-    "D=7, P=4": ((7,), 2, {"patch_size": 4}),
-    "D=10, P=4": ((10,), 2, {"patch_size": 4}),
-    "D=9, P=4": ((9,), 1, {"patch_size": 4}),
     "P = D": ((5,), 2, {"patch_size": 5}),
     "expansions": ((4,), 2, {"ffn_expansion_inner": 1, "ffn_expansion_outer": 2}),
     "relu, tanh, gelu": (
@@ -48,29 +37,13 @@ CASES: dict[str, tuple[tuple[int, ...], int, dict[str, Any]]] = {
         2,
         {"activation_inner": "relu", "activation_outer": "tanh", "activation_head": "gelu"},
     ),
-    "silu, gelu, relu": (
-        (4,),
-        2,
-        {"activation_inner": "silu", "activation_outer": "gelu", "activation_head": "relu"},
-    ),
     "no positions": ((4,), 2, {"position_encoding": False}),
     "temporal positions": ((4,), 4, {"temporal_positions": "learned"}),
-    "no positions but temporal": (
-        (4,),
-        2,
-        {"position_encoding": False, "temporal_positions": "learned"},
-    ),
     "shared blocks": ((4,), 2, {"share_blocks": True, "num_blocks": 3}),
     "one block": ((4,), 2, {"num_blocks": 1}),
     "three blocks": ((4,), 3, {"num_blocks": 3}),
     "image": ((12, 12), 2, {"patch_size": 4, "num_heads_inner": 2}),
-    "image of one patch": ((6, 6), 1, {"patch_size": 6}),
     "wide image of three channels": ((3, 8, 12), 4, {"patch_size": 4, "num_heads_outer": 2}),
-    "tall image, temporal positions": (
-        (12, 4),
-        2,
-        {"patch_size": 2, "temporal_positions": "learned"},
-    ),
 }
 
 PAIRS = [
@@ -138,20 +111,6 @@ def test_outputs_and_gradients(network: str, case: str) -> None:
 
 
 @pytest.mark.parametrize("network", NETWORKS)
-def test_memory_layout_does_not_matter(network: str) -> None:
-    shape, num_frames, settings = CASES["wide image of three channels"]
-    ours, _ = make_pair(network, shape, num_frames, **settings)
-    history = torch.randn(3, num_frames, *shape)
-    expected = ours(history)
-    channels_last = history.permute(0, 1, 3, 4, 2).contiguous().permute(0, 1, 4, 2, 3)
-    step_last = history.movedim(1, -1).contiguous().movedim(-1, 1)
-    window = torch.randn(3, num_frames + 3, *shape)[:, 2:-1].copy_(history)
-    for other in (channels_last, step_last, window):
-        assert not other.is_contiguous()
-        assert_near(ours(other), expected)
-
-
-@pytest.mark.parametrize("network", NETWORKS)
 @pytest.mark.parametrize("leading", [(), (2, 3), (0,)])
 @pytest.mark.parametrize(
     "case", ["array, K=1", "array, K=4", "three blocks", "shared blocks", "image", "P = D"]
@@ -179,26 +138,9 @@ def test_attention_maps(network: str, leading: tuple[int, ...], case: str) -> No
         assert_near(weights, expected)
         assert_near(weights.sum(-1), torch.ones(weights.shape[:-1]))
     for weights in maps.outer:
-        assert weights.shape == (
-            *leading,
-            settings.get("num_heads_outer", 1),
-            num_frames,
-            num_frames,
-        )
+        heads = settings.get("num_heads_outer", 1)
+        assert weights.shape == (*leading, heads, num_frames, num_frames)
         assert not weights.triu(1).any(), "a step sees a later one"
-
-
-def test_usual_pass_computes_no_attention_maps(monkeypatch: pytest.MonkeyPatch) -> None:
-    tit = EnhancedTIT((8, 8), 3, patch_size=4)
-
-    def never(*_: object, **__: object) -> None:
-        raise AssertionError("attention weights were computed")
-
-    for name in ("weights", "_weights"):
-        monkeypatch.setattr(f"torchrl_tit.layers.attention.SelfAttention.{name}", never)
-    tit(torch.randn(2, 3, 8, 8))
-    with pytest.raises(AssertionError, match="were computed"):
-        tit.attention_maps(torch.randn(2, 3, 8, 8))
 
 
 @pytest.mark.parametrize("network", ["vanilla", "enhanced"])

@@ -30,15 +30,3 @@ def test_history_of_another_dtype(kind: type[Any], dtype: torch.dtype) -> None:
     for call in (tit, tit.attention_maps):
         with pytest.raises(TypeError, match=rf"{dtype} .* network of torch.float32: {hint}"):
             call(torch.zeros(5, 2, 3, dtype=dtype))
-
-
-def test_float_history_of_a_network_in_double() -> None:
-    with pytest.raises(TypeError, match=r"give it torch.float64 .* with \.to\(torch.float32\)"):
-        EnhancedTIT((3,), 2).double()(torch.zeros(5, 2, 3))
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.int64])
-def test_autocast_does_not_convert_these(dtype: torch.dtype) -> None:
-    tit = EnhancedTIT((3,), 2)
-    with torch.autocast("cpu", torch.bfloat16), pytest.raises(TypeError, match=f"{dtype}"):
-        tit(torch.zeros(5, 2, 3, dtype=dtype))

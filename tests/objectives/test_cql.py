@@ -7,12 +7,10 @@ import pytest
 import torch
 from scipy.stats import norm
 from tensordict import TensorDict
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
 from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot, Unbounded
-from torchrl.modules import MLP, QValueActor, ValueOperator
+from torchrl.modules import QValueActor, ValueOperator
 
-from torchrl_tit import Backbone, EnhancedTIT
 from torchrl_tit.modules import make_squashed_actor
 from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
 
@@ -228,59 +226,6 @@ def test_forward_computes_the_same_terms_and_adds_priorities_to_the_batch(monkey
     assert set(terms.keys()) == set(loss.out_keys) == set(expected)
     for name, value in expected.items():
         torch.testing.assert_close(terms[name], value.detach(), msg=name)
-
-
-def test_keys_can_be_set():
-    """The policy's and the critics' own, and that of priorities."""
-    mlp = MLP(OBSERVATION + ACTION, 1, num_cells=[8]).double()
-    batch, results = make_batch(), []
-    for action, value in (("action", "state_action_value"), ("a", "q")):
-        torch.manual_seed(0)
-        actor = make_squashed_actor(OBSERVATION, SPEC, in_key="observation", action_key=action)
-        critic = ValueOperator(mlp, in_keys=["state", action], out_keys=[value])
-        loss = ContinuousCQLLoss(actor.double(), [critic, critic], action_spec=SPEC)
-        loss.set_keys(action=action, state_action_value=value, priority="p")
-        loss.make_value_estimator(gamma=GAMMA)
-        renamed = batch.clone().rename_key_("action", action)
-        results.append({**loss(renamed).to_dict(), "p": renamed["p"]})
-    torch.testing.assert_close(results[1], results[0])
-
-
-def test_backbones_run_once_a_state_and_all_of_it_trains():
-    """The actor at s and at s'; the critics at s, at s', and at s with the actor's action."""
-    calls: dict[str, list[int]] = {"actor": [], "critic": []}  # number of frames in each
-
-    def backbone(name, key):
-        network = EnhancedTIT((OBSERVATION,), 2, embed_dim=16, ffn_dropout_inner=0.1)
-        network.frames[0].register_forward_pre_hook(
-            lambda _, frames: calls[name].append(frames[0].numel() // OBSERVATION)
-        )
-        return Backbone(network, out_keys=[key]), network.features_dim
-
-    first, size = backbone("actor", "features")
-    actor = ProbabilisticTensorDictSequential(first, *make_squashed_actor(size, SPEC))
-    second, size = backbone("critic", "critic_features")
-    critic = TensorDictSequential(
-        second,
-        ValueOperator(
-            MLP(size + ACTION, 1, num_cells=[8]),
-            in_keys=["critic_features", "action"],
-            out_keys=["state_action_value"],
-        ),
-    )
-    loss = ContinuousCQLLoss(actor, critic, action_spec=SPEC, num_random=SAMPLES)
-    loss.make_value_estimator(gamma=GAMMA)
-    batch = make_batch().apply(lambda x: x.float() if x.is_floating_point() else x)
-    for part in (batch, batch["next"]):
-        part["history"] = torch.randn(BATCH, 2, OBSERVATION)
-    batch["next", "history"][:, 0] = batch["history"][:, 1]
-    for names in calls.values():
-        names.clear()
-    terms = loss(batch)
-    assert calls == {"actor": [2 * BATCH] * 2, "critic": [2 * BATCH] * 6}
-    sum(terms[name] for name in ("loss_actor", "loss_qvalue", "loss_cql", "loss_alpha")).backward()
-    for params in (loss.actor_network_params, loss.qvalue_network_params):
-        assert all(w.grad is not None for w in params.values(True, True) if w.requires_grad)
 
 
 @pytest.mark.parametrize("spec", [Categorical(3), Unbounded((2,)), Bounded(-1, 1, shape=(4, 2))])

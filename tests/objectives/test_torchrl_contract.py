@@ -158,24 +158,6 @@ def test_parameters_appear_once_and_all_of_them_train(make: Callable[[], Case]) 
 
 
 @each_loss
-def test_parameters_can_be_reset(make: Callable[[], Case]) -> None:
-    loss, batch = make()
-    modified = []
-    for name, group in loss.named_children():
-        if name.endswith("_params"):
-            for key, weight in group.items(True, True):
-                if weight.is_floating_point() and isinstance(weight, nn.Parameter):
-                    weight.data += 1_000
-                    modified.append((f"{name}.{key}", weight, weight.clone()))
-    assert modified
-    loss.reset_parameters_recursive()
-    kept = [key for key, weight, before in modified if (weight == before).all()]
-    assert kept == []
-    terms = compute(loss, batch)
-    assert all(value.isfinite().all() for value in terms.values())
-
-
-@each_loss
 def test_what_a_batch_holds_is_left_unchanged(make: Callable[[], Case]) -> None:
     loss, batch = make()
     before = batch.clone()

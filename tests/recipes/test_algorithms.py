@@ -13,12 +13,7 @@ from recipes.core import runner
 from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
 from tests.agents.runs import packed
-from tests.recipes.small import (
-    RECIPES,
-    assert_resumes_bit_for_bit,
-    make_algorithm,
-    train,
-)
+from tests.recipes.small import RECIPES, assert_resumes_bit_for_bit, make_algorithm, train
 from torchrl_tit.agents import load_agent
 from torchrl_tit.agents.folder import WEIGHTS
 from torchrl_tit.checkpoint import load_checkpoint
@@ -29,7 +24,7 @@ from torchrl_tit.export.program import make_program
 from torchrl_tit.frames import NormalizedFrames
 
 NOISE = {
-    "standard_normal": (
+    "standard_normal": [
         "ppo, continuous",
         "ppo, smooth",
         "sac",
@@ -41,15 +36,15 @@ NOISE = {
         "cql, mingru",
         "odt",
         "odt, offline",
-    ),
-    "gumbel": (
+    ],
+    "gumbel": [
         "ppo",
         "ppo, contrastive",
         "ppo, novelty",
         "bc, discrete",
         "iql, discrete",
         "dt, discrete",
-    ),
+    ],
 }
 """With which the actions of policies are drawn that draw them."""
 

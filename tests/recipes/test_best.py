@@ -81,10 +81,3 @@ def test_the_best_weights_are_those_that_collected_the_best_episodes(run, capsys
     assert said in capsys.readouterr().out
     assert json.loads((run.folder / "evaluation_best.json").read_text()) == best
     assert not (run.folder / "evaluation.json").exists()
-
-
-def test_a_run_without_enough_episodes_has_no_best_weights(run):
-    step, state = load_checkpoint(run.checkpoints)
-    run.save(step, {**state, "best": Best(nn.Linear(1, 1)).state_dict()})
-    with pytest.raises(ValueError, match="no best weights yet: fewer than 20 training episodes"):
-        evaluate(run, best=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import random
 import re
 import shutil
@@ -27,14 +26,13 @@ from recipes.dqn import DQN
 from recipes.novelty import NovelPPO
 from recipes.ppo import PPO
 from recipes.sac import SAC
-from tests.envs import tasks
 from tests.recipes.commands import fails
 from tests.recipes.ppo import tasks as ppo_tasks
 from tests.recipes.small import Batches, train
 from tests.recipes.states import TIMES, assert_same
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.envs import AtariGames
-from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp, nature_cnn
+from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
 # Active dropout draws from the global generator too.
 TIT = enhanced_tit(3, embed_dim=8, features_dim=8, ffn_dropout_inner=0.1)
@@ -69,37 +67,21 @@ _REPLAY: dict[str, Any] = {
 }
 SAC_RECIPE = SAC(env="Pendulum-v1", backbone=mlp(2, hidden_dim=8), critic_hidden=(8,), **_REPLAY)
 DQN_RECIPE = DQN(env="CartPole-v1", backbone=TIT, buffer_size=64, slice_length=4, **_REPLAY)
-IMAGES = ("minigrid.wrappers:ImgObsWrapper",)
 RECIPES: dict[str, Recipe] = {
     "CartPole": PPO_RECIPE,
     "novelty": NovelPPO(**vars(PPO_RECIPE)),
     "recurrent": replace(PPO_RECIPE, backbone=lstm(embed_dim=8, hidden_dim=8, features_dim=8)),
-    "MuJoCo": replace(PPO_RECIPE, env="Hopper-v5", backbone=mlp()),
-    "ale_py": replace(PPO_RECIPE, env="ALE/Breakout-v5", backbone=nature_cnn()),
-    "minigrid": replace(PPO_RECIPE, env="MiniGrid-Empty-5x5-v0", wrappers=IMAGES, backbone=mlp()),
     "TorchRL": replace(
         PPO_RECIPE, env="torchrl.envs:PendulumEnv", env_settings=("max_episode_steps=10",)
-    ),
-    "one's own": replace(
-        PPO_RECIPE,
-        env=f"{tasks.__name__}:Robot-v0",
-        observation_keys=("arm/joint_angles",),
-        backbone=mlp(),
     ),
     "collectors": replace(PPO_RECIPE, collectors=2),
     "SAC": SAC_RECIPE,
     "DQN": DQN_RECIPE,
 }
 KINDS = [
-    pytest.param(name, marks=pytest.mark.slow if name in ("ale_py", "collectors") else ())
-    for name in RECIPES
+    *("CartPole", "novelty", "recurrent", "SAC", "DQN"),
+    pytest.param("collectors", marks=pytest.mark.slow),
 ]
-
-
-def recipe_of(kind: str) -> Recipe:
-    if kind in ("ale_py", "minigrid") and importlib.util.find_spec(kind) is None:
-        pytest.skip(f"{kind} is an extra")
-    return RECIPES[kind]
 
 
 def train_in(folder: Path, recipe: Recipe, *callbacks: Callback) -> dict[str, Any]:
@@ -120,7 +102,7 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_depends_on_checkpoints_and_evaluations(kind: str, tmp_path: Path) -> None:
-    recipe = recipe_of(kind)
+    recipe = RECIPES[kind]
     whole = train_in(tmp_path / "whole", recipe)
     rows = rows_of(tmp_path / "whole")
     assert len(rows) == 2
@@ -146,7 +128,7 @@ def starts_of(batch: Any) -> list[tuple[float, ...]]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path: Path) -> None:
-    recipe = recipe_of(kind)
+    recipe = RECIPES[kind]
     begun = Batches(96)
     train_in(tmp_path / "first", recipe, begun)
     shutil.copytree(tmp_path / "first", tmp_path / "second")
@@ -166,9 +148,8 @@ def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path
     assert rows_of(tmp_path / "first")[: len(stopped)] == stopped
     # Episodes and histories are new ones.
     batch = seen[0][0]
-    if kind not in ("ale_py", "minigrid"):
-        assert (batch["next", "episode_reward"] - batch["next", "reward"])[:, 0].abs().max() == 0
-        assert not set(starts_of(batch)) & set(starts_of(begun.batches[0]))  # with other seeds
+    assert (batch["next", "episode_reward"] - batch["next", "reward"])[:, 0].abs().max() == 0
+    assert not set(starts_of(batch)) & set(starts_of(begun.batches[0]))  # with other seeds
     if "is_init" in batch.keys():  # noqa: SIM118 (a tensordict)
         assert batch["is_init"][:, 0].all()
 
@@ -190,7 +171,7 @@ def test_neighboring_seeds_share_no_game(monkeypatch: pytest.MonkeyPatch) -> Non
     seeds: list[int] = []
     monkeypatch.setattr(AtariGames, "_begin", lambda games, which, given: seeds.extend(given or ()))
     for seed in (20, 21, 22):
-        seed_copies(make_task(RECIPES["ale_py"], 2), seed).close()
+        seed_copies(make_task(replace(PPO_RECIPE, env="ALE/Breakout-v5"), 2), seed).close()
     assert len(set(seeds)) == len(seeds) == 6
 
 

@@ -12,15 +12,7 @@ from torchrl.modules import set_recurrent_mode
 
 from recipes.dqn import DQN
 from recipes.sac import SAC
-from tests.recipes.small import (
-    BC,
-    CQL,
-    IQL,
-    TD3BC,
-    DiscreteCQL,
-    make,
-    make_algorithm,
-)
+from tests.recipes.small import BC, CQL, IQL, TD3BC, DiscreteCQL, make, make_algorithm
 from torchrl_tit.modules import Backbone, as_sequences
 from torchrl_tit.settings import HistorySettings
 from torchrl_tit.settings.networks import lstm

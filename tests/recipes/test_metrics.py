@@ -79,17 +79,6 @@ def test_what_is_damaged_is_named(text, after, tmp_path):
         read_metrics(path)
 
 
-def test_a_linked_folder_of_tensorboard_is_not_touched(tmp_path):
-    other = tmp_path / "elsewhere"
-    other.mkdir()
-    (other / "thesis.tex").write_text("years of work")
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "tensorboard").symlink_to(other)
-    write(tmp_path / "run", [(64, 1.0, 2.0)])
-    assert [path.name for path in other.iterdir()] == ["thesis.tex"]
-    assert scalars(tmp_path / "run", "loss") == [(64, 1.0)]
-
-
 def test_metrics_of_another_run_are_refused_and_stay(tmp_path):
     path = tmp_path / "metrics.csv"
     path.write_text("step,time,steps_per_second,loss\n64,1.0,9.0,2.0\n")

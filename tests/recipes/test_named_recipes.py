@@ -229,36 +229,6 @@ def test_all_pictures_train_with_one_set_of_settings() -> None:
     assert not one.warmup_steps
 
 
-def test_tit_on_pictures_has_no_dropout_and_tells_frames_apart() -> None:
-    sizes = {**TIT_OF_IMAGES, "temporal_positions": "learned"}
-    sizes |= {name: 0.0 for name in sizes if "dropout" in name}
-    for name in PICTURES:
-        if name.endswith(("/enhanced-tit", "/enhanced-tit-k16")):
-            num_frames = 16 if name.endswith("k16") else 4
-            patch = {"patch_size": 2} if "minatar" in name else {}
-            expected = enhanced_tit(num_frames, **{**sizes, **patch})
-            assert get_recipe(name).backbone == expected, name
-
-
-def test_all_tit_networks_differ_only_in_frames_and_positions() -> None:
-    no_positions: dict[str, Any] = {"temporal_positions": "none"}
-    networks = {
-        replace(
-            recipe.backbone,
-            num_frames=1,
-            history=replace(recipe.backbone.history, **no_positions),
-        )
-        for name, recipe in RECIPES.items()
-        if isinstance(recipe, PPO)
-        and "enhanced-tit" in name
-        and not name.endswith(PAPERS)
-        and "wo-outer" not in name
-        and name not in PICTURES
-        and "MiniGrid" not in recipe.env  # whose patch is a tile
-    }
-    assert networks == {enhanced_tit(patch_size="auto", patch_weights="own")}
-
-
 TASKS_OF_MEMORY = sorted({name.rpartition("/")[0] for name in MEMORIES})
 
 

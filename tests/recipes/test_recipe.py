@@ -37,24 +37,15 @@ class Careful(FrameSettings):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (
-            {"initialization": "orthogonl"},
-            "field 'initialization' is 'orthogonl', not one of",
-        ),
+        ({"initialization": "orthogonl"}, "field 'initialization' is 'orthogonl', not one of"),
         ({"compile": "yes"}, r"field 'compile' is 'yes', not one of \('auto', 'on', 'off'\)"),
         ({"num_envs": "2"}, "field 'num_envs' is '2': Expected `int`"),
         ({"epochs": 2.0}, r"field 'epochs' is 2\.0: Expected `int`"),
         ({"hide_velocities": 1}, "field 'hide_velocities' is 1: Expected `bool`"),
-        (
-            {"backbone": "mlp"},
-            "must be the settings of a network, .* not 'mlp'",
-        ),
+        ({"backbone": "mlp"}, "must be the settings of a network, .* not 'mlp'"),
         ({"backbone": MLP((4,))}, "must be the settings of a network"),
         ({"backbone": replace(mlp(), frame=Careless(embed_dim=HALF))}, "'embed_dim' is 2.5"),
-        (
-            {"total_steps": 10**30},
-            "total_steps must be at most 1000000000000, not 10000000",
-        ),
+        ({"total_steps": 10**30}, "total_steps must be at most 1000000000000, not 10000000"),
         ({"threads": 5000}, "threads must be at most 1024, not 5000"),
         ({"adam_eps": math.inf}, r"adam_eps must be at most 1000000000.0, not inf"),
         ({"entropy_coeff": math.nan}, r"entropy_coeff must be at least -1000000000.0, not nan"),

@@ -10,7 +10,6 @@ from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from recipes.cli import main
@@ -30,10 +29,7 @@ from torchrl_tit.checkpoint import latest_step
 from torchrl_tit.settings.networks import enhanced_tit
 
 SMALL = replace(
-    TINY,
-    name="ppo/cartpole/small",
-    backbone=enhanced_tit(embed_dim=8, features_dim=8),
-    num_envs=2,
+    TINY, name="ppo/cartpole/small", backbone=enhanced_tit(embed_dim=8, features_dim=8), num_envs=2
 )
 LONG = replace(SMALL, total_steps=64 * 400)
 BACKBONE = settings_to_dict(SMALL.backbone)
@@ -169,7 +165,6 @@ def test_a_damaged_list_of_imports_does_not_hide_the_reason(tmp_path):
     [
         {"env": "Acrobot-v1"},
         {"backbone": {**BACKBONE, "frame": {"encoder": "inner", "embed_dim": 16}}},
-        {"backbone": {**BACKBONE, "frame": {"encoder": "linear", "embed_dim": 8}}},
         {"backbone": {**BACKBONE, "trunks": "separate"}},
         {"backbone": {**BACKBONE, "num_frames": 2}},  # whose weights would fit
     ],
@@ -188,8 +183,8 @@ def test_an_edited_recipe_that_no_longer_fits_changes_nothing(fields, run, capsy
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        *((text, "") for text in (b"\xff\xfe{", b"[" * 100_000, b"{}", b"null", b"", b"[]", b"{")),
-        *((b'{"algorithm": %s}' % text, "") for text in (b"1", b'["ppo"]')),
+        *((text, "") for text in (b"\xff\xfe{", b"[" * 100_000, b"{}", b"[]")),
+        (b'{"algorithm": ["ppo"]}', ""),
         (b'{"algorithm": "ppo", "backbone": {"network": "enhanced-tit"}}', "unknown field"),
     ],
 )
@@ -204,33 +199,11 @@ def test_a_damaged_or_older_recipe_is_named(text, reason, tmp_path, capsys):
     assert contents(run.folder) == before
 
 
-def test_batches_that_no_longer_meet_the_last_step_are_saved_all_the_same(run):
-    recipe = replace(SMALL, total_steps=192, steps_per_batch=96, checkpoint_interval=10**6)
-    with run:
-        runner.train(recipe, run)
-    assert latest_step(run.checkpoints) == 224
-
-
-def test_no_episode_ends_at_all(tmp_path):
-    run = train(replace(SMALL, env="Pendulum-v1"), tmp_path / "run")
-    rows = read_metrics(run.folder / "metrics.csv")
-    assert [row["episodes"] for row in rows] == [0, 0]
-    assert np.isnan([row["return_mean"] for row in rows]).all()
-    plot_run(run)
-    assert run.curve.read_bytes().startswith(b"\x89PNG")
-
-
-def test_fewer_steps_than_a_batch_are_one_batch(tmp_path):
-    run = train(replace(SMALL, total_steps=1), tmp_path / "run")
-    assert latest_step(run.checkpoints) == 64
-
-
 @pytest.mark.parametrize(
     ("poison", "message"),
     [
         ({"critic_coeff": float("inf")}, "loss_critic became inf"),
         ({"learning_rate": 1e30}, "weights became (inf|nan)"),
-        ({"learning_rate": 1e30, "minibatch_size": 64}, "weights became (inf|nan)"),  # at the end
     ],
 )
 def test_what_explodes_is_never_saved(poison, message, tmp_path):
@@ -309,22 +282,6 @@ def test_of_two_that_begin_at_once_one_gets_the_folder(tmp_path, monkeypatch):
     Run.create(folder, SMALL)
     assert refused
     assert Run.open(folder).recipe == SMALL
-
-
-def test_the_second_looks_again_once_it_has_the_folder(tmp_path, monkeypatch):
-    folder, checks = tmp_path / "run", list[object]()
-    check = Run.check_new
-
-    def made_meanwhile(path):
-        check(path)
-        if not checks:  # after the first look, another process makes the run
-            checks.append(path)
-            Run.create(folder, replace(SMALL, seed=1))
-
-    monkeypatch.setattr(Run, "check_new", made_meanwhile)
-    with pytest.raises(FileExistsError, match="exists already"):
-        Run.create(folder, SMALL)
-    assert Run.open(folder).recipe.seed == 1
 
 
 def test_a_run_in_use_is_evaluated_into_another_file_only(tmp_path, capsys):

@@ -22,7 +22,7 @@ from recipes.core import runner
 from recipes.core.algorithm import Algorithm, NotFiniteError, check_finite
 from recipes.core.callback import Callback
 from recipes.core.evaluation import Outcome
-from recipes.core.metrics import Metrics, read_metrics
+from recipes.core.metrics import read_metrics
 from recipes.core.recipe import Recipe
 from recipes.core.run import Run
 from recipes.core.runner import evaluate, load_trained
@@ -273,26 +273,6 @@ def test_a_disk_that_is_full_at_any_write_loses_nothing(tmp_path, monkeypatch):
         shutil.rmtree(folder)
 
 
-def test_rows_are_on_the_disk_before_a_checkpoint_and_memory_is_returned_after(
-    tmp_path, monkeypatch
-):
-    done: list[str] = []
-
-    def noted(owner: Any, name: str) -> None:
-        call = getattr(owner, name)
-
-        def note(*own: Any) -> None:
-            done.append(name)
-            call(*own)
-
-        monkeypatch.setattr(owner, name, note)
-
-    for owner, name in ((Metrics, "sync"), (Run, "save"), (runner, "return_free_memory")):
-        noted(owner, name)
-    train(replace(SMALL, total_steps=8), tmp_path / "run")
-    assert done == ["sync", "save", "return_free_memory"] * 2
-
-
 @pytest.mark.parametrize("act", [lambda: interrupt(2), lambda: interrupt(1, RuntimeError("g++"))])
 def test_a_second_ctrl_c_or_an_error_that_it_brings_about_stops_at_once(tmp_path, act):
     """A compiler that the batch runs is stopped by the same Ctrl-C."""
@@ -338,22 +318,6 @@ def test_what_is_not_finite_is_neither_logged_nor_saved(tmp_path, value, bad_ste
     assert ([0, *checkpoint_steps(run.checkpoints)])[-1] == saved
     assert all(step <= bad_step for step in steps_of(run))
     assert ToyAlgorithm.log[-1] == ("close",)
-
-
-def test_hooks_are_called_in_their_order_and_from_the_checkpoint_on(tmp_path):
-    calls: list[Any] = []
-    hooks = [Hooks(name=name, calls=calls) for name in "ab"]
-    recipe = replace(SMALL, total_steps=3, evaluation_interval=3)
-    train(recipe, tmp_path / "run", *hooks)
-    steps = [(hook, n) for n in (1, 2, 3) for hook in ("collected", "updated")]
-    end = [("evaluated", 3, [3, 4]), ("logged", 3, 3), ("saving", 3), ("saved", 3)]
-    assert calls == [(n, *call) for call in [*steps, *end] for n in "ab"]
-    calls.clear()
-    run = train(replace(recipe, total_steps=4), tmp_path / "run", *hooks)
-    evaluate(run, callbacks=hooks[:1])
-    four = [(n, *call) for call in [("collected", 4), ("updated", 4)] for n in "ab"]
-    saved = [(n, *call) for call in [("saving", 4), ("saved", 4)] for n in "ab"]
-    assert calls == [*four, *saved, ("a", "evaluated", 4, [4, 5])]
 
 
 def test_evaluations_are_played_once(tmp_path):

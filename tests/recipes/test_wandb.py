@@ -125,15 +125,3 @@ def test_what_cannot_be_sent(tmp_path, capsys, monkeypatch):
     assert "wandb.json is damaged" in fails(
         capsys, "train", "--resume", run.folder, "--wandb", "mine"
     )
-
-
-def test_nobody_is_logged_in(tmp_path, capsys, monkeypatch):
-    import wandb
-
-    def init(**settings):
-        raise wandb.errors.UsageError("api_key not configured (no-tty).\nCall wandb.login")
-
-    monkeypatch.setattr(wandb, "init", init)
-    run = Run.create(tmp_path / "run", RECIPE)
-    line = fails(capsys, "train", "--resume", run.folder, "--wandb", "mine")
-    assert "cannot start: api_key not configured (no-tty). Call wandb.login; log in with" in line

@@ -83,16 +83,8 @@ def test_processes_that_are_started_later_know_what_is_allowed():
             ImportError,
             r"no_python.py is not Python: .* \(line 1\)$",
         ),
-        (
-            lambda: import_allowed("nowhere.x"),
-            ImportError,
-            "^there is no module 'nowhere', looked",
-        ),
-        (
-            lambda: import_allowed("pack_a.x"),
-            ImportError,
-            r"^there is no module 'pack_a\.x', look",
-        ),
+        (lambda: import_allowed("nowhere.x"), ImportError, "^there is no module 'nowhere', looked"),
+        (lambda: import_allowed("pack_a.x"), ImportError, r"^there is no module 'pack_a\.x', look"),
         (
             lambda: import_allowed("raises_a"),
             ImportError,

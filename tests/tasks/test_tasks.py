@@ -98,11 +98,6 @@ def test_bad_lengths(length):
         TMaze(length)
 
 
-def test_a_word_is_no_yes():
-    with pytest.raises(ValueError, match="end_when_behind must be True or False, not 'no'"):
-        gymnasium.make("TMaze-v0", end_when_behind="no")
-
-
 def test_other_actions_are_gone():
     env = FirstActions(gymnasium.make("Taxi-v4"), 4)
     assert env.action_space == Discrete(4)
@@ -117,19 +112,6 @@ def test_other_actions_are_gone():
 def test_wrong_numbers_of_actions(count):
     with pytest.raises(ValueError, match=f"from 1 to 6, the task's actions, not {count}"):
         FirstActions(gymnasium.make("Taxi-v4"), count)
-
-
-def test_other_kinds_of_actions():
-    with pytest.raises(ValueError, match="needs Discrete actions, not Box"):
-        FirstActions(gymnasium.make("Pendulum-v1"), 1)
-
-
-def test_a_spec_recreates_the_wrapper():
-    env = FirstActions(gymnasium.make("Taxi-v4"), 4)
-    assert env.spec is not None
-    again = gymnasium.make(env.spec)
-    assert again.action_space == Discrete(4)
-    assert again.spec == env.spec
 
 
 @pytest.mark.filterwarnings("error")

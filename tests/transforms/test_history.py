@@ -5,14 +5,9 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
-from torchrl.envs import (
-    CatFrames,
-    Compose,
-    RewardSum,
-    TransformedEnv,
-)
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.transforms.streams import StreamEnv, assert_histories
@@ -43,22 +38,6 @@ def test_a_new_environment_takes_the_state():
     assert torch.equal(*[each.state_dict()["_cat_buffers_observation"] for each in (env, other)])
 
 
-def test_moves_to_an_environment_of_another_size():
-    history = History(3)
-    TransformedEnv(StreamEnv([2]), history).rollout(4)
-    history.reset_parent()
-    assert_histories(TransformedEnv(StreamEnv([5]), history), 3, "same")
-
-
-def test_transforms_can_be_added_in_the_middle_of_an_episode():
-    env = TransformedEnv(StreamEnv([2]), History(3))
-    root = env.reset()
-    first = root["observation"]
-    env.append_transform(RewardSum())
-    step = env.step(env.rand_action(root.set("episode_reward", torch.zeros(2, 1))))["next"]
-    assert torch.equal(step["history"], torch.stack([first, first, step["observation"]], 1))
-
-
 @pytest.mark.parametrize("padding", ["same", "constant"])
 def test_next_observations_can_be_named_as_for_cat_frames(padding):
     env = TransformedEnv(StreamEnv([4]), History(3, padding=padding))
@@ -70,25 +49,6 @@ def test_next_observations_can_be_named_as_for_cat_frames(padding):
     assert torch.equal(again["next", "history"], rollout["next", "history"])
     same = TransformedEnv(StreamEnv([4]), History(3, *keys, padding=padding))
     assert_histories(same, 3, padding)
-
-
-def test_without_an_environment_it_is_cat_frames():
-    """Steps begin with zeros; a reset pads."""
-    history = History(3)
-    history.reset_key = "_reset"
-    cat_frames = CatFrames(3, -2, ["observation"], ["history"], reset_key="_reset")
-    resets = [None, None, torch.tensor([True, False]), None, torch.tensor([True, True])]
-    for reset in resets:
-        step = TensorDict({"observation": torch.randn(2, 4)}, [2])
-        expected = step.apply(lambda frame: frame.unsqueeze(-2))
-        if reset is not None:
-            step["_reset"] = expected["_reset"] = reset.unsqueeze(-1)
-        for transform, entries in ((history, step), (cat_frames, expected)):
-            if reset is None:
-                transform._call(entries)
-            else:
-                transform._reset(entries, entries)
-        assert torch.equal(step["history"], expected["history"])
 
 
 def stored_once(history: History, **settings: Any) -> tuple[TensorDictBase, ReplayBuffer]:

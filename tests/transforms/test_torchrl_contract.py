@@ -84,10 +84,7 @@ def test_specs_in_every_layout(name: str, lay_out: str) -> None:
 @pytest.mark.parametrize("name", ONLINE)
 def test_inside_and_around_a_batch_are_the_same(name: str) -> None:
     rollouts = []
-    for env in (
-        SerialEnv(2, lambda: transformed(name)),
-        transformed(name, SerialEnv(2, task)),
-    ):
+    for env in (SerialEnv(2, lambda: transformed(name)), transformed(name, SerialEnv(2, task))):
         torch.manual_seed(0)
         env.set_seed(0)
         rollouts.append(env.rollout(20, break_when_any_done=False))
@@ -123,13 +120,3 @@ def test_sequences_are_made_in_environments_only() -> None:
     buffer.extend(stored)
     with pytest.raises(NotImplementedError, match="SequenceHistory"):
         buffer.sample()
-
-
-@pytest.mark.parametrize("name", ONLINE)
-def test_copies_join_other_environments(name: str) -> None:
-    env = transformed(name)
-    env.rollout(4)
-    copy = env.transform.clone()
-    assert copy is not env.transform
-    assert copy.parent is None
-    check_env_specs(TransformedEnv(task(), copy))

@@ -63,13 +63,6 @@ def test_a_run_is_an_agent_too(run):
     assert loaded.evaluate(1, seed=6).tolist() == evaluation["returns"][1:2]  # the same episode
 
 
-def test_only_what_acts_is_packed(tmp_path):
-    run = make_run(tmp_path / "run", RECIPES["squashed"])
-    files, _ = pack(run, "small")
-    checkpoint = next((run / "checkpoints").glob("*/tensors.safetensors"))
-    assert len(files[WEIGHTS]) < checkpoint.stat().st_size / 2  # critics and targets are larger
-
-
 def test_no_places_are_packed(tmp_path):
     recipe = replace(RECIPES["statistics"])
     files, _ = pack(make_run(tmp_path / "run", recipe), "small")

@@ -4,8 +4,6 @@ import json
 from dataclasses import fields, replace
 from typing import Any
 
-import pytest
-
 from recipes.cli import main
 from recipes.cli.backbone_options import choose_network
 from recipes.core.registry import get_recipe
@@ -22,7 +20,7 @@ from torchrl_tit.settings import (
     PairedOuter,
     ResNetFrames,
 )
-from torchrl_tit.settings.networks import catformer, enhanced_tit
+from torchrl_tit.settings.networks import catformer
 
 PONG = get_recipe("ppo/pong/enhanced-tit")
 CARTPOLE = get_recipe("ppo/cartpole/enhanced-tit")
@@ -51,11 +49,6 @@ def test_defaults_and_fields_of_another_type_are_not_taken_over():
     assert choose(lstm, ["--backbone.frame", "inner"]).backbone.frame == Inner(embed_dim=64)
     mlp = get_recipe("ppo/cartpole/mlp")
     assert choose(mlp, ["--backbone.history", "outer"]).backbone.history == Outer()
-
-
-def test_the_same_encoder_stays_as_it_is():
-    recipe = choose(PONG, ["--backbone.frame", "inner", "--backbone.history", "paired-outer"])
-    assert recipe == PONG
 
 
 def test_a_network_by_name_reads_as_many_frames_as_before():
@@ -122,14 +115,3 @@ def test_what_only_fits_with_a_later_option(tmp_path, monkeypatch, capsys):
     coberl = ["--backbone.network", "coberl", "--backbone.num-frames", "2"]
     main(["train", "ppo/cartpole/mlp", *coberl])
     assert "CoBERL(" in capsys.readouterr().out
-
-
-def test_help_names_the_choices_and_the_fields_of_the_chosen_part(capsys):
-    with pytest.raises(SystemExit) as exit_:
-        main(["train", "ppo/pong/enhanced-tit", "--backbone.history", "catformer", "--help"])
-    assert exit_.value.code == 0
-    out = capsys.readouterr().out
-    for text in ("--backbone.network", "--backbone.frame {", "resnet", "--backbone.history {"):
-        assert text in out
-    assert "--backbone.history.attention-expansion" in out
-    assert enhanced_tit().history.name in out

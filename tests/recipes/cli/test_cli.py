@@ -143,7 +143,6 @@ def test_wrong_types_and_unknown_options(option, capsys, tmp_path, monkeypatch):
     [
         ({"num_envz": 2}, r"unknown field 'num_envz'.*did you mean num_envs"),
         ({"num_envs": "2"}, r"field 'num_envs' is '2'.*int"),
-        ({"learning_rate": None}, r"field 'learning_rate'"),
         ({"algorithm": "pppo"}, r"unknown algorithm 'pppo'.*ppo"),
         (
             {"backbone": {"frame": {"encoder": "inner", "embed_dim": 1.5}}},
@@ -153,13 +152,10 @@ def test_wrong_types_and_unknown_options(option, capsys, tmp_path, monkeypatch):
         ({"backbone": {"frame": {"embed_dim": 8}}}, r"field 'backbone\.frame\.encoder'"),
         ({"backbone": {"frame": "inner"}}, r"field 'backbone\.frame': expected an object"),
         ({"backbone": {"frame": {"encoder": "inner"}}}, r"backbone lacks the field 'history'"),
-        ({"backbone": 3}, r"field 'backbone': expected an object"),
         *(
             ({"backbone": BACKBONE | {"frames": frames}}, rf"field 'backbone\.frames{message}")
             for frames, message in [
                 ({"image": {"encoder": "innr"}}, r"\.image\.encoder': unknown frame encod"),
-                ({"image": {"encoder": "inner", "patch_size": 2.5}}, r"\.image\.patch_size"),
-                ({"image": "inner"}, r"\.image': expected an object, not 'inner'"),
                 (["inner"], r"': expected an object, not \['inner'\]"),
             ]
         ),
@@ -190,15 +186,7 @@ ROOT = Path(__file__).parents[3]
 SLOW = ("torch", "torchrl", "tensordict", "gymnasium", "matplotlib", "scipy", "optuna", "ray")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["--help"],
-        ["list"],
-        ["evaluate", "--help"],
-    ],
-    ids=" ".join,
-)
+@pytest.mark.parametrize("words", [["list"], ["evaluate", "--help"]], ids=" ".join)
 def test_no_slow_import(words):
     program = f"""
 import sys

@@ -59,14 +59,8 @@ def test_the_logs_of_a_sweep_are_passed_over(begun, drawn, capsys):
 @pytest.mark.parametrize(
     ("other", "message"),
     [
-        (
-            "ppo/acrobot/mlp",
-            "a and b do not go together: their tasks are CartPole-v1 and",
-        ),
-        (
-            "discrete-cql/cartpole-mixed/mlp",
-            "environment steps and gradient steps do not share",
-        ),
+        ("ppo/acrobot/mlp", "a and b do not go together: their tasks are CartPole-v1 and"),
+        ("discrete-cql/cartpole-mixed/mlp", "environment steps and gradient steps do not share"),
     ],
 )
 def test_what_does_not_go_together(other, message, begun, capsys):

@@ -3,7 +3,6 @@
 import sys
 from dataclasses import replace
 from typing import Any
-from unittest.mock import Mock
 
 import imageio.v3 as imageio
 import numpy as np
@@ -15,16 +14,13 @@ from recipes.core.runner import load_trained
 from recipes.offline import with_spaces
 from recipes.ppo import PPO
 from recipes.tools.results import explanation, paper_figures
-from recipes.tools.results.recorded import Recording
 from tests.recipes.commands import fails
 from tests.recipes.offline.test_without_env import log_machine
 from tests.recipes.small import SMALL_DT, make_discrete_cql, make_dt, train
 from tests.recipes.untrained import untrained
-from torchrl_tit import load_agent
-from torchrl_tit.agents.acting import make_given_env
 from torchrl_tit.datasets import load_episodes
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, lstm, mlp, nature_cnn
+from torchrl_tit.settings.networks import decision_transformer, enhanced_tit, mlp, nature_cnn
 
 TIT: dict[str, Any] = {"patch_size": "auto", "embed_dim": 8, "num_blocks": 1, "features_dim": 8}
 PAGE = (432, 768, 3)
@@ -109,20 +105,6 @@ def test_an_image_task(tmp_path):
     assert (pictures[1] != pictures["attention"]).any()
 
 
-def test_several_observations_and_a_recurrent_state(tmp_path):
-    pytest.importorskip("minigrid")
-    pytest.importorskip("imageio_ffmpeg")
-    pytest.importorskip("captum")  # a linear layer reads the image
-    recipe = make_ppo(
-        "MiniGrid-Empty-5x5-v0",
-        lstm(embed_dim=8, hidden_dim=8, features_dim=8),
-        observation_keys=("image", "direction"),
-    )
-    run = untrained(tmp_path / "run", recipe)
-    explain(run.folder, "--out", tmp_path / "a.mp4", "--max-steps", 2)
-    assert imageio.imread(tmp_path / "a.mp4").shape == (2, *PAGE)
-
-
 def make_cartpole_dt(folder):
     return make_dt(
         folder,
@@ -205,25 +187,6 @@ def test_maps_of_several_agents_on_the_same_frames(pong, tmp_path, monkeypatch):
     assert any((both[i] != both[i - i % 3]).any() for i in (2, 5)), "the maps lie over the frames"
 
 
-def test_agents_of_other_tasks_see_other_frames(pong, tmp_path, capsys):
-    other = make_ppo("ALE/Breakout-v5", nature_cnn(2), num_envs=2)
-    other = untrained(tmp_path / "breakout", other).folder
-    out = tmp_path / "a.png"
-    assert "see different frames in step 1" in fails(
-        capsys, "explain", pong["tit"], other, "--step", 1, "--out", out
-    )
-    assert "are a picture (.png)" in fails(
-        capsys, "explain", pong["tit"], pong["cnn"], "--out", tmp_path / "a.gif"
-    )
-    assert "no attention over several patches" in fails(
-        capsys, "explain", pong["cnn"], "--map", "weights", "--out", out
-    )
-    assert "draws one step of one agent" in fails(
-        capsys, "explain", pong["cnn"], pong["tit"], "--map", "weights", "--out", out
-    )
-    assert not out.exists()
-
-
 def test_weights_of_all_blocks(pong, cartpole, tmp_path, monkeypatch):
     explain(pong["tit"], "--map", "weights", "--step", 2, "--out", tmp_path / "a.png")
     assert imageio.imread(tmp_path / "a.png").ndim == 3
@@ -280,22 +243,3 @@ def test_a_recorded_episode(tmp_path, capsys, monkeypatch):
     }.items():
         more = ["--dataset", data, "--out", tmp_path / "no.png", *words]
         assert message in fails(capsys, "explain", run.folder, *more)
-
-
-def test_a_recorded_episode_of_a_decision_transformer(tmp_path, monkeypatch):
-    """It reads the actions that were taken."""
-    pytest.importorskip("captum")
-    recipe = make_dt(tmp_path, backbone=decision_transformer(**SMALL_DT))
-    run = untrained(tmp_path / "run", recipe)
-    agent, recording = load_agent(run.folder), Recording(load_episodes(recipe.dataset), 2)
-    seen, steps = [], range(4, 5)
-    explainer = explanation.Explainer(agent.policy)
-    monkeypatch.setattr(explainer, "explain", lambda td: seen.append(td["sequence"][0].clone()))
-    monkeypatch.setattr(explanation, "Page", lambda *args: Mock())
-    env = make_given_env(agent.make_env, recording)
-    show: Any = lambda *args: None  # noqa: E731
-    explanation.explain_episode(
-        env, explainer, "dt", steps, show, title="", actions=recording.actions
-    )
-    assert seen[0]["action"][1:5].tolist() == recording.actions[:4].tolist()
-    assert seen[0]["timestep"].tolist() == [0, 0, 1, 2, 3, 4]

@@ -148,19 +148,3 @@ def test_a_module_that_only_a_file_names_is_not_imported(own_modules, capsys):
 def main_output(capsys, *words):
     main(list(words))
     return capsys.readouterr().out
-
-
-def test_a_broken_plugin_is_a_note_of_list(own_modules, capsys):
-    info = own_modules / "site" / "broken-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[torchrl_tit.plugins]\nparts = raises\n")
-    sys.path += [str(own_modules / "site"), str(own_modules)]
-    main(["show", "ppo/cartpole/mlp"])
-    assert capsys.readouterr().err == ""
-    main(["list", "ppo/cartpole/lstm"])
-    assert capsys.readouterr() == (
-        "ppo/cartpole/lstm\n",
-        "note: the entry point 'parts' of the package broken failed: module 'raises' cannot be "
-        "imported: ZeroDivisionError: division by zero\n",
-    )

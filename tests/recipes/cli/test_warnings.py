@@ -94,12 +94,3 @@ def test_episodes_shorter_than_the_history_are_named_once():
 )
 def test_others_are_not(num_frames, length):
     assert watch(num_frames, length) == []
-
-
-def test_on_the_command_line(tmp_path):
-    errors = tmp_path / "errors"
-    words = ["train", "ppo/tmaze-10/enhanced-tit", "--out", tmp_path / "run", "--compile", "off"]
-    words += ["--total-steps", 2048, "--epochs", 1]
-    words += ["--evaluation-episodes", 1]
-    assert Command([*words, "--backbone.num-frames", 12], errors).wait() == 0
-    assert errors.read_text().count("warning: num_frames is 12, but no episode so far had") == 1

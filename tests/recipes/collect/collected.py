@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from recipes.ppo import PPO
 from recipes.sac import SAC
 from recipes.tools.collect import Collection
-from recipes.tools.collect.settings import KINDS
 from torchrl_tit.datasets import load_episodes
 from torchrl_tit.settings.networks import mlp
 
@@ -71,14 +70,6 @@ def read(path: Path) -> dict[str, NDArray]:
 
 def attributes(path: Path) -> dict[str, Any]:
     return dict(load_episodes(path, dtype=None).attributes)
-
-
-def assert_same(left: Path, right: Path) -> None:
-    for kind in KINDS:
-        for name, array in read(left / f"{kind}.hdf5").items():
-            np.testing.assert_array_equal(array, read(right / f"{kind}.hdf5")[name])
-        rows = [load_episodes(folder / f"{kind}-v0").rows for folder in (left, right)]
-        assert (rows[0] == rows[1]).all()
 
 
 def check_episodes(data: dict[str, NDArray]) -> None:

@@ -8,12 +8,7 @@ import pytest
 from recipes.core.recipe_json import recipe_to_json
 from recipes.tools.collect import Collection
 from recipes.tools.collect.collect import collect
-from tests.recipes.collect.collected import (
-    CARTPOLE,
-    CARTPOLE_RECIPE,
-    PENDULUM,
-    PENDULUM_RECIPE,
-)
+from tests.recipes.collect.collected import CARTPOLE, CARTPOLE_RECIPE, PENDULUM, PENDULUM_RECIPE
 
 
 @pytest.fixture(scope="session")

@@ -11,11 +11,9 @@ import minari
 import numpy as np
 import pytest
 import torch
-from gymnasium.envs.classic_control import CartPoleEnv
-from gymnasium.envs.registration import EnvSpec
 from tensordict import TensorDict
 
-from recipes.core.algorithm import NotFiniteError, make_algorithm
+from recipes.core.algorithm import make_algorithm
 from recipes.core.recipe_json import recipe_to_json
 from recipes.core.run import Run
 from recipes.core.runner import train
@@ -32,7 +30,6 @@ from tests.recipes.collect.collected import (
     check_episodes,
     read,
 )
-from tests.recipes.ppo.tasks import Paying
 from tests.recipes.small import Batches
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import HistoryStorage, load_episodes, make_replay_buffer
@@ -263,14 +260,3 @@ def test_rewards_are_the_tasks_own(tmp_path: Path) -> None:
     assert not data["terminals"].any()
     assert np.flatnonzero(data["timeouts"]).tolist() == [199, 399, 599, 799]
     assert np.abs(data["actions"]).max() == 2  # a Gaussian's, clipped as the task does
-
-
-def test_rewards_that_are_not_finite_are_named_before_they_are_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    task = EnvSpec("Paying-v0", lambda **_: Paying(CartPoleEnv(), "inf"))
-    monkeypatch.setitem(gymnasium.registry, "Paying-v0", task)
-    settings = Collection(env="Paying-v0", sets=("random",), num_envs=2, transitions=40)
-    with pytest.raises(NotFiniteError, match=r"^the reward of copy \d is inf in Paying-v0$"):
-        collect(settings, tmp_path / "data")
-    assert not list((tmp_path / "data").rglob("*.hdf5"))

@@ -14,13 +14,7 @@ from recipes.sac import SAC
 from recipes.tools.collect import Collection
 from recipes.tools.collect.agents import AgentInTraining, find_agent
 from recipes.tools.collect.collect import collect
-from tests.recipes.collect.collected import (
-    CARTPOLE,
-    CARTPOLE_RECIPE,
-    PENDULUM,
-    attributes,
-    read,
-)
+from tests.recipes.collect.collected import CARTPOLE, CARTPOLE_RECIPE, PENDULUM, attributes, read
 from tests.recipes.commands import fails
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.datasets import TaskSpaces, task_spaces

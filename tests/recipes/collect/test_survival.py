@@ -14,7 +14,7 @@ from recipes.tools.collect import collect as collecting
 from recipes.tools.collect.agents import AgentInTraining
 from recipes.tools.collect.collect import collect
 from recipes.tools.collect.settings import KINDS
-from tests.recipes.collect.collected import assert_same, attributes, check_episodes, read
+from tests.recipes.collect.collected import attributes, check_episodes, read
 
 
 class Kill(BaseException):
@@ -135,12 +135,3 @@ def test_a_mark_that_is_never_reached_and_a_longer_training(
     assert attributes(tmp_path / "c" / "medium.hdf5")["agent_return"] >= 100
     with pytest.raises(ValueError, match="total_steps: 8192 -> 256"):
         collect(settings, tmp_path / "c")
-
-
-@pytest.mark.slow
-def test_sets_that_are_made_later_are_the_same(
-    cartpole: Path, cartpole_settings: Collection, tmp_path: Path
-) -> None:
-    for kinds in (("random",), ("expert",), KINDS):
-        collect(replace(cartpole_settings, sets=kinds), tmp_path / "c", "the command")
-    assert_same(tmp_path / "c", cartpole)

@@ -17,13 +17,7 @@ from recipes.core.metrics import read_metrics
 from recipes.core.run import Run
 from recipes.decision_transformer import check_data
 from tests.datasets.rollouts import roll, write
-from tests.recipes.small import (
-    SMALL_DT,
-    make_algorithm,
-    make_dt,
-    make_odt,
-    train,
-)
+from tests.recipes.small import SMALL_DT, make_algorithm, make_dt, make_odt, train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import (
     SequenceStorage,
@@ -209,18 +203,6 @@ def test_episodes_that_are_explored_are_as_long_as_those_of_the_evaluation(tmp_p
 def test_every_entry_of_an_action_must_reach_as_far_as_the_heads(tmp_path):
     with pytest.raises(ValueError, match="actions of tests/Lopsided-v0 range from 0 to 1, but"):
         make_algorithm(make_dt(tmp_path, env="tests/Lopsided-v0"))
-
-
-def test_whole_atari_games_need_as_many_time_steps(tmp_path):
-    pytest.importorskip("ale_py")
-    settings: dict[str, Any] = {"env": "ALE/Pong-v5", "action_space": "discrete"}
-    recipe = make_dt(tmp_path, backbone=dt_tit(**SMALL_DT, patch_size=42), **settings)
-    with pytest.raises(ValueError, match="Pong-v5 have up to 27000 steps, but max_ep_len is 1000"):
-        make_algorithm(recipe)
-    backbone = dt_tit(**SMALL_DT, patch_size=42, max_ep_len=27_000)
-    algorithm = make_algorithm(make_dt(tmp_path, backbone=backbone, **settings))
-    state = algorithm.make_env(2).reset()
-    assert algorithm.policy(state)["action"].shape == (2,)
 
 
 def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):

@@ -16,12 +16,7 @@ from recipes.core.metrics import read_metrics
 from recipes.online_decision_transformer import OnlineData, make_lamb
 from tests.datasets.rollouts import roll
 from tests.recipes.ppo import tasks
-from tests.recipes.small import (
-    SMALL_DT,
-    make_algorithm,
-    make_odt,
-    train,
-)
+from tests.recipes.small import SMALL_DT, make_algorithm, make_odt, train
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.datasets import (
     SequenceStorage,

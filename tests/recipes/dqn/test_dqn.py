@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -95,6 +96,24 @@ def test_target_updates_and_learning(tmp_path: Path) -> None:
     algorithm.learn(batch, 29)
     state = algorithm.model.state_dict()
     assert all(torch.equal(state[n], state[n.removeprefix("target_")]) for n in targets)
+
+
+def test_gradient_steps_are_counted_from_the_first_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    algorithm, counted = make(SMALL), list[int]()
+    algorithm.prepare(0, tmp_path)
+    learn = algorithm.learn
+
+    def count(samples: TensorDictBase, number: int) -> Any:
+        counted.append(number)
+        return learn(samples, number)
+
+    monkeypatch.setattr(algorithm, "learn", count)
+    for step, batch in zip(range(0, 50, 10), algorithm.batches(), strict=False):
+        algorithm.update(batch, step)
+    algorithm.close()
+    assert counted == [*range(3 * 5)]  # of the batches after the random steps
 
 
 def test_exploration(tmp_path: Path) -> None:

@@ -18,13 +18,7 @@ from recipes.iql import IQL
 from recipes.offline import read_data, with_spaces
 from recipes.ppo import PPO
 from recipes.tools import off_policy
-from recipes.tools.off_policy import (
-    clone,
-    fit_q,
-    fitted_q,
-    recorded_log_probs,
-    weighted_returns,
-)
+from recipes.tools.off_policy import clone, fit_q, fitted_q, recorded_log_probs, weighted_returns
 from tests.agents.runs import make_run
 from tests.recipes.commands import fails
 from tests.recipes.offline.test_without_env import log_machine
@@ -50,11 +44,7 @@ def two_states():
 
 @pytest.mark.parametrize(
     ("actions", "values"),
-    [
-        ((1, 0), (1 / (1 - GAMMA), 1 / (1 - GAMMA))),
-        ((1, 1), (1 + GAMMA * 2, 2)),
-        ((0, 0), (0, 1)),
-    ],
+    [((1, 0), (1 / (1 - GAMMA), 1 / (1 - GAMMA))), ((1, 1), (1 + GAMMA * 2, 2)), ((0, 0), (0, 1))],
 )
 def test_values_of_discrete_policies(actions, values):
     torch.manual_seed(0)

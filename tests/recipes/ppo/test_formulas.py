@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import pytest
@@ -11,10 +10,8 @@ from torch import nn
 
 from recipes.core.compilation import should_compile
 from recipes.core.registry import get_recipe
-from recipes.ppo import PPO, ActorCritic, PPOAlgorithm
+from recipes.ppo import PPO, PPOAlgorithm
 from tests.recipes.ppo.algorithms import prepared
-from tests.recipes.small import train
-from torchrl_tit.settings.networks import mlp
 
 RECIPE = get_recipe("ppo/cartpole/enhanced-tit")
 assert isinstance(RECIPE, PPO)
@@ -29,32 +26,6 @@ def test_the_loss_is_compiled_if_the_recipe_says_so(setting, tmp_path, monkeypat
     algorithm = prepared(replace(SMALL, compile=setting), tmp_path)
     objective: object = algorithm.objective
     assert (objective == "the loss") is (setting == "on")
-
-
-def test_numbers_that_a_subclass_changes_change_its_compiled_loss(tmp_path, monkeypatch):
-    class Scheduled(PPOAlgorithm):
-        weight = 1.0
-
-        def loss(self, minibatch):
-            terms = super().loss(minibatch)
-            return terms.set("clip_fraction", torch.full((), self.weight))
-
-    monkeypatch.setattr(shutil, "which", lambda name: name)
-    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
-    algorithm = Scheduled(replace(SMALL, compile="on", backbone=mlp(1)))
-    algorithm.prepare(0, tmp_path)
-    with torch.no_grad():
-        batch = next(iter(algorithm.batches()))
-        algorithm.close()
-        rollout = algorithm.rollout(batch)
-        algorithm.advantages(batch, rollout)
-    minibatch = next(algorithm.minibatches(batch, rollout))
-    found = []
-    for weight in (1.0, 2.0):
-        algorithm.weight = weight
-        _, terms = algorithm.objective(minibatch._replace(steps=minibatch.steps.copy()))
-        found.append(terms[algorithm.terms.index("clip_fraction")].item())
-    assert found == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -81,10 +52,6 @@ def test_compiling_without_a_compiler_is_refused(monkeypatch):
         PPOAlgorithm(replace(SMALL, compile="on")).check()
 
 
-def test_whole_rollouts_cover_the_steps():
-    assert RECIPE.final_step == 100_352  # 49 batches of 2048 cover 100k
-
-
 @pytest.mark.numerics
 def test_initialization_is_that_of_stable_baselines3():
     model = PPOAlgorithm(SMALL).model
@@ -101,34 +68,3 @@ def test_initialization_is_that_of_stable_baselines3():
         norms = layer.weight.norm(dim=1)
         torch.testing.assert_close(norms, torch.full_like(norms, gain))
         assert not layer.bias.any()
-
-
-class Recorder:
-    """Counts the passes through a network and remembers in which mode they came."""
-
-    def __init__(self, monkeypatch):
-        self.modes = []
-        original = ActorCritic.__init__
-
-        def init(model, *args):
-            original(model, *args)
-            model.backbone.module.head.register_forward_hook(self)
-
-        monkeypatch.setattr(ActorCritic, "__init__", init)
-
-    def __call__(self, network, inputs, output):
-        kind = "update" if torch.is_grad_enabled() else "act"
-        self.modes.append((kind, network.training, len(inputs[0])))
-
-
-def test_backbone_runs_once_a_step_and_once_a_minibatch(monkeypatch, tmp_path):
-    recorder = Recorder(monkeypatch)
-    train(SMALL, tmp_path / "run")
-    updates = [mode for mode in recorder.modes if mode[0] == "update"]
-    acts = [mode for mode in recorder.modes if mode[0] == "act"]
-    batches, minibatches_each, epochs = 2, 2, 2
-    assert len(updates) == batches * minibatches_each * epochs
-    # 16 steps of 2 environments in each batch, and the true next observations of its ends.
-    assert len(acts) == batches * (16 + 1)
-    assert all(training for _, training, _ in updates)
-    assert not any(training for _, training, _ in acts)

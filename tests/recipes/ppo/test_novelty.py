@@ -134,22 +134,6 @@ def test_cells_are_coarse_for_floats_and_exact_for_bytes_and_without_width():
         assert {(i, j) for i, j in pairs if cells[i].equal(cells[j])} == expected
 
 
-@pytest.mark.parametrize("backbone", [enhanced_tit(3, patch_size="auto"), mlp(), lstm()])
-def test_what_is_known_is_no_longer_new(backbone):
-    """Whatever the frame encoder: the error falls there, but not elsewhere."""
-    novelty = Novelty(backbone, (2,))
-    known, far = torch.rand(256, 2) * 2 - 1, torch.tensor([[4.0, 4], [-4, 4], [4, -4], [-4, -4]])
-    novelty.update([torch.randn(1024, 2)])
-    before = novelty([known]).mean()
-    optimizer = torch.optim.Adam(novelty.predictor.parameters(), lr=1e-3)
-    for part in known.repeat(100, 1).split(64):
-        optimizer.zero_grad()
-        novelty.errors([part]).mean().backward()
-        optimizer.step()
-    assert novelty([known]).mean() < before / 6
-    assert novelty([far]).mean() > 3 * novelty([known]).mean()
-
-
 @pytest.mark.parametrize("env", ["MultiDiscreteActions-v0", "BoxActions-v0"])
 def test_it_trains_on_images_categories_and_arrays_together(env, tmp_path):
     recipe = replace(RECIPE, env=env, env_settings=(), normalize_observations=True)

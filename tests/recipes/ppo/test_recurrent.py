@@ -99,9 +99,3 @@ def test_a_film_is_evaluated_alike(tmp_path, capsys):
     # One episode after the other remembers no more of them than all side by side.
     main(["play", str(run.folder), "--out", str(tmp_path / "film.gif"), "--episodes", "3"])
     assert f"return {mean:.1f} ± " in capsys.readouterr().out
-
-
-def test_with_several_frames_it_reads_those_and_carries_no_state():
-    recipe = replace(RECIPE, backbone=replace(RECIPE.backbone, num_frames=4))
-    assert not recipe.backbone.carries_state
-    PPOAlgorithm(recipe).check()

@@ -105,9 +105,7 @@ def test_an_observation_in_parts_trains_as_a_whole(tmp_path):
     network = mlp(3, hidden_dim=8)
     whole = replace(RECIPE, backbone=network)
     parts = replace(
-        whole,
-        backbone=replace(network, frames={"cart": Flat(), "pole": Flat()}),
-        wrappers=(SPLIT,),
+        whole, backbone=replace(network, frames={"cart": Flat(), "pole": Flat()}), wrappers=(SPLIT,)
     )
     weights, rows = trained(whole, tmp_path / "whole")
     other, other_rows = trained(parts, tmp_path / "parts")

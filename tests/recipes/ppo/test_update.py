@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from copy import deepcopy
 from dataclasses import replace
@@ -16,7 +15,6 @@ from torch import nn
 from recipes.coberl import ContrastivePPO
 from recipes.core.metrics import read_metrics
 from recipes.ppo import PPO, FlatParameters, Minibatch, PPOAlgorithm
-from tests.numerics import assert_near
 from tests.recipes.ppo.algorithms import named, prepared
 from tests.recipes.small import Batches, train
 from torchrl_tit.checkpoint import load_checkpoint
@@ -198,27 +196,6 @@ def test_the_contrastive_loss_is_added_with_its_weight(tmp_path):
     torch.testing.assert_close(terms, expected_terms, rtol=1e-4, atol=1e-5)
     gradient = torch.autograd.grad(total, network.history_encoder.mask_token)
     assert gradient[0].any()
-
-
-@pytest.mark.usefixtures("float64")
-def test_clipping_and_adam_take_the_same_steps():
-    torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(3, 5), nn.LayerNorm(5), nn.Tanh(), nn.Linear(5, 2))
-    alone = copy.deepcopy(network)
-    flat = FlatParameters(list(network.parameters())).flat
-    optimizer = torch.optim.Adam([flat], lr=0.1, fused=True)
-    other = torch.optim.Adam(alone.parameters(), lr=0.1, fused=True)
-    for _ in range(5):
-        x = torch.randn(7, 3)
-        optimizer.zero_grad(set_to_none=False)
-        network(x).square().sum().backward()
-        norm = nn.utils.clip_grad_norm_(flat, 0.5)
-        optimizer.step()
-        other.zero_grad()
-        alone(x).square().sum().backward()
-        assert_near(norm, nn.utils.clip_grad_norm_(alone.parameters(), 0.5))
-        other.step()
-        assert_near(list(network.parameters()), list(alone.parameters()))
 
 
 def test_parameters_stay_views_when_weights_are_loaded():

@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 from recipes.cli import main
-from recipes.tools.results.comparison import (
-    compare,
-    interquartile_mean,
-    probability_of_improvement,
-)
+from recipes.tools.results.comparison import compare, interquartile_mean, probability_of_improvement
 from tests.recipes.commands import fails
 from tests.recipes.results.report_runs import write_run
 

@@ -77,11 +77,3 @@ def test_limits():
     assert limit(words_of("ppo", "kl_approx").high, recipe) == 0.02
     assert limit(words_of("ppo", "entropy").high, recipe) is None
     assert limit("10 * no_field", recipe) is None
-
-
-def test_columns_that_are_not_known():
-    assert words_of("ppo", "mine").what == ""
-    assert (
-        words_of("dt", "return_-20").what == "The mean return of the evaluation that aims for -20."
-    )
-    assert words_of("dt", "return_scale").what == ""

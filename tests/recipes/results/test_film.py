@@ -77,10 +77,3 @@ def test_pictures_that_cannot_be_drawn(cartpole, tmp_path, capsys, monkeypatch):
     assert "cannot be rendered: OpenGL has not been loaded; for MuJoCo without a screen" in error
     assert "MUJOCO_GL to egl" in error
     assert not any(tmp_path.iterdir())
-
-
-def test_tasks_without_pictures(cartpole):
-    env = load_trained(cartpole)[1].make_env(1, 0)
-    env.reset()
-    with pytest.raises(ValueError, match="have no pictures; make them with render_mode"):
-        env.base_env.render()

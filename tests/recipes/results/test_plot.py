@@ -1,10 +1,7 @@
 """Pictures of learning curves and tables."""
 
-from itertools import combinations
-
 import numpy as np
 import pytest
-from matplotlib.image import imread
 
 from recipes.core.run import Run
 from recipes.tools.results import plot, table
@@ -17,7 +14,6 @@ from recipes.tools.results.plot import (
     plot_comparison,
     plot_run,
 )
-from recipes.tools.results.table import Cell, plot_table
 from tests.recipes.results.report_runs import write_run
 from tests.recipes.small import TINY
 
@@ -36,24 +32,6 @@ def figures(monkeypatch):
     for module in (plot, table):
         monkeypatch.setattr(module, "save_figure", lambda figure, picture: found.append(figure))
     return found
-
-
-def test_the_legend_of_many_curves_has_a_place_of_its_own(tmp_path):
-    def height(count):
-        picture = tmp_path / f"{count}.png"
-        runs = experiments_of(tmp_path / str(count), *map("run {}".format, range(count)))
-        plot_comparison(runs, picture, title="")
-        return len(imread(picture))
-
-    assert height(1) == height(2) < height(3) < height(9)
-
-
-@pytest.mark.parametrize("length", [5, 45, 90])
-def test_the_legend_is_in_the_picture(length, tmp_path):
-    names = [f"{i} {'n' * length} {'m' * length}" for i in range(4)]
-    plot_comparison(experiments_of(tmp_path / "run", *names), tmp_path / "curves.png", title="")
-    shape = imread(tmp_path / "curves.png")[..., :3]
-    assert all(edge.min() == 1 for edge in (shape[:, 0], shape[:, -1], shape[0], shape[-1]))
 
 
 def test_what_names_have_in_common_stands_in_the_title_alone(tmp_path, figures):
@@ -118,33 +96,3 @@ def test_without_an_environment_the_error_on_held_out_episodes_is_drawn(tmp_path
     (axes,) = figures[0].axes
     assert axes.get_ylabel() == "error on held-out episodes"
     assert [*axes.lines[-1].get_ydata()] == [0.5, 0.25]
-
-
-def test_a_legend_names_what_is_drawn(tmp_path, figures):
-    many = Cell("Online", "ppo/a/mlp", 5, 1, 1, 0, 0, 1, 0, 2, np.nan, np.nan)
-    few = Cell("Online", "ppo/b/mlp", 3, 1, 1, 0, 0, np.nan, np.nan, np.nan, 2, 1, paper="2 ± 1")
-    plot_table([many], tmp_path / "table.png")
-    plot_table([many, few], tmp_path / "table.png")
-    texts = [[text.get_text() for text in f.legends[0].get_texts()] for f in figures]
-    middle = "interquartile mean, 95%"
-    assert texts == [[middle], [middle, "mean of fewer than 5 runs", "paper"]]
-
-
-def test_what_was_changed_has_room_beside_its_panel(tmp_path, figures):
-    """Names of cells overlap neither another panel nor each other, and show what was changed."""
-    changes = "env ALE/Pong-v5, num_envs 2, total_steps 128, steps_per_batch 64, epochs 3"
-    cells = [
-        Cell("Online", f"ppo/{task}/enhanced-tit", 1, 1, 1, 0, 0, 1, 1, 1, 1, 0, changes=text)
-        for task in ("a", "b", "c")
-        for text in ("", changes)
-    ]
-    plot_table(cells, tmp_path / "table.png")
-    (figure,) = figures
-    figure.canvas.draw()
-    boxes = []
-    for axes in figure.axes:
-        labels = axes.get_yticklabels()
-        texts = [label.get_text().replace("\n", " ") for label in labels]
-        assert texts == ["enhanced-tit", f"enhanced-tit ({changes})"]
-        boxes += [axes.bbox, *(label.get_window_extent() for label in labels)]
-    assert not any(box.overlaps(other) for box, other in combinations(boxes, 2))

@@ -212,28 +212,6 @@ def test_a_film_and_what_the_agent_looks_at(acting, tmp_path, capsys):
     assert all(page.alts)
 
 
-def test_a_task_that_cannot_be_rendered(acting, tmp_path, monkeypatch):
-    def fail(make_env, name):
-        raise ValueError("it has no pictures")
-
-    monkeypatch.setattr("recipes.tools.results.film.make_rendered", fail)
-    report(acting, "--out", tmp_path / "a.html")
-    text = Page(tmp_path / "a.html").text
-    assert "is shown: it has no pictures" in text
-
-
-def test_what_does_not_go_together(runs, tmp_path, capsys):
-    out = tmp_path / "a.html"
-    write_run(tmp_path / "acrobot", "ppo/acrobot/mlp")
-    line = fails(capsys, "report", runs / "mlp", tmp_path / "acrobot", "--out", out)
-    assert "do not go together: their tasks are CartPole-v1 and Acrobot-v1" in line
-    write_run(tmp_path / "again", TIT)
-    line = fails(capsys, "report", runs / "tit", tmp_path / "again", "--out", out)
-    assert "are the same run" in line
-    assert "no holds no run" in fails(capsys, "report", tmp_path / "no", "--out", out)
-    assert not out.exists()
-
-
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -253,12 +231,6 @@ def test_damaged_files_are_named(tmp_path, capsys, name, content, message):
         assert "all runs not known" in Page(tmp_path / "a.html").text
     else:
         assert message in fails(capsys, "report", *words)
-
-
-def test_files_that_cannot_be_written(runs, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("os.access", lambda path, mode: False)
-    line = fails(capsys, "report", runs / "mlp", "--out", tmp_path / "a.html")
-    assert "may not be written to" in line
 
 
 def test_agents_in_the_middle_are_shown(tmp_path, monkeypatch):

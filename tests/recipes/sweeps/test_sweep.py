@@ -144,14 +144,6 @@ def test_a_run_in_use_is_waited_for(tmp_path):
     assert begun == [(free, False), (used, False)]
 
 
-def test_without_a_progress_view(tmp_path, monkeypatch):
-    """TQDM_DISABLE=1 switches it off."""
-    monkeypatch.setattr(sweep, "tqdm", partial(sweep.tqdm, disable=True))
-    job = begin(tmp_path / "run", TINY)
-    ends = [sys.executable, "-c", ""]
-    assert sweep.run_jobs([job], workers=1, start=lambda job: subprocess.Popen(ends)) == []
-
-
 @pytest.mark.parametrize("completes", [True, False])
 def test_a_run_that_another_sweep_began_first_is_no_failure(completes, tmp_path, monkeypatch):
     job = begin(tmp_path / "run", TINY)
@@ -182,11 +174,6 @@ def test_other_settings_under_the_same_name_are_refused(tmp_path, capsys):
         capsys, "sweep", "ppo/acrobot/mlp", "ppo/cartpole/mlp", "--out", str(tmp_path)
     )
     assert not (tmp_path / "ppo/acrobot").exists()
-
-
-def test_unknown_names_are_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"called 'ppo/cartpole/mpl'.*ppo/cartpole/mlp"):
-        sweep.make_jobs(["ppo/cartpole/mpl"], [0], tmp_path)
 
 
 @pytest.mark.slow

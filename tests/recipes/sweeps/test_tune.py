@@ -25,7 +25,7 @@ optuna = pytest.importorskip("optuna")
 
 from recipes.tools.sweeps import tune  # noqa: E402
 from recipes.tools.sweeps.search_space import load_space, with_values  # noqa: E402
-from recipes.tools.sweeps.tune import Search, Settings, importances, why_no_importances  # noqa: E402
+from recipes.tools.sweeps.tune import Search, Settings  # noqa: E402
 
 RECIPE = replace(TINY, name="ppo/cartpole/mine", backbone=mlp(), total_steps=256)
 SPACE: dict[str, Any] = {
@@ -130,8 +130,7 @@ def test_a_search_that_was_killed_goes_on(files, capsys, monkeypatch):
     assert "holds a search with other settings" in fails(capsys, *words(files, 2), "--seeds", "1")
 
 
-@pytest.mark.parametrize("disable", [False, True])  # as TQDM_DISABLE=1 does
-def test_trials_are_recorded_and_their_study_is_made_again(searched, disable, monkeypatch):
+def test_trials_are_recorded_and_their_study_is_made_again(searched, monkeypatch):
     folder, study = searched
     rows = read(folder / "trials.csv")
     assert [row["state"] for row in rows] == ["complete"] * 2
@@ -142,7 +141,7 @@ def test_trials_are_recorded_and_their_study_is_made_again(searched, disable, mo
     best = json.loads((folder / "best.json").read_text())
     assert best["learning_rate"] == study.best_value
 
-    monkeypatch.setattr(tune, "tqdm", partial(tune.tqdm, disable=disable))
+    monkeypatch.setattr(tune, "tqdm", partial(tune.tqdm, disable=True))  # as TQDM_DISABLE=1 does
     monkeypatch.setattr(tune, "start", lambda job: Process(2))
     with Search(folder, SETTINGS) as search:
         for again, before in zip(search.study.trials, study.trials, strict=True):
@@ -200,17 +199,12 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, naps, monkeypatch):
     ("space", "message"),
     [
         ({"learning_rat": SPACE["learning_rate"]}, "unknown field 'learning_rat'"),
-        ({"backbone.history.depth": SPACE["epochs"]}, "unknown field 'backbone.history.depth'"),
         ({"seed": SPACE["epochs"]}, "unknown field 'seed'"),
         ({"epochs": {"type": "int", "low": 0, "high": 3}}, "epochs must be at least 1, not 0"),
-        ({"epochs": {"type": "int", "low": 1.5, "high": 3}}, "field 'epochs' is 1.5"),
         ({"epochs": {"type": "float", "low": 1, "high": 3.5}}, "field 'epochs' is 3.5"),
         ({"epochs": {"type": "int", "low": 3, "high": 1}}, "`low <= high` must hold"),
-        ({"gamma": {"type": "float", "low": 0, "high": 1, "log": True}}, "`low > 0` must hold"),
-        ({"gamma": {"type": "categorical", "choices": []}}, "is not a search space"),
         ({"gamma": {"type": "uniform", "low": 0}}, "gamma is none of categorical, float, int"),
         ({"gamma": [1, 2]}, "is not a search space"),
-        ([], "is not a search space"),
         ({}, "names no field"),
     ],
 )
@@ -274,11 +268,8 @@ def test_no_more_trials_than_workers_go_on(tmp_path, naps, monkeypatch):
     ("change", "message"),
     [
         ({"learning_rate": "1e9"}, r"isn't contained in the distribution FloatDistribution"),
-        ({"learning_rate": "nan"}, r"`nan` is invalid value"),
-        ({"learning_rate": "fast"}, r"could not convert string to float: 'fast'"),
         ({"backbone.history.activation": "sin"}, r"KeyError: 'sin'"),
         ({"value": "nan"}, "trial 0 has the return nan, not a finite number"),
-        ({"value": "high"}, "could not convert string to float: 'high'"),
         ({"state": "done"}, "KeyError: 'DONE'"),
         ({"trial": "7"}, "trial 0 is missing"),
         ({"step": None}, "KeyError: 'step'"),
@@ -315,7 +306,7 @@ def test_a_trial_is_not_credited_with_the_run_of_another(searched):
         Search(folder, SETTINGS).__enter__()
 
 
-@pytest.mark.parametrize("mean", [math.nan, 1e300, "high"])
+@pytest.mark.parametrize("mean", [math.nan, "high"])
 def test_an_evaluation_that_cannot_be_read_fails_the_trial(mean, tmp_path, naps, monkeypatch):
     monkeypatch.setattr(tune, "start", partial(complete, mean=mean))
     with Search(tmp_path, SETTINGS) as search:
@@ -332,8 +323,7 @@ def test_one_process_at_a_time(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["ppo/acrobot/enhanced-tit", "ppo/pong/vanilla-tit", "ppo/hopper/mlp", "ppo/pong/nature-cnn"],
+    "name", ["ppo/acrobot/enhanced-tit", "ppo/hopper/mlp", "ppo/pong/nature-cnn"]
 )
 def test_every_default_space_fits_its_recipes(name):
     recipe = get_recipe(name)
@@ -361,21 +351,3 @@ def test_fields_are_options_and_a_missing_table_of_importances_is_explained(
     assert recipe.backbone.history.name == "lstm"
     assert "other settings" in fails(capsys, *words(files, 2))  # without these fields
     assert "--evn" in fails(capsys, *words(files, 2), "--evn", "Acrobot-v1")
-
-
-@pytest.mark.parametrize("value", [lambda rate: 100 * rate, lambda rate: 1.0])
-def test_the_field_that_decides_is_the_most_important(value):
-    study = optuna.create_study(direction="maximize", sampler=optuna.samplers.RandomSampler(seed=0))
-    for _ in range(30):
-        trial = study.ask()
-        rate = trial.suggest_float("learning_rate", 0, 1)
-        trial.suggest_int("epochs", 1, 9)
-        study.tell(trial, value(rate))
-    shares = importances(study)
-    if value(0) == value(1):
-        assert shares == {}
-        assert why_no_importances(study) == "all complete trials have the same value"
-        return
-    assert list(shares) == ["learning_rate", "epochs"]
-    assert shares["learning_rate"] > 0.6
-    assert sum(shares.values()) == pytest.approx(1)
