@@ -34,12 +34,9 @@ unexport PYTHONDONTWRITEBYTECODE
 help:  ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-12s%s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-DEMO := ppo/cartpole-no-velocity/enhanced-tit
-demo: $(VENV)/installed-recipes  ## Train TIT on CartPole without velocities, with one frame and with eight (3 minutes)
-	for frames in 1 8; do \
-	  $(BIN)/python -m recipes train $(DEMO)-k$$frames --total-steps 60000 --out $(OUT)/k$$frames $(ARGS) || exit; \
-	done
-	$(BIN)/python -m recipes compare $(OUT)/k* --out $(OUT)/demo.png
+demo: $(VENV)/installed-recipes  ## Train TIT on CartPole without velocities, on one frame and on eight (3 minutes)
+	$(BIN)/python -m recipes sweep docs/examples/histories.py --workers 2 --out $(OUT) $(ARGS)
+	$(BIN)/python -m recipes compare $(OUT)/ppo/cartpole-no-velocity/*/seed-* --out $(OUT)/demo.png
 
 demo-memory: $(VENV)/installed-recipes  ## Train four frames and TIT on a maze that only memory solves (about 3 minutes)
 	$(BIN)/python -m recipes sweep ppo/tmaze-10/frames-4 ppo/tmaze-10/enhanced-tit \
