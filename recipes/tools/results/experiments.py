@@ -10,7 +10,6 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from torchrl_tit.agents.folder import is_agent
 from torchrl_tit.settings.checks import printable
 
 from ...core.metrics import parse_metrics
@@ -64,6 +63,8 @@ def _runs_below(folder: Path) -> list[Run]:
     if (found := find_records(folder)) is not None:
         records, below = found
         return [RecordedRun(records, run) for run in records.below(below)]
+    from torchrl_tit.agents.folder import is_agent  # not at the top: training needs no agents
+
     found_in = (path.parent for path in folder.rglob("recipe.json"))
     runs = [Run.open(path) for path in found_in if not is_agent(path)]
     for records in (Records(path.parent) for path in folder.rglob(TABLE)):
