@@ -86,7 +86,7 @@ def test_on_another_device_nothing_is_on_the_cpu(monkeypatch, capsys):
         segments.measure(segments.Row(Case("Enhanced", "images", 4, 32), length=16), 1, 0)
         memories.training("gtrxl", 8)()
     with pytest.raises(SystemExit):
-        main(["offline", "--device", "cuda"])
+        main(["offline", "--device", "meta"])
     assert "['offline'] run on the CPU only" in capsys.readouterr().err
 
 

@@ -55,7 +55,10 @@ def test_the_agent_of_a_finished_run(cartpole: Path, tmp_path: Path) -> None:
         ({"threads": 5000}, "threads must be at most 1024, not 5000"),
         ({"expert_return": -3000}, "expert_return -3000 must be above medium_return -2000"),
         ({"env": "Pendulun-v1"}, "'Pendulun-v1' cannot be made: .*Did you mean: `Pendulum`"),
-        ({"env": "CartPole-v1"}, "sac needs continuous .*, but CartPole-v1 .*: use a ppo recipe"),
+        (
+            {"env": "CartPole-v1"},
+            "sac needs continuous .*, but those of CartPole-v1 are discrete .*: use a ppo recipe",
+        ),
         ({"env": "Blackjack-v1", "sets": ("random",)}, r"Blackjack-v1 has observations Tuple\("),
         ({"agent": "ppo/pendulum/mlp"}, "unknown recipe 'ppo/pendulum/mlp': did you mean"),
         ({"agent": "ppo/cartpole/mlp"}, "is of the task CartPole-v1, not Pendulum-v1"),
