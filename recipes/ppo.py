@@ -42,7 +42,7 @@ from torchrl_tit.settings.numbers import (
     StepsOrNone,
     Weight,
 )
-from torchrl_tit.windows import Windows
+from torchrl_tit.windows import Windows, take
 
 from .core.adaptive import AdvantageScale, ReturnScale, normalize_advantages
 from .core.algorithm import Stateful, check_finite
@@ -224,8 +224,7 @@ class Minibatch(NamedTuple):
     @property
     def observations(self) -> list[Tensor]:
         """The newest observation of each step, [N, T, *observation_shape] each, not normalized."""
-        newest = Windows(self.windows.rows[..., -1], None)
-        return [newest.gather(table) for table in self.frames]
+        return [take(table, self.windows.rows[..., -1]) for table in self.frames]
 
 
 class ActorCritic(nn.Module):

@@ -49,7 +49,7 @@ def examples(arguments: list[str]) -> None:
     out = parser.parse_args(arguments).out
     folders = (_HERE / "examples", _HERE / "docs" / "examples")
     source = next(folder for folder in folders if folder.is_dir())
-    out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
     with whole_or_not_at_all(out) as hidden:
         shutil.copytree(source, hidden, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
     say("\n".join(str(path) for path in sorted(out.rglob("*")) if path.is_file()))
