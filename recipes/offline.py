@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
@@ -231,6 +232,9 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
         Args:
             step: number of steps done so far.
             episodes: the episodes to measure them on; those that are held out if None.
+
+        Raises:
+            ValueError: if they have fewer transitions than a slice.
         """
         recipe = self.recipe
         if episodes is None and not recipe.held_out_fraction:
@@ -242,7 +246,13 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
         episodes = episodes.to(storage_device(recipe))
         items, length = self.measured_items(episodes), getattr(recipe, "drawn_length", 1)
         arrange = arranging(recipe) or (lambda samples: samples)
-        starts = torch.arange(0, len(items) - length + 1, max(1, len(items) // _MOST_MEASURED))
+        count = len(items) - length + 1
+        if count < 1:
+            raise ValueError(
+                f"{episodes.source} has {len(items)} transitions, but the recipe measures slices "
+                f"of {length}: use longer episodes"
+            )
+        starts = torch.arange(0, count, math.ceil(count / _MOST_MEASURED))
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
         sums = dict.fromkeys(self.measures, 0.0)
         with (

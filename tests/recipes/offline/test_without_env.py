@@ -119,6 +119,29 @@ def test_the_measures_of_held_out_episodes(tmp_path):
     assert torch.equal(torch.get_rng_state(), state)
 
 
+def test_no_more_items_are_measured_than_the_limit(tmp_path, monkeypatch):
+    data = str(log_machine(tmp_path / "log.hdf5"))
+    recipe = BC(dataset=data, backbone=SMALL, validation_fraction=0.9)
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    monkeypatch.setattr("recipes.offline._MOST_MEASURED", 100)
+    counts, measure_batch = [], algorithm.measure_batch
+    monkeypatch.setattr(
+        algorithm, "measure_batch", lambda x: counts.append(len(x)) or measure_batch(x)
+    )
+    algorithm.measure(0)
+    assert sum(counts) == 86  # every second of 9 * 19
+
+
+def test_data_shorter_than_a_slice_are_not_measured(tmp_path):
+    data = str(log_machine(tmp_path / "log.hdf5"))
+    recipe = BC(dataset=data, backbone=gru(hidden_dim=8), slice_length=8)
+    algorithm = make_algorithm(recipe)
+    short = load_episodes(str(log_machine(tmp_path / "short.hdf5", steps=6, length=6)))
+    with pytest.raises(ValueError, match=r"has 5 transitions, but the recipe measures slices of 8"):
+        algorithm.measure(0, short)
+
+
 def test_the_best_weights_are_those_before_the_data_are_learned_by_heart(tmp_path):
     noise = np.random.default_rng(1).uniform(-1, 1, (60, 2))
     data = log_machine(tmp_path / "log.hdf5", steps=60, actions=noise)
