@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, get_args
 
 import pytest
@@ -38,6 +39,36 @@ def test_a_chained_block_reads_its_token_and_the_block_before(share: bool) -> No
     assert_near(chained(tokens), torch.cat(outputs, dim=-1))
     assert_near(chained.attention_maps(tokens), maps)
     assert len(chained.blocks) == (1 if share else 3)
+
+
+@pytest.mark.parametrize("kind", [settings.Outer, settings.ChainedOuter])
+def test_two_blocks_that_attend_to_three_frames_see_five(kind: Any) -> None:
+    encoder = kind(attention_frames=3, temporal_positions="rotary").build(
+        HistoryShape(num_frames=5, num_tokens=2, width=WIDTH)
+    )
+    randomize(encoder)
+    tokens = torch.randn(4, 5, 2, WIDTH, requires_grad=True)
+    encoder(tokens).sum().backward()
+    assert tokens.grad is not None
+    assert tokens.grad[:, 0, 0].abs().amin() > 0
+    band = torch.ones(5, 5, dtype=torch.bool).tril().triu(-2)
+    for maps in encoder.attention_maps(tokens.detach()):
+        assert torch.equal(maps != 0, band.expand_as(maps))
+    # What the first block says of the middle frame does not depend on what precedes the two before.
+    block, x = encoder.blocks[0], torch.randn(4, 5, WIDTH)
+    assert_near(block(x, mask=band)[:, 4:], block(x[:, 2:], read="last"))
+
+
+def test_attention_frames_that_do_not_fit() -> None:
+    shape = HistoryShape(num_frames=4, num_tokens=3, width=WIDTH)
+    message = (
+        "3 outer blocks with attention_frames 2 see 4 frames, but num_frames is 5: set it to 4"
+    )
+    with pytest.raises(ValueError, match=message):
+        settings.ChainedOuter(attention_frames=2).build(replace(shape, num_frames=5))
+    message = "not 'learned': set temporal_positions to rotary or none"
+    with pytest.raises(ValueError, match=message):
+        settings.ChainedOuter(attention_frames=2, temporal_positions="learned").build(shape)
 
 
 KINDS: dict[str, Any] = {

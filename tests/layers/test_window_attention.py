@@ -1,5 +1,7 @@
 """Windows on a table read as copies of them do, in values and gradients."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -7,7 +9,7 @@ from torchrl_tit.layers.attention import RelativeSelfAttention, SelfAttention
 from torchrl_tit.layers.window_attention import attend_windows, worth_a_table
 from torchrl_tit.modules.frame_tables import find_starts, table_of_first, table_without_histories
 from torchrl_tit.networks import EnhancedTIT, build_network
-from torchrl_tit.settings import GTrXL, Inner, Network
+from torchrl_tit.settings import ChainedOuter, GTrXL, Inner, Network, Outer
 from torchrl_tit.windows import Windows, find_windows
 
 SEQUENCES, STEPS, K, WIDTH = 3, 9, 5, 8
@@ -100,7 +102,9 @@ def check_sequences(network, padding, tolerance, monkeypatch):
     monkeypatch.setattr(network.history_encoder, "read_table", counted)
     features = network.encode_windows(table.frames, table.windows)
     expected = network(table.windows.gather(table.frames[0]))
-    torch.testing.assert_close(features, expected, rtol=tolerance, atol=tolerance)
+    weights = list(network.parameters())
+    ours, theirs = ([x, *torch.autograd.grad(x.sin().sum(), weights)] for x in (features, expected))
+    torch.testing.assert_close(ours, theirs, rtol=tolerance, atol=tolerance)
     return len(calls)
 
 
@@ -122,6 +126,17 @@ def test_gtrxl_reads_sequences_as_histories(num_blocks, padding, monkeypatch):
     network = build_network(settings, (4,)).double()
     tables = check_sequences(network, padding, 1e-10, monkeypatch)
     assert tables == (num_blocks == 1)
+
+
+@pytest.mark.parametrize("padding", ["same", "constant"])
+@pytest.mark.parametrize("positions", ["none", "rotary"])
+@pytest.mark.parametrize("history", [Outer(), Outer(dense=True), ChainedOuter()])
+def test_sliding_blocks_read_sequences_as_histories(history, positions, padding, monkeypatch):
+    torch.manual_seed(0)
+    history = replace(history, temporal_positions=positions, attention_frames=3)
+    settings = Network(frame=Inner(), history=history, num_frames=K)
+    network = build_network(settings, (4,)).double()
+    assert check_sequences(network, padding, TOLERANCES[positions], monkeypatch) == 1
 
 
 def test_when_a_table_is_worth_it():

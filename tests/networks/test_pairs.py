@@ -51,6 +51,7 @@ FRAMES: dict[str, FrameSettings] = {
 }
 HISTORIES: dict[str, HistorySettings] = {
     "outer": settings.Outer(ffn_expansion=1, temporal_positions="rotary"),
+    "outer, sliding": settings.Outer(ffn_expansion=1, attention_frames=2),
     "paired-outer": settings.PairedOuter(**BLOCKS, temporal_positions="learned"),
     "chained-outer": settings.ChainedOuter(**BLOCKS, temporal_positions="relative"),
     "stacked-inner": settings.StackedInner(patch_size=4, embed_dim=WIDTH, **BLOCKS),
@@ -177,8 +178,9 @@ def ours(registered: dict[str, type[Any]]) -> set[str]:
 
 def test_all_registered_parts_are_here() -> None:
     assert set(FRAMES) == ours(FrameSettings.registered)
-    assert set(HISTORIES) == ours(HistorySettings.registered)
-    assert all(parts[name].name == name for parts in (FRAMES, HISTORIES) for name in parts)
+    assert {x.partition(",")[0] for x in HISTORIES} == ours(HistorySettings.registered)
+    pairs = [*FRAMES.items(), *HISTORIES.items()]
+    assert all(part.name == name.partition(",")[0] for name, part in pairs)
 
 
 @every_case

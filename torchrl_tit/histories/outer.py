@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -9,7 +11,7 @@ from torchrl_tit import settings
 from torchrl_tit.histories.encoder import HistoryEncoder, HistoryShape, OneToken
 from torchrl_tit.layers.blocks import TransformerBlock
 from torchrl_tit.layers.window_attention import worth_a_table
-from torchrl_tit.windows import Windows
+from torchrl_tit.windows import Windows, take
 
 
 class OuterTransformer(HistoryEncoder):
@@ -69,6 +71,86 @@ class OuterTransformer(HistoryEncoder):
         return tokens if self.positions is None else tokens + self.positions
 
 
+class SlidingOuterTransformer(OuterTransformer):
+    """The base of outer blocks that read the output of the block before, at all frames.
+
+    If a block attends to A of the K frames, N blocks see N (A - 1) + 1 frames, as the layers of
+    Transformer-XL see beyond a segment (arXiv 1901.02860). A block's output at a frame then depends
+    on the frames before it alone, not on where the window begins, so that sequences compute it
+    once, exactly.
+
+    Args:
+        settings: those of the outer blocks.
+        shape: shape of the input.
+        num_blocks: number N of blocks.
+        out_features: size of the output.
+
+    Raises:
+        ValueError: if ``attention_frames`` does not fit the number of frames or the positions.
+    """
+
+    def __init__(
+        self,
+        settings: settings.Outer | settings.ChainedOuter,
+        shape: HistoryShape,
+        *,
+        num_blocks: int,
+        out_features: int,
+    ) -> None:
+        super().__init__(settings, shape, num_blocks=num_blocks, out_features=out_features)
+        self.attention_frames = attended = settings.attention_frames
+        if attended is None:
+            return
+        seen, positions = num_blocks * (attended - 1) + 1, settings.temporal_positions
+        if shape.num_frames != seen:
+            raise ValueError(
+                f"{num_blocks} outer blocks with attention_frames {attended} see {seen} frames, "
+                f"but num_frames is {shape.num_frames}: set it to {seen}"
+            )
+        if positions in ("learned", "relative"):
+            raise ValueError(
+                f"attention_frames {attended} needs positions that do not depend on where the "
+                f"history begins, not {positions!r}: set temporal_positions to rotary or none"
+            )
+
+    def reads_tables(self, windows: Windows) -> bool:
+        """Whether blocks can read each frame of a sequence once.
+
+        If they attend to all K frames, what a block passes on depends on where the window begins.
+        """
+        attended = self.attention_frames
+        return attended is not None and worth_a_table(windows.newest(attended))
+
+    def chain(self, tokens: Sequence[Tensor], windows: Windows | None = None) -> list[Tensor]:
+        """The output of each block at the newest frame, float [..., D] or [N, T, D] of a table.
+
+        Args:
+            tokens: the input of the first block, [..., K, D], or of a table, [R, D]; then what is
+                added to the output of each block, if anything is, for the next.
+            windows: the rows of each window on the table, [N, T, K].
+        """
+        x, mask, newest = tokens[0], None, []
+        attended = self.attention_frames or self.shape.num_frames
+        if self.attention_frames is not None and windows is None:
+            ones = torch.ones(x.shape[-2], x.shape[-2], dtype=torch.bool, device=x.device)
+            mask = ones.tril().triu(1 - attended)
+        for index in range(self.num_blocks - 1):
+            if windows is None:
+                x = self._block(index)(x, mask=mask)
+                newest.append(x[..., -1, :])
+            else:
+                x = self._block(index).read_every_row(x, windows, attended)
+                newest.append(take(x, windows.rows[..., -1]))
+            if len(tokens) > 1:
+                x = x + tokens[index + 1]
+        last = self._block(self.num_blocks - 1)
+        if windows is None:
+            newest.append(last(x, "last", mask).squeeze(-2))
+        else:
+            newest.append(last.read_windows(x, windows.newest(attended)))
+        return newest
+
+
 class PairedOuterTransformer(OuterTransformer):
     """The outer blocks of Enhanced_TIT (arXiv 2212.14538, section "Enhanced_TIT").
 
@@ -87,15 +169,9 @@ class PairedOuterTransformer(OuterTransformer):
         torch.Size([8, 64])
     """
 
-    def __init__(
-        self, settings: settings.PairedOuter | settings.ChainedOuter, shape: HistoryShape
-    ) -> None:
-        super().__init__(
-            settings,
-            shape,
-            num_blocks=shape.num_tokens,
-            out_features=shape.num_tokens * shape.width,
-        )
+    def __init__(self, settings: settings.PairedOuter, shape: HistoryShape) -> None:
+        blocks = shape.num_tokens
+        super().__init__(settings, shape, num_blocks=blocks, out_features=blocks * shape.width)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., L * D]."""
@@ -117,7 +193,7 @@ class PairedOuterTransformer(OuterTransformer):
         return torch.cat(newest, dim=-1)
 
 
-class ChainedOuterTransformer(PairedOuterTransformer):
+class ChainedOuterTransformer(SlidingOuterTransformer):
     """The outer blocks of Enhanced_TIT, each also reading the output of the previous one.
 
     Outer block l reads, at all K frames, the sum of token l (the output of inner block l) and the
@@ -144,23 +220,20 @@ class ChainedOuterTransformer(PairedOuterTransformer):
         torch.Size([8, 64])
     """
 
-    def reads_tables(self, windows: Windows) -> bool:
-        """No: what a block passes on at a frame depends on where the window begins."""
-        return False
+    def __init__(self, settings: settings.ChainedOuter, shape: HistoryShape) -> None:
+        blocks = shape.num_tokens
+        super().__init__(settings, shape, num_blocks=blocks, out_features=blocks * shape.width)
 
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., L * D]."""
-        x, *later = self._with_positions(tokens).unbind(-2)
-        newest = []
-        for index, token in enumerate(later):
-            x = self._block(index)(x)
-            newest.append(x[..., -1:, :])
-            x = x + token
-        newest.append(self._block(self.num_blocks - 1)(x, read="last"))
-        return torch.cat(newest, dim=-1).squeeze(-2)
+        return torch.cat(self.chain(self._with_positions(tokens).unbind(-2)), dim=-1)
+
+    def read_table(self, tokens: Tensor, windows: Windows) -> Tensor:
+        """Tokens of a table of frames, float [R, L, D] -> float [N, T, L * D]."""
+        return torch.cat(self.chain(tokens.unbind(-2), windows), dim=-1)
 
 
-class StackedOuterTransformer(OuterTransformer):
+class StackedOuterTransformer(SlidingOuterTransformer):
     """The outer transformer of Vanilla_TIT (arXiv 2212.14538, section "The Outer Transformer").
 
     A stack of causal blocks over one token per frame. The output is the last block's output for the
@@ -189,10 +262,11 @@ class StackedOuterTransformer(OuterTransformer):
     def forward(self, tokens: Tensor) -> Tensor:
         """Tokens of K frames, float [..., K, L, D] -> float [..., D] (dense: [..., blocks * D])."""
         x = self._with_positions(self.one_token(tokens).unsqueeze(-2)).squeeze(-2)
-        newest = []
-        for index in range(self.num_blocks):
-            last = index == self.num_blocks - 1
-            x = self._block(index)(x, read="last" if last else "all")
-            if last or self.dense:
-                newest.append(x[..., -1, :])
-        return torch.cat(newest, dim=-1)
+        return self._join(self.chain([x]))
+
+    def read_table(self, tokens: Tensor, windows: Windows) -> Tensor:
+        """Tokens of a table of frames, float [R, L, D] -> float [N, T, D or blocks * D]."""
+        return self._join(self.chain([self.one_token(tokens)], windows))
+
+    def _join(self, newest: list[Tensor]) -> Tensor:
+        return torch.cat(newest, dim=-1) if self.dense else newest[-1]

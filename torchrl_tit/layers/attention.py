@@ -172,7 +172,7 @@ class SelfAttention(_Heads):
             steps = torch.arange(key.shape[-2], device=key.device)
             turned = self.rotary.at(query, back[:, None, :, 0])  # steps after the first row
             scores = turned @ self.rotary.at(key, steps).mT
-            padding = self.rotary.at_each_distance(query, oldest_key)
+            padding = self.rotary.at_each_distance(query, oldest_key)[..., -num_frames:]
         if self.relative is not None:
             bias = self.relative.bias.t()  # [K, heads]
             chosen = bias.index_select(0, back.clamp(0, num_frames - 1).flatten())

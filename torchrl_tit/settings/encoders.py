@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
-from torchrl_tit.settings.numbers import Count, CountOrNone, Probability, Real, Steps, Width
+from torchrl_tit.settings.numbers import Count, CountOrNone, Frames, Probability, Real, Steps, Width
 from torchrl_tit.settings.parts import Part
 
 __all__ = [
@@ -211,8 +211,19 @@ class OuterSettings(TransformerSettings, HistorySettings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class SlidingOuterSettings(OuterSettings):
+    """Settings of outer blocks that read each other, and so can see beyond what one attends to."""
+
+    attention_frames: Frames | None = None
+    """Frames that a block attends to; by default all K. With A frames, N blocks see N (A - 1) + 1,
+    which K must be. What a block says of a frame then depends on that frame and the A - 1 before
+    it, wherever the history begins, so sequences compute it once. Positions are "none" or
+    "rotary"."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Outer(
-    OuterSettings,
+    SlidingOuterSettings,
     name="outer",
     builds="torchrl_tit.histories.outer:StackedOuterTransformer",
 ):
@@ -235,7 +246,7 @@ class PairedOuter(
 
 @dataclass(frozen=True, kw_only=True)
 class ChainedOuter(
-    OuterSettings,
+    SlidingOuterSettings,
     name="chained-outer",
     builds="torchrl_tit.histories.outer:ChainedOuterTransformer",
 ):
