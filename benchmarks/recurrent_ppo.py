@@ -2,8 +2,9 @@
 
 The environments are those of the recipes ``ppo/memory-s7/...``. Success, and when training ends
 early, are defined as in ``benchmarks.memory_tasks``. Steps per second are those of all of training.
-The settings are the library's defaults, or with ``--settings recipe`` those of these recipes, as
-far as the library has them.
+The settings are the library's defaults but for the convolutions, which take smaller images; or with
+``--settings recipe`` those of these recipes, as far as the library has them. Rewards and pixels are
+then normalized in the environment, by running statistics, as are pixels in the recipes.
 A row is added to --out as soon as a run ends; runs that have a row are not repeated.
 """
 
@@ -26,7 +27,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, VecTransposeImage
 from torch import Tensor, nn
 
 from recipes.core.registry import get_recipe
@@ -66,19 +67,16 @@ class Tiles(BaseFeaturesExtractor):
     Args:
         observation_space: that of images of 3 x 3 tiles, channels first.
         features_dim: number of features.
-        normalize: whether to normalize pixels by channel.
     """
 
     def __init__(
         self,
         observation_space: gymnasium.spaces.Box,
         features_dim: int = 64,
-        normalize: bool = False,
     ) -> None:
         super().__init__(observation_space, features_dim)
         channels = observation_space.shape[0]
         self.layers = nn.Sequential(
-            nn.BatchNorm2d(channels, affine=False) if normalize else nn.Identity(),
             nn.Conv2d(channels, 32, kernel_size=8, stride=8),
             nn.ReLU(),
             nn.Conv2d(32, 64, kernel_size=3),
@@ -100,7 +98,7 @@ def _settings_of(name: str) -> PPO:
 
 _RECIPE = _settings_of("ppo/memory-s7/lstm")
 SETTINGS: dict[str, dict[str, Any]] = {
-    "default": {"n_epochs": 4},  # instead of 10
+    "default": {},
     "recipe": {
         "batch_size": _RECIPE.minibatch_size,
         "n_epochs": _RECIPE.epochs,
@@ -111,8 +109,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "learning_rate": lambda left: _RECIPE.learning_rate * left,  # left falls from 1 to 0
     },
 }
-"""All other settings are the library's defaults, so the actor and the critic have an LSTM each.
-These have 64 entries, as in the recipe, instead of 256."""
+"""All other settings are the library's defaults, so the actor and the critic have an LSTM each: of
+256 entries by default, with those of the recipe of 64, as there."""
 
 
 class Progress(BaseCallback):
@@ -153,11 +151,19 @@ def make_env(size: int) -> gymnasium.Env[Any, Any]:
     return FirstActions(ImgObsWrapper(RGBImgPartialObsWrapper(env, tile_size=8)), count=3)
 
 
+def make_envs(size: int, seed: int) -> VecEnv:
+    """Returns copies of the environment, with the channels of images first."""
+    return VecTransposeImage(make_vec_env(partial(make_env, size), NUM_ENVS, seed=seed))
+
+
 def measure(size: int, seed: int, total_steps: int, settings: str, episodes: int) -> list[object]:
     """Trains once and evaluates the last weights with their most likely actions; returns a row."""
 
     def evaluate(seed: int) -> list[float]:
-        test_envs = make_vec_env(make, NUM_ENVS, seed=seed)
+        test_envs = make_envs(size, seed)
+        if like_recipe:
+            test_envs = VecNormalize(test_envs, training=False, norm_reward=False)
+            test_envs.obs_rms = envs.obs_rms
         returns, _ = evaluate_policy(agent, test_envs, episodes, return_episode_rewards=True)
         assert isinstance(returns, list)
         return returns
@@ -165,16 +171,12 @@ def measure(size: int, seed: int, total_steps: int, settings: str, episodes: int
     def success(returns: list[float]) -> float:
         return fmean(value > THRESHOLD for value in returns)
 
-    make = partial(make_env, size)
     like_recipe = settings == "recipe"
-    envs: VecEnv = make_vec_env(make, NUM_ENVS, seed=seed)
+    envs: Any = make_envs(size, seed)
+    network: dict[str, Any] = {"features_extractor_class": Tiles}
     if like_recipe:
-        envs = VecNormalize(envs, norm_obs=False, gamma=_RECIPE.gamma)
-    network = {
-        "features_extractor_class": Tiles,
-        "features_extractor_kwargs": {"normalize": like_recipe},
-        "lstm_hidden_size": 64,
-    }
+        envs = VecNormalize(envs, gamma=_RECIPE.gamma)
+        network |= {"lstm_hidden_size": 64, "normalize_images": False}
     agent = RecurrentPPO(
         "CnnLstmPolicy",
         envs,
