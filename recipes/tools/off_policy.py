@@ -111,8 +111,16 @@ def fitted_q(
         "gamma", "value", the mean over the episodes' first observations, its 95% bootstrap interval
         "low" and "high" over episodes, and "data_value", the mean discounted return of the data,
         which ends at time limits.
+
+    Raises:
+        ValueError: if the discount factor is 1.
     """
     recipe = algorithm.recipe
+    if _gamma(recipe) == 1:
+        raise ValueError(
+            "fitted Q evaluation of a run with gamma 1 has no scale, and where episodes need not "
+            "end no solution: use --ope wis, or train with a gamma below 1"
+        )
     critic = _make_critic(algorithm, episodes)
     episodes = episodes.to(storage_device(recipe))
     num_frames = recipe.backbone.num_frames

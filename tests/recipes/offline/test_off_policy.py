@@ -102,6 +102,13 @@ def test_an_estimate_of_an_algorithms_policy(tmp_path):
     assert fitted_q(algorithm, episodes, 600) == found
 
 
+def test_without_a_discount_there_is_no_fitted_value(tmp_path):
+    data = log_machine(tmp_path / "log.hdf5")
+    algorithm = make_algorithm(IQL(dataset=str(data), backbone=SMALL, gamma=1.0))
+    with pytest.raises(ValueError, match="of a run with gamma 1 has no scale"):
+        fitted_q(algorithm, algorithm.load_data(), 1)
+
+
 def test_weights_are_those_of_the_formula(tmp_path):
     """A third of the steps take the policy's action; what an episode pays later weighs less."""
     draw = np.random.default_rng(1)
