@@ -109,8 +109,12 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         instead = f"a {'sac or ' if spec.dtype.is_floating_point else ''}ppo recipe"
         check_actions(recipe, spec, is_discrete(spec), "a few discrete actions", instead)
         mask_key = MASK if recipe.mask_actions else None
-        slices = recipe.slice_length > 1
-        backbone = make_backbone(recipe.backbone, observation_specs(env), slices=slices)
+        backbone = make_backbone(
+            recipe.backbone,
+            observation_specs(env),
+            slices=recipe.slice_length > 1,
+            normalization=self.normalization,
+        )
         self._policy = make_value_policy(backbone, spec, mask_key=mask_key).to(self.device)
         self.exploration = EGreedyModule(
             spec,

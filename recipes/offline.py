@@ -35,7 +35,6 @@ from torchrl_tit.datasets import (
 from torchrl_tit.datasets.checks import check_actions, check_shape
 from torchrl_tit.envs import make_env, observation_specs
 from torchrl_tit.evaluation import evaluate
-from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.modules import Backbone
 from torchrl_tit.networks.building import evaluating
 from torchrl_tit.settings.choices import Padding
@@ -53,7 +52,14 @@ from .core.algorithm import (
     to_networks,
 )
 from .core.evaluation import HeldOut, Outcome
-from .core.networks import arranging, make_backbone, make_critic, state_transforms
+from .core.networks import (
+    arranging,
+    check_normalizes,
+    make_backbone,
+    make_critic,
+    set_statistics,
+    state_transforms,
+)
 from .core.recipe import DatasetRecipe, SamplesRecipe
 from .core.task import make_task
 
@@ -405,11 +411,8 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
                     f"data sets hold one observation, but {recipe.env} has several "
                     f"({', '.join(observation)}): choose one with observation_keys"
                 )
-            if recipe.normalize_observations and not observation.dtype.is_floating_point:
-                raise ValueError(
-                    f"normalize_observations is on, but observations of {recipe.task_name} are "
-                    f"{observation.dtype}, not floats: switch it off"
-                )
+            if recipe.normalize_observations:
+                check_normalizes(recipe.task_name, observation)
             self.model = self.networks(task).to(self.device)
 
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
@@ -427,7 +430,9 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         """
         recipe, slices = self.recipe, slices or self.recipe.slice_length > 1
         observation = observation_specs(env)
-        return make_backbone(recipe.backbone, observation, slices=slices, eps=self._eps)
+        return make_backbone(
+            recipe.backbone, observation, slices=slices, normalization=self._normalization
+        )
 
     def make_critic(self, env: EnvBase, action_dim: int, **settings: Any) -> TensorDictModuleBase:
         """Builds a value network; see :func:`~recipes.core.networks.make_critic`."""
@@ -438,7 +443,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             recipe.critic_hidden,
             recipe.backbone if recipe.critic == "backbone" else None,
             slices=recipe.slice_length > 1,
-            eps=self._eps,
+            normalization=self._normalization,
             **settings,
         ).to(self.device)
 
@@ -488,7 +493,11 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         """
         recipe, episodes = self.recipe, self.load_data()
         if recipe.normalize_observations:
-            self._set_statistics(episodes)
+            set_statistics(
+                self.policy,
+                self.model,
+                lambda x: x.set_statistics(*episodes.observation_statistics(x.samples)),
+            )
         storage = self.measured_items(episodes.to(storage_device(recipe)))
         held_out = [] if self._held_out is None else [self.measured_items(self._held_out)]
         if (count := min(map(len, [storage, *held_out]))) < recipe.drawn_length:
@@ -555,21 +564,9 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         return [Outcome(step, returns.tolist())]
 
     @property
-    def _eps(self) -> float | None:
-        """What is added to the deviations that normalize observations; None if they are not.
+    def _normalization(self) -> dict[str, float] | None:
+        """How observations are normalized; None if they are not.
 
-        The authors of TD3+BC and d3rlpy use the same.
+        The authors of TD3+BC and d3rlpy add the same to the deviations.
         """
-        return 1e-3 if self.recipe.normalize_observations else None
-
-    @torch.no_grad()
-    def _set_statistics(self, episodes: Episodes) -> None:
-        """Sets the statistics of all networks: the policy's, the critics' and the targets'."""
-        (frames,) = (m for m in self.policy.modules() if isinstance(m, NormalizedFrames))
-        frames.set_statistics(*episodes.observation_statistics(frames.samples))
-        statistics = dict(frames.named_buffers(recurse=False))
-        buffers = dict(self.model.named_buffers())  # the loss stacks those of the critics
-        for name, buffer in buffers.items():
-            path, _, leaf = name.rpartition(".")
-            if leaf in statistics and all(f"{path}.{own}" in buffers for own in statistics):
-                buffer.copy_(statistics[leaf])
+        return {"limit": math.inf, "eps": 1e-3} if self.recipe.normalize_observations else None

@@ -19,6 +19,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_checkpoint
 from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
+from torchrl_tit.envs import observation_specs
 from torchrl_tit.settings.choices import Device
 from torchrl_tit.settings.numbers import Batch, Steps, Weight
 
@@ -31,7 +32,7 @@ from .core.algorithm import (
     storage_device,
     to_networks,
 )
-from .core.networks import arranging, state_transforms
+from .core.networks import arranging, check_normalizes, set_statistics, state_transforms
 from .core.recipe import SamplesRecipe
 from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
@@ -59,6 +60,9 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     """Gradient steps for each environment step."""
     buffer_size: Batch = 1_000_000
     """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
+    normalize_observations: bool = False
+    """Whether to normalize observations by their mean and standard deviation in the random steps,
+    and to clip them to +-10; only for arrays of floats."""
     storage_device: Device = "cpu"
     """Device of the stored data, from which batches are moved to the networks; those on the CPU
     store data there, too. "cuda" is faster if all data fit on the GPU."""
@@ -111,7 +115,14 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
         with closing(make_task(recipe, clip_actions=False)) as task:
+            if recipe.normalize_observations:
+                check_normalizes(recipe.env, observation_specs(task))
             self.model = self.networks(task).to(self.device)
+
+    @property
+    def normalization(self) -> dict[str, Any] | None:
+        """Settings of what normalizes the observations that networks read; None if nothing does."""
+        return {} if self.recipe.normalize_observations else None
 
     @property
     def behavior(self) -> TensorDictModuleBase:
@@ -161,6 +172,9 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
     def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
         """Stores a batch, then takes gradient steps on samples from the buffer."""
         recipe, count = self.recipe, batch.numel()
+        if recipe.normalize_observations and step < recipe.random_steps:
+            seen = batch["observation"].flatten(0, 1).to(self.device)
+            set_statistics(self.policy, self.model, lambda frames: frames.update(seen))
         self.buffer.extend(self.collected(batch).select(*_STORED, strict=False))
         if step + count <= recipe.random_steps:
             return dict.fromkeys(self.columns, torch.nan)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -78,7 +78,8 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
             recipe, spec, has_bounds(spec), "continuous actions within bounds", "a ppo recipe"
         )
         size, slices = spec.shape[0], recipe.slice_length > 1
-        backbone = make_backbone(recipe.backbone, observation, slices=slices)
+        reading: Any = {"slices": slices, "normalization": self.normalization}
+        backbone = make_backbone(recipe.backbone, observation, **reading)
         head = nn.Sequential(nn.Linear(backbone.features_dim, 2 * size), NormalParamExtractor())
         self._policy = ProbabilisticActor(
             TensorDictSequential(backbone, TensorModule(head, ["features"], ["loc", "scale"])),
@@ -90,7 +91,7 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
         # Two critics keep their initial weights; TorchRL would copy a single one and re-initialize
         # the copy.
         critics = [
-            make_critic(observation, size, hidden, network, slices=slices).to(self.device)
+            make_critic(observation, size, hidden, network, **reading).to(self.device)
             for _ in range(2)
         ]
         loss = SACLoss(

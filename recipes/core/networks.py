@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import (
     AddStateIndependentNormalScale,
@@ -42,7 +43,7 @@ def make_backbone(
     *,
     out_key: str = "features",
     slices: bool = False,
-    eps: float | None = None,
+    normalization: Mapping[str, Any] | None = None,
 ) -> Backbone:
     """Builds the backbone of an actor or of a critic.
 
@@ -52,13 +53,13 @@ def make_backbone(
         out_key: key of the features.
         slices: whether it reads slices of consecutive steps [..., T] in TorchRL's recurrent mode;
             it then also reads the observations and "is_init".
-        eps: if given, it normalizes observations by the statistics of a data set; see
+        normalization: if given, it normalizes observations with these settings of
             :class:`~torchrl_tit.frames.NormalizedFrames`.
     """
     histories = history_keys(observation)
     built = build_network(network, observation, trunks="shared")
-    if eps is not None:
-        normalize_frames(built, limit=math.inf, eps=eps)
+    if normalization is not None:
+        normalize_frames(built, **normalization)
     return Backbone(
         built,
         in_keys=histories,
@@ -80,6 +81,37 @@ def normalize_frames(network: nn.Module, **settings: Any) -> None:
         for key, encoder, observation in seen:
             if observation.categories is None:
                 trunk.frame_encoders[key] = NormalizedFrames(encoder, **settings)
+
+
+@torch.no_grad()
+def set_statistics(
+    policy: nn.Module, model: nn.Module, set_of: Callable[[NormalizedFrames], None]
+) -> None:
+    """Sets the statistics of all networks: the policy's, the critics' and the targets'.
+
+    Args:
+        policy: reads one observation, normalized.
+        model: a TorchRL loss, which stacks the statistics of the critics.
+        set_of: sets or updates the policy's.
+    """
+    (frames,) = (m for m in policy.modules() if isinstance(m, NormalizedFrames))
+    set_of(frames)
+    statistics = dict(frames.named_buffers(recurse=False))
+    buffers = dict(model.named_buffers())
+    for name, buffer in buffers.items():
+        path, _, leaf = name.rpartition(".")
+        if leaf in statistics and all(f"{path}.{own}" in buffers for own in statistics):
+            buffer.copy_(statistics[leaf])
+
+
+def check_normalizes(task: str, observation: Any) -> None:
+    """Raises ValueError if observations of this spec, or of these, are not to be normalized."""
+    if isinstance(observation, dict) or not observation.dtype.is_floating_point:
+        several = isinstance(observation, dict)
+        found = "several" if several else f"{observation.dtype}, not floats"
+        raise ValueError(
+            f"normalize_observations is on, but observations of {task} are {found}: switch it off"
+        )
 
 
 def make_cloning_policy(
@@ -148,7 +180,7 @@ def make_critic(
     values: int = 1,
     out_key: str = "state_action_value",
     slices: bool = False,
-    eps: float | None = None,
+    normalization: Mapping[str, Any] | None = None,
 ) -> TensorDictModuleBase:
     """Builds an MLP on the newest observation or a backbone's features, and on the action, if any.
 
@@ -161,7 +193,7 @@ def make_critic(
         out_key: key of the values.
         slices: whether the backbone reads slices of consecutive steps [..., T] in TorchRL's
             recurrent mode; it then also reads "observation" and "is_init".
-        eps: as in :func:`make_backbone`; normalizes what an MLP reads, too.
+        normalization: as in :func:`make_backbone`; normalizes what an MLP reads, too.
 
     Returns:
         A module that reads "observation" [..., D], or "history" [..., K, *obs], and "action"
@@ -173,12 +205,13 @@ def make_critic(
     modules: list[TensorDictModuleBase] = []
     if network is not None:
         key = "critic_features"
-        backbone = make_backbone(network, observation, out_key=key, slices=slices, eps=eps)
+        shared: dict[str, Any] = {"slices": slices, "normalization": normalization}
+        backbone = make_backbone(network, observation, out_key=key, **shared)
         modules, size = [backbone], backbone.features_dim
     else:
         key, size = "observation", _array_size(observation)
-        if eps is not None:
-            frames = NormalizedFrames(Flat().build((size,)), math.inf, eps=eps)
+        if normalization is not None:
+            frames = NormalizedFrames(Flat().build((size,)), **normalization)
             flat = nn.Sequential(frames, nn.Flatten(-2))
             modules, key = [TensorModule(flat, [key], ["normalized"])], "normalized"
     mlp = MLP(

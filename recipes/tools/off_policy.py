@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -278,13 +279,15 @@ def _make_critic(algorithm: TransitionAlgorithm[Any], episodes: Episodes) -> Ten
         observation = observation_specs(env)
     assert isinstance(observation, TensorSpec)
     small = mlp(recipe.backbone.num_frames, hidden_dim=256, activation="relu")
+    floats = observation.dtype.is_floating_point
+    normalization = {"limit": math.inf, "eps": 1e-3} if floats else None
     critic = make_critic(
         observation,
         0 if is_discrete(spec) else spec.shape[0],
         (256,),
         small if observation.ndim == 1 else recipe.backbone,
         values=spec.space.n if is_discrete(spec) else 1,
-        eps=1e-3 if observation.dtype.is_floating_point else None,
+        normalization=normalization,
     )
     for module in critic.modules():
         if isinstance(module, NormalizedFrames):

@@ -174,6 +174,7 @@ _REPLAY: dict[str, Any] = {
     "steps_per_batch": 20,
     "random_steps": 20,
     "log_interval": 20,
+    "normalize_observations": True,
 }
 _NORMALIZED: dict[str, Any] = {"backbone": tit(3), "normalize_observations": True}
 _CRITIC: dict[str, Any] = {**_NORMALIZED, "critic": "backbone", "total_updates": 9}

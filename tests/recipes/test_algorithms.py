@@ -106,7 +106,7 @@ def test_the_environment_leaves_observations_as_they_are(trained):
     for seen in (step["observation"][0], newest):
         assert np.array_equal(seen.numpy(), raw)
     statistics = [m for m in trained.agent.policy.modules() if isinstance(m, NormalizedFrames)]
-    assert len(statistics) == (recipe.algorithm not in ("sac", "dqn"))
+    assert len(statistics) == 1
     for frames in statistics:
         assert (frames.variance < 0.9).any()
 

@@ -14,6 +14,7 @@ from recipes.core.algorithm import make_algorithm
 from recipes.core.metrics import read_metrics
 from recipes.dqn import DQN, DQNAlgorithm
 from tests.recipes.small import Batches, train
+from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.settings.networks import mlp
 
 SMALL = DQN(
@@ -66,6 +67,31 @@ def values(algorithm: DQNAlgorithm, states: TensorDictBase, params: str) -> torc
     """The values of all actions with the weights of a network, [B, actions]."""
     with getattr(algorithm.model, params).data.to_module(algorithm.policy):
         return algorithm.policy(states.select("history"))["action_value"].detach()
+
+
+def test_the_statistics_are_those_of_the_random_steps(tmp_path: Path) -> None:
+    algorithm = make(replace(SMALL, normalize_observations=True))
+    algorithm.prepare(0, tmp_path)
+    seen, step = [], 0
+    for batch in algorithm.batches():
+        seen.append(batch["observation"].flatten(0, 1).clone())
+        algorithm.update(batch, step)
+        step += batch.numel()
+    algorithm.close()
+    random = torch.cat(seen)[:20]
+    buffers = dict(algorithm.model.named_buffers())
+    for ending, expected in (("mean", random.mean(0)), ("variance", random.var(0, False))):
+        found = [buffer for name, buffer in buffers.items() if name.endswith(f".{ending}")]
+        assert len(found) == 2  # of the network and of its target
+        for buffer in found:
+            torch.testing.assert_close(buffer, expected, rtol=1e-5, atol=1e-6)
+    (frames,) = (m for m in algorithm.policy.modules() if isinstance(m, NormalizedFrames))
+    assert frames.count == 20
+
+
+def test_categories_are_not_normalized() -> None:
+    with pytest.raises(ValueError, match=r"FrozenLake-v1 are torch\.int64, not"):
+        make(replace(SMALL, env="FrozenLake-v1", normalize_observations=True))
 
 
 @pytest.mark.parametrize("doubled", [True, False])

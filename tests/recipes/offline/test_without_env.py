@@ -126,9 +126,12 @@ def test_no_more_items_are_measured_than_the_limit(tmp_path, monkeypatch):
     algorithm.prepare(0, tmp_path)
     monkeypatch.setattr("recipes.offline._MOST_MEASURED", 100)
     counts, measure_batch = [], algorithm.measure_batch
-    monkeypatch.setattr(
-        algorithm, "measure_batch", lambda x: counts.append(len(x)) or measure_batch(x)
-    )
+
+    def counted(samples):
+        counts.append(len(samples))
+        return measure_batch(samples)
+
+    monkeypatch.setattr(algorithm, "measure_batch", counted)
     algorithm.measure(0)
     assert sum(counts) == 86  # every second of 9 * 19
 
