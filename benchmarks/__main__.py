@@ -18,6 +18,7 @@ BENCHMARKS = [
     "segments",
     "window_tables",
     "memories",
+    "sliding",
     "offline",
     "decision_transformer",
     "history_windows",
@@ -25,7 +26,7 @@ BENCHMARKS = [
     "ppo_cartpole",
     "off_policy",
 ]
-ON_DEVICE = ["acting", "segments", "memories"]
+ON_DEVICE = ["acting", "segments", "memories", "sliding"]
 """The benchmarks that can run on another device than the CPU."""
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 import torch
@@ -49,9 +50,8 @@ def make_sequences(backbone: Backbone, length: int, samples: int = SAMPLES) -> T
     return TensorDict(entries, [count, length])
 
 
-def training(name: str, length: int) -> Callable[[], None]:
+def training(backbone: Backbone, length: int) -> Callable[[], None]:
     """Returns a training step on sequences."""
-    backbone = make_backbone(name, length)
 
     def loss_of(sequences: TensorDictBase) -> Tensor:
         with set_recurrent_mode(True):
@@ -60,9 +60,9 @@ def training(name: str, length: int) -> Callable[[], None]:
     return make_descent(backbone, loss_of, make_sequences(backbone, length))
 
 
-def acting(name: str, length: int, stack: ExitStack) -> Callable[[], None]:
+def acting(backbone: Backbone, length: int, stack: ExitStack) -> Callable[[], None]:
     """Returns a step of acting, in the acting mode that the stack leaves."""
-    backbone = make_backbone(name, length).eval()
+    backbone.eval()
     frames = torch.randn(COPIES, length + 100, WIDTH)
     starts = itertools.cycle(range(100))
     num_frames = backbone.module.num_frames
@@ -87,11 +87,18 @@ def main(
     rows: dict[str, dict[str, Any]] = {name: {} for name in names}
     for length in lengths:
         torch.manual_seed(0)
-        with ExitStack() as stack:
-            acts = {name: acting(name, length, stack) for name in names}
-            times = {"acting": take_turns(acts, ROUNDS, seconds)}
-        times["training"] = take_turns({n: training(n, length) for n in names}, ROUNDS, seconds)
-        for what, found in times.items():
+        for what, found in measure(partial(make_backbone, length=length), names, length, seconds):
             for name, milliseconds in found.items():
                 rows[name][f"{what}_{length}_ms"] = milliseconds
     return rows
+
+
+def measure(
+    make: Callable[[str], Backbone], names: Sequence[str], length: int, seconds: float
+) -> list[tuple[str, dict[str, list[float]]]]:
+    """The milliseconds of a step of acting and of a training step of each backbone."""
+    with ExitStack() as stack:
+        acts = {name: acting(make(name), length, stack) for name in names}
+        acted = take_turns(acts, ROUNDS, seconds)
+    trained = take_turns({n: training(make(n), length) for n in names}, ROUNDS, seconds)
+    return [("acting", acted), ("training", trained)]

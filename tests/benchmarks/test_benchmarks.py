@@ -18,12 +18,14 @@ from benchmarks import (
     memories,
     off_policy,
     segments,
+    sliding,
     window_tables,
 )
 from benchmarks.__main__ import BENCHMARKS, main
 from benchmarks.straightforward import Case
 from docs.tools import tables
 from tests.numerics import assert_near
+from torchrl_tit.histories.outer import ChainedOuterTransformer
 from torchrl_tit.modules import Backbone
 
 CASES = [
@@ -84,7 +86,7 @@ def test_on_another_device_nothing_is_on_the_cpu(monkeypatch, capsys):
     monkeypatch.setattr(torch.optim, "Adam", lambda weights, fused: torch.optim.SGD(weights))
     with torch.device("meta"):
         segments.measure(segments.Row(Case("Enhanced", "images", 4, 32), length=16), 1, 0)
-        memories.training("gtrxl", 8)()
+        memories.training(memories.make_backbone("gtrxl", 8), 8)()
     with pytest.raises(SystemExit):
         main(["offline", "--device", "meta"])
     assert "['offline'] run on the CPU only" in capsys.readouterr().err
@@ -114,6 +116,21 @@ def test_memories_forget_where_an_episode_begins(monkeypatch):
     monkeypatch.setattr(memories, "SAMPLES", 12)
     for row in memories.main([3, 6], names, seconds=0).values():
         assert len(row) == 4
+        assert all(time > 0 for times in row.values() for time in times)
+
+
+def test_sliding_blocks_are_measured_on_their_tables(monkeypatch):
+    monkeypatch.setattr(memories, "SAMPLES", 12)
+    tables, read_table = [], ChainedOuterTransformer.read_table
+
+    def counted(*arguments):
+        tables.append(arguments)
+        return read_table(*arguments)
+
+    monkeypatch.setattr(ChainedOuterTransformer, "read_table", counted)
+    rows = sliding.main(length=6, seconds=0)
+    assert tables
+    for row in rows.values():
         assert all(time > 0 for times in row.values() for time in times)
 
 
