@@ -87,7 +87,8 @@ def main(
     rows: dict[str, dict[str, Any]] = {name: {} for name in names}
     for length in lengths:
         torch.manual_seed(0)
-        for what, found in measure(partial(make_backbone, length=length), names, length, seconds):
+        times = measure(partial(make_backbone, length=length), names, length, seconds)
+        for what, found in times.items():
             for name, milliseconds in found.items():
                 rows[name][f"{what}_{length}_ms"] = milliseconds
     return rows
@@ -95,10 +96,10 @@ def main(
 
 def measure(
     make: Callable[[str], Backbone], names: Sequence[str], length: int, seconds: float
-) -> list[tuple[str, dict[str, list[float]]]]:
+) -> dict[str, dict[str, list[float]]]:
     """The milliseconds of a step of acting and of a training step of each backbone."""
     with ExitStack() as stack:
         acts = {name: acting(make(name), length, stack) for name in names}
         acted = take_turns(acts, ROUNDS, seconds)
     trained = take_turns({n: training(make(n), length) for n in names}, ROUNDS, seconds)
-    return [("acting", acted), ("training", trained)]
+    return {"acting": acted, "training": trained}

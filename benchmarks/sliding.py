@@ -36,7 +36,7 @@ def make_backbone(name: str) -> Backbone:
 def main(length: int = LENGTH, seconds: float = SECONDS) -> dict[str, Any]:
     """Measures, alternating between the networks."""
     rows: dict[str, dict[str, Any]] = {name: {} for name in HISTORIES}
-    for what, found in measure(make_backbone, list(HISTORIES), length, seconds):
+    for what, found in measure(make_backbone, list(HISTORIES), length, seconds).items():
         for name, milliseconds in found.items():
             rows[name][f"{what}_ms"] = milliseconds
     return rows

@@ -186,6 +186,8 @@ def with_spaces(recipe: DatasetRecipeT) -> DatasetRecipeT:
     return replace(recipe, env_settings=tuple(f"{x}={value}" for x, value in settings.items()))
 
 
+BY_DATA: Mapping[str, float] = {"limit": math.inf, "eps": 1e-3}
+"""Normalization by the statistics of a data set, as the authors of TD3+BC and d3rlpy do it."""
 _MOST_MEASURED = 10_000
 """Items of held-out episodes that are measured at a time, evenly spaced if there are more."""
 _MEASURED_AT_ONCE = 500
@@ -431,7 +433,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         recipe, slices = self.recipe, slices or self.recipe.slice_length > 1
         observation = observation_specs(env)
         return make_backbone(
-            recipe.backbone, observation, slices=slices, normalization=self._normalization
+            recipe.backbone, observation, slices=slices, normalization=self.normalization
         )
 
     def make_critic(self, env: EnvBase, action_dim: int, **settings: Any) -> TensorDictModuleBase:
@@ -443,7 +445,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             recipe.critic_hidden,
             recipe.backbone if recipe.critic == "backbone" else None,
             slices=recipe.slice_length > 1,
-            normalization=self._normalization,
+            normalization=self.normalization,
             **settings,
         ).to(self.device)
 
@@ -564,9 +566,6 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         return [Outcome(step, returns.tolist())]
 
     @property
-    def _normalization(self) -> dict[str, float] | None:
-        """How observations are normalized; None if they are not.
-
-        The authors of TD3+BC and d3rlpy add the same to the deviations.
-        """
-        return {"limit": math.inf, "eps": 1e-3} if self.recipe.normalize_observations else None
+    def normalization(self) -> Mapping[str, float] | None:
+        """Settings of what normalizes the observations that networks read; None if nothing does."""
+        return BY_DATA if self.recipe.normalize_observations else None

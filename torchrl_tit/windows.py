@@ -66,7 +66,7 @@ class Windows(NamedTuple):
         missing = None if self.missing is None else self.missing[..., -num_frames:]
         return Windows(self.rows[..., -num_frames:], missing, self.span)
 
-    def of_every_row(self, count: int, num_frames: int) -> Tensor:
+    def of_every_row(self, count: int, num_frames: int) -> Windows:
         """Finds a shorter window for every frame that a window holds, not only for the newest ones.
 
         Only for windows of sequences whose newest frames follow one another.
@@ -76,17 +76,19 @@ class Windows(NamedTuple):
             num_frames: number A <= K of frames of a shorter window.
 
         Returns:
-            int64 [R, A]. A row that only the A - 1 oldest frames of windows have is repeated.
+            Windows [N, span, A]. A row that only the A - 1 oldest frames of windows have is
+            repeated.
 
         Example:
             >>> windows = Windows(torch.tensor([[[0, 1, 2], [1, 2, 3]]]), None, span=4)
-            >>> windows.of_every_row(count=4, num_frames=2).tolist()
-            [[0, 0], [0, 1], [1, 2], [2, 3]]
+            >>> windows.of_every_row(count=4, num_frames=2).rows.tolist()
+            [[[0, 0], [0, 1], [1, 2], [2, 3]]]
         """
         found = torch.arange(count, device=self.rows.device).unsqueeze(-1).repeat(1, num_frames)
         for rows in (self.rows[:, 0].unfold(-1, num_frames, 1), self.rows[..., -num_frames:]):
             found[rows[..., -1].flatten()] = rows.flatten(0, -2)
-        return found
+        span, sequences = self.span or 0, self.rows.shape[0]
+        return Windows(found[: sequences * span].view(sequences, span, -1), None, span)
 
     def gather(self, frames: Tensor) -> Tensor:
         """Gathers frames.

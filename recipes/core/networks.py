@@ -85,17 +85,17 @@ def normalize_frames(network: nn.Module, **settings: Any) -> None:
 
 @torch.no_grad()
 def set_statistics(
-    policy: nn.Module, model: nn.Module, set_of: Callable[[NormalizedFrames], None]
+    policy: nn.Module, model: nn.Module, change: Callable[[NormalizedFrames], None]
 ) -> None:
     """Sets the statistics of all networks: the policy's, the critics' and the targets'.
 
     Args:
         policy: reads one observation, normalized.
         model: a TorchRL loss, which stacks the statistics of the critics.
-        set_of: sets or updates the policy's.
+        change: updates or replaces the policy's.
     """
     (frames,) = (m for m in policy.modules() if isinstance(m, NormalizedFrames))
-    set_of(frames)
+    change(frames)
     statistics = dict(frames.named_buffers(recurse=False))
     buffers = dict(model.named_buffers())
     for name, buffer in buffers.items():
@@ -105,9 +105,14 @@ def set_statistics(
 
 
 def check_normalizes(task: str, observation: Any) -> None:
-    """Raises ValueError if observations of this spec, or of these, are not to be normalized."""
-    if isinstance(observation, dict) or not observation.dtype.is_floating_point:
-        several = isinstance(observation, dict)
+    """Raises ValueError unless a task has one observation, and this is of floats.
+
+    Args:
+        task: its name.
+        observation: spec of the observation, or of each by name.
+    """
+    several = isinstance(observation, dict)
+    if several or not observation.dtype.is_floating_point:
         found = "several" if several else f"{observation.dtype}, not floats"
         raise ValueError(
             f"normalize_observations is on, but observations of {task} are {found}: switch it off"

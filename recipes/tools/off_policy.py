@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -34,7 +33,7 @@ from ..core.optional import tqdm
 from ..core.recipe import DatasetRecipe, Recipe
 from ..core.run import Run
 from ..core.runner import load_trained
-from ..offline import DatasetAlgorithm, TransitionAlgorithm, action_values, read_data
+from ..offline import BY_DATA, DatasetAlgorithm, TransitionAlgorithm, action_values, read_data
 
 UPDATES = {"fqe": 20_000, "wis": 2000}
 """Gradient steps of fitted Q evaluation, and of cloning the behavior."""
@@ -279,15 +278,13 @@ def _make_critic(algorithm: TransitionAlgorithm[Any], episodes: Episodes) -> Ten
         observation = observation_specs(env)
     assert isinstance(observation, TensorSpec)
     small = mlp(recipe.backbone.num_frames, hidden_dim=256, activation="relu")
-    floats = observation.dtype.is_floating_point
-    normalization = {"limit": math.inf, "eps": 1e-3} if floats else None
     critic = make_critic(
         observation,
         0 if is_discrete(spec) else spec.shape[0],
         (256,),
         small if observation.ndim == 1 else recipe.backbone,
         values=spec.space.n if is_discrete(spec) else 1,
-        normalization=normalization,
+        normalization=BY_DATA if observation.dtype.is_floating_point else None,
     )
     for module in critic.modules():
         if isinstance(module, NormalizedFrames):

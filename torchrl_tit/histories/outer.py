@@ -131,7 +131,9 @@ class SlidingOuterTransformer(OuterTransformer):
         """
         x, mask, newest = tokens[0], None, []
         attended = self.attention_frames or self.shape.num_frames
-        if self.attention_frames is not None and windows is None:
+        if windows is not None:
+            around = windows.of_every_row(x.shape[0], attended)
+        elif self.attention_frames is not None:
             ones = torch.ones(x.shape[-2], x.shape[-2], dtype=torch.bool, device=x.device)
             mask = ones.tril().triu(1 - attended)
         for index in range(self.num_blocks - 1):
@@ -139,7 +141,7 @@ class SlidingOuterTransformer(OuterTransformer):
                 x = self._block(index)(x, mask=mask)
                 newest.append(x[..., -1, :])
             else:
-                x = self._block(index).read_every_row(x, windows, attended)
+                x = self._block(index).read_every_row(x, around)
                 newest.append(take(x, windows.rows[..., -1]))
             if len(tokens) > 1:
                 x = x + tokens[index + 1]

@@ -88,22 +88,19 @@ class TransformerBlock(nn.Module):
         x = _newest(x, windows) + attend_windows(self.attention, self.norm1(x), windows)
         return x + self.ffn(self.norm2(x))
 
-    def read_every_row(self, x: Tensor, windows: Windows, num_frames: int) -> Tensor:
-        """Reads every row of a table, each with the rows before it in the windows that hold it.
+    def read_every_row(self, x: Tensor, windows: Windows) -> Tensor:
+        """Reads every row of a table.
 
         Args:
             x: tokens of the table, float [R, D].
-            windows: windows of sequences, [N, T, K].
-            num_frames: number A of rows that a row sees, itself included.
+            windows: the window of each row of the sequences, [N, span, A].
 
         Returns:
-            float [R, D]; rows of no sequence, such as that of padding, see themselves.
+            float [R, D]; a row of no sequence, such as that of padding, sees itself alone.
         """
-        rows, span = windows.of_every_row(x.shape[0], num_frames), windows.span or 0
-        inside = windows.rows.shape[0] * span
-        around = Windows(rows[:inside].view(-1, span, num_frames), None, span)
-        alone = self(x[inside:].unsqueeze(-2)).squeeze(-2)
-        return torch.cat([self.read_windows(x, around).flatten(0, 1), alone])
+        inside = self.read_windows(x, windows).flatten(0, 1)
+        alone = self(x[len(inside) :].unsqueeze(-2)).squeeze(-2)
+        return torch.cat([inside, alone])
 
 
 class GPT2Block(nn.Module):
