@@ -5,7 +5,7 @@ from __future__ import annotations
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import lstm, mlp
 
-from .ppo_settings import PPO_SETTINGS, reliable_tit
+from .ppo_settings import reliable_tit, settings_of
 from .preset import PPO, NovelPPO, Preset, SmoothPPO
 
 # The task determines the patches, and the encoders of several observations.
@@ -24,7 +24,7 @@ _ALGORITHMS = {
 }
 
 ANY_TASK_RECIPES: list[Preset] = [
-    make(name=f"ppo/{network}{ending}", env=env, backbone=backbone, **PPO_SETTINGS)
+    make(name=f"ppo/{network}{ending}", env=env, backbone=backbone, **settings_of(network))
     for ending, (make, env) in _ALGORITHMS.items()
     for network, backbone in _NETWORKS.items()
 ]

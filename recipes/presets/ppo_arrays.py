@@ -1,7 +1,8 @@
 """The named recipes of classic control and MuJoCo (arXiv 2212.14538, table 2).
 
-All networks train with one set of settings. Recipes whose names end in "-protocol" use the settings
-of the paper and its release instead; where the two contradict each other, "-paper" has the paper's.
+All networks train with one set of settings, but for the MLP's learning rate. Recipes whose names
+end in "-protocol" use the settings of the paper and its release instead; where the two contradict
+each other, "-paper" has the paper's.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import d2rl, enhanced_tit, lstm, mlp, ofenet, vanilla_tit
 
-from .ppo_settings import PPO_SETTINGS, reliable_tit
+from .ppo_settings import reliable_tit, settings_of
 from .preset import PPO, Preset
 
 # Task name: environment and steps (arXiv 2212.14538, appendix). The paper ran MuJoCo's v3.
@@ -52,7 +53,7 @@ def _named() -> list[Preset]:
         for network, backbone in _NETWORKS.items():
             name = f"ppo/{task}/{network}"
             recipe = PPO(name=name, env=env, total_steps=total_steps, backbone=backbone)
-            recipes.append(recipe.replace(**PPO_SETTINGS))
+            recipes.append(recipe.replace(**settings_of(network)))
             if network in _PROTOCOL:
                 backbone = (_PROTOCOL | published)[network]
                 recipes.append(recipe.replace(name=f"{name}-protocol", backbone=backbone))

@@ -25,6 +25,17 @@ PPO_SETTINGS: dict[str, Any] = {
 }
 """Fields of the recipe; the others have their defaults, which are Stable-Baselines3's."""
 
+def settings_of(network: str) -> dict[str, Any]:
+    """Returns :data:`PPO_SETTINGS` with the learning rate that suits a network.
+
+    An MLP's updates are a fraction of the others' at their rate: docs/results/update_size.md.
+
+    Args:
+        network: its name, such as mlp.
+    """
+    return PPO_SETTINGS | {"learning_rate": 1e-3 if network == "mlp" else 3e-4}
+
+
 STEADY_PPO_SETTINGS: dict[str, Any] = PPO_SETTINGS | {"minibatch_size": 256, "target_kl": 0.02}
 """The same with smaller and less noisy updates, for tasks that only a history solves."""
 

@@ -197,7 +197,7 @@ def test_recipes_of_data_sets() -> None:
 
 
 def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
-    """Only the task, the number of steps and what the network reads differ."""
+    """Only the task, the number of steps, what the network reads and the MLP's rate differ."""
     recipes = [
         recipe
         for name, recipe in RECIPES.items()
@@ -212,7 +212,10 @@ def test_all_tasks_and_networks_train_with_one_set_of_settings() -> None:
     same: dict[str, Any] = {
         "env": "one", "backbone": mlp(), "total_steps": one.total_steps, "name": "",
     }  # fmt: skip
-    assert {replace(recipe, **same) for recipe in recipes} == {one, steady}
+    faster = replace(one, learning_rate=1e-3)
+    assert {replace(recipe, **same) for recipe in recipes} == {one, faster, steady}
+    found = {recipe.backbone for recipe in recipes if replace(recipe, **same) == faster}
+    assert found == {mlp()}
 
 
 def test_all_pictures_train_with_one_set_of_settings() -> None:
