@@ -25,6 +25,7 @@ PPO_SETTINGS: dict[str, Any] = {
 }
 """Fields of the recipe; the others have their defaults, which are Stable-Baselines3's."""
 
+
 def settings_of(network: str) -> dict[str, Any]:
     """Returns :data:`PPO_SETTINGS` with the learning rate that suits a network.
 
