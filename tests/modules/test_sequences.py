@@ -15,7 +15,6 @@ from torchrl.modules import set_recurrent_mode
 from tests.modules.frames import CountedFrames
 from tests.networks.test_pairs import (
     CASES,
-    IS_INIT,
     NUM_FRAMES,
     PAIRS,
     N,
@@ -47,17 +46,6 @@ def backbone_of(network: HistoryNetwork, **options: Any) -> Backbone:
     return Backbone(network, in_keys=[*keys, *network.history_encoder.context], **options)
 
 
-def spoil(td: TensorDictBase, *, keep_starts: bool) -> TensorDictBase:
-    """Overwrites the histories that must not be read."""
-    td = td.clone()
-    kept = IS_INIT.squeeze(-1).clone() if keep_starts else torch.zeros(N, T, dtype=torch.bool)
-    kept[:, 0] = True
-    for key, history in td.items(True, True):
-        if "history" in key:
-            history[~kept] = torch.nan if history.is_floating_point() else 0
-    return td
-
-
 def read(backbone: Backbone, td: TensorDictBase, key: str = "features") -> Tensor:
     with set_recurrent_mode(True):
         return backbone(td)[key]
@@ -76,11 +64,8 @@ def test_every_pair_equals_single_steps(pair: Pair, padding: Padding) -> None:
     td = sequences(pair, padding)
     expected = backbone_of(network)(td.clone())["features"]
     expected_gradients = gradients(expected, network)
-    for options, given in [
-        ({}, spoil(td, keep_starts=True)),
-        ({"padding": padding}, spoil(td, keep_starts=False)),
-    ]:
-        features = read(backbone_of(network, **options), given)
+    for options in ({}, {"padding": padding}):
+        features = read(backbone_of(network, **options), td.clone())
         torch.testing.assert_close(features, expected, rtol=0, atol=1e-9)
         for actual, other in zip(gradients(features, network), expected_gradients, strict=True):
             torch.testing.assert_close(
@@ -107,23 +92,18 @@ def test_without_histories_the_valid_steps_are_those_of_single_steps(
     assert (features - expected)[~mask].abs().amax(-1).min() > 1e-3
 
 
-def test_each_frame_is_encoded_once() -> None:
-    network = EnhancedTIT((4,), num_frames=16)
-    counted = CountedFrames(network)
-    td = TensorDict(
-        {
-            "history": torch.randn(2, 1, 16, 4).expand(2, 32, 16, 4),
-            "observation": torch.randn(2, 32, 4),
-            "is_init": torch.rand(2, 32, 1) < 0.2,
-        },
-        [2, 32],
-    )
-    read(Backbone(network, padding="same"), td.clone())
-    assert counted.take() == 2 * (32 + 15)
-    read(Backbone(network, padding="constant"), td.clone())
-    assert counted.take() == 2 * (32 + 15) + 1  # zeros once
+@pytest.mark.parametrize("padding", PADDINGS)
+def test_each_frame_is_encoded_once(padding: Padding) -> None:
+    network = EnhancedTIT((4,), num_frames=16).double()
+    counted, td = CountedFrames(network), rollout_of(16, padding)
+    read(Backbone(network, padding=padding), td.clone())
+    assert counted.take() == 3 * (60 + 15) + (padding == "constant")  # zeros once
+    starts = int(td["is_init"].sum())
+    assert starts > 3
+    read(Backbone(network), td.clone())
+    assert counted.take() == 3 * 60 + 15 * starts
     read(Backbone(network), td.exclude("history"))
-    assert counted.take() == 2 * 32
+    assert counted.take() == 3 * 60
 
 
 def test_dropout_is_drawn_once_a_frame() -> None:
@@ -208,7 +188,7 @@ def test_every_frame_and_leading_dimensions() -> None:
 def test_other_modules_read_the_windows() -> None:
     td = sequences(CASE, "constant")
     module = torch.nn.Flatten(-2)
-    features = read(Backbone(module, padding="constant"), spoil(td, keep_starts=False))
+    features = read(Backbone(module, padding="constant"), td.clone())
     assert torch.equal(features, td["history"].flatten(-2))
 
 
@@ -245,8 +225,31 @@ def test_shuffled_steps_are_refused(padding: Padding | None) -> None:
         read(backbone, shuffled.clone())
     assert "\n" not in str(raised.value)
     assert_near(read(backbone, shuffled.exclude("is_init")), expected)
-    if padding is None:  # the rows of a rollout one after another, of which only some are done
+    # Losses that select the in_keys leave out "done" and the next observations.
+    bare = shuffled.select("history", "observation", "is_init")
+    if padding is None:
+        assert_near(read(backbone, bare), expected)
+        # The rows of a rollout one after another, of which only some are done.
         assert_near(read(backbone, steps.clone()), backbone(steps)["features"])
+    else:
+        with pytest.raises(ValueError, match="leave padding out"):
+            read(backbone, bare)
+
+
+@pytest.mark.parametrize("done", [True, False])
+def test_histories_say_where_sequences_begin(done: bool) -> None:
+    """In the next steps of a loss, nothing else does."""
+    rollout = rollout_of(4, "same")
+    after = rollout["next"].select("history", "observation", *["done"] * done)
+    after["is_init"] = torch.zeros_like(rollout["is_init"])
+    network = EnhancedTIT((4,), 4).double()
+    expected = Backbone(network)(after.clone())["features"]
+    assert_near(read(Backbone(network), after.clone()), expected)
+    with pytest.raises(ValueError, match="for the next steps of a loss or GAE") as raised:
+        read(Backbone(network, padding="same"), after.clone())
+    assert "\n" not in str(raised.value)
+    with pytest.raises(ValueError, match="and if History pads otherwise"):
+        read(Backbone(network, padding="constant"), rollout)
 
 
 def test_settings_declare_keys_or_say_what_to_do() -> None:

@@ -114,8 +114,10 @@ class Backbone(ActingModule):
         padding: what precedes an ``is_init`` in a sequence, as in
             :class:`~torchrl_tit.transforms.History`: its observation ("same") or zeros
             ("constant"). If given, only the histories at t = 0 are read, all shapes are static (for
-            ``torch.compile`` and ``vmap``), and padding is encoded once. If None, the histories at
-            the starts of sequences are read; without histories, "same" is used.
+            ``torch.compile`` and ``vmap``), and padding is encoded once. It is for sequences in
+            which ``is_init`` marks every first observation: neither for flat slices, nor for the
+            next steps of losses and GAE. If None, every history is read that does not continue the
+            one before it; without histories, "same" is used.
         observation_keys: keys of the observations, one for each history; by default a history's
             key with "history" replaced by "observation". If these or ``padding`` are given, the
             ``in_keys`` include them and ``is_init``, for losses that select the ``in_keys``, and
@@ -124,7 +126,8 @@ class Backbone(ActingModule):
     Raises:
         ValueError: if the number of keys does not match the network's inputs and outputs,
             ``every_frame`` is set for a history encoder that only encodes the newest frame, or the
-            padding is unknown.
+            padding is unknown; in ``forward``, if the padding makes other histories than the stored
+            ones.
         KeyError: in ``forward``, if the tensordict lacks one of the entries.
 
     Example:

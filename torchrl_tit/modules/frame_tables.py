@@ -32,6 +32,9 @@ def table_of_stored(
 ) -> FrameTable:
     """Reads the stored histories at the starts of sequences, and the newest observation elsewhere.
 
+    A history that does not continue the one before it begins a sequence, too: losses that select
+    a network's ``in_keys`` drop "done", and a shuffled step continues nothing.
+
     The number of frames depends on the data, so ``torch.compile`` breaks its graph here, and
     ``vmap`` cannot map over ``starts``.
 
@@ -41,6 +44,9 @@ def table_of_stored(
         starts: bool [N, T], where a sequence begins; at the first step in any case.
     """
     num_frames = histories[0].shape[2]
+    starts = starts.clone()
+    for history in histories:
+        starts[:, 1:] |= differs(history[:, 1:, :-1], history[:, :-1, 1:])
     newest = torch.where(starts, num_frames, 1).flatten().cumsum(0) - 1  # int64 [N * T]
     places = newest[starts.flatten()].unsqueeze(-1) + torch.arange(
         1 - num_frames, 1, device=starts.device
@@ -137,6 +143,16 @@ def find_starts(is_init: Tensor, ends: Sequence[Tensor]) -> Tensor:
     for end in ends:
         is_init = is_init | end.roll(1, dims=1)
     return _after_first(is_init, True)
+
+
+def differs(one: Tensor, other: Tensor) -> Tensor:
+    """Where steps differ, [N, T, ...] each -> bool [N, T]; NaN equals NaN.
+
+    Example:
+        >>> differs(torch.tensor([[[1.0, torch.nan]]]), torch.tensor([[[2.0, torch.nan]]]))
+        tensor([[True]])
+    """
+    return ((one != other) & ((one == one) | (other == other))).flatten(2).any(-1)
 
 
 def _after_first(mask: Tensor, first: bool) -> Tensor:

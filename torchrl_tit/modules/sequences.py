@@ -13,6 +13,7 @@ from torchrl.modules import recurrent_mode
 
 from torchrl_tit.modules.frame_tables import (
     FrameTable,
+    differs,
     find_starts,
     table_of_first,
     table_of_stored,
@@ -83,8 +84,9 @@ class SequenceKeys:
 
         Raises:
             KeyError: if an entry is missing.
-            ValueError: if there is no time dimension, an entry does not fit a network, or the next
-                observation of a step is not that of the step after it.
+            ValueError: if there is no time dimension, an entry does not fit a network, the next
+                observation of a step is not that of the step after it, or padding makes other
+                histories than the stored ones.
         """
         self._check(tensordict, trunks)
         *batch, steps = self.shape_of(tensordict)
@@ -113,7 +115,9 @@ class SequenceKeys:
         if histories and self.padding is not None:
             own = time + len(group) + 1
             first = [x.select(time, 0).reshape(count, *x.shape[own:]) for x in histories]
-            return table_of_first(first, observations, is_init, self.padding), context
+            table = table_of_first(first, observations, is_init, self.padding)
+            _check_padding(table, [flat(x) for x in histories])
+            return table, context
         if histories:
             return table_of_stored([flat(x) for x in histories], observations, starts), context
         padding, num_frames = self.padding or "same", trunks[0].num_frames
@@ -232,14 +236,25 @@ def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -
     """Raises ValueError if steps [N, T] do not follow one another, as shuffled ones do not."""
     if is_transformed():
         return
-    now, after = observation[:, 1:], following[:, :-1]
-    differs = ((now != after) & (after == after)).flatten(2).any(-1)  # NaN differs from itself
-    if (differs & ~starts[:, 1:]).any():
+    if (differs(observation[:, 1:], following[:, :-1]) & ~starts[:, 1:]).any():
         raise ValueError(
             "in recurrent mode the last batch dimension is time, but the next observation of a "
             "step is not the observation of the step after it: leave is_init out of shuffled steps "
             "(or read them within set_recurrent_mode(False)), and set it where a sequence begins"
         )
+
+
+def _check_padding(table: FrameTable, histories: Sequence[Tensor]) -> None:
+    """Raises ValueError if the windows of a table are not the histories, [N, T, K, ...] each."""
+    if is_transformed():
+        return
+    for frames, history in zip(table.frames, histories, strict=True):
+        if differs(table.windows.gather(frames), history).any():
+            raise ValueError(
+                "with padding, only the first history of a sequence is read, but the stored "
+                "histories are others than those that follow from it: leave padding out for flat "
+                "slices, for the next steps of a loss or GAE, and if History pads otherwise"
+            )
 
 
 def default_observation_keys(histories: Sequence[NestedKey]) -> list[NestedKey]:
