@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import (
     AddStateIndependentNormalScale,
@@ -21,7 +20,7 @@ from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl.envs import Compose
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, QValueModule, TanhModule
 
-from torchrl_tit.frames import NormalizedFrames
+from torchrl_tit.frames import NormalizedFrames, share_statistics
 from torchrl_tit.frames.observation import Observations, read_observations
 from torchrl_tit.modules import Backbone, as_sequences, history_keys, make_actor
 from torchrl_tit.modules.action_specs import has_bounds
@@ -83,7 +82,6 @@ def normalize_frames(network: nn.Module, **settings: Any) -> None:
                 trunk.frame_encoders[key] = NormalizedFrames(encoder, **settings)
 
 
-@torch.no_grad()
 def set_statistics(
     policy: nn.Module, model: nn.Module, change: Callable[[NormalizedFrames], None]
 ) -> None:
@@ -96,12 +94,7 @@ def set_statistics(
     """
     (frames,) = (m for m in policy.modules() if isinstance(m, NormalizedFrames))
     change(frames)
-    statistics = dict(frames.named_buffers(recurse=False))
-    buffers = dict(model.named_buffers())
-    for name, buffer in buffers.items():
-        path, _, leaf = name.rpartition(".")
-        if leaf in statistics and all(f"{path}.{own}" in buffers for own in statistics):
-            buffer.copy_(statistics[leaf])
+    share_statistics(frames, model)
 
 
 def check_normalizes(task: str, observation: Any) -> None:

@@ -35,7 +35,7 @@ def read(path: Path, output: Path) -> None:
     with pytest.raises(RuntimeError):  # the limit holds
         torch.ones(LIMIT // 4 + LIMIT // 16)
     episodes = load_episodes(path)
-    mean, _ = episodes.observation_statistics()
+    mean, _, _ = episodes.observation_statistics()
     batch = make_replay_buffer(HistoryStorage(episodes, 4), 256).sample()
     make_replay_buffer(SequenceStorage(episodes, 20), 64).sample()
     assert (batch["history"][:, -1, 0] + 1 == batch["next", "history"][:, -1, 0]).all()

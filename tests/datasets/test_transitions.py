@@ -111,7 +111,7 @@ def test_a_trailing_unfinished_episode_is_separate(arrays: Transitions) -> None:
     assert data.finished.tolist() == [True] * (len(spans(arrays)) - 1) + [False]
     assert len(HistoryStorage(data)) == start
     assert len(HistoryStorage(data, unfinished="keep")) == stop - 1
-    mean, std = data.observation_statistics()  # of finished episodes
+    mean, std, _ = data.observation_statistics()  # of finished episodes
     observations = whole["observations"].astype(np.float64)
     np.testing.assert_allclose(mean, observations.mean(0), rtol=1e-6)
     np.testing.assert_allclose(std, observations.std(0), rtol=1e-6)

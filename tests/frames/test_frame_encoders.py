@@ -65,11 +65,17 @@ def test_linear_frames_are_a_linear_layer(
     torch.testing.assert_close(encoder(frames / 255), expected)
 
 
-def test_statistics_of_parts_are_those_of_the_whole() -> None:
+@pytest.mark.parametrize("of_data", [False, True])
+def test_statistics_of_parts_are_those_of_the_whole(of_data: bool) -> None:
     torch.manual_seed(0)
     observations = torch.randn(600, 4) * torch.tensor([1e-2, 1.0, 50.0, 1.0]) + 3
     frames = NormalizedFrames(settings.Linear().build((4,)))
-    for part in observations.split([1, 199, 400]):
+    parts = observations.split([1, 199, 400])
+    if of_data:  # learning goes on online
+        data = observations[:200]
+        frames.set_statistics(data.mean(0), data.std(0, unbiased=False), 200)
+        parts = parts[2:]
+    for part in parts:
         frames.update(part)
     torch.testing.assert_close(frames.mean, observations.mean(0))
     torch.testing.assert_close(frames.variance, observations.var(0, unbiased=False))

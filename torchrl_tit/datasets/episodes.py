@@ -121,7 +121,7 @@ class Episodes:
 
     def observation_statistics(
         self, samples: Callable[[Tensor], Tensor] = lambda observations: observations
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, int]:
         """Computes the mean and standard deviation of the observations of finished episodes.
 
         Args:
@@ -129,9 +129,10 @@ class Episodes:
                 :meth:`torchrl_tit.frames.FrameEncoder.samples`.
 
         Returns:
-            Mean and population standard deviation, float32 [*sample] each, for
-            :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`. The deviation of a constant
-            entry of an array is 1, with a warning, so that it is not amplified if it changes later.
+            Mean and population standard deviation, float32 [*sample] each, and the number of
+            samples, for :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`. The deviation
+            of a constant entry of an array is 1, with a warning, so that it is not amplified if it
+            changes later.
 
         Raises:
             DatasetError: if there are none, because no episode is finished or all sets are empty.
@@ -156,7 +157,7 @@ class Episodes:
                     "are constant, so they are not divided by their deviation",
                     stacklevel=2,
                 )
-        return mean.float(), std
+        return mean.float(), std, count
 
     def _observations(self) -> Iterator[Tensor]:
         """The observations at the steps of finished episodes, in chunks."""

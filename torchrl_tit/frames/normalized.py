@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.layers.images import bytes_to_floats
@@ -65,8 +65,14 @@ class NormalizedFrames(FrameEncoder):
         self.register_buffer("variance", torch.ones(shape))
 
     @torch.no_grad()
-    def set_statistics(self, mean: Tensor, std: Tensor) -> None:
-        """Replaces the statistics by those of a data set's samples, float [*sample] each."""
+    def set_statistics(self, mean: Tensor, std: Tensor, count: int) -> None:
+        """Replaces the statistics by those of a data set's samples.
+
+        Args:
+            mean: float [*sample].
+            std: population standard deviation, float [*sample].
+            count: number of samples, which says how much they weigh in later updates.
+        """
         variance = std.square()
         if self.is_image:  # of a channel: the mean of its variances, and the variance of its means
             over = (-2, -1)
@@ -74,11 +80,15 @@ class NormalizedFrames(FrameEncoder):
             mean = mean.mean(over, keepdim=True)
         self.mean.copy_(mean)
         self.variance.copy_(variance)
+        self.count.fill_(count)
         self._keep_mask()
 
     @torch.no_grad()
     def update(self, observations: Tensor) -> None:
-        """Adds observations to the statistics, float or uint8 [N, *observation_shape]."""
+        """Adds observations to the statistics, float or uint8 [N, *observation_shape].
+
+        Networks that a TorchRL loss stacked or copied do not notice: see :func:`share_statistics`.
+        """
         for part in observations.split(_IMAGES) if self.is_image else [observations]:
             self._add(bytes_to_floats(self.samples(part), self.mean.dtype))
         self._keep_mask()
@@ -118,3 +128,36 @@ class NormalizedFrames(FrameEncoder):
     def forward(self, observation: Tensor) -> Tensor:
         """See :meth:`FrameEncoder.forward`."""
         return self.encoder(self.normalize(observation))
+
+
+@torch.no_grad()
+def share_statistics(frames: NormalizedFrames, loss: nn.Module) -> None:
+    """Copies statistics to all networks of a TorchRL loss that normalize observations.
+
+    A loss stacks the buffers of its critics and copies those of its targets, and a soft update
+    moves weights only.
+
+    Args:
+        frames: the encoder whose statistics have changed, such as that of the policy.
+        loss: a loss on networks that read the same observation.
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+        >>> from torchrl.modules import QValueActor
+        >>> from torchrl.objectives import DQNLoss
+        >>> from torchrl_tit import Backbone, EnhancedTIT
+        >>> tit = EnhancedTIT((4,), num_frames=2)
+        >>> frames = tit.frame_encoders["observation"] = NormalizedFrames(tit.frames[0])
+        >>> head = QValueActor(nn.Linear(64, 2), in_keys=["features"], action_space="categorical")
+        >>> loss = DQNLoss(TensorDictSequential(Backbone(tit), head), action_space="categorical")
+        >>> frames.update(torch.randn(100, 4) + 5)
+        >>> share_statistics(frames, loss)
+        >>> [value.mean().round().item() for name, value in loss.named_buffers() if "mean" in name]
+        [5.0, 5.0]
+    """
+    statistics = dict(frames.named_buffers(recurse=False))
+    buffers = dict(loss.named_buffers())
+    for name, buffer in buffers.items():
+        path, _, leaf = name.rpartition(".")
+        if leaf in statistics and all(f"{path}.{own}" in buffers for own in statistics):
+            buffer.copy_(statistics[leaf])

@@ -41,7 +41,7 @@ def test_a_step_is_the_protocols(tmp_path):
     _, state = load_checkpoint(train(recipe, tmp_path / "run").checkpoints)
 
     episodes = load_episodes(recipe.dataset)
-    mean, std = episodes.observation_statistics()
+    mean, std, _ = episodes.observation_statistics()
     storage = SequenceStorage(episodes, 6, return_scale=50.0)
     generator = torch.Generator().manual_seed(recipe.seed)
     torch.manual_seed(recipe.seed)
@@ -76,7 +76,7 @@ def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
     algorithm = make_algorithm(recipe)
     agent = deepcopy(algorithm.model)
     agent.network.history_encoder.return_scale.fill_(1.0)
-    mean, std = algorithm.load_data().observation_statistics()
+    mean, std, _ = algorithm.load_data().observation_statistics()
     env = gymnasium.make("Hopper-v5")
     observation, _ = env.reset(seed=3)
     states, actions, to_go, ended = [], [torch.zeros(3)], [60.0], False

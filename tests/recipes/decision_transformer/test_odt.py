@@ -41,7 +41,7 @@ def test_a_step_is_the_protocols(tmp_path):
     _, state = load_checkpoint(train(recipe, tmp_path / "run").checkpoints)
 
     episodes = load_episodes(recipe.dataset)
-    mean, std = episodes.observation_statistics()
+    mean, std, _ = episodes.observation_statistics()
     storage = SequenceStorage(episodes, 6, return_scale=50.0)
     seed = np.random.SeedSequence([recipe.seed, 0]).generate_state(1).item()
     generator = torch.Generator().manual_seed(seed)
