@@ -12,6 +12,7 @@ from tests.recipes.ppo import tasks
 from torchrl_tit.envs import make_env
 from torchrl_tit.export.comparison import COPIES, NotTheSameError, compare
 from torchrl_tit.export.parts import Entry, read_parts
+from torchrl_tit.export.policy import export_policy
 from torchrl_tit.modules import Backbone, make_actor
 from torchrl_tit.networks import MLP
 from torchrl_tit.settings import (
@@ -77,6 +78,15 @@ def test_recurrent_states(history):
     policy, task = make_policy(history=history, num_frames=1)
     assert program_of(policy, task).state[0] == "recurrent_state_h"
     assert difference(policy, task) < 1e-5
+
+
+def test_training_goes_on_after_an_export(tmp_path):
+    policy, task = make_policy(history=Outer(num_blocks=1, num_heads=1, ffn_dropout=0.5))
+    policy[1].train()
+    modes = [part.training for part in policy.modules()]
+    assert len(set(modes)) == 2
+    assert export_policy(policy, task, tmp_path / "policy.pt2")["difference"] < 1e-5
+    assert [part.training for part in policy.modules()] == modes
 
 
 def test_two_trunks_leave_the_value_out():

@@ -36,6 +36,21 @@ def build(name: str, tokens: int = 1, frames: int = 1) -> LinearRecurrentEncoder
     return encoder
 
 
+@every_memory
+@pytest.mark.parametrize("length", [1, T])
+def test_a_state_that_is_not_read_may_be_nan(name: str, length: int) -> None:
+    encoder = build(name)
+    tokens, state, is_init = draw(encoder)
+    tokens, is_init = tokens[:, :length], is_init[:, :length]
+    is_init[:, 0] = True
+    lost = {key: torch.full_like(x, torch.nan) for key, x in state.items()}
+    outputs, after = read(encoder, tokens, lost, is_init)
+    expected, expected_after = read(encoder, tokens, state, is_init)
+    assert torch.equal(outputs, expected)
+    for key, x in after.items():
+        assert torch.equal(x, expected_after[key])
+
+
 def mixer_of(encoder: LinearRecurrentEncoder) -> Any:
     """The layer of its first block that reads the past."""
     return encoder.blocks[0].mixer

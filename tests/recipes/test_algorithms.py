@@ -135,6 +135,15 @@ def test_its_program_acts_as_the_agent(trained, step_by_step):
     assert not {*program.inputs} & {*program(program.examples(1))}
     assert compare(program, program, policy, env, observations=60) < 1e-5
     env.close()
+    # Where an episode begins, the state is not read, whatever became of it.
+    first = program.examples(2)
+    if program.state:
+        first["is_init"] = torch.ones(2, dtype=torch.bool)
+        floats = [name for name in program.state if first[name].is_floating_point()]
+        lost = {name: torch.full_like(first[name], torch.nan) for name in floats}
+        expected = program(first)
+        for name, value in program(first | lost).items():
+            assert torch.equal(value, expected[name]), name
 
 
 @pytest.mark.slow

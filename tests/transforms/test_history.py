@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, DTypeCastTransform, ObservationNorm, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.transforms.streams import StreamEnv, assert_histories
@@ -27,6 +27,13 @@ def test_without_a_batch():
     check_env_specs(env)
     first = env.reset()
     assert torch.equal(first["history"], first["observation"].expand(3, 2))
+
+
+def test_a_transform_before_it_may_change_the_dtype():
+    env = TransformedEnv(StreamEnv([3], dtype=torch.uint8), Compose(History(4)))
+    env.insert_transform(0, DTypeCastTransform(torch.uint8, torch.float32, ["observation"]))
+    env.insert_transform(1, ObservationNorm(0.5, 1 / 255, in_keys=["observation"]))
+    assert_histories(env, 4, "same")
 
 
 def test_a_new_environment_takes_the_state():

@@ -133,7 +133,8 @@ def trace_observation(env: EnvBase, history_key: NestedKey, suffix: str = "") ->
     if not stacked:
         raise ValueError(
             f"no History of the environment writes {history_key!r}, so it is not known what the "
-            "policy reads: make the environment with torchrl_tit.envs.make_env, or add History"
+            "policy reads: make the environment with torchrl_tit.envs.make_env and its "
+            "append_transform, or add History to the outermost TransformedEnv"
         )
     spec = env.observation_spec[history_key]
     shape = tuple(spec.shape[env.ndim + 1 :])

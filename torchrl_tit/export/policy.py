@@ -17,6 +17,7 @@ from torchrl_tit.export.formats import find_format, trace
 from torchrl_tit.export.parts import Entry, read_parts, transforms_of
 from torchrl_tit.export.program import Program, make_program
 from torchrl_tit.files import whole_or_not_at_all
+from torchrl_tit.networks.building import evaluating
 
 VERSION = 1
 """Version of the facts in a file."""
@@ -51,8 +52,8 @@ def export_policy(
     the live policy's episodes.
 
     Args:
-        policy: a :class:`~torchrl_tit.modules.Backbone` and the modules after it, in evaluation
-            mode and on a CPU.
+        policy: a :class:`~torchrl_tit.modules.Backbone` and the modules after it, on a CPU. What
+            is exported is its evaluation mode.
         make_env: makes the environment in which the policy acts, given the number of copies.
         path: the file to write, which must not exist yet.
         format: "pt2" (`torch.export`) or "onnx"; by default, given by the file's suffix.
@@ -97,7 +98,11 @@ def export_policy(
     path = Path(path)
     kind = find_format(path, format)
     kind.check_installed()
-    with whole_or_not_at_all(path) as hidden, closing(make_env(COPIES)) as env:
+    with (
+        whole_or_not_at_all(path) as hidden,
+        closing(make_env(COPIES)) as env,
+        evaluating(policy),
+    ):
         parts = read_parts(policy, env)
         precision, parts.backbone.autocast = parts.backbone.autocast, None
         try:

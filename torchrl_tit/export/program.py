@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import unravel_key
+from tensordict.utils import expand_right, unravel_key
 from torch import Tensor, nn
 
 from torchrl_tit.export.parts import Entry, Parts
@@ -382,8 +382,11 @@ class SequenceSteps(TokenSteps):
         time = torch.where(first, 0, inputs["time"] + 1)
         to_go = inputs["return_to_go"] - inputs["reward"]
         to_go = torch.where(first, inputs["target_return"], to_go)
-        returns = torch.cat([inputs["returns"], to_go.reshape(-1, 1, 1)], dim=1)
-        actions = inputs["actions"]
+        returns, actions = (
+            torch.where(expand_right(first, x.shape), 0, x)
+            for x in (inputs["returns"], inputs["actions"])
+        )
+        returns = torch.cat([returns, to_go.reshape(-1, 1, 1)], dim=1)
         actions = torch.cat([actions, torch.zeros_like(actions[:, :1])], dim=1)
         back = torch.arange(1 - steps, 1, device=time.device)
         timestep = time.unsqueeze(1) + back  # negative before the episode

@@ -6,6 +6,7 @@ import math
 from typing import ClassVar
 
 import torch
+from tensordict.utils import expand_right
 from torch import Tensor, nn
 from torch.nn.functional import silu, softplus
 from torchrl.modules import recurrent_mode
@@ -90,7 +91,10 @@ class LinearRecurrentEncoder(RecurrentEncoder):
         Returns:
             float [N, T, D], and the state after the last step.
         """
-        states = []
+        begins, states = is_init[:, 0], []
+        state = {  # a NaN of the last episode times 0 would be NaN
+            key: x.masked_fill(expand_right(begins, x.shape), 0) for key, x in state.items()
+        }
         for index, block in enumerate(self.blocks):
             before = [state[key][:, index] for key in self.state_shapes]
             x, after = block(x, before, is_init)

@@ -2,6 +2,7 @@
 
 In all of them, the state is 0 before a step at which an episode begins (``is_init``). Over
 sequences this is a mask: what lies in another episode has a weight of exactly 0, and no gradient.
+So finite numbers of another episode have no effect, but NaN and infinity spread.
 """
 
 from __future__ import annotations
@@ -207,7 +208,7 @@ class ShortConvolution(nn.Module):
         output = torch.zeros_like(x[:, :length]) if self.bias is None else self.bias
         for tap in range(_KERNEL):
             steps = slice(tap, tap + length)
-            seen = (episode[:, steps] == newest).unsqueeze(-1)
-            output = output + self.weight[:, tap] * x[:, steps] * seen
-        last = episode[:, length:] == episode[:, -1:]
-        return nn.functional.silu(output), x[:, length:] * last.unsqueeze(-1)
+            other = (episode[:, steps] != newest).unsqueeze(-1)
+            output = output + self.weight[:, tap] * x[:, steps].masked_fill(other, 0)
+        other = (episode[:, length:] != episode[:, -1:]).unsqueeze(-1)
+        return nn.functional.silu(output), x[:, length:].masked_fill(other, 0)

@@ -129,7 +129,7 @@ class History(CatFrames):
     def _make_buffer(self, name: str, zeros: Tensor) -> None:
         present = getattr(self, name, None)
         # A transform that joins the same environment again keeps its buffers.
-        if present is None or present.shape != zeros.shape:
+        if present is None or (present.shape, present.dtype) != (zeros.shape, zeros.dtype):
             self.register_buffer(name, zeros)
 
     def _call(
@@ -140,7 +140,9 @@ class History(CatFrames):
             history = next_tensordict.get(in_key).unsqueeze(dim)  # [..., 1, *obs]
             if self.N > 1:
                 name = _buffer_name(in_key)
-                if not hasattr(self, name):  # no environment has made it
+                buffer = getattr(self, name, None)
+                # No environment has made it, or one to which a transform was added since.
+                if buffer is None or buffer.dtype != history.dtype:
                     zeros = torch.zeros_like(history).repeat_interleave(self.N, dim)
                     self._make_buffer(name, zeros)
                 history = self._push(getattr(self, name), history, _reset, dim)
