@@ -66,14 +66,14 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
         self.optimizer = self.make_adam({"": self.recipe.learning_rate})
         self.buffer = self.make_buffer()
 
-    def load_data(self) -> Episodes:
-        """As :meth:`TransitionAlgorithm.load_data`, the best of the episodes only."""
-        episodes, fraction = super().load_data(), self.recipe.best_fraction
-        if fraction == 1:
-            return episodes
-        finished = episodes.finished.nonzero().squeeze(-1)
-        order = finished[episodes.returns[finished].argsort(descending=True, stable=True)]
-        return select_episodes(episodes, order[: max(1, round(fraction * len(order)))])
+    def split(self, episodes: Episodes) -> Episodes:
+        """Leaves out all but the best episodes, and holds some of the best out."""
+        if (fraction := self.recipe.best_fraction) < 1:
+            finished = episodes.finished.nonzero().squeeze(-1)
+            order = finished[episodes.returns[finished].argsort(descending=True, stable=True)]
+            best = order[: max(1, round(fraction * len(order)))]
+            episodes = select_episodes(episodes, best)
+        return super().split(episodes)
 
     def loss(self, samples: TensorDictBase) -> TensorDictBase:
         """Returns the terms of the loss; see :meth:`TransitionAlgorithm.loss`."""

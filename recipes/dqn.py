@@ -43,7 +43,7 @@ class DQN(ReplayRecipe, algorithm="dqn"):
     steps_per_batch: Batch = 10
     """Environment steps between two rounds of gradient steps; must be a multiple of num_envs."""
     updates_per_step: Weight = 0.1
-    """Gradient steps for each environment step."""
+    """Gradient steps for each environment step; a whole number of them follows each batch."""
     buffer_size: Batch = 10_000
     """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
     batch_size: Batch = 128

@@ -47,8 +47,9 @@ class NovelPPO(PPO, algorithm="ppo-noveld"):
     makes the bonus that of random network distillation, gated to first visits."""
     novelty_cell: Weight = 0.5
     """Width of the cells, in standard deviations of each entry, within which observations of floats
-    count as the same in an episode; 0 counts equal ones only. Bytes and categories must be equal,
-    as in the paper."""
+    count as the same in an episode; 0 counts equal ones only. The deviations are running ones, so a
+    batch later the same observation may be in another cell, ever more rarely as the run goes on.
+    Bytes and categories must be equal, as in the paper."""
 
     def build(self) -> NovelPPOAlgorithm:
         """Builds the algorithm."""

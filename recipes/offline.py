@@ -6,7 +6,7 @@ import math
 import warnings
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
@@ -264,12 +264,15 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
         sums = dict.fromkeys(self.measures, 0.0)
         with (
+            ExitStack() as modes,
             torch.random.fork_rng(range(torch.cuda.device_count())),
             torch.no_grad(),
-            evaluating(self.model),
-            evaluating(self.policy),
             set_exploration_type(ExplorationType.DETERMINISTIC),
         ):
+            # A loss hides the networks of its critics from PyTorch.
+            for part in (self.policy, self.model, *vars(self.model).values()):
+                if isinstance(part, nn.Module):
+                    modes.enter_context(evaluating(part))
             torch.manual_seed(recipe.evaluation_seed)
             for part in index.to(items.device).split(max(1, _MEASURED_AT_ONCE // length)):
                 samples = to_networks(arrange(items.get(part)), self.device)

@@ -125,7 +125,8 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     Reported returns are always unscaled."""
     normalize_rewards: bool = False
     """Whether rewards are divided by the running standard deviation of the discounted return, as
-    in VecNormalize of Stable-Baselines3 (arXiv 2005.12729, "reward scaling")."""
+    in VecNormalize of Stable-Baselines3, which also clips the result to +-10 (arXiv 2005.12729,
+    "reward scaling")."""
     advantage_floor: Weight = 0.0
     """Lower bound on the standard deviation by which a minibatch's advantages are divided. With 0,
     advantages that are almost pure noise, as on a solved task, move the policy as far as any

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import closing
@@ -57,7 +58,7 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     steps_per_batch: Batch = 50
     """Environment steps between two rounds of gradient steps; must be a multiple of num_envs."""
     updates_per_step: Weight = 1.0
-    """Gradient steps for each environment step."""
+    """Gradient steps for each environment step; a whole number of them follows each batch."""
     buffer_size: Batch = 1_000_000
     """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
     normalize_observations: bool = False
@@ -72,6 +73,13 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_divides("steps_per_batch", "random_steps", self.random_steps)
+        updates = self.steps_per_batch * self.updates_per_step
+        if self.updates_per_batch < 1 or not math.isclose(updates, self.updates_per_batch):
+            raise ValueError(
+                f"updates_per_step {self.updates_per_step:g} times steps_per_batch "
+                f"{self.steps_per_batch} is {updates:g} gradient steps: make it a whole number, at "
+                "least 1"
+            )
         if self.collectors > 1 and self.ray is None:
             raise ValueError(
                 f"collectors is {self.collectors}, but {self.algorithm} collects in one process, "
@@ -92,7 +100,7 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     @property
     def updates_per_batch(self) -> int:
         """Gradient steps after each batch."""
-        return max(1, round(self.steps_per_batch * self.updates_per_step))
+        return round(self.steps_per_batch * self.updates_per_step)
 
 
 RecipeT = TypeVar("RecipeT", bound=ReplayRecipe)

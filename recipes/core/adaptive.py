@@ -15,10 +15,11 @@ class ReturnScale:
     """The running standard deviation of the discounted return, by which rewards are divided.
 
     As in `VecNormalize` of Stable-Baselines3 and OpenAI Baselines, the return of the rewards so
-    far, ``r_t + gamma * R_{t-1}``, starts at 0 in each episode. Here the statistics are those up to
-    the end of the batch whose rewards are divided; no policy reads them. A resumed run begins new
-    episodes, so a checkpoint holds the statistics alone. TorchRL's `VecNormV2` and `RewardScaling`
-    scale by single rewards, or by a number that is known in advance.
+    far, ``r_t + gamma * R_{t-1}``, starts at 0 in each episode. Here nothing is clipped, and the
+    statistics are those up to the end of the batch whose rewards are divided; no policy reads them.
+    A resumed run begins new episodes, so a checkpoint holds the statistics alone. TorchRL's
+    `VecNormV2` and `RewardScaling` scale by single rewards, or by a number that is known in
+    advance.
 
     Args:
         gamma: discount factor.

@@ -327,6 +327,24 @@ def check_finite(names: Sequence[str], values: Tensor) -> None:
         raise NotFiniteError(f"{names[index]} became {values[index].item()}")
 
 
+def check_weights(networks: nn.Module) -> None:
+    """Checks that weights are finite: a gradient may not be, although its loss is.
+
+    Raises:
+        NotFiniteError: if one is not; the message names the first.
+
+    Example:
+        >>> layer = nn.Linear(1, 1)
+        >>> _ = nn.init.constant_(layer.bias, torch.nan)
+        >>> check_weights(layer)
+        Traceback (most recent call last):
+            ...
+        recipes.core.algorithm.NotFiniteError: the weight bias became nan
+    """
+    weights = {f"the weight {name}": x for name, x in networks.named_parameters()}
+    check_finite(list(weights), torch.stack([x.detach().sum() for x in weights.values()]))
+
+
 def check_without_waiting(names: Sequence[str], values: Tensor) -> None:
     """As :func:`check_finite`, on the CPU only.
 

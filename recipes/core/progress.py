@@ -150,7 +150,8 @@ class Best:
     """Keeps a copy of the weights with the highest return so far.
 
     That is the mean return of an evaluation during training. Where there is none, it is that of the
-    last 20 training episodes, and the weights are those that collected the last of them. Of runs
+    last 20 training episodes, without those that ended while actions were uniformly random, and the
+    weights are those that collected the last of them. Of runs
     without an environment, it is minus the error on held-out episodes. If returns are equal, the
     later weights are kept. The copy is part of each checkpoint.
 

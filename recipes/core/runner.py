@@ -18,7 +18,7 @@ from torch import nn
 from torchrl_tit.checkpoint import checkpoint_steps, global_rng_state, set_global_rng_state
 from torchrl_tit.evaluation import watching_episodes
 
-from .algorithm import Algorithm, Stateful, load_weights, make_algorithm, naming
+from .algorithm import Algorithm, Stateful, check_weights, load_weights, make_algorithm, naming
 from .callback import Callback
 from .evaluation import summarize
 from .interrupt import Interrupt
@@ -93,7 +93,8 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
                 callback.collected(step, batch)
             with _naming(f"in {recipe.env} after step {before}", saved_step):
                 returns = algorithm.returns(batch)
-            if returns is not None and not record.outcomes:
+            at_random = before < getattr(recipe, "random_steps", 0)
+            if returns is not None and not record.outcomes and not at_random:
                 best.add_episodes(before, returns.flatten().tolist())
             with _naming(f"in the update at step {step}", saved_step):
                 record.add(returns, algorithm.update(batch, before))
@@ -105,6 +106,8 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             if log_due or evaluation_due:
                 with _naming(f"in the update at step {step}", saved_step):
                     record.check()
+                    if evaluation_due:
+                        check_weights(algorithm.model)
             enough = any([callback.updated(step, algorithm.policy) for callback in callbacks])
             if evaluation_due:
                 with _naming(f"in {recipe.env}, in the evaluation at step {step}", saved_step):
@@ -132,6 +135,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
             if due or evaluation_due or enough or interrupt.requested:
                 with _naming(f"in the update at step {step}", saved_step):
                     record.check()
+                    check_weights(algorithm.model)
                 metrics.sync()  # the checkpoint's rows must be on the disk before it
                 for callback in callbacks:
                     callback.saving(step)

@@ -347,7 +347,7 @@ def fit_q(
     following = torch.cat([_act(policy, draw(i)["next"]) for i in everything.split(_AT_ONCE)])
     # Values are then of scale 1.
     scale = (1 - gamma) / items[:]["next", "reward"].abs().mean().clamp(min=1e-8).item()
-    target = copy.deepcopy(critic).requires_grad_(False)
+    target = copy.deepcopy(critic).requires_grad_(False).eval()
     pairs = list(zip(target.parameters(), critic.parameters(), strict=True))
     optimizer = torch.optim.Adam(critic.parameters(), lr=learning_rate, fused=True)
     for _ in tqdm.trange(updates, unit=" updates", desc="fitted Q evaluation", leave=False):
@@ -370,7 +370,8 @@ def fit_q(
     @torch.no_grad()
     def value(index: Tensor) -> Tensor:
         found = draw(index)
-        return action_values(critic, found, _act(policy, found)).double() / scale
+        with evaluating(critic):
+            return action_values(critic, found, _act(policy, found)).double() / scale
 
     return value
 

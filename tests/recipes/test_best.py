@@ -8,6 +8,7 @@ from torch import nn
 from recipes.cli import main
 from recipes.core.progress import EPISODES, Best
 from recipes.core.runner import evaluate, load_trained
+from recipes.dqn import DQN
 from recipes.ppo import PPO
 from tests.recipes.small import train
 from tests.recipes.states import assert_same
@@ -53,6 +54,16 @@ def test_the_weights_with_the_highest_return_are_kept():
         one.add_episodes(50, [6.0])  # 18 fives, a four and a six: as high as before
         assert (one.step, one.return_mean) == (50, 5.0)
         assert one.state_dict()["networks"]["weight"].item() == 5.0
+
+
+def test_random_actions_say_nothing_of_the_weights(tmp_path):
+    recipe = DQN(
+        env="CartPole-v1", backbone=mlp(hidden_dim=8), random_steps=1000, total_steps=1100,
+        steps_per_batch=100, updates_per_step=0.01,
+    )  # fmt: skip
+    run = train(recipe, tmp_path / "dqn")
+    with pytest.raises(ValueError, match="no best weights yet"):
+        load_trained(run, best=True)
 
 
 @pytest.fixture

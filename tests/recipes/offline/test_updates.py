@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,6 +13,7 @@ from torch.nn import functional as F
 from torchrl.modules import MLP
 from torchrl.objectives import BCLoss
 
+from recipes.bc import BCAlgorithm
 from recipes.cql import CQL, DiscreteCQL
 from recipes.dqn import DQN
 from recipes.sac import SAC
@@ -27,6 +29,7 @@ from tests.recipes.small import (
     make_cartpole_data,
     make_data,
     tit,
+    train,
 )
 from torchrl_tit.datasets import HistoryStorage, load_episodes
 from torchrl_tit.settings.networks import lstm
@@ -233,6 +236,31 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path, kind, term):
         algorithm.update(batch, 0)
 
 
+def test_a_gradient_that_is_not_finite_is_not_saved(tmp_path, monkeypatch):
+    def loss(self, samples):
+        weight = next(self.model.parameters())
+        return {**self.model(samples), "loss_root": (0 * weight).square().sum().sqrt()}
+
+    monkeypatch.setattr(BCAlgorithm, "loss", loss)
+    with pytest.raises(
+        FloatingPointError, match=r"^the weight .* became nan in .*; none was saved"
+    ):
+        train(make(BC, tmp_path, total_updates=1), tmp_path / "run")
+
+
+def test_nothing_that_is_measured_has_dropout(tmp_path):
+    settings: dict[str, Any] = {"critic": "backbone", "validation_fraction": 0.5}
+    recipe = make(IQL, tmp_path, backbone=tit(3), **settings)  # which have dropout
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    critic = vars(algorithm.model)["qvalue_network"]
+    modes = [part.training for part in critic.modules()]
+    found = [algorithm.measure(0).values]
+    algorithm.recipe = replace(recipe, evaluation_seed=7)
+    assert [*found, algorithm.measure(0).values] == found * 2
+    assert [part.training for part in critic.modules()] == modes
+
+
 @pytest.mark.parametrize("kind", [SAC, CQL, IQL, TD3BC])
 def test_critics_start_as_they_were_built(tmp_path, kind, monkeypatch):
     """Of a single one, TorchRL's loss makes a copy whose weights it draws anew."""
@@ -286,7 +314,7 @@ def test_an_entry_that_is_constant_in_the_data_may_change_later(tmp_path):
     frames = algorithm.policy.module[0].module.frame_encoders["observation"]
     normal = frames.normalize(seen)
     with pytest.warns(UserWarning, match=r"constant\.hdf5: entries 0 of the observations are con"):
-        mean, std = algorithm.load_data().observation_statistics()
+        mean, std, _ = algorithm.load_data().observation_statistics()
     assert std[0] == 1
     torch.testing.assert_close(normal, (seen - mean) / (std + 1e-3))
     torch.testing.assert_close(normal[:, 0], torch.full((len(seen),), 0.5 / 1.001))

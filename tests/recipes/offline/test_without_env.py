@@ -288,10 +288,16 @@ def test_every_recipe_for_any_data_builds_what_it_needs(tmp_path):
 
 def test_cloning_of_the_best_episodes(tmp_path):
     data = log_machine(tmp_path / "log.hdf5")
-    recipe = BC(dataset=str(data), backbone=SMALL, best_fraction=0.25)
-    found = make_algorithm(recipe).load_data().returns
-    everything = make_algorithm(replace(recipe, best_fraction=1.0)).load_data().returns
-    assert found.tolist() == everything.sort(descending=True).values[:2].tolist()
+    recipe = BC(
+        dataset=str(data), backbone=SMALL, best_fraction=0.25, validation_fraction=0.5,
+        unfinished="keep", time_limits="keep",
+    )  # fmt: skip
+    algorithm = make_algorithm(recipe)
+    learned = algorithm.load_data().returns.tolist()
+    held_out = algorithm.measure(0)
+    assert len(learned) == held_out.episodes == 1
+    found = sorted([*learned, *algorithm._held_out.returns.tolist()], reverse=True)
+    assert found == load_episodes(data).returns.sort(descending=True).values[:2].tolist()
 
 
 def test_the_command_line(tmp_path, capsys):
