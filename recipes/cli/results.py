@@ -24,8 +24,8 @@ def compare(arguments: list[str]) -> None:
     if options.out.suffix != ".png":
         fail(f"--out {options.out} must end in .png: the figure is a PNG")
     from ..tools.results.comparison import HEADER, WORDS, compare_with_first
-    from ..tools.results.experiments import check_together, find_runs, group_runs
-    from ..tools.results.plot import plot_comparison
+    from ..tools.results.experiments import check_together, find_runs, group_runs, read_metrics
+    from ..tools.results.plot import plot_comparison, short_runs
     from ..tools.results.table import read_evaluations, to_lines, value_of
 
     # The logs of a sweep lie next to its runs, so `sweep/*/seed-*` matches them too.
@@ -33,15 +33,18 @@ def compare(arguments: list[str]) -> None:
     if not folders:
         fail(f"{options.runs[0]} is not a run folder, but a log: name the folder beside it")
     experiments = group_runs(find_runs(folders.values()))
-    check_together(experiments)
+    notes = check_together(experiments)
     plot_comparison(experiments, options.out, title=options.title)
     say(f"written to {options.out}")
-    if len(experiments) < 2:
-        return
-    evaluated, notes = read_evaluations(folders.values())
-    for line in notes:
+    for one in experiments:
+        last = {f"seed {x.recipe.seed}": read_metrics(x)[-1:] for x in one.runs}
+        notes += short_runs(one.label, {name: int(row["step"]) for name, [row] in last.items()})
+    evaluated, left_out = read_evaluations(folders.values())
+    for line in [*notes, *left_out]:
         note(line)
-    if rows := compare_with_first([(x.label, [*map(value_of, found)]) for x, found in evaluated]):
+    labels = {run.folder: one.label for one in experiments for run in one.runs}
+    named = [(labels[x.runs[0].folder], [*map(value_of, found)]) for x, found in evaluated]
+    if rows := compare_with_first(named):
         say("\n".join(["", *to_lines(HEADER, rows), "", WORDS]))
 
 
@@ -121,10 +124,15 @@ def record(arguments: list[str]) -> None:
     )
     parser.add_argument("--commit", default="", help="commit of the code that the runs had")
     options = parser.parse_args(arguments)
+    from ..core.records import Records
+    from ..core.run import RecordedRun
     from ..tools.results.recording import record_runs
 
     names = record_runs(options.runs, options.out, under=options.under, commit=options.commit)
     for name in names:
+        run = RecordedRun(Records(options.out), name)
+        if (run.read_evaluation() or {"steps": 0})["steps"] < run.recipe.final_step:
+            note(f"{name} has not ended, or is not evaluated: record it again once it is")
         say(str(options.out / name))
     say(f"{len(names)} recorded in {options.out}")
 

@@ -83,6 +83,11 @@ class Record:
         """What no two runs have in common, whatever their names."""
         return tuple(self.row[column] for column in ("settings", "seed", "ended", "steps"))
 
+    def is_beginning_of(self, other: Record) -> bool:
+        """Whether it is the same run before it had ended."""
+        same = all(self.row[x] == other.row[x] for x in ("settings", "seed", "versions"))
+        return same and other.curve.startswith(self.curve) and other.curve != self.curve
+
 
 class Records:
     """The table of runs in a folder.
@@ -150,6 +155,8 @@ class Records:
     def add(self, records: Mapping[str, Record]) -> None:
         """Adds runs and writes the table; a process that is killed leaves the table as it was.
 
+        A run whose beginning the table holds under the same name is replaced.
+
         Args:
             records: the runs by name.
 
@@ -157,6 +164,9 @@ class Records:
             ValueError: if the table holds one of them already.
         """
         found = self.records()
+        for run, record in records.items():
+            if run in found and found[run].is_beginning_of(record):
+                del found[run]
         known = {record.key: run for run, record in found.items()}
         for run, record in records.items():
             same = run if run in found else known.setdefault(record.key, run)

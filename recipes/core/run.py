@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -245,12 +246,13 @@ class Run:
         Raises:
             CheckpointError: if they are damaged.
         """
-        return load_checkpoint(self.folder / _WEIGHTS, 0)[1] if self.has_initial_weights else {}
+        return load_checkpoint(self.folder / _WEIGHTS, 0)[1] if self.initial_weights else {}
 
     @property
-    def has_initial_weights(self) -> bool:
-        """Whether it starts from the weights of another run."""
-        return bool(checkpoint_steps(self.folder / _WEIGHTS))
+    def initial_weights(self) -> str:
+        """Which weights of another run it starts from, as a checksum; empty if from none."""
+        content = self.read(f"{_WEIGHTS}/{0:012}/state.json")  # with the checksum of the tensors
+        return "" if content is None else hashlib.sha256(content).hexdigest()[:8]
 
     def load_trained(self) -> tuple[int, dict[str, Any]]:
         """Loads the newest checkpoint of a run that has been trained: (step, state).
@@ -295,8 +297,11 @@ class Run:
             evaluation = self.read_evaluation()
         except (OSError, ValueError):  # it is written again
             return False
-        evaluated = evaluation is not None and evaluation["steps"] >= self.recipe.final_step
-        return evaluated and self.curve.is_file()
+        end = self.recipe.final_step
+        evaluated = evaluation is not None and evaluation["steps"] >= end
+        # Without any checkpoint, it needs none; but one that was deleted is trained again.
+        trained = latest_step(self.checkpoints) in (None, end)
+        return evaluated and trained and self.curve.is_file()
 
     @property
     def curve(self) -> Path:
@@ -348,9 +353,10 @@ class RecordedRun(Run):
         return None if content is None else parse_evaluation(content, self.folder)
 
     @property
-    def has_initial_weights(self) -> bool:
-        """Whether it started from the weights of another run."""
-        return b'"initial_weights"' in (self.read("changes") or b"")
+    def initial_weights(self) -> str:
+        """As :attr:`Run.initial_weights`; "unknown" where a table of an earlier version has it."""
+        found = json.loads(self.read("changes") or b"{}").get("initial_weights", "")
+        return "unknown" if found is True else str(found)
 
 
 @contextmanager

@@ -118,6 +118,11 @@ def test_a_run_is_complete_when_trained_evaluated_and_drawn(run):
     plot_run(run)
     assert run.curve.read_bytes().startswith(b"\x89PNG")
     assert run.is_complete()
+    newest = max(run.checkpoints.iterdir())
+    newest.rename(run.folder / "elsewhere")  # resumed from the one before
+    assert not run.is_complete()
+    (run.folder / "elsewhere").rename(newest)
+    assert run.is_complete()
     for text in ("{", "[]", json.dumps(evaluation | {"steps": 64})):  # of a checkpoint on the way
         (run.folder / "evaluation.json").write_text(text)
         assert not run.is_complete()

@@ -14,9 +14,9 @@ import numpy as np
 from scipy.stats import norm, permutation_test, trim_mean
 
 from ...core.recipe import Recipe
+from .experiments import TASK
 from .interval import FEWEST, Interval
 from .numbers import mean_std, number, read_rows
-from .paper import TASK
 from .table import measure_of, read_evaluations, value_of
 
 Task = tuple[Any, ...]
@@ -119,7 +119,8 @@ def interquartile_mean(values: Values) -> Interval:
     """The interquartile mean over all runs of all tasks, each task counting equally.
 
     Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv
-    2108.13264: the interval is a bootstrap of the runs within each task.
+    2108.13264: the interval is a bootstrap of the runs within each task. Where a task has a single
+    run, there is none.
 
     Args:
         values: normalized returns.
@@ -137,7 +138,7 @@ def interquartile_mean(values: Values) -> Interval:
         return trim_mean(np.concatenate(equal, -1), 0.25, axis=-1)
 
     found = middle([_resampled(x, task) for task, x in enumerate(groups)])
-    return Interval(float(middle(groups)), *map(float, np.quantile(found, [0.025, 0.975])))
+    return _with_interval(middle(groups), found, groups)
 
 
 def probability_of_improvement(ours: Values, others: Values) -> Interval:
@@ -157,8 +158,14 @@ def probability_of_improvement(ours: Values, others: Values) -> Interval:
     draws = [
         _better(_resampled(x, 2 * i), _resampled(y, 2 * i + 1)) for i, (x, y) in enumerate(pairs)
     ]
-    low, high = np.quantile(np.mean(draws, 0), [0.025, 0.975])
-    return Interval(float(np.mean([_better(x, y) for x, y in pairs])), float(low), float(high))
+    better = np.mean([_better(x, y) for x, y in pairs])
+    return _with_interval(better, np.mean(draws, 0), [x for pair in pairs for x in pair])
+
+
+def _with_interval(value: np.ndarray, draws: np.ndarray, groups: list[np.ndarray]) -> Interval:
+    """A number with the interval of its resamples, or with none if a group has a single run."""
+    low, high = np.quantile(draws, [0.025, 0.975]) if min(map(len, groups)) > 1 else (nan, nan)
+    return Interval(float(value), float(low), float(high))
 
 
 def _better(x: np.ndarray, y: np.ndarray) -> np.ndarray:

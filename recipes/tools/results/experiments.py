@@ -19,6 +19,9 @@ from ...core.records import TABLE, Records, find_records
 from ...core.registry import RECIPES
 from ...core.run import RecordedRun, Run
 
+TASK = ("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions")
+"""The fields that determine which task is learned."""
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -75,7 +78,7 @@ def _runs_below(folder: Path) -> list[Run]:
 def group_runs(runs: Iterable[Run]) -> list[Experiment]:
     """Groups runs of the same settings, ignoring seed and machine.
 
-    Those that started from the weights of another run have a group of their own.
+    Those that started from the same weights of another run have a group of their own.
 
     Args:
         runs: the runs.
@@ -87,9 +90,9 @@ def group_runs(runs: Iterable[Run]) -> list[Experiment]:
     Raises:
         ValueError: if two runs have the same settings and seed.
     """
-    groups: dict[tuple[Recipe, bool], dict[int, Run]] = {}
+    groups: dict[tuple[Recipe, str], dict[int, Run]] = {}
     for run in runs:
-        seeds = groups.setdefault((experiment_of(run.recipe), run.has_initial_weights), {})
+        seeds = groups.setdefault((experiment_of(run.recipe), run.initial_weights), {})
         same = seeds.setdefault(run.recipe.seed, run)
         if same is not run:
             raise ValueError(
@@ -99,37 +102,49 @@ def group_runs(runs: Iterable[Run]) -> list[Experiment]:
             )
     own: dict[str, Recipe] = {}
     experiments = []
-    for (settings, moved), seeds in groups.items():
+    for (settings, weights), seeds in groups.items():
         first = next(iter(seeds.values()))
         name, changes = str(first.folder), ""
         if settings.name:
             name = settings.name
             named = RECIPES.get(name) or own.setdefault(name, settings)
             changes = changed_fields(named, settings)
-        changes = ", ".join([changes] * bool(changes) + ["weights of another run"] * moved)
+        moved = [f"weights of another run, {weights}"] if weights else []
+        changes = ", ".join([changes] * bool(changes) + moved)
         experiments.append(Experiment(settings, name, changes, tuple(seeds.values())))
     return experiments
 
 
-def check_together(experiments: Sequence[Experiment]) -> None:
+def check_together(experiments: Sequence[Experiment]) -> list[str]:
     """Checks that experiments can be compared, with the same task and unit of steps.
+
+    Returns:
+        A note for each experiment whose task has other settings, such as hidden velocities.
 
     Raises:
         ValueError: if their returns or steps cannot share an axis.
     """
-    first = experiments[0]
+    first, notes = experiments[0], []
     for other in experiments:
         names = f"{first.runs[0].folder} and {other.runs[0].folder} do not go together"
-        if other.settings.env != first.settings.env:
+        tasks = [one.settings.task_name for one in (first, other)]
+        if tasks[0] != tasks[1]:
             raise ValueError(
-                f"{names}: their tasks are {first.settings.env} and {other.settings.env}; compare "
-                "the runs of each task"
+                f"{names}: their tasks are {tasks[0]} and {tasks[1]}; compare the runs of each task"
             )
         if other.settings.offline != first.settings.offline:
             raise ValueError(
                 f"{names}: environment steps and gradient steps do not share an axis; compare the "
                 "runs of each kind"
             )
+        for field in TASK if first.settings.env else ():
+            values = [getattr(one.settings, field, None) for one in (first, other)]
+            if values[0] != values[1]:
+                notes.append(
+                    f"{other.label} has another task than {first.label}: {field} is {values[1]}, "
+                    f"not {values[0]}"
+                )
+    return notes
 
 
 def read_metrics(run: Run) -> list[dict[str, float]]:

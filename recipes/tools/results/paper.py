@@ -11,7 +11,7 @@ from torchrl_tit.settings.checks import printable
 
 from ...core.recipe import DatasetRecipe, Recipe
 from ...core.registry import RECIPES, get_recipe
-from .experiments import changes_of, fields_of
+from .experiments import TASK, changes_of, fields_of
 from .numbers import read_rows
 
 HEADINGS = {
@@ -24,8 +24,6 @@ HEADINGS = {
 }
 """What the paper's tables of results are about, by their numbers."""
 
-TASK = ("env", "env_settings", "wrappers", "observation_keys", "hide_velocities", "mask_actions")
-"""The fields that determine which task is learned."""
 _KIND = ("backbone.frame.encoder", "backbone.history.encoder", "backbone.num_frames")
 """The fields that determine which kind of network learns."""
 _OF_THE_RUN = {"name", "collectors", "evaluation_seed", "log_interval", "ray"}

@@ -104,6 +104,25 @@ def draw_curves(
     return bold
 
 
+def short_runs(label: str, steps: Mapping[str, int]) -> list[str]:
+    """Names the runs that bold lines leave out, because they are shorter than the others.
+
+    Args:
+        label: the name of their group.
+        steps: the steps of each run by its name.
+
+    Example:
+        >>> short_runs("mlp", {"seed 0": 1000, "seed 1": 400})
+        ['mlp, seed 1 is at 400 of 1,000 steps: bold lines leave it out']
+    """
+    longest = max(steps.values())
+    return [
+        f"{label}, {name} is at {step:,} of {longest:,} steps: bold lines leave it out"
+        for name, step in steps.items()
+        if step < NEARLY * longest
+    ]
+
+
 def plot_run(run: Run) -> None:
     """Draws a run's learning curve into its folder.
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from ...core.records import COLUMNS, LEFT_OUT, OF_EVALUATION, Record, Records, to_csv
 from ...core.registry import RECIPES
-from ...core.run import Run
+from ...core.run import Run, locked
 from .experiments import changes_of, find_runs, read_metrics
 
 
@@ -22,7 +22,8 @@ def record_runs(
 ) -> list[str]:
     """Adds runs to the table of runs in a folder, which it begins if there is none.
 
-    A run is named as its path below the folder that is given, or as that folder if it is a run.
+    A run that was recorded before it had ended is replaced. A run is named as its path below the
+    folder that is given, or as that folder if it is a run.
     Beside ``metrics.csv``, the columns of other CSV files of its folder with a column ``step`` are
     recorded, such as the successes of ``benchmarks.memory_tasks``.
 
@@ -36,10 +37,13 @@ def record_runs(
         The names of the runs in the table.
 
     Raises:
-        ValueError: if a folder holds no run, a run has no metrics or is damaged, or the table has
-            it already.
+        ValueError: if a folder holds no run, a run has no metrics or is damaged, the table has it
+            already, or ``under`` leads out of it.
+        RuntimeError: if another process is adding runs.
     """
     records: dict[str, Record] = {}
+    if PurePosixPath(under).is_absolute() or ".." in PurePosixPath(under).parts:
+        raise ValueError(f"--under {under} must be a path below {out}, such as screening")
     for folder in folders:
         for run in find_runs([folder]):
             below = run.folder.relative_to(folder).as_posix()
@@ -50,7 +54,9 @@ def record_runs(
                     "another path in --under"
                 )
             records[name] = _record(name, run, commit)
-    Records(out).add(records)
+    out.mkdir(parents=True, exist_ok=True)
+    with locked(out):
+        Records(out).add(records)
     return list(records)
 
 
@@ -60,7 +66,7 @@ def _record(name: str, run: Run, commit: str) -> Record:
         raise ValueError(f"{run.folder} has no metrics yet: train it first, or leave it out")
     named = RECIPES.get(run.recipe.name)
     changes = changes_of(named, run.recipe) if named else {}
-    changes |= {"initial_weights": True} if run.has_initial_weights else {}
+    changes |= {"initial_weights": run.initial_weights} if run.initial_weights else {}
     recipe, found = _read(run, "recipe.json"), run.read_evaluation() or {}
     settings = {field: value for field, value in recipe.items() if field != "seed"}
     row = {

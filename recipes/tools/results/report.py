@@ -11,7 +11,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from importlib import resources
 from pathlib import Path
@@ -50,7 +50,6 @@ from .film import film_policy, make_rendered
 from .metric_words import MetricWords, known_columns, limit, words_of
 from .numbers import number, numbers
 from .plot import (
-    NEARLY,
     WINDOW,
     Curve,
     add_legend,
@@ -58,6 +57,7 @@ from .plot import (
     draw_curves,
     new_chart,
     plain,
+    short_runs,
     to_bytes,
 )
 from .table import HEADER, Cell, make_table, to_columns
@@ -167,6 +167,8 @@ def report(
     for group in groups:
         try:
             found, texts = make_table([data.run.folder for data in group.runs])
+            one = group.experiment
+            found = [replace(cell, recipe=one.name, changes=one.changes) for cell in found]
         except ValueError as error:  # none of the runs is trained and evaluated
             found, texts = [], [f"{group.label} has no results: {error}"]
         cells += found
@@ -220,7 +222,10 @@ def _read(run: Run) -> RunData:
     if "return_mean" not in rows[0]:
         raise ValueError(f"{run.folder / 'metrics.csv'} is damaged: it has no column return_mean")
     evaluation = run.read_evaluation()
-    if evaluation is not None and "returns" not in evaluation:  # nothing was played
+    if evaluation is not None and (
+        "returns" not in evaluation  # nothing was played
+        or evaluation["steps"] < rows[-1]["step"]  # by earlier weights
+    ):
         evaluation = None
     return RunData(run, rows, evaluation)
 
@@ -473,14 +478,11 @@ def _description(groups: Sequence[Group]) -> str:
 
 
 def _short_runs(groups: Sequence[Group]) -> list[str]:
-    """Names the runs that bold lines leave out, because they are shorter than the others."""
+    """Names the runs that bold lines leave out."""
     return [
-        f"{group.label}, {data.name} is at {data.steps:,} of {longest:,} {_unit(group.recipe)}: "
-        "bold lines leave it out."
+        line
         for group in groups
-        for longest in [max(data.steps for data in group.runs)]
-        for data in group.runs
-        if data.steps < NEARLY * longest
+        for line in short_runs(group.label, {data.name: data.steps for data in group.runs})
     ]
 
 

@@ -56,7 +56,7 @@ class Published:
 class Cell:
     """All runs of the same settings: one cell of a table.
 
-    A run's value is the mean return of its evaluation, or its best normalized score if it has one
+    A run's value is the mean return of its last weights, or their normalized score if it has one
     (offline recipes).
     """
 
@@ -97,6 +97,10 @@ class Cell:
 
     values: tuple[float, ...] = ()
     """The runs' values."""
+
+    best: float = float("nan")
+    """Mean of the runs' highest evaluations during training, as the paper reports them offline; NaN
+    if there are none. The highest of many noisy means is biased upwards."""
 
     @property
     def label(self) -> str:
@@ -186,15 +190,20 @@ def to_markdown(cells: Sequence[Cell]) -> str:
     """Writes cells as Markdown, one table for each of the paper's.
 
     Where others have published results for the same task and network, the table has a column for
-    them.
+    them, and where runs learned from data, one for their highest evaluations.
     """
     parts = []
     for table in dict.fromkeys(cell.table for cell in cells):
         rows = [cell for cell in cells if cell.table == table]
         is_published = any(cell.published for cell in rows)
-        columns = [*HEADER, "published"] if is_published else HEADER
+        has_best = any(cell.best == cell.best for cell in rows)
+        columns = [*HEADER, *["highest evaluation"] * has_best, *["published"] * is_published]
         texts = (
-            [*to_columns(cell), *([", ".join(map(_published, cell.published))] * is_published)]
+            [
+                *to_columns(cell),
+                *[number(cell.best)] * has_best,
+                *[", ".join(map(_published, cell.published))] * is_published,
+            ]
             for cell in rows
         )
         lines = [f"### {table[0].upper()}{table[1:]}\n", *to_lines(columns, texts)]
@@ -307,8 +316,8 @@ def reported_of(recipe: Recipe) -> tuple[Match | None, tuple[Published, ...]]:
 
 
 def value_of(evaluation: dict[str, Any]) -> float:
-    """The number that a run counts with: the mean return, or the best normalized score."""
-    return float(evaluation["score"]["best"] if "score" in evaluation else evaluation["mean"])
+    """The number that a run counts with: the mean return, or the normalized score, at the end."""
+    return float(evaluation["score"]["last"] if "score" in evaluation else evaluation["mean"])
 
 
 def measure_of(recipe: Recipe, evaluation: dict[str, Any]) -> str:
@@ -346,6 +355,7 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
         measure=measure_of(experiment.settings, evaluations[0]),
         published=published,
         values=tuple(values),
+        best=fmean(x["score"]["best"] if "score" in x else float("nan") for x in evaluations),
     )
 
 

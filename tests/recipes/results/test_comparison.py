@@ -6,7 +6,7 @@ import pytest
 from recipes.cli import main
 from recipes.tools.results.comparison import compare, interquartile_mean, probability_of_improvement
 from tests.recipes.commands import fails
-from tests.recipes.results.report_runs import write_run
+from tests.recipes.results.report_runs import metrics_of, write_run
 
 TIT, MLP = "ppo/cartpole/enhanced-tit", "ppo/cartpole/mlp"
 
@@ -41,11 +41,14 @@ def test_all_tasks_count_equally_and_runs_are_drawn_within_their_task():
     assert interquartile_mean({"a": [0.0] * 4, "b": [1.0, 3.0]}).middle == 0.5
     found = interquartile_mean({task: [task, task] for task in (1.0, 2.0, 3.0, 4.0)})
     assert (found.middle, found.low, found.high) == (2.5, 2.5, 2.5)
-    ours = {"a": [2.0, 3.0], "b": [1.0]}
+    ours = {"a": [2.0, 3.0], "b": [1.0, 1.0]}
     others = {"b": [0.0, 0.0], "a": [1.0, 3.0]}
     improved = probability_of_improvement(ours, others)
     assert improved.middle == (0.625 + 1) / 2
     assert (improved.low, improved.high) == (0.5, 1)
+    single = {"a": [2.0, 3.0], "b": [1.0]}
+    assert str(interquartile_mean(single)) == "1.5"  # no interval
+    assert np.isnan(probability_of_improvement(single, others).low)
 
 
 def test_compare_says_which_is_better(tmp_path, monkeypatch, capsys):
@@ -60,6 +63,18 @@ def test_compare_says_which_is_better(tmp_path, monkeypatch, capsys):
     assert rows[0] == f"| {TIT} | 5 | 482 ± 2 |  |  |  |  |"
     assert rows[1].startswith(f"| {MLP} | 5 | 492 ± 2 | 10.0 [8")
     assert rows[1].endswith("| 1 | 0.00794 | 4 |")
+
+
+def test_compare_names_what_does_not_count_and_what_differs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for seed, rows in enumerate([60, 60, 20]):
+        write_run(tmp_path / "tit" / str(seed), TIT, seed, metrics=metrics_of(seed, rows))
+    write_run(tmp_path / "hidden", MLP, hide_velocities=True)
+    main(["compare", "tit"])
+    said = capsys.readouterr().err
+    assert f"{TIT}, seed 2 is at 20,480 of 61,440 steps: bold lines leave it out" in said
+    main(["compare", "tit", "hidden"])
+    assert "has another task than ppo/cartpole/enhanced-tit: hide_vel" in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from recipes.core import records
 from recipes.core.metrics import parse_metrics
 from recipes.core.records import Records
 from recipes.core.registry import find_recipe
+from recipes.core.run import locked
 from recipes.tools.results.experiments import find_runs, read_metrics
 from recipes.tools.results.recording import record_runs
 from recipes.tools.results.table import make_table
@@ -56,13 +57,35 @@ def test_a_table_is_read_as_the_folders_are(runs, tmp_path):
 
 def test_runs_from_the_weights_of_others_are_apart(tmp_path):
     write_run(tmp_path / "runs" / "scratch", MLP, 2, [500.0])
-    moved = write_run(tmp_path / "runs" / "moved", MLP, 2, [400.0], metrics=metrics_of(2, 50))
-    save_checkpoint(moved / "initial_weights", 0, {"weight": torch.ones(1)})
+    for number, value in enumerate([400.0, 300.0]):
+        rows = metrics_of(2, 50 + number)
+        moved = write_run(tmp_path / "runs" / str(number), MLP, 2, [value], metrics=rows)
+        save_checkpoint(moved / "initial_weights", 0, {"weight": torch.full((1,), value)})
     record_runs([tmp_path / "runs"], tmp_path / "page")
     for folder in ("runs", "page"):
         cells, _ = make_table([tmp_path / folder])
-        found = {(cell.changes, cell.mean) for cell in cells}
-        assert found == {("", 500.0), ("weights of another run", 400.0)}
+        found = {cell.mean: cell.changes for cell in cells}
+        assert found[500.0] == ""
+        assert found[400.0] != found[300.0]
+        assert found[400.0].startswith("weights of another run, ")
+
+
+def test_a_run_that_had_not_ended_is_replaced(runs, tmp_path, capsys):
+    out = tmp_path / "page"
+    main(["record", str(runs / "stopped"), "--out", str(out)])
+    assert "stopped has not ended, or is not evaluated" in capsys.readouterr().err
+    path = runs / "stopped" / "metrics.csv"
+    path.write_text(path.read_text() + "3,1700000009,2.5,7\n")
+    record_runs([runs / "stopped"], out)
+    (run,) = find_runs([out])
+    assert [row["step"] for row in read_metrics(run)] == [1, 2, 3]
+    with pytest.raises(ValueError, match="holds stopped already"):
+        record_runs([runs / "stopped"], out)
+    for under in ("/elsewhere", "../up"):
+        with pytest.raises(ValueError, match="must be a path below"):
+            record_runs([runs / "wide"], out, under=under)
+    with locked(out), pytest.raises(RuntimeError, match="in use by another process"):
+        record_runs([runs / "wide"], out)
 
 
 def test_each_metric_that_is_kept_has_four_digits(runs, tmp_path):

@@ -167,7 +167,16 @@ def test_a_run_that_is_not_as_far_is_named(tmp_path):
         write_run(tmp_path / f"seed-{seed}", TIT, seed, metrics=metrics_of(seed, rows))
     report(tmp_path, "--out", tmp_path / "a.html", "--no-pictures")
     text = Page(tmp_path / "a.html").text
-    assert "seed 2 is at 20,480 of 61,440 environment steps: bold lines leave it out" in text
+    assert "seed 2 is at 20,480 of 61,440 steps: bold lines leave it out" in text
+
+
+def test_settings_under_one_name_that_is_not_registered(tmp_path):
+    for width in (4, 8):
+        path = tmp_path / str(width)
+        write_run(path, MLP, returns=[float(width)], backbone=mlp(hidden_dim=width), name="mine/a")
+    report(tmp_path, "--out", tmp_path / "a.html", "--no-pictures")
+    text = Page(tmp_path / "a.html").text
+    assert text.count("mine/a (backbone.history.hidden_dim 8)") >= 2
 
 
 def test_names_cannot_be_markup_or_formulas(tmp_path):
