@@ -111,7 +111,12 @@ class Recipe:
             )
         parse_assignments(self.env_settings)
         for wrapper in self.wrappers:
-            parse_call(wrapper)
+            _, _, name = parse_call(wrapper)[0].partition(":")
+            if name in _LEARNS:
+                raise ValueError(
+                    f"{wrapper} learns statistics, which neither evaluations nor a saved agent "
+                    f"would have: use the field {_LEARNS[name]} instead"
+                )
         if self.name and not re.fullmatch(r"\w[\w.-]*(/\w[\w.-]*)*", self.name):
             raise ValueError(
                 f"name must be words joined by '/', such as ppo/cartpole/mine, not {self.name!r}"
@@ -265,6 +270,13 @@ class DatasetRecipe(Recipe):
         return self.env or self.dataset or "the data"
 
 
+_LEARNS = {
+    "NormalizeObservation": "normalize_observations",
+    "NormalizeReward": "normalize_rewards",
+    "VecNorm": "normalize_observations",
+    "VecNormV2": "normalize_observations",
+}
+"""Wrappers whose statistics each environment learns for itself, and what to use instead."""
 _OF_THE_MACHINE = ("device", "storage_device", "threads", "compile", "checkpoint_interval")
 
 

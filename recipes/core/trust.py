@@ -46,9 +46,9 @@ TASKS = {
 _GYMNASIUM = """
     AtariPreprocessing ClipAction ClipReward DelayObservation DiscretizeAction
     DiscretizeObservation DtypeObservation FilterObservation FlattenObservation
-    FrameStackObservation GrayscaleObservation MaxAndSkipObservation NormalizeObservation
-    NormalizeReward ObstructView RepeatAction RescaleAction RescaleObservation ReshapeObservation
-    ResizeObservation StickyAction TimeAwareObservation TimeLimit
+    FrameStackObservation GrayscaleObservation MaxAndSkipObservation ObstructView RepeatAction
+    RescaleAction RescaleObservation ReshapeObservation ResizeObservation StickyAction
+    TimeAwareObservation TimeLimit
 """
 _MINIGRID = """
     ActionBonus DictObservationSpaceWrapper DirectionObsWrapper FlatObsWrapper FullyObsWrapper
@@ -60,7 +60,7 @@ _TORCHRL = """
     DTypeCastTransform DoubleToFloat FrameSkipTransform GrayScale LineariseRewards NoopResetEnv
     ObservationNorm PermuteTransform RenameTransform Resize RewardClipping RewardScaling
     SelectTransform SignTransform SqueezeTransform StepCounter TimeMaxPool ToTensorImage
-    UnsqueezeTransform VecNorm VecNormV2
+    UnsqueezeTransform
 """
 WRAPPERS = {
     "gymnasium.wrappers": frozenset(_GYMNASIUM.split()),

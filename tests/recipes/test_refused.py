@@ -128,6 +128,11 @@ REFUSED: list[tuple[Recipe, dict[str, Any], str]] = [
         {"env": "SeveralActions-v0"},
         r"dqn needs a few discrete .* \(MultiCategorical, shape \[2\]\): use a ppo",
     ),
+    (
+        SAC_RECIPE,
+        {"wrappers": ("gymnasium.wrappers:NormalizeObservation",)},
+        "which neither evaluations .* would have: use the field normalize_observations instead",
+    ),
     (DQN_RECIPE, {"updates_per_step": 0.05}, "times steps_per_batch 10 is 0.5 gradient steps: mak"),
     (DQN_RECIPE, {"updates_per_step": 0.25}, "0.25 times steps_per_batch 10 is 2.5 gradient steps"),
     (DQN_RECIPE, {"buffer_size": 5}, "buffer_size 5 has no room for a batch of 10 steps"),
