@@ -29,12 +29,15 @@ class Agent:
 
     def act(self, observation, *, reward=0.0, action_mask=True):
         """Maps an observation, or those of N copies, [N, ...], to actions; holds values for NaN."""
-        shape = self.facts["inputs"]["observation"]["shape"]
+        shape = tuple(self.facts["inputs"]["observation"]["shape"])
         frames = np.asarray(np.full(shape, np.nan) if observation is None else observation)
-        several, frames = frames.ndim > len(shape), frames.reshape(-1, *shape)
+        several = frames.ndim > len(shape)
+        if frames.shape[several:] != shape:
+            raise ValueError(f"expected observations {shape} or N of them, not {frames.shape}")
+        frames = frames.reshape(-1, *shape)
         if (missing := np.isnan(frames)).any():
-            if self.last is None:
-                raise ValueError("the first observation is missing or has NaN")
+            if (missing.reshape(len(frames), -1).any(1) & self.first).any():
+                raise ValueError("the first observation of an episode is missing or has NaN")
             frames = np.where(missing, self.last, frames)
         self.last = frames
         given = {"observation": frames, "is_init": self.first, "reward": reward, **self.state}

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +56,8 @@ def evaluate(arguments: list[str]) -> None:
     )
     if options.out is not None and not options.out.absolute().parent.is_dir():
         fail(f"--out {options.out} cannot be written: there is no folder {options.out.parent}")
+    if options.out is not None and options.out.is_dir():
+        fail(f"--out {options.out} is a folder: name a file in it, such as evaluation.json")
     if options.ope is not None and options.dataset is None:
         fail("--ope estimates returns from data: name them with --dataset FILE")
     if options.episodes is not None and (options.dataset is not None or not run.recipe.env):
@@ -67,8 +72,10 @@ def evaluate(arguments: list[str]) -> None:
 
             settings = {"best": options.best, "ope": options.ope}
             evaluation = evaluate_on_data(run, recipe, options.dataset, **settings)
+        if options.seed is not None and options.dataset is None:
+            recipe = replace(recipe, evaluation_seed=evaluation["seed"])  # another of best weights
         name = _file_name(run.recipe, recipe, options.best, options.dataset, options.ope)
-        out = options.out or run.folder / name
+        out = options.out or _free(run.folder / name, options.dataset)
         run.save_evaluation(evaluation, out)
     say(f"{one_line(recipe, evaluation)}\nwritten to {out}")
 
@@ -85,6 +92,15 @@ def _file_name(
     if dataset is not None:
         parts += [f"dataset-{Path(dataset).stem}", *([ope] if ope else [])]
     return f"{'_'.join(parts)}.json"
+
+
+def _free(path: Path, dataset: str | None) -> Path:
+    """Adds a checksum to the name of a file that holds the evaluation on other data."""
+    if dataset is None or not path.is_file():
+        return path
+    if json.loads(path.read_text(encoding="utf-8")).get("dataset") == dataset:
+        return path
+    return path.with_stem(f"{path.stem}-{hashlib.sha256(dataset.encode()).hexdigest()[:6]}")
 
 
 def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:

@@ -97,6 +97,10 @@ def test_missing_values_are_held(tmp_path):
         agent.act(held[2])
     with pytest.raises(ValueError, match=r"has the shape \[4\], but must have \[11\]"):
         agent.act(np.zeros(4))
+    with pytest.raises(ValueError, match="must be numbers, not <U1"):
+        agent.act(np.array(["a"] * 11))
+    with pytest.raises(ValueError, match="there are 2 rewards, but 1 copies"):
+        agent.act(frames[0], reward=[1.0, 2.0])
 
 
 def test_an_agent_without_an_environment(tmp_path):
@@ -139,3 +143,12 @@ def test_a_file_acts_as_its_agent(tmp_path, name):
             found = exported.act(frames, reward=1.0)
             assert found.dtype == expected.dtype
             np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+    [size] = env.observation_space.shape
+    for frames in (np.zeros(2 * size), np.zeros((3, 2 * size)), np.zeros((2, 3, size))):
+        with pytest.raises(ValueError, match="expected observations"):
+            exported.act(frames)
+    exported.reset([False, True, False])
+    frames = np.zeros((3, size))
+    frames[1, 0] = np.nan
+    with pytest.raises(ValueError, match="the first observation of an episode is missing or has N"):
+        exported.act(frames)

@@ -86,7 +86,11 @@ class Actor:
             mask = torch.as_tensor(np.asarray(action_mask, bool))
             given["action_mask"] = mask.reshape(self._env.observation_spec["action_mask"].shape)
         rewards = torch.as_tensor(np.asarray(reward, np.float32)).reshape(-1, 1)
-        given["reward"] = rewards.expand(len(self._begins), 1)
+        if len(rewards) not in (1, copies := len(self._begins)):
+            raise ValueError(
+                f"there are {len(rewards)} rewards, but {copies} copies: give {copies}"
+            )
+        given["reward"] = rewards.expand(copies, 1)
         given["truncated"] = self._begins
         self._given = given
         with (
@@ -139,6 +143,8 @@ class Actor:
             frame = torch.zeros(shape, dtype=spec.dtype)
         else:
             array = np.asarray(value)
+            if array.dtype.kind not in "biuf":
+                raise ValueError(f"the {name} must be numbers, not {array.dtype}")
             if array.shape != (shape if self._batched else shape[1:]):
                 expected = list(shape) if self._batched else list(shape[1:])
                 raise ValueError(

@@ -34,8 +34,8 @@ class Collection:
     sets: tuple[Kind, ...] = ("random", "mixed", "medium", "expert")
     """Which sets to make. More sets can be added to the same folder later."""
     transitions: Batch = 100_000
-    """Minimum number of transitions in a set; the last episode is always complete. The mixed set
-    has as many as the training took."""
+    """Minimum number of transitions in a set; the last episode is complete, unless a single one is
+    longer than the set. The mixed set has as many as the training took."""
     medium_return: Real | None = None
     """Mean return in an evaluation at which the mixed set ends and the agent is medium; by default
     at the end of training."""

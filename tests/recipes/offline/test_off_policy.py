@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from typing import Any
 
@@ -168,6 +169,14 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert lines[1].startswith("discounted return (0.99) by fqe: ")
     evaluation = json.loads((run.folder / "evaluation_best_dataset-log_fqe.json").read_bytes())
     assert evaluation["held_out_episodes"] == 10
+    other = tmp_path / "other" / "log.hdf5"
+    other.parent.mkdir()
+    shutil.copy(data, other)
+    for name in (data, str(other), data, str(other)):
+        main(["evaluate", str(run.folder), "--dataset", name])
+    found = [json.loads(x.read_bytes()) for x in run.folder.glob("evaluation_dataset-log*.json")]
+    assert sorted(x["dataset"] for x in found) == sorted([data, str(other)])
+    assert "is a folder: name a file" in fails(capsys, "evaluate", run.folder, "--out", tmp_path)
     assert evaluation["low"] <= evaluation["value"] <= evaluation["high"]
     dt = train(make_dt(tmp_path), tmp_path / "dt")
     memory: dict[str, Any] = {"backbone": gru(hidden_dim=8), "slice_length": 4}

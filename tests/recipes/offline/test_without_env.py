@@ -314,6 +314,16 @@ def test_the_command_line(tmp_path, capsys):
     assert "is left out: it has no environment" in fails(capsys, "table", out)
 
 
+def test_a_run_does_not_go_on_with_other_data_of_the_same_size(tmp_path, capsys):
+    data = log_machine(tmp_path / "log.hdf5")
+    recipe = replace(BC(dataset=str(data), backbone=SMALL), total_updates=2)
+    run = train(with_spaces(recipe), tmp_path / "run")
+    data.unlink()
+    log_machine(data, actions=np.zeros((200, 2)))
+    words = ["train", "--resume", run.folder, "--total-updates", 4]
+    assert "saved with other data, of which there were as many" in fails(capsys, *words)
+
+
 def test_what_reads_evaluations_knows_those_without_returns(tmp_path, capsys):
     recipe = with_spaces(BC(dataset=str(log_machine(tmp_path / "log.hdf5")), backbone=SMALL))
     run = train(replace(recipe, total_updates=2, name="bc/mine"), tmp_path / "run")
