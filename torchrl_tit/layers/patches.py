@@ -173,15 +173,25 @@ def find_patch_size(
         categories: whether the entries count categories.
 
     Raises:
-        ValueError: if no patch divides an image into fewer than 1025 patches.
+        ValueError: if no patch divides an image into fewer than 1025 patches, or None is given for
+            an image that is not square.
 
     Example:
         >>> [find_patch_size(shape, "auto") for shape in [(4,), (27,), (3, 84, 84), (7, 7)]]
         [4, 27, 12, 1]
         >>> find_patch_size((27,), "auto", categories=True)
         3
+        >>> find_patch_size((84, 42), None)
+        Traceback (most recent call last):
+            ...
+        ValueError: patch_size is None, but an image of shape (84, 42) is not one square patch: ...
     """
     if patch_size is None:
+        if len(observation_shape) > 1 and observation_shape[-1] != observation_shape[-2]:
+            raise ValueError(
+                f"patch_size is None, but an image of shape {tuple(observation_shape)} is not one "
+                'square patch: give its side, or "auto"'
+            )
         return observation_shape[-1]
     if patch_size != "auto":
         return patch_size

@@ -120,7 +120,8 @@ class PatchTransformerSettings(ClassTokenSettings):
     patch_weights: Literal["shared", "own"] = "shared"
     """Whether all patches of an array share one embedding, which has no bias, or each patch has its
     own weights and bias, all of the same size (the feature tokenizer of arXiv 2106.11959). With
-    shared weights and patches of one entry, attention sees little more than each entry's sign."""
+    shared weights and patches of one entry, attention sees little more than each entry's sign.
+    Images and categories have embeddings of their own, whatever this says."""
     position_encoding: bool = True
     """Whether patches and class token get a learned position encoding."""
 
