@@ -6,19 +6,20 @@ function of the features whose random weights stay the same for several steps.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.modules.models.exploration import gSDEModule
 
 from torchrl_tit.layers import init_orthogonal_
+from torchrl_tit.modules.action_specs import initial_scale
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.settings.numbers import Steps
 
@@ -50,22 +51,23 @@ class StateDependentNoise(nn.Module):
         features_dim: size of the features.
         action_dim: number A of entries of an action.
         steps: steps for which the weights stay the same.
+        scale: standard deviation of each entry for features of scale 1, float [A].
 
     Example:
-        >>> noise = StateDependentNoise(64, 2, steps=4).eval()
+        >>> noise = StateDependentNoise(64, 2, steps=4, scale=torch.ones(2)).eval()
         >>> with set_exploration_type(ExplorationType.RANDOM):
         ...     loc, scale, drawn = noise(torch.zeros(8, 2), torch.randn(8, 64))
         >>> scale.shape, drawn.shape
         (torch.Size([8, 2]), torch.Size([8, 2]))
     """
 
-    def __init__(self, features_dim: int, action_dim: int, steps: int) -> None:
+    def __init__(self, features_dim: int, action_dim: int, steps: int, scale: Tensor) -> None:
         super().__init__()
         self.gsde = gSDEModule(action_dim, features_dim)
-        # So that features of scale 1 give noise of scale 1, as gSDEModule means to do; but its
-        # argument sigma_init has no effect.
-        sigma = features_dim**-0.5
-        nn.init.constant_(self.gsde.log_sigma, math.log(math.expm1(sigma)))
+        # gSDEModule means to do the same, but its argument sigma_init has no effect.
+        sigma = scale.unsqueeze(-1) * features_dim**-0.5
+        with torch.no_grad():
+            self.gsde.log_sigma.copy_(sigma.expm1().log())
         self.steps = steps
         self._weights: Tensor | None = None
         self._left = 0
@@ -149,13 +151,14 @@ class SmoothPPOAlgorithm(PPOAlgorithm):
                 "ppo recipe"
             )
         key = model.backbone.features_keys[0]
-        model.actor = self._actor(model.backbone.features_dim, spec.shape[0], key)
+        model.actor = self._actor(model.backbone.features_dim, spec, key)
         return model
 
-    def _actor(self, features_dim: int, action_dim: int, key: Any) -> TensorDictModuleBase:
-        mean = nn.Linear(features_dim, action_dim)
+    def _actor(self, features_dim: int, spec: TensorSpec, key: Any) -> TensorDictModuleBase:
+        mean = nn.Linear(features_dim, spec.shape[0])
         init_orthogonal_(mean, gain=0.01)
-        noise = StateDependentNoise(features_dim, action_dim, self.recipe.noise_steps)
+        scale = initial_scale(spec, spec.shape, self.recipe.initial_std)
+        noise = StateDependentNoise(features_dim, spec.shape[0], self.recipe.noise_steps, scale)
         return ProbabilisticActor(
             TensorDictSequential(
                 TensorModule(mean, [key], ["mean"]),

@@ -146,6 +146,10 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     OpenAI's Spinning Up."""
     gae_lambda: Fraction = 0.95
     """Lambda of generalized advantage estimation (arXiv 1506.02438)."""
+    initial_std: Positive | None = None
+    """Standard deviation of continuous actions at the start, as a share of half the range of each
+    entry (0.5 in arXiv 2006.05990); by default 1 in its own units, as in Stable-Baselines3. It can
+    only fall as fast as Adam's learning rate allows."""
     initialization: Literal["orthogonal", "own"] = "orthogonal"
     """Initialization of the backbone: orthogonal, as in Stable-Baselines3 and so in the paper's
     online runs, or the network's own (TIT: normal with a standard deviation of 0.02)."""
@@ -266,7 +270,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
 
     def __init__(self, recipe: PPO) -> None:
         super().__init__(recipe)
-        with closing(make_task(recipe)) as task:
+        with closing(make_task(recipe, clip_actions=False)) as task:  # its spec has the bounds
             self.model = self.networks(task).to(self.device)
         self.model.backbone.autocast = autocast_type(recipe.precision, self.device)
         means = ["feature_spread", "explained_variance", "epochs", *self.terms, "gradient_norm"]
@@ -296,6 +300,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
             in_key=keys[0],
             mask_key=MASK if recipe.mask_actions else None,
             batch_dims=0,
+            std=recipe.initial_std,
         )
         return ActorCritic(backbone, actor, make_value(backbone.features_dim, in_key=keys[-1]))
 

@@ -154,6 +154,21 @@ def test_continuous(shape, dtype):
     assert torch.equal(td["action"], td["loc"])
 
 
+def test_the_deviation_starts_as_a_share_of_half_the_range():
+    spec = Bounded(torch.tensor([-1.0, 0.0, 0.0]), torch.tensor([1.0, 10.0, torch.inf]))
+    actor = make_actor(16, spec, std=0.4)
+    assert_near(act(actor, features())["scale"][0], torch.tensor([0.4, 2.0, 0.4]))
+    (scale,) = (m for m in actor.modules() if hasattr(m, "state_independent_scale"))
+    torch.nn.init.constant_(scale.state_independent_scale, 3.0)
+    actor.reset_parameters_recursive()
+    assert_near(act(actor, features())["scale"][0], torch.tensor([0.4, 2.0, 0.4]))
+    batched = spec.expand(5, 3)
+    assert_near(
+        act(make_actor(16, batched, batch_dims=1, std=0.4), features())["scale"][0],
+        torch.tensor([0.4, 2.0, 0.4]),
+    )
+
+
 @pytest.mark.parametrize("name", ["categorical", "one-hot", "multi-categorical", "multi-one-hot"])
 def test_a_batched_spec_gives_the_same_head(name):
     spec, _, _ = DISCRETE[name]

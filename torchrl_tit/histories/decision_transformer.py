@@ -29,8 +29,8 @@ class DecisionTransformer(HistoryEncoder):
     The last block computes only the state tokens, because only these are read. No state sees the
     action of the last step, so that action is not read.
 
-    Returns to go are divided by the buffer ``return_scale``, which is 1 unless it is filled. It is a
-    setting and not in a state dict: fill it again where weights are loaded.
+    Returns to go are divided by the buffer ``return_scale``, which is 1 unless it is filled. It is
+    a setting and not in a state dict: fill it again where weights are loaded.
 
     Args:
         settings: blocks, heads, FFN, dropout and time steps.

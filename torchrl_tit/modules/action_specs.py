@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import torch
+from torch import Tensor
 from torchrl.data import (
     Binary,
     Bounded,
@@ -116,6 +117,31 @@ def check_bounds(spec: TensorSpec, refusal: str) -> None:
             "each lower bound must be below the upper one, and their difference and sum finite "
             f"in {spec.dtype}"
         )
+
+
+def initial_scale(spec: TensorSpec, shape: torch.Size, std: float | None) -> Tensor:
+    """The standard deviation with which Gaussian actions start.
+
+    Args:
+        spec: the action's spec.
+        shape: the shape of one action.
+        std: share of half the range of each entry, or of 1 where it has no bounds; None for 1.
+
+    Returns:
+        float [entries].
+
+    Example:
+        >>> spec = Bounded(torch.tensor([-2.0, 0.0]), torch.tensor([2.0, math.inf]))
+        >>> initial_scale(spec, spec.shape, 0.5)
+        tensor([1.0000, 0.5000])
+    """
+    if std is None:
+        return torch.ones(math.prod(shape))
+    half = torch.ones(spec.shape)
+    if isinstance(spec, Bounded):
+        half = (spec.space.high - spec.space.low).to(half) / 2
+    half = half.reshape(-1, math.prod(shape))[0]
+    return std * half.where(half.isfinite() & (half > 0), 1.0)
 
 
 def describe(spec: TensorSpec) -> str:

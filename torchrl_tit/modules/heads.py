@@ -24,6 +24,7 @@ from torchrl_tit.modules.action_specs import (
     action_shape,
     check_bounds,
     describe,
+    initial_scale,
     numbers_of_options,
 )
 from torchrl_tit.modules.distributions import (
@@ -35,7 +36,7 @@ from torchrl_tit.modules.sequences import beside
 from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
 from torchrl_tit.modules.torch_internals import is_transformed
 from torchrl_tit.settings.checks import checked_arguments
-from torchrl_tit.settings.numbers import Size, Weight
+from torchrl_tit.settings.numbers import Positive, Size, Weight
 
 
 @checked_arguments
@@ -48,6 +49,7 @@ def make_actor(
     mask_key: NestedKey | None = None,
     batch_dims: int | None = None,
     gain: Weight = 0.01,
+    std: Positive | None = None,
 ) -> ProbabilisticActor:
     """Builds the policy head for an action space.
 
@@ -60,7 +62,7 @@ def make_actor(
     ``MultiOneHot``         independent categoricals, one-hot vectors joined    [..., sum(nvec)]
     ``Binary``              independent Bernoullis                              none
     float, of any order     diagonal Gaussian, whose log standard deviation     none
-                            is a parameter that starts at 0
+                            is a parameter
     ======================  ==================================================  ====================
 
     An action has the shape and dtype of the spec, and one log-probability and one entropy: the sums
@@ -83,6 +85,9 @@ def make_actor(
         gain: gain of the initial weights. With a small gain, the initial policy has almost the same
             probabilities in all states (recommended by arXiv 2006.05990); with 1, it differs by
             state.
+        std: initial standard deviation of continuous actions, as a share of half the range of each
+            entry, or in its own units where it has no bounds. None is 1 in its own units, as in
+            Stable-Baselines3.
 
     Returns:
         A :class:`~torchrl.modules.ProbabilisticActor` that writes the action and its
@@ -117,7 +122,8 @@ def make_actor(
     elif isinstance(action_spec, Binary):
         parts = _switches(features_dim, action_spec, shape, gain)
     else:
-        parts = _gaussian(features_dim, action_spec, shape, gain)
+        scale = initial_scale(action_spec, shape, std)
+        parts = _gaussian(features_dim, action_spec, shape, gain, scale)
     in_keys = [in_key] if mask_key is None else [in_key, mask_key]
     parameters = {name: beside(in_key, key) for name, key in parts.parameters.items()}
     return ProbabilisticActor(
@@ -293,10 +299,11 @@ def _switches(features_dim: int, spec: Binary, shape: torch.Size, gain: float) -
     return _Parts(network, {"logits": "logits"}, IndependentBernoulli, settings)
 
 
-def _gaussian(features_dim: int, spec: TensorSpec, shape: torch.Size, gain: float) -> _Parts:
+def _gaussian(
+    features_dim: int, spec: TensorSpec, shape: torch.Size, gain: float, scale: Tensor
+) -> _Parts:
     """Parts for continuous actions."""
-    size = math.prod(shape)
-    network = nn.Sequential(_Linear(features_dim, size, gain), _Scale(size, scale_lb=0.0))
+    network = nn.Sequential(_Linear(features_dim, len(scale), gain), _Scale(scale))
     if len(shape) != 1 or spec.dtype != torch.float32:
         network.append(_Fit(shape, spec.dtype))
     settings = {"event_dim": len(shape), "validate_args": False}
@@ -317,11 +324,17 @@ class _Linear(nn.Linear):
 
 
 class _Scale(AddStateIndependentNormalScale):
-    """TensorDict's scale of a Gaussian, whose logarithm can be set back to 0."""
+    """TensorDict's scale of a Gaussian, whose logarithm starts at a value, and can be set back."""
 
+    def __init__(self, scale: Tensor) -> None:
+        super().__init__(len(scale), scale_lb=0.0)
+        self._initial = scale.log()
+        self.reset_parameters()
+
+    @torch.no_grad()
     def reset_parameters(self) -> None:
         """Initializes the logarithm of the scale."""
-        nn.init.zeros_(self.state_independent_scale)
+        self.state_independent_scale.copy_(self._initial)
 
 
 class _Fit(nn.Module):

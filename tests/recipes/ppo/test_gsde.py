@@ -38,11 +38,13 @@ RECIPE = SmoothPPO(
 def test_noise_and_log_probabilities_are_those_by_hand(backbone, float64, monkeypatch, tmp_path):
     """In the batch, whose episodes end while the noise keeps its weights, and in the update."""
     monkeypatch.setenv("TORCHRL_TIT_IMPORTS", tasks.__name__)
-    recipe = replace(RECIPE, backbone=backbone, wrappers=(f"{tasks.__name__}:Double",))
+    wrappers = (f"{tasks.__name__}:Double",)
+    recipe = replace(RECIPE, backbone=backbone, wrappers=wrappers, initial_std=0.25)
     algorithm: Any = make_algorithm(recipe)
     model, drawn, draw = algorithm.model, [], StateDependentNoise._draw
     mean, noise = (part.module for part in model.actor[0])
-    assert_near(noise.gsde.sigma, torch.full_like(noise.gsde.sigma, mean.in_features**-0.5))
+    scale = 0.25 * 2 * mean.in_features**-0.5  # of torques from -2 to 2
+    assert_near(noise.gsde.sigma, torch.full_like(noise.gsde.sigma, scale))
     torch.nn.init.uniform_(noise.gsde.log_sigma, -2, 1)
     torch.nn.init.normal_(mean.weight)
 

@@ -146,6 +146,15 @@ def test_what_was_chosen_is_printed_and_recorded(monkeypatch, tmp_path, capsys):
     assert network.frame_settings == frames
 
 
+@pytest.mark.parametrize(("std", "expected"), [(None, 1.0), (0.5, 0.5 * 2)])
+def test_the_deviation_starts_as_a_share_of_the_tasks_range(std, expected):
+    """Although the environment clips, so that the bounds are not in its spec."""
+    algorithm: Any = make_algorithm(replace(RECIPE, env="Pendulum-v1", initial_std=std))
+    features = torch.zeros(1, algorithm.model.backbone.features_dim)
+    step = algorithm.model.actor(TensorDict({"features": features}, [1]))
+    assert_near(step["scale"], torch.full((1, 1), expected))
+
+
 def test_recipes_with_frames_have_a_hash_and_json():
     recipe = get_recipe("ppo/enhanced-tit")
     frames = {"image": Inner(patch_size="auto"), "arm/left": Linear()}
