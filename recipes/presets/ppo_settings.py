@@ -20,6 +20,8 @@ PPO_SETTINGS: dict[str, Any] = {
     "normalize_rewards": True,
     # Once a task is solved, advantages are mostly noise, which must not count as much as a signal.
     "running_advantage_floor": 0.5,
+    # In few steps, a larger deviation of continuous actions could not fall as far as it should.
+    "initial_std": 0.5,
     # An update ends once it has moved the policy this far; small minibatches often get there.
     "target_kl": 0.05,
 }
