@@ -137,7 +137,7 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     far, for tasks whose advantages differ in scale. The larger of the two floors applies."""
     normalize_observations: bool = False
     """Whether the network reads observations normalized to a running mean of 0 and standard
-    deviation of 1, per entry of an array and per channel of an image (as in VecNormalize; arXiv
+    deviation of 1, per entry of an array and per pixel of an image (as in VecNormalize; arXiv
     2006.05990, "observation normalization"). The observations of a batch are added after its
     update, so the first batch is read as it is."""
     target_kl: Positive | None = None

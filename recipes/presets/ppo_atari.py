@@ -65,6 +65,8 @@ def _named(game: str) -> list[Preset]:
         total_steps=10_000_000,
         epochs=4,
         sequence_length=None,
+        normalize_observations=False,
+        padding="constant",
         decay_learning_rate=True,
         decay_clip_epsilon=True,
     )

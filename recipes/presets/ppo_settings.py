@@ -55,7 +55,8 @@ PICTURE_SETTINGS: dict[str, Any] = {
     "clip_epsilon": 0.1,
     "entropy_coeff": 0.01,
     "clip_rewards": True,
-    "padding": "constant",
+    # Otherwise the features of all images are nearly the same, for a million steps and more.
+    "normalize_observations": True,
 }
 """Fields of the recipes on pictures: those of rl-baselines3-zoo on Atari games, with longer
 sequences, one epoch less, and a learning rate and a clipping range that stay as they are."""

@@ -131,7 +131,7 @@ class Episodes:
         Returns:
             Mean and population standard deviation, float32 [*sample] each, and the number of
             samples, for :meth:`torchrl_tit.frames.NormalizedFrames.set_statistics`. The deviation
-            of a constant entry of an array is 1, with a warning, so that it is not amplified if it
+            of a constant entry is 1, for an array with a warning, so that it is not amplified if it
             changes later.
 
         Raises:
@@ -148,16 +148,14 @@ class Episodes:
         for chunk in map(samples, self._observations()):
             squares += chunk.double().sub_(mean).square_().sum(0)
         std = (squares / count).sqrt().float()
-        if mean.ndim == 1:  # pixels of an image have the statistics of their channel
-            varies = std > 1e-7 * mean.abs()  # less is rounding
-            std = std.where(varies, 1.0)
-            if constant := (~varies).nonzero().flatten().tolist():
-                warnings.warn(
-                    f"{self.source}: entries {', '.join(map(str, constant))} of the observations "
-                    "are constant, so they are not divided by their deviation",
-                    stacklevel=2,
-                )
-        return mean.float(), std, count
+        varies = std > 1e-7 * mean.abs()  # less is rounding
+        if mean.ndim == 1 and (constant := (~varies).nonzero().flatten().tolist()):
+            warnings.warn(
+                f"{self.source}: entries {', '.join(map(str, constant))} of the observations are "
+                "constant, so they are not divided by their deviation",
+                stacklevel=2,
+            )
+        return mean.float(), std.where(varies, 1.0), count
 
     def _observations(self) -> Iterator[Tensor]:
         """The observations at the steps of finished episodes, in chunks."""

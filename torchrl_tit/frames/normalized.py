@@ -18,10 +18,11 @@ class NormalizedFrames(FrameEncoder):
 
     The statistics are running ones (:meth:`update`), or those of a data set
     (:meth:`set_statistics`). Until then, observations are read as they are. Each entry of an array
-    has its own mean and standard deviation, as in `VecNormalize` of Stable-Baselines3. So has each
-    channel of an image, whose bytes are first scaled to 0..1: if all pixels are positive, a network
-    first sees what all images have in common. The entities of a set share their statistics: padding
-    does not count, and the mask is not normalized. Results beyond +-``limit`` are clipped.
+    and each pixel of an image, whose bytes are first scaled to 0..1, has its own mean and standard
+    deviation, as in `VecNormalize` of Stable-Baselines3 and as in random network distillation
+    (arXiv 1810.12894). Otherwise a network first sees what all images have in common. The entities
+    of a set share their statistics: padding does not count, and the mask is not normalized. Results
+    beyond +-``limit`` are clipped.
 
     The statistics are buffers of the network, so checkpoints, evaluation, copies and exports have
     them, and a frame's tokens stay the same while a batch is collected. TorchRL's `VecNormV2` is a
@@ -59,7 +60,7 @@ class NormalizedFrames(FrameEncoder):
         shape = encoder.observation_shape
         self.reads_entities = encoder.reads_entities
         self.is_image = len(shape) > 1 and not self.reads_entities
-        shape = (*shape[:-2], 1, 1) if self.is_image else shape[-1:]
+        shape = shape if self.is_image else shape[-1:]
         self.register_buffer("count", torch.zeros(()))
         self.register_buffer("mean", torch.zeros(shape))
         self.register_buffer("variance", torch.ones(shape))
@@ -73,13 +74,8 @@ class NormalizedFrames(FrameEncoder):
             std: population standard deviation, float [*sample].
             count: number of samples, which says how much they weigh in later updates.
         """
-        variance = std.square()
-        if self.is_image:  # of a channel: the mean of its variances, and the variance of its means
-            over = (-2, -1)
-            variance = variance.mean(over, keepdim=True) + mean.var(over, False, keepdim=True)
-            mean = mean.mean(over, keepdim=True)
         self.mean.copy_(mean)
-        self.variance.copy_(variance)
+        self.variance.copy_(std.square())
         self.count.fill_(count)
         self._keep_mask()
 
@@ -94,12 +90,11 @@ class NormalizedFrames(FrameEncoder):
         self._keep_mask()
 
     def _add(self, observations: Tensor) -> None:
-        over = (0, -2, -1) if self.is_image else (0,)
         if not (size := observations.shape[0]):  # sets without entities
             return
         total = self.count + size
-        shift = observations.mean(over, keepdim=True)[0] - self.mean
-        variance = observations.var(over, unbiased=False, keepdim=True)[0]
+        shift = observations.mean(0) - self.mean
+        variance = observations.var(0, unbiased=False)
         squares = self.variance * self.count + variance * size
         self.variance.copy_((squares + shift.square() * self.count * size / total) / total)
         self.mean.add_(shift * size / total)
