@@ -50,7 +50,7 @@ PIXELS: dict[str, Callable[[Tensor], Tensor]] = {
     "0 to 4": lambda pictures: 4 * pictures,
     "-1 to 1": lambda pictures: 2 * pictures - 1,
     "without their mean": lambda pictures: pictures - pictures.mean(0),
-    "normalised by channel": _normalized,
+    "normalised by pixel": _normalized,
 }
 """The transforms of images [N, 3, H, W] from 0 to 1; the last is ``normalize_observations``."""
 

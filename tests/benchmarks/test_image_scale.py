@@ -25,7 +25,7 @@ def test_a_transformer_learns_from_normalized_pixels(episodes: image_scale.Episo
     network = memory_networks(image_scale.NUM_FRAMES, patch_size=8)["enhanced-tit"]
     steps, accuracy = image_scale.gradient_steps(
         network,
-        image_scale.PIXELS["normalised by channel"],
+        image_scale.PIXELS["normalised by pixel"],
         episodes,
         seed=0,
         limit=400,
