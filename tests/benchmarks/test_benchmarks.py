@@ -107,8 +107,11 @@ def test_memories_forget_where_an_episode_begins(monkeypatch):
     for name in names:
         backbone = memories.make_backbone(name, 6).eval()
         steps = memories.make_sequences(backbone, 6, samples=12)
-        other = steps.clone()
-        other["observation"][:, :2] = other["history"][:, :2] = 1
+        seen = steps["observation"].clone()
+        seen[:, :2] = 1
+        other = steps.copy().set("observation", seen)
+        if backbone.is_recurrent:
+            other["history"] = seen.unsqueeze(2)
         with set_recurrent_mode(True):
             features = [backbone(x)["features"] for x in (steps, other)]
         assert_near(features[0][:, 2:], features[1][:, 2:])

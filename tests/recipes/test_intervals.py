@@ -59,7 +59,7 @@ _REPLAY: dict[str, Any] = {
     "total_steps": 160,
     "random_steps": 32,
     "steps_per_batch": 32,
-    "updates_per_step": 0.1,
+    "updates_per_step": 0.125,
     "batch_size": 8,
     "log_interval": 64,
     "checkpoint_interval": 10**6,

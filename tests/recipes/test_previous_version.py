@@ -48,7 +48,8 @@ def test_a_recipe_of_each_algorithm_and_network_loads(which):
     assert recipe.final_step == now.final_step
     if isinstance(recipe, PPO) and isinstance(now, PPO):
         # The size of an update is set by other settings now; a run keeps those that it had.
-        recipe = replace(recipe, minibatch_size=now.minibatch_size, target_kl=now.target_kl)
+        fields = ("minibatch_size", "target_kl", "initial_std", "learning_rate")
+        recipe = replace(recipe, **{field: getattr(now, field) for field in fields})
     assert recipe == now or which.startswith("recipes-0.1.0"), "another setting than before"
 
 

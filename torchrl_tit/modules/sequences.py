@@ -22,6 +22,7 @@ from torchrl_tit.modules.frame_tables import (
 from torchrl_tit.modules.torch_internals import is_transformed
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.choices import Padding
+from torchrl_tit.windows import Windows
 
 
 @dataclass(frozen=True)
@@ -234,7 +235,7 @@ def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
 
 def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -> None:
     """Raises ValueError if steps [N, T] do not follow one another, as shuffled ones do not."""
-    if is_transformed():
+    if is_transformed() or observation.is_meta:
         return
     if (differs(observation[:, 1:], following[:, :-1]) & ~starts[:, 1:]).any():
         raise ValueError(
@@ -245,11 +246,15 @@ def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -
 
 
 def _check_padding(table: FrameTable, histories: Sequence[Tensor]) -> None:
-    """Raises ValueError if the windows of a table are not the histories, [N, T, K, ...] each."""
-    if is_transformed():
-        return
+    """Raises ValueError if the windows of a table are not the histories, [N, T, K, ...] each.
+
+    The frame before the newest one tells, where the first history is not expanded over time.
+    """
+    rows, missing, _ = table.windows
+    before = Windows(rows[..., -2:-1], None if missing is None else missing[..., -2:-1])
     for frames, history in zip(table.frames, histories, strict=True):
-        if differs(table.windows.gather(frames), history).any():
+        known = history.stride(1) and not (is_transformed() or history.is_meta)
+        if known and differs(before.gather(frames), history[:, :, -2:-1]).any():
             raise ValueError(
                 "with padding, only the first history of a sequence is read, but the stored "
                 "histories are others than those that follow from it: leave padding out for flat "
