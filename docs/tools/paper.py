@@ -33,6 +33,7 @@ from recipes.tools.results.paper import (
     match,
     paper_cells,
 )
+from recipes.tools.results.table import value_of
 from torchrl_tit import EnhancedTIT, VanillaTIT
 from torchrl_tit.analysis import Flows, count_flows
 from torchrl_tit.scores import REFERENCE_RETURNS
@@ -115,10 +116,7 @@ def measured() -> dict[PaperCell, list[Measured]]:
     cells: dict[PaperCell, list[Measured]] = defaultdict(list)
     for (page, recipe), runs in groups.items():
         found = runs[0][0]
-        values = [
-            float(evaluation["score"]["best"] if "score" in evaluation else evaluation["mean"])
-            for _, evaluation in runs
-        ]
+        values = [value_of(evaluation) for _, evaluation in runs]
         steps = min(evaluation["steps"] for _, evaluation in runs)
         cells[found.cell].append(
             Measured(found, recipe, _PAGES.get(page, f"results/{page}.md"), tuple(values), steps)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -73,7 +72,8 @@ def evaluate(arguments: list[str]) -> None:
             settings = {"best": options.best, "ope": options.ope}
             evaluation = evaluate_on_data(run, recipe, options.dataset, **settings)
         if options.seed is not None and options.dataset is None:
-            recipe = replace(recipe, evaluation_seed=evaluation["seed"])  # another of best weights
+            # The best weights play from another seed where they were chosen by this one.
+            recipe = replace(recipe, evaluation_seed=evaluation["seed"])
         name = _file_name(run.recipe, recipe, options.best, options.dataset, options.ope)
         out = options.out or _free(run.folder / name, options.dataset)
         run.save_evaluation(evaluation, out)
@@ -98,7 +98,9 @@ def _free(path: Path, dataset: str | None) -> Path:
     """Adds a checksum to the name of a file that holds the evaluation on other data."""
     if dataset is None or not path.is_file():
         return path
-    if json.loads(path.read_text(encoding="utf-8")).get("dataset") == dataset:
+    from torchrl_tit.evaluation_file import parse_object  # not at the top: help is fast
+
+    if parse_object(path.read_bytes(), str(path)).get("dataset") == dataset:
         return path
     return path.with_stem(f"{path.stem}-{hashlib.sha256(dataset.encode()).hexdigest()[:6]}")
 

@@ -24,8 +24,8 @@ def compare(arguments: list[str]) -> None:
     if options.out.suffix != ".png":
         fail(f"--out {options.out} must end in .png: the figure is a PNG")
     from ..tools.results.comparison import HEADER, WORDS, compare_with_first
-    from ..tools.results.experiments import check_together, find_runs, group_runs, read_metrics
-    from ..tools.results.plot import plot_comparison, short_runs
+    from ..tools.results.experiments import check_together, find_runs, group_runs
+    from ..tools.results.plot import plot_comparison
     from ..tools.results.table import read_evaluations, to_lines, value_of
 
     # The logs of a sweep lie next to its runs, so `sweep/*/seed-*` matches them too.
@@ -34,11 +34,8 @@ def compare(arguments: list[str]) -> None:
         fail(f"{options.runs[0]} is not a run folder, but a log: name the folder beside it")
     experiments = group_runs(find_runs(folders.values()))
     notes = check_together(experiments)
-    plot_comparison(experiments, options.out, title=options.title)
+    notes += plot_comparison(experiments, options.out, title=options.title)
     say(f"written to {options.out}")
-    for one in experiments:
-        last = {f"seed {x.recipe.seed}": read_metrics(x)[-1:] for x in one.runs}
-        notes += short_runs(one.label, {name: int(row["step"]) for name, [row] in last.items()})
     evaluated, left_out = read_evaluations(folders.values())
     for line in [*notes, *left_out]:
         note(line)
@@ -129,8 +126,9 @@ def record(arguments: list[str]) -> None:
     from ..tools.results.recording import record_runs
 
     names = record_runs(options.runs, options.out, under=options.under, commit=options.commit)
+    table = Records(options.out)
     for name in names:
-        run = RecordedRun(Records(options.out), name)
+        run = RecordedRun(table, name)
         if (run.read_evaluation() or {"steps": 0})["steps"] < run.recipe.final_step:
             note(f"{name} has not ended, or is not evaluated: record it again once it is")
         say(str(options.out / name))

