@@ -32,12 +32,12 @@ def drawn(monkeypatch):
 
     def compare(*folders):
         found = {}
-        monkeypatch.setattr(
-            "recipes.tools.results.plot.plot_comparison",
-            lambda experiments, picture, title: found.update(
-                {experiment.label: experiment.runs for experiment in experiments}
-            ),
-        )
+
+        def plot(experiments, picture, title):
+            found.update({experiment.label: experiment.runs for experiment in experiments})
+            return []
+
+        monkeypatch.setattr("recipes.tools.results.plot.plot_comparison", plot)
         main(["compare", *folders])
         return {name: [str(run.folder) for run in runs] for name, runs in found.items()}
 
