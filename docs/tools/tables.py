@@ -88,8 +88,12 @@ class Runs:
                 rows = [row for row in rows if row[column or next(iter(row))] == wanted]
             self.rows = rows
         else:
-            found = [pair for name in path.split() for pair in _runs_below(name)]
-            self.runs = sorted(found, key=lambda pair: int(pair[0].rows[pair[1]]["seed"]))
+            for name in path.split():
+                found = list(_runs_below(name))
+                if not found:
+                    raise ValueError(f"docs/results has no run {name}")
+                self.runs += found
+            self.runs.sort(key=lambda pair: int(pair[0].rows[pair[1]]["seed"]))
             self.rows = [records.rows[run] for records, run in self.runs]
         if not self.rows:
             raise ValueError(f"docs/results has no run {path}")
