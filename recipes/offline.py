@@ -31,8 +31,9 @@ from torchrl_tit.datasets import (
     load_episodes,
     make_replay_buffer,
     split_episodes,
+    task_spaces,
 )
-from torchrl_tit.datasets.checks import check_actions, check_shape
+from torchrl_tit.datasets.checks import check_actions, check_bytes, check_shape
 from torchrl_tit.envs import make_env, observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.modules import Backbone
@@ -93,13 +94,22 @@ def read_data(recipe: DatasetRecipe) -> Episodes:
     key = recipe.dataset, path.absolute(), recipe.reading(), stamps
     if key != _NEWEST.key:
         _NEWEST.key, _NEWEST.episodes = None, None  # frees their memory first
-        _NEWEST.episodes = load_episodes(recipe.dataset, **recipe.reading())
+        _NEWEST.episodes = _load(recipe)
         _NEWEST.key = key
     episodes, spaces = _NEWEST.episodes, recipe.task_settings
     assert episodes is not None
     if recipe.env or "observation_shape" not in spaces:
         return episodes
     return _checked(episodes, spaces)
+
+
+def _load(recipe: DatasetRecipe) -> Episodes:
+    """Loads a data set, with discrete actions counted from 0, as policies and losses count them."""
+    spaces = task_spaces(recipe.env) if recipe.env else None
+    episodes = load_episodes(recipe.dataset, **{**recipe.reading(), "task": spaces})
+    if np.any(start := getattr(spaces and spaces.action, "start", 0)):
+        episodes.rows["action"] -= torch.as_tensor(start)
+    return episodes
 
 
 @dataclass
@@ -120,7 +130,8 @@ def _checked(episodes: Episodes, spaces: Mapping[str, Any]) -> Episodes:
         DatasetError: if shapes differ, or an action is outside.
     """
     source, rows = episodes.source, episodes.rows.copy()
-    observation, action = Box(-np.inf, np.inf, tuple(spaces["observation_shape"])), rows["action"]
+    shape, kind = tuple(spaces["observation_shape"]), spaces.get("observation_dtype", "float32")
+    observation, action = Box(0, 255, shape, np.dtype(kind).type), rows["action"]
     if "num_actions" in spaces:
         space: Space = Discrete(spaces["num_actions"])
         rows["action"] = action = action.squeeze(-1) if action.shape[1:] == (1,) else action
@@ -129,6 +140,7 @@ def _checked(episodes: Episodes, spaces: Mapping[str, Any]) -> Episodes:
         space = Box(low, high)
     task = TaskSpaces(observation, space, "the recipe")
     check_shape(source, "observations", tuple(rows["observation"].shape[1:]), observation, task)
+    check_bytes(source, rows["observation"].dtype, observation, task)
     check_shape(source, "actions", tuple(action.shape[1:]), space, task)
     check_actions(source, action[episodes.step_rows].numpy(), space)
     return replace(episodes, rows=rows)

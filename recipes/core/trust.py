@@ -57,8 +57,8 @@ _MINIGRID = """
 """
 _TORCHRL = """
     ActionDiscretizer ActionScaling BinarizeReward CatTensors CenterCrop ClipTransform Crop
-    DTypeCastTransform DoubleToFloat FrameSkipTransform GrayScale LineariseRewards NoopResetEnv
-    ObservationNorm PermuteTransform RenameTransform Resize RewardClipping RewardScaling
+    DTypeCastTransform DoubleToFloat GrayScale LineariseRewards NoopResetEnv ObservationNorm
+    PermuteTransform RenameTransform Resize RewardClipping RewardScaling
     SelectTransform SignTransform SqueezeTransform StepCounter TimeMaxPool ToTensorImage
     UnsqueezeTransform
 """

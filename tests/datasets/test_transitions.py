@@ -17,6 +17,7 @@ from torchrl_tit.datasets import (
     DatasetError,
     Episodes,
     HistoryStorage,
+    TaskSpaces,
     episodes,
     episodes_from_arrays,
     join_episodes,
@@ -328,6 +329,17 @@ def test_a_task_of_the_same_sizes(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="is walker2d, but the task is HalfCheetah-v5"):
         load_episodes("walker2d-medium-v0", task="HalfCheetah-v5", cache_dir=tmp_path / "none")
     assert not (tmp_path / "none").exists()  # nothing was downloaded
+
+
+def test_bytes_stay_bytes() -> None:
+    """Networks divide bytes by 255: data in another dtype would be of another scale."""
+    frames, ends = np.full((2, 8, 8), 255, np.uint8), [False, True]
+    task = TaskSpaces(Box(0, 255, (8, 8), np.uint8), Discrete(2), "a game")
+    episodes_from_arrays(frames, np.zeros(2, int), np.ones(2), ends, task=task)
+    floats = task._replace(observation=Box(0, 255, (8, 8)))
+    for wrong, other in ((np.float32(frames), task), (frames, floats)):
+        with pytest.raises(DatasetError, match=r"'observations': is .*, but in a game it is"):
+            episodes_from_arrays(wrong, np.zeros(2, int), np.ones(2), ends, task=other)
 
 
 def test_bounds_are_those_of_the_entry_that_is_wrong() -> None:

@@ -87,6 +87,7 @@ def test_names_in_modules():
             "FlattenObservation' stands after a TorchRL transform",
         ),
         ("ALE/Pong-v5", [FLATTEN], "read in one way"),
+        ("CartPole-v1", ["torchrl.envs:FrameSkipTransform"], "has ended, and loses its end"),
     ],
 )
 def test_one_line_says_what_is_wrong(name, wrappers, words):

@@ -154,6 +154,20 @@ def test_games_of_minatar(game):
     assert env.spec.max_episode_steps == 10_000
 
 
+def test_seeded_games_of_minatar_know_nothing_of_those_before():
+    pytest.importorskip("minatar")
+    env = gymnasium.make("MinAtar/Breakout-v1", sticky_action_prob=0.9)
+
+    def played(before):
+        env.reset(seed=1)
+        for _ in range(20):
+            env.step(before)
+        env.reset(seed=0)
+        return [env.step(0)[0] for _ in range(3)]
+
+    assert np.array_equal(played(1), played(2))
+
+
 def test_a_game_of_minatar_without_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "minatar.gym", None)
     with pytest.raises(

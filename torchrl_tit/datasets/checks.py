@@ -149,6 +149,25 @@ def check_shape(
         )
 
 
+def check_bytes(source: str, dtype: torch.dtype, space: Space, task: TaskSpaces) -> None:
+    """Checks that observations are bytes where those of the task are: networks divide bytes by 255.
+
+    Raises:
+        DatasetError: if only one of the two is uint8.
+
+    Example:
+        >>> task = task_spaces("Pendulum-v1")
+        >>> check_bytes("a.hdf5", torch.float32, task.observation, task)
+    """
+    if isinstance(space, Box) and (dtype == torch.uint8) != (space.dtype == np.uint8):
+        raise DatasetError(
+            source,
+            f"is {str(dtype).removeprefix('torch.')}, but in {task.name} it is {space.dtype}, and "
+            "networks divide uint8 by 255, and nothing else: store it as the task has it.",
+            "observations",
+        )
+
+
 def check_finite(
     source: str,
     field: str,

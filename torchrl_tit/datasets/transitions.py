@@ -18,6 +18,7 @@ from torchrl_tit.datasets.checks import (
     DatasetError,
     TaskSpaces,
     check_actions,
+    check_bytes,
     check_finite,
     check_shape,
     check_task_name,
@@ -251,6 +252,8 @@ class _Reader:
         if self.task is not None and name in ("observations", "actions"):
             space = self.task.observation if name == "observations" else self.task.action
             check_shape(self.source, name, shape, space, self.task)
+            if name == "observations":
+                check_bytes(self.source, self.dtypes[name], space, self.task)
 
     def row_fields(self) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
         """Shapes and dtypes of the rows of the episodes."""

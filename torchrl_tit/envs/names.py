@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import FrameSkipTransform, Transform
 
 from torchrl_tit.extras import install
 from torchrl_tit.settings.checks import nearest
@@ -122,8 +122,8 @@ def load_wrappers(names: Sequence[str]) -> tuple[list[Wrap], list[Transform]]:
         Functions that apply the Gymnasium wrappers to a task, and the transforms.
 
     Raises:
-        ValueError: if there is no such class, it is of another kind, its arguments are invalid, or
-            a wrapper comes after a transform.
+        ValueError: if there is no such class, it is of another kind or misses ends of episodes, its
+            arguments are invalid, or a wrapper comes after a transform.
 
     Example:
         >>> wraps, transforms = load_wrappers(
@@ -142,6 +142,11 @@ def load_wrappers(names: Sequence[str]) -> tuple[list[Wrap], list[Transform]]:
         except ImportError as error:
             raise ValueError(f"Wrapper {name!r} cannot be used: {error}.") from error
         kind = found if isinstance(found, type) else type(None)
+        if issubclass(kind, FrameSkipTransform):
+            raise ValueError(
+                f"Wrapper {name!r} steps on where an episode has ended, and loses its end: repeat "
+                "actions with gymnasium.wrappers:RepeatAction(num_repeats=4), or in the task"
+            )
         if issubclass(kind, Transform):
             transforms.append(_called(kind, name, **arguments))
         elif not issubclass(kind, gymnasium.Wrapper):

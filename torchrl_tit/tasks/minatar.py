@@ -44,6 +44,11 @@ def make_game(game: str, render_mode: str | None = None, **settings: Any) -> gym
     class Game(BaseEnv):
         metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
+        def reset(self, **settings: Any) -> tuple[np.ndarray, dict[str, Any]]:
+            if settings.get("seed") is not None:
+                self.game.last_action = 0  # else the first action might be one of a game before
+            return super().reset(**settings)
+
         def render(self) -> np.ndarray:
             cells = (255 * super().render()).astype(np.uint8)  # its colors are from 0 to 1
             return cells.repeat(_PIXELS, 0).repeat(_PIXELS, 1)

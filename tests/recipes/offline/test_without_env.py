@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box, Discrete
 
 from recipes import offline
 from recipes.cli import main
@@ -41,7 +42,7 @@ from tests.recipes.small import (
     train,
 )
 from torchrl_tit import load_agent
-from torchrl_tit.datasets import DatasetError, load_episodes
+from torchrl_tit.datasets import DatasetError, TaskSpaces, load_episodes
 from torchrl_tit.evaluation_file import check_evaluation
 from torchrl_tit.settings.networks import gru
 
@@ -229,6 +230,20 @@ def test_spaces_of_images_and_discrete_actions(tmp_path):
     recipe = with_spaces(BC(dataset=str(data), backbone=SMALL))
     shape, dtype, count = recipe.task_settings.values()
     assert (shape, dtype, count) == ([20, 20], "uint8", 3)
+    other = log_machine(tmp_path / "f.hdf5", observations=images / 1.0, actions=np.arange(200) % 3)
+    with pytest.raises(DatasetError, match="is float32, but in the recipe it is uint8"):
+        read_data(replace(recipe, dataset=str(other)))
+
+
+def test_discrete_actions_count_from_0(tmp_path, monkeypatch):
+    """Policies do, and the task gets them shifted: data of the task are shifted back."""
+    actions = 2 + np.arange(200) % 2
+    data = log_machine(tmp_path / "log.hdf5", actions=actions)
+    spaces = TaskSpaces(Box(-9, 9, (5,)), Discrete(3, start=1))
+    monkeypatch.setattr(offline, "task_spaces", lambda env: spaces)
+    episodes = read_data(BC(env="CartPole-v1", dataset=str(data), backbone=SMALL))
+    found = episodes.rows["action"][episodes.step_rows].numpy()
+    np.testing.assert_array_equal(found, actions - 1)
 
 
 def test_bad_settings_in_one_line(tmp_path, capsys):
