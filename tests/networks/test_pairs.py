@@ -103,8 +103,7 @@ OF_KINDS: dict[Pair, Any] = {
 }
 CASES: dict[Pair, Any] = {pair: shape_of(pair) for pair in PAIRS} | OF_KINDS
 every_case = pytest.mark.parametrize("case", CASES, ids="+".join)
-# What concerns the two encoders of a pair apart: each history encoder once (traced on one token in
-# tests/modules/test_sequences.py), and each frame encoder once.
+# What concerns the two encoders of a pair apart: each history encoder and each frame encoder once.
 APART: list[Pair] = [("flat" if h in STACKED else "inner", h) for h in HISTORIES]
 APART += [(f, "outer") for f in FRAMES if f != "inner"]
 APART += [("inner", "paired-outer", "categories"), ("resnet", "mlp", "several")]
@@ -318,8 +317,16 @@ def test_export(case: Pair) -> None:
 @apart
 @pytest.mark.usefixtures("_fresh_compiler")
 def test_compile_in_one_graph(case: Pair) -> None:
-    """The backward pass once for each history encoder: tracing it takes as long again."""
-    check_compiled(case, "aot_eager", backward=case[0] == "inner" or case[1] in STACKED)
+    """What breaks a graph is found in tracing; `make slow` compiles all backward passes."""
+    backward = case == ("linear", "outer")
+    check_compiled(case, "aot_eager" if backward else "eager", backward=backward)
+
+
+@pytest.mark.slow
+@apart
+@pytest.mark.usefixtures("_fresh_compiler")
+def test_compile_with_gradients(case: Pair) -> None:
+    check_compiled(case, "aot_eager", backward=True)
 
 
 @pytest.mark.slow
