@@ -27,7 +27,7 @@ from tests.recipes.small import BC, SMALL, DiscreteCQL, make, make_algorithm, ma
 from torchrl_tit.datasets import HistoryStorage, episodes_from_arrays, load_episodes
 from torchrl_tit.settings.networks import gru
 
-GAMMA = 0.8
+GAMMA = 0.5
 
 
 def two_states():
@@ -57,7 +57,7 @@ def test_values_of_discrete_policies(actions, values):
     policy = TensorDictModule(choose, ["observation"], ["action"])
     critic = TensorDictModule(nn.Linear(2, 2), ["observation"], ["state_action_value"])
     items = two_states()
-    value = fit_q(policy, critic, items, gamma=GAMMA, updates=2500, learning_rate=0.02)
+    value = fit_q(policy, critic, items, gamma=GAMMA, updates=700, learning_rate=0.02)
     everything = torch.arange(len(items))
     found, state = value(everything), items.get(everything)["observation"].argmax(-1)
     for number, expected in enumerate(values):
@@ -86,7 +86,7 @@ def test_value_of_a_continuous_policy():
 
     policy = TensorDictModule(lambda x: 0.5 * torch.ones_like(x), ["observation"], ["action"])
     critic = TensorDictModule(Critic(), ["observation", "action"], ["state_action_value"])
-    value = fit_q(policy, critic, items, gamma=GAMMA, updates=2500, learning_rate=0.02)
+    value = fit_q(policy, critic, items, gamma=GAMMA, updates=700, learning_rate=0.02)
     assert value(torch.tensor([0])).item() == pytest.approx(0.5 / (1 - GAMMA), rel=0.03)
 
 
@@ -95,12 +95,12 @@ def test_an_estimate_of_an_algorithms_policy(tmp_path):
     data = log_machine(tmp_path / "log.hdf5", rewards=np.full(200, 2.0))
     algorithm = make_algorithm(IQL(dataset=str(data), backbone=SMALL, gamma=0.5))
     episodes = algorithm.load_data()
-    found = fitted_q(algorithm, episodes, 600)
+    found = fitted_q(algorithm, episodes, 300)
     assert found["gamma"] == 0.5
     assert found["value"] == pytest.approx(4, rel=0.05)
     assert found["low"] <= found["value"] <= found["high"]
     assert found["data_value"] == pytest.approx(4 * (1 - 0.5**20))
-    assert fitted_q(algorithm, episodes, 600) == found
+    assert fitted_q(algorithm, episodes, 2) == fitted_q(algorithm, episodes, 2)
 
 
 def test_without_a_discount_there_is_no_fitted_value(tmp_path):
