@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import json
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,6 +126,10 @@ def test_memories_forget_where_an_episode_begins(monkeypatch):
 
 def test_sliding_blocks_are_measured_on_their_tables(monkeypatch):
     monkeypatch.setattr(memories, "SAMPLES", 12)
+    monkeypatch.setattr(sliding, "ATTENDED", 3)
+    history: Any = sliding.HISTORIES["chained, sliding"]
+    history = replace(history, attention_frames=3)
+    monkeypatch.setitem(sliding.HISTORIES, "chained, sliding", history)
     tables, read_table = [], ChainedOuterTransformer.read_table
 
     def counted(*arguments):
