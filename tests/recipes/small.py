@@ -154,11 +154,12 @@ def double(recipe: Recipe, folder: Path) -> tuple[Any, TensorDictBase]:
     return made, batch.apply(lambda x: x.double() if x.is_floating_point() else x)
 
 
+_SHORT: dict[str, Any] = {"env_settings": ("max_episode_steps=20",)}
 _ONLINE: dict[str, Any] = {
     "backbone": tit(3),
     "name": "small",
     "evaluation_episodes": 2,
-    "env_settings": ("max_episode_steps=20",),
+    **_SHORT,
 }
 _ROLLOUTS: dict[str, Any] = {
     **_ONLINE,
@@ -173,10 +174,11 @@ _REPLAY: dict[str, Any] = {
     "total_steps": 60,
     "steps_per_batch": 20,
     "random_steps": 20,
+    "updates_per_step": 0.25,
     "log_interval": 20,
     "normalize_observations": True,
 }
-_NORMALIZED: dict[str, Any] = {"backbone": tit(3), "normalize_observations": True}
+_NORMALIZED: dict[str, Any] = {**_SHORT, "backbone": tit(3), "normalize_observations": True}
 _CRITIC: dict[str, Any] = {**_NORMALIZED, "critic": "backbone", "total_updates": 9}
 
 
@@ -220,10 +222,9 @@ RECIPES: dict[str, Callable[[Path], Recipe]] = {
     "td3bc": partial(make, TD3BC, **_CRITIC),
     "cql": partial(make, CQL, over_critics="sum", **_CRITIC),
     "discrete-cql": partial(make_discrete_cql, **_NORMALIZED),
-    "dt": make_dt,
-    "dt, discrete": make_cartpole_dt,
-    "odt": make_odt,
-    "odt, offline": partial(make_odt, rounds=0, pretraining_updates=10),
+    "dt": partial(make_dt, **_SHORT),
+    "dt, discrete": partial(make_cartpole_dt, **_SHORT),
+    "odt": partial(make_odt, **_SHORT),
 }
 """Makes a small recipe of each algorithm, with the data that it needs in a folder."""
 

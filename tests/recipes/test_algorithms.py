@@ -35,7 +35,6 @@ NOISE = {
         "cql",
         "cql, mingru",
         "odt",
-        "odt, offline",
     ],
     "gumbel": [
         "ppo",
