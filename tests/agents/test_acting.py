@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from functools import cache
 from pathlib import Path
 
 import gymnasium
@@ -21,20 +22,29 @@ from torchrl_tit import load_agent
 from torchrl_tit.agents import agent_names
 from torchrl_tit.export import export_policy
 from torchrl_tit.settings.literals import parse_assignments
-from torchrl_tit.settings.networks import lstm
+from torchrl_tit.settings.networks import dt_tit, lstm, mlp
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "act_from_onnx.py"
 STEPS = 12
 
 
-def made(name, folder):
-    if name in agent_names():
-        return load_agent(name)
-    if name == "dt":
-        return load_agent(train(make_dt(folder), folder / "run").folder)
-    backbone = {"lstm": lstm(1), "blackjack": tit(3)}[name]
-    env = "Blackjack-v1" if name == "blackjack" else "Pendulum-v1"
-    return load_agent(make_run(folder / "run", PPO(env=env, backbone=backbone)))
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Loads an agent by name; runs are made once."""
+
+    @cache
+    def run(name):
+        folder = tmp_path_factory.mktemp(name)
+        if name == "dt":
+            backbone = dt_tit(4, embed_dim=8, num_blocks=1)
+            dt = make_dt(folder, iterations=1, evaluation_episodes=1, backbone=backbone)
+            return train(dt, folder / "run").folder
+        small = {"hidden_dim": 8, "embed_dim": 8, "features_dim": 8}
+        backbone = {"lstm": lstm(1, **small), "frames": mlp(3, hidden_dim=8)}[name]
+        recipe = PPO(env="Pendulum-v1", backbone=backbone, evaluation_episodes=1)
+        return make_run(folder / "run", recipe)
+
+    return lambda name: load_agent(name if name in agent_names() else run(name))
 
 
 def tasks(agent, count):
@@ -43,8 +53,8 @@ def tasks(agent, count):
 
 
 @pytest.mark.parametrize("name", [*agent_names(), "dt", "lstm"])
-def test_one_by_one_as_in_an_evaluation(tmp_path, name):
-    agent = made(name, tmp_path)
+def test_one_by_one_as_in_an_evaluation(made, name):
+    agent = made(name)
     env = agent.make_env(1)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         first = env.reset(seed=4)
@@ -61,9 +71,9 @@ def test_one_by_one_as_in_an_evaluation(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", ["cartpole-no-velocity", "dt", "lstm"])
-def test_many_at_a_time_each_as_if_alone(tmp_path, name):
+def test_many_at_a_time_each_as_if_alone(made, name):
     """Episodes begin at different times, in some copies only."""
-    agent = made(name, tmp_path)
+    agent = made(name)
     draw = np.random.default_rng(0)
     [env] = tasks(agent, 1)
     frames = draw.normal(size=(STEPS, 3, *env.observation_space.shape))
@@ -81,8 +91,8 @@ def test_many_at_a_time_each_as_if_alone(tmp_path, name):
             np.testing.assert_allclose(action, together[step][copy], rtol=1e-4, atol=1e-5)
 
 
-def test_missing_values_are_held(tmp_path):
-    agent = made("dt", tmp_path)
+def test_missing_values_are_held(made):
+    agent = made("dt")
     draw = np.random.default_rng(0)
     frames = draw.normal(size=(5, 11))
     held, whole = frames.copy(), frames.copy()
@@ -119,11 +129,11 @@ def test_an_agent_without_an_environment(tmp_path):
     assert torch.is_grad_enabled()
 
 
-@pytest.mark.parametrize("name", ["cartpole-no-velocity", "dt", "lstm"])
-def test_a_file_acts_as_its_agent(tmp_path, name):
+@pytest.mark.parametrize("name", ["frames", "dt", "lstm"])
+def test_a_file_acts_as_its_agent(made, tmp_path, name):
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnxscript")
-    agent, file = made(name, tmp_path), tmp_path / "agent.onnx"
+    agent, file = made(name), tmp_path / "agent.onnx"
     export_policy(agent.policy, agent.make_env, file, step_by_step=True)
     exported = runpy.run_path(str(EXAMPLE))["Agent"](str(file))
     draw = np.random.default_rng(0)
