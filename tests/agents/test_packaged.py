@@ -49,7 +49,7 @@ def test_they_act(name):
     """The quick ones repeat the first episodes of their evaluation; the others take steps."""
     agent = load_agent(name)
     if agent.recipe["env"] in QUICK:
-        episodes = 4
+        episodes = 2
         before = torch.tensor(agent.evaluation["returns"][:episodes])
         # Not exactly: processors round differently, which can change an action.
         assert agent.evaluate(episodes).mean() == pytest.approx(before.mean().item(), rel=0.15)

@@ -65,7 +65,13 @@ _REPLAY: dict[str, Any] = {
     "checkpoint_interval": 10**6,
     "evaluation_episodes": 1,
 }
-SAC_RECIPE = SAC(env="Pendulum-v1", backbone=mlp(2, hidden_dim=8), critic_hidden=(8,), **_REPLAY)
+SAC_RECIPE = SAC(
+    env="Pendulum-v1",
+    env_settings=("max_episode_steps=40",),
+    backbone=mlp(2, hidden_dim=8),
+    critic_hidden=(8,),
+    **_REPLAY,
+)
 DQN_RECIPE = DQN(env="CartPole-v1", backbone=TIT, buffer_size=64, slice_length=4, **_REPLAY)
 RECIPES: dict[str, Recipe] = {
     "CartPole": PPO_RECIPE,

@@ -261,8 +261,8 @@ def test_recipes_of_memory_differ_in_the_memory_alone(task: str) -> None:
 @pytest.mark.parametrize(
     "name",
     [f"ppo/{name}/enhanced-tit" for name in ("ant", "cartpole", "memory-s7")]
-    + [f"ppo/pong/{network}" for network in (*IMAGE_NETWORKS, "catformer-tuned", "coberl-tuned")]
-    + [f"ppo/minatar-asterix/{network}" for network in ("minatar-cnn", *ABLATED)]
+    + [f"ppo/pong/{network}" for network in ("resnet", "enhanced-tit-wo-outer", "coberl-tuned")]
+    + [f"ppo/minatar-asterix/{network}" for network in ("minatar-cnn", "enhanced-tit")]
     + ["ppo/pong-flickering/enhanced-tit-k16"]
     + ["sac/hopper/mlp", "odt/hopper-medium-replay-v2/odt-small"],
 )

@@ -70,7 +70,8 @@ def test_training_sees_the_signs_of_rewards_and_returns_are_raw(clip, tmp_path, 
     """Of Pendulum, whose rewards are between -16 and 0."""
     rewards = []
     note_calls(monkeypatch, "collected", lambda batch, *_: rewards.append(batch["next", "reward"]))
-    recipe = replace(RECIPE, env="Pendulum-v1", steps_per_batch=400, total_steps=400, epochs=1)
+    recipe = replace(RECIPE, env="Pendulum-v1", env_settings=("max_episode_steps=100",))
+    recipe = replace(recipe, steps_per_batch=200, total_steps=200, epochs=1)
     run = train(replace(recipe, clip_rewards=clip), tmp_path / "run")
     assert set(rewards[0].unique().tolist()) <= {-1.0, 0.0} if clip else rewards[0].min() < -2
     assert read_metrics(run.folder / "metrics.csv")[0]["return_mean"] < -200
