@@ -19,6 +19,8 @@ from tests.recipes.untrained import untrained
 from torchrl_tit.settings.networks import enhanced_tit, mlp
 
 TIT, MLP = "ppo/cartpole/enhanced-tit", "ppo/cartpole/mlp"
+# For pages whose charts do not matter.
+FEW = {name: column for name, column in metrics_of(0).items() if name in ("step", "return_mean")}
 
 
 class Page(HTMLParser):
@@ -142,7 +144,7 @@ def test_long_names_leave_room_for_boxes(tmp_path):
     fields = {"num_envs": 4, "gamma": 0.97, "gae_lambda": 0.9, "max_grad_norm": 0.7}
     fields |= {"reward_scale": 0.1, "adam_eps": 1e-6}
     for of in (TIT, MLP):
-        write_run(tmp_path / of, of, returns=[300.0, 310.0], **fields)
+        write_run(tmp_path / of, of, returns=[300.0, 310.0], metrics=FEW, **fields)
     report(tmp_path, "--out", tmp_path / "a.html", "--no-pictures")
 
 
@@ -173,7 +175,8 @@ def test_a_run_that_is_not_as_far_is_named(tmp_path):
 def test_settings_under_one_name_that_is_not_registered(tmp_path):
     for width in (4, 8):
         path = tmp_path / str(width)
-        write_run(path, MLP, returns=[float(width)], backbone=mlp(hidden_dim=width), name="mine/a")
+        settings = {"backbone": mlp(hidden_dim=width), "name": "mine/a"}
+        write_run(path, MLP, returns=[float(width)], metrics=FEW, **settings)
     report(tmp_path, "--out", tmp_path / "a.html", "--no-pictures")
     text = Page(tmp_path / "a.html").text
     assert text.count("mine/a (backbone.history.hidden_dim 8)") >= 2
@@ -181,8 +184,8 @@ def test_settings_under_one_name_that_is_not_registered(tmp_path):
 
 def test_names_cannot_be_markup_or_formulas(tmp_path):
     evil = "</script><img src=x onerror=alert(1)> $\\frac$"
-    run = write_run(tmp_path / "a&b <i>", TIT, env_settings=(f"render={evil!r}",))
-    write_run(tmp_path / "other", TIT, returns=[1.0])
+    run = write_run(tmp_path / "a&b <i>", TIT, env_settings=(f"render={evil!r}",), metrics=FEW)
+    write_run(tmp_path / "other", TIT, returns=[1.0], metrics=FEW)
     (run / "versions.json").write_text(json.dumps({evil: evil}))
     words = ["--title", evil, "--import", "gymnasium.envs.classic_control", "--no-pictures"]
     report(run, tmp_path / "other", "--out", tmp_path / "a.html", *words)
@@ -196,7 +199,7 @@ def test_names_cannot_be_markup_or_formulas(tmp_path):
 def acting(tmp_path):
     """A run of a small network that can act."""
     network = enhanced_tit(2, patch_size="auto", embed_dim=8, num_blocks=1, features_dim=8)
-    folder = write_run(tmp_path / "run", MLP, backbone=network)
+    folder = write_run(tmp_path / "run", MLP, metrics=FEW, backbone=network)
     recipe = recipe_from_json((folder / "recipe.json").read_bytes(), "")
     untrained(tmp_path / "weights", recipe).checkpoints.rename(folder / "checkpoints")
     return folder
@@ -232,7 +235,7 @@ def test_a_film_and_what_the_agent_looks_at(acting, tmp_path, capsys):
     ],
 )
 def test_damaged_files_are_named(tmp_path, capsys, name, content, message):
-    folder = write_run(tmp_path / "run", TIT, returns=[1.0])
+    folder = write_run(tmp_path / "run", TIT, returns=[1.0], metrics=FEW)
     (folder / name).write_text(content)
     words = [folder, "--out", tmp_path / "a.html", "--no-pictures"]
     if message is None:
@@ -244,7 +247,7 @@ def test_damaged_files_are_named(tmp_path, capsys, name, content, message):
 
 def test_agents_in_the_middle_are_shown(tmp_path, monkeypatch):
     for seed, value in enumerate([10.0, 500.0, 300.0]):
-        folder = write_run(tmp_path / f"seed-{seed}", MLP, seed, [value], backbone=mlp())
+        folder = write_run(tmp_path / f"seed-{seed}", MLP, seed, [value], FEW, backbone=mlp())
         (folder / "checkpoints").mkdir()
     monkeypatch.setattr(reports, "checkpoint_steps", lambda folder: [1])
     shown = []
