@@ -48,7 +48,7 @@ def test_features_are_those_of_the_full_pass_whatever_comes(name, padding):
     streams = Streams(5, 4, shape, padding, dtype)
     evaluation = Streams(3, 4, shape, padding, dtype)
     with backbone.acting():
-        for _ in range(60):
+        for _ in range(30):
             match random.randrange(10):
                 case 0:  # evaluation in between
                     assert_exact(backbone, evaluation.step(torch.rand(3) < 0.2))
@@ -311,7 +311,7 @@ def test_a_recorded_backbone_is_the_whole_network(record):
     with backbone.acting():
         args = (fill(backbone, stream),)
         if record == "compile":
-            recorded = torch.compile(backbone, backend="aot_eager", fullgraph=True)
+            recorded = torch.compile(backbone, backend="eager", fullgraph=True)
         elif record == "jit":
             recorded = torch.jit.trace(lambda history: backbone(history), args, check_trace=False)
         else:
@@ -345,7 +345,7 @@ def test_compiled_parts(name):
 
     def backend(graph, inputs):
         graphs.append([x.shape for x in inputs if isinstance(x, torch.Tensor)])
-        return torch._dynamo.lookup_backend("aot_eager")(graph, inputs)
+        return graph
 
     backbone.compile_parts(backend=backend, dynamic=False, fullgraph=True)
     stream = torch.randn(5, 20, *shape)
