@@ -35,7 +35,7 @@ PENDULUM_RECIPE = SAC(
     batch_size=16,
     random_steps=100,
     total_steps=400,
-    updates_per_step=0.2,
+    updates_per_step=0.04,
 )
 # The fixtures in conftest.py write the recipes and fill in their paths.
 CARTPOLE = Collection(
