@@ -172,11 +172,8 @@ def test_maps_of_several_agents_on_the_same_frames(pong, tmp_path, monkeypatch):
         drawn.append([axes.images[0].get_array() for axes in figure.axes])
         drawn.append([axes.get_title() for axes in figure.axes if axes.get_title()])
 
-    explain(pong["tit"], pong["cnn"], "--step", 3, 1, "--out", tmp_path / "maps.png")
-    height, width = imageio.imread(tmp_path / "maps.png").shape[:2]
-    assert width > 300 < height, "two rows of three pictures"
     monkeypatch.setattr(paper_figures, "_save", save)
-    explain(pong["tit"], pong["cnn"], "--step", 1, 3, "--out", tmp_path / "a.png")
+    explain(pong["tit"], pong["cnn"], "--step", 3, 1, "--out", tmp_path / "a.png")
     explain(pong["tit"], "--step", 1, 3, "--out", tmp_path / "b.png")
     both, titles, alone, _ = drawn
     assert titles == ["observation", "tit", "cnn"]

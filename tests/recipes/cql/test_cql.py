@@ -65,7 +65,8 @@ def test_temperature_and_critics_then_actor_then_targets(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
 def test_dropout_is_on_in_updates_and_off_in_evaluations(tmp_path, make, monkeypatch):
-    recipe = make(tmp_path, **({"critic": "backbone"} if make is make_cql else {}))
+    settings = {"critic": "backbone"} if make is make_cql else {}
+    recipe = make(tmp_path, total_updates=2, evaluation_interval=2, **settings)
     seen = set()
     forward = HistoryNetwork.forward
 
