@@ -11,7 +11,8 @@ from torchrl_tit.settings import FrameSettings, HistorySettings
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
-RUN_ELSEWHERE = ("tutorials", "how-to")  # with their commands: test_tutorials.py
+# With their commands in test_tutorials.py, and README.md without extras in tests/test_extras.py.
+RUN_ELSEWHERE = ("tutorials", "how-to", ROOT.name)
 
 
 def name(path: Path) -> str:
