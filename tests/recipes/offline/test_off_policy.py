@@ -178,14 +178,15 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert sorted(x["dataset"] for x in found) == sorted([data, str(other)])
     assert "is a folder: name a file" in fails(capsys, "evaluate", run.folder, "--out", tmp_path)
     assert evaluation["low"] <= evaluation["value"] <= evaluation["high"]
-    dt = train(make_dt(tmp_path), tmp_path / "dt")
+    dt = train(make_dt(tmp_path, iterations=1, evaluation_episodes=1), tmp_path / "dt")
+    ppo = PPO(env="CartPole-v1", backbone=SMALL, evaluation_episodes=1)
     memory: dict[str, Any] = {"backbone": gru(hidden_dim=8), "slice_length": 4}
     for folder, message in {
         train(
             make(BC, tmp_path, total_updates=1, **memory), tmp_path / "memory"
         ).folder: "gru carries a state: leave out --ope",
         dt.folder: "depends on the return that it is told",
-        make_run(tmp_path / "ppo", PPO(env="CartPole-v1", backbone=SMALL)): "reads no data sets",
+        make_run(tmp_path / "ppo", ppo): "reads no data sets",
     }.items():
         words = ["evaluate", folder, "--dataset", tmp_path / "hopper.hdf5", "--ope", "fqe"]
         assert message in fails(capsys, *words)
