@@ -31,8 +31,8 @@ RECIPE = PPO(
 )
 
 
-@pytest.fixture(params=["lstm", "mingru", "gated-deltanet", "mamba2"])
-def batch(request):
+@pytest.fixture(scope="module", params=["lstm", "mingru", "gated-deltanet", "mamba2"])
+def collected(request):
     """A batch of 200 steps of 2 environments, and the algorithm whose policy took them."""
     torch.manual_seed(0)
     backbone = RECIPE.backbone
@@ -52,8 +52,16 @@ def batch(request):
         use_buffers=False,
     )
     with torch.no_grad():
-        yield next(iter(collector)), algorithm
+        batch = next(iter(collector))
     collector.shutdown()
+    return batch, algorithm
+
+
+@pytest.fixture
+def batch(collected):
+    batch, algorithm = collected
+    with torch.no_grad():
+        yield batch.clone(), algorithm
 
 
 def test_the_next_values_know_the_state_before_them(batch):
@@ -94,7 +102,7 @@ def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
 
 
 def test_a_film_is_evaluated_alike(tmp_path, capsys):
-    run = train(RECIPE, tmp_path / "run")
+    run = train(replace(RECIPE, total_steps=64), tmp_path / "run")
     mean = evaluate(run)["mean"]
     # One episode after the other remembers no more of them than all side by side.
     main(["play", str(run.folder), "--out", str(tmp_path / "film.gif"), "--episodes", "3"])
