@@ -9,10 +9,8 @@ windows. Times are milliseconds per step, in processor time of one thread.
 from __future__ import annotations
 
 import itertools
-import statistics
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -53,40 +51,30 @@ def make_windows(case: Case, steps: int) -> list[Tensor]:
 
 @torch.no_grad()
 def measure(case: Case, rounds: int, seconds: float, *, compiled: bool) -> dict[str, Any]:
-    """Measures ours, ours compiled, ours with K = 64 and the straightforward network."""
+    """Measures ours, ours compiled and the straightforward network."""
     torch.manual_seed(0)
-    long = replace(case, num_frames=64)
     with ExitStack() as stack:
 
-        def act(case: Case, network: Callable[[Tensor], Any]) -> Callable[[], None]:
+        def act(network: Callable[[Tensor], Any]) -> Callable[[], None]:
             windows = itertools.cycle(make_windows(case, STEPS))
             return lambda: network(next(windows))
 
-        def ours(case: Case, compiled: bool) -> Callable[[], None]:
+        def ours(compiled: bool) -> Callable[[], None]:
             backbone = Backbone(case.ours()).eval()
             if compiled:
                 backbone.compile_parts(dynamic=False)
             stack.enter_context(backbone.acting())
-            return act(
-                case, lambda window: backbone(TensorDict({"history": window}, [len(window)]))
-            )
+            return act(lambda window: backbone(TensorDict({"history": window}, [len(window)])))
 
-        steps = {"ours": ours(case, False)}
+        steps = {"ours": ours(False)}
         if compiled:
-            steps["compiled"] = ours(case, True)
-        steps["straightforward"] = act(case, case.straightforward().eval())
-        if case.num_frames == 4:
-            steps["ours, K = 64"] = ours(long, False)
-            if compiled:
-                steps["compiled, K = 64"] = ours(long, True)
+            steps["compiled"] = ours(True)
+        steps["straightforward"] = act(case.straightforward().eval())
         times = take_turns(steps, rounds, seconds)
     row: dict[str, Any] = {**case.record(), **{f"{name}_ms": x for name, x in times.items()}}
     for name in ("ours", "compiled"):
         if name in times:
             row[f"{name}_ratios"] = ratios(times["straightforward"], times[name])
-            row[f"{name}_median_ratio"] = statistics.median(row[f"{name}_ratios"])
-        if f"{name}, K = 64" in times:
-            row[f"{name}_growth"] = ratios(times[f"{name}, K = 64"], times[name])
     return row
 
 

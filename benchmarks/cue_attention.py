@@ -52,7 +52,7 @@ class Decision:
         return sum(self.cue) / len(self.cue)
 
 
-def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None) -> list[Decision]:
+def measure_decisions(run: Run, *, episodes: int = 100) -> list[Decision]:
     """Plays episodes and measures what the agent reads of the cue in their last step.
 
     In MiniGrid-Memory the cue is the object in the room where the agent starts, whenever it is in
@@ -63,7 +63,6 @@ def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None)
         run: a run on MiniGrid-Memory, or on a task whose first observation is the cue, such as
             TMaze-v0.
         episodes: number of episodes.
-        seed: seed of the first episode; by default the evaluation's.
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
@@ -77,7 +76,6 @@ def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None)
         raise ValueError(f"{run.folder}: histories begin with zeros, not with the cue")
     policy = algorithm.policy
     network = find_network(policy)
-    first = run.recipe.evaluation_seed if seed is None else seed
     found = []
     shown: list[bool] = []
     with closing(algorithm.make_env(1)) as env:
@@ -87,7 +85,8 @@ def measure_decisions(run: Run, *, episodes: int = 100, seed: int | None = None)
             shown.append(shows_cue(len(shown)))
             return policy(tensordict)
 
-        for states, outcome in islice(play_episodes(env, watched, first), episodes):
+        played = play_episodes(env, watched, run.recipe.evaluation_seed)
+        for states, outcome in islice(played, episodes):
             attention = outer_attention(network, *histories_of(policy, states[-1]))
             copies = max(network.num_frames - len(shown), 0)
             cue = [shown[0]] * copies + shown[-network.num_frames :]
@@ -157,7 +156,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser("python -m benchmarks.cue_attention")
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of trained runs")
     parser.add_argument("--episodes", type=int, default=100, help="episodes of each run")
-    parser.add_argument("--seed", type=int, help="of the first episode; default: the evaluation's")
     parser.add_argument("--out", type=folder, help="folder for cue_attention.md, .json and .png")
     options = parser.parse_args(arguments)
     try:
@@ -165,7 +163,7 @@ def main(arguments: list[str] | None = None) -> None:
         for run in map(Run.open, options.runs):
             name = f"{run.recipe.name}, seed {run.recipe.seed}"
             name += f" ({run.folder})" if name in groups else ""
-            groups[name] = measure_decisions(run, episodes=options.episodes, seed=options.seed)
+            groups[name] = measure_decisions(run, episodes=options.episodes)
     except (ValueError, OSError, RuntimeError) as error:
         parser.error(" ".join(str(error).split()))
     numbers = {

@@ -69,7 +69,6 @@ def measure_figure_claims(
     run: Run,
     *,
     steps: int = 500,
-    seed: int | None = None,
     background: Background = "place",
     target: Target = "action",
 ) -> FigureClaims:
@@ -81,7 +80,6 @@ def measure_figure_claims(
     Args:
         run: a run on a task whose observation, or one of them, is an image.
         steps: number of steps to look at.
-        seed: seed of the first episode; by default the evaluation's.
         background: see :func:`~torchrl_tit.analysis.find_objects`.
         target: what maps explain; see :data:`~torchrl_tit.analysis.targets.Target`.
 
@@ -99,11 +97,10 @@ def measure_figure_claims(
     if image is None:
         raise ValueError(f"{run.folder}: its network reads no image that Grad-CAM can map")
     index = list(network.observations).index(image)
-    seed = run.recipe.evaluation_seed if seed is None else seed
     states: list[TensorDictBase] = []
     numbers: list[int] = []
     with closing(algorithm.make_env(1)) as env:
-        played = enumerate(play_episodes(env, policy, seed))
+        played = enumerate(play_episodes(env, policy, run.recipe.evaluation_seed))
         while len(states) < steps:
             number, (found, _) = next(played)
             states += found
@@ -194,28 +191,18 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser("python -m benchmarks.figure_claims")
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of trained runs")
     parser.add_argument("--steps", type=int, default=500, help="steps of each run to look at")
-    parser.add_argument("--seed", type=int, help="of the first episode; default: the evaluation's")
-    parser.add_argument(
-        "--background",
-        choices=["place", "color"],
-        default="place",
-        help="what is no object: the median at each place, or each frame's most common color",
-    )
-    parser.add_argument("--target", choices=["action", "value"], default="action")
     parser.add_argument("--out", type=folder, help="folder for figure_claims.md and .json")
     options = parser.parse_args(arguments)
-    chosen = {name: getattr(options, name) for name in ("steps", "background", "target")}
     try:
         groups: dict[str, list[FigureClaims]] = {
-            one.label: [measure_figure_claims(run, seed=options.seed, **chosen) for run in one.runs]
+            one.label: [measure_figure_claims(run, steps=options.steps) for run in one.runs]
             for one in group_runs(Run.open(folder) for folder in options.runs)
         }
     except (ValueError, OSError, RuntimeError) as error:
         parser.error(" ".join(str(error).split()))
     found = {name: [asdict(claims) for claims in found] for name, found in groups.items()}
-    words = " ".join(f"--{name} {value}" for name, value in chosen.items())
-    command = f"python -m benchmarks.figure_claims RUN ... {words}"
-    numbers = {**chosen, "runs": found}
+    command = f"python -m benchmarks.figure_claims RUN ... --steps {options.steps}"
+    numbers = {"steps": options.steps, "runs": found}
     publish("figure_claims", to_markdown(groups), numbers, options.out, command)
 
 

@@ -33,7 +33,8 @@ from .measuring import add_missing_rows
 
 COLUMNS = ["network", "pixels", "seed", "gradient_steps", "accuracy"]
 NUM_FRAMES = 16
-HELD_OUT = 512
+EPISODES, HELD_OUT, LIMIT = 5512, 512, 3000
+"""The scripted episodes, those that are not trained on, and the gradient steps of a row."""
 _SIZE, _TILE = 7, 8
 _LEFT, _RIGHT, _FORWARD, _WAIT = 0, 1, 2, 6
 _EAST, _NORTH = 0, 3
@@ -105,10 +106,8 @@ def gradient_steps(
     episodes: Episodes,
     *,
     seed: int,
-    limit: int,
-    batch_size: int = 64,
+    limit: int = LIMIT,
     held_out: int = HELD_OUT,
-    learning_rate: float = 3e-4,
 ) -> tuple[int, float]:
     """Trains a network; returns the number of gradient steps and the final accuracy."""
     torch.manual_seed(seed)
@@ -117,7 +116,7 @@ def gradient_steps(
     assert isinstance(network, HistoryNetwork)
     init_orthogonal_(network)
     head = nn.Linear(network.features_dim, 1)
-    optimizer = torch.optim.Adam([*network.parameters(), *head.parameters()], learning_rate)
+    optimizer = torch.optim.Adam([*network.parameters(), *head.parameters()], lr=3e-4)
     train = len(episodes.matches) - held_out
     accuracy = 0.0
 
@@ -126,7 +125,7 @@ def gradient_steps(
         return head(network.encode_history(tokens[episodes.histories[chosen]])).squeeze(-1)
 
     for step in range(1, limit + 1):
-        chosen = torch.randint(train, (batch_size,))
+        chosen = torch.randint(train, (64,))
         loss = F.binary_cross_entropy_with_logits(logits(chosen), episodes.matches[chosen])
         optimizer.zero_grad()
         loss.backward()
@@ -145,20 +144,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Trains every network with every scale, and writes a row for each."""
     parser = argparse.ArgumentParser("python -m benchmarks.image_scale")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--episodes", type=int, default=5512)
-    parser.add_argument("--limit", type=int, default=3000, help="gradient steps of a row")
-    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="CSV that rows are added to")
     options = parser.parse_args(arguments)
-    if options.episodes <= HELD_OUT or options.limit < 1:
-        parser.error(f"--episodes must be above {HELD_OUT}, and --limit at least 1")
-    torch.set_num_threads(options.threads)
-    episodes = Episodes(options.episodes)
+    torch.set_num_threads(1)
+    episodes = Episodes(EPISODES)
     networks = memory_networks(NUM_FRAMES, patch_size=_TILE)
 
     def measure(name: str, scale: str, seed: int) -> list[object]:
-        settings = {"seed": seed, "limit": options.limit}
-        steps, accuracy = gradient_steps(networks[name], PIXELS[scale], episodes, **settings)
+        steps, accuracy = gradient_steps(networks[name], PIXELS[scale], episodes, seed=seed)
         return [name, scale, seed, steps, round(accuracy, 3)]
 
     runs = product(("lstm", "gtrxl", "enhanced-tit"), PIXELS, options.seeds)

@@ -20,7 +20,6 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from torch.utils.flop_counter import FlopCounterMode
 
 from recipes.tools.results.numbers import number
 from recipes.tools.results.numbers import numbers as format_all
@@ -76,20 +75,6 @@ def empty_compile_cache() -> Iterator[None]:
         patch.dict(os.environ, TORCHINDUCTOR_CACHE_DIR=cache),
     ):
         yield
-
-
-def count_flops(step: Callable[[], Any]) -> int:
-    """Counts floating-point operations of the matrix products of a step, backward included."""
-    with FlopCounterMode(display=False) as counter:
-        step()
-    return counter.get_total_flops()
-
-
-def peak_flops(rows: int = 2048, inner: int = 2048, columns: int = 2048) -> float:
-    """Measures the floating-point operations per second of one large product."""
-    a, b = torch.randn(rows, inner), torch.randn(inner, columns)
-    best = min(milliseconds(lambda: a @ b, 0) for _ in range(20))
-    return 2000 * rows * inner * columns / best
 
 
 def spread(values: Sequence[float]) -> str:

@@ -52,6 +52,8 @@ COLUMNS = [
     "processor_steps_per_second",
     "sb3_contrib",
 ]
+TOTAL_STEPS, EPISODES = 1_000_000, 100
+"""The steps of a run, and the episodes of its evaluation."""
 THRESHOLD = 0.0
 """Successful episodes return more."""
 NUM_ENVS = 16
@@ -156,7 +158,7 @@ def make_envs(size: int, seed: int) -> VecEnv:
     return VecTransposeImage(make_vec_env(partial(make_env, size), NUM_ENVS, seed=seed))
 
 
-def measure(size: int, seed: int, total_steps: int, settings: str, episodes: int) -> list[object]:
+def measure(size: int, seed: int, total_steps: int, settings: str) -> list[object]:
     """Trains once and evaluates the last weights with their most likely actions; returns a row."""
 
     def evaluate(seed: int) -> list[float]:
@@ -164,7 +166,7 @@ def measure(size: int, seed: int, total_steps: int, settings: str, episodes: int
         if like_recipe:
             test_envs = VecNormalize(test_envs, training=False, norm_reward=False)
             test_envs.obs_rms = envs.obs_rms
-        returns, _ = evaluate_policy(agent, test_envs, episodes, return_episode_rewards=True)
+        returns, _ = evaluate_policy(agent, test_envs, EPISODES, return_episode_rewards=True)
         assert isinstance(returns, list)
         return returns
 
@@ -211,16 +213,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser("python -m benchmarks.recurrent_ppo")
     parser.add_argument("--size", type=int, default=7, help="of MiniGrid-MemoryS{size}-v0")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--total-steps", type=int, default=1_000_000)
     parser.add_argument("--settings", choices=SETTINGS, default="default")
-    parser.add_argument("--episodes", type=int, default=100, help="episodes of the evaluation")
-    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="CSV that rows are added to")
     options = parser.parse_args(arguments)
-    torch.set_num_threads(options.threads)
-    runs = [(options.size, seed, options.total_steps, options.settings) for seed in options.seeds]
-    measure_run = partial(measure, episodes=options.episodes)
-    add_missing_rows(options.out, COLUMNS, runs, measure_run)
+    torch.set_num_threads(1)
+    runs = [(options.size, seed, TOTAL_STEPS, options.settings) for seed in options.seeds]
+    add_missing_rows(options.out, COLUMNS, runs, measure)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ A row is added to --out as soon as a run ends; runs that have a row are not repe
 from __future__ import annotations
 
 import argparse
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
@@ -29,7 +28,7 @@ COLUMNS = [
     "training_last_fifth",
     "stable_baselines3",
 ]
-EVALUATION_SEED = 1_000_000
+EVALUATION_SEED, EPISODES = 1_000_000, 100
 
 
 class LastFifth(BaseCallback):
@@ -51,7 +50,7 @@ class LastFifth(BaseCallback):
         return True
 
 
-def measure(env: str, seed: int, total_steps: int, episodes: int) -> list[object]:
+def measure(env: str, seed: int, total_steps: int) -> list[object]:
     """Trains once and evaluates the last weights with their most likely actions; returns a row."""
     agent = PPO("MlpPolicy", make_vec_env(env, seed=seed), seed=seed, device="cpu")
     last = LastFifth(total_steps)
@@ -59,7 +58,7 @@ def measure(env: str, seed: int, total_steps: int, episodes: int) -> list[object
     returns, _ = evaluate_policy(
         agent,
         make_vec_env(env, seed=EVALUATION_SEED),
-        n_eval_episodes=episodes,
+        n_eval_episodes=EPISODES,
         return_episode_rewards=True,
     )
     training = round(fmean(last.returns), 1) if last.returns else ""
@@ -73,14 +72,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("envs", nargs="+", metavar="ENV", help="Gymnasium's ids")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--total-steps", type=int, default=100_000)
-    parser.add_argument("--episodes", type=int, default=100, help="episodes of the evaluation")
-    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="CSV that rows are added to")
     options = parser.parse_args(arguments)
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(1)
     runs = [(env, seed, options.total_steps) for seed in options.seeds for env in options.envs]
-    measure_run = partial(measure, episodes=options.episodes)
-    add_missing_rows(options.out, COLUMNS, runs, measure_run)
+    add_missing_rows(options.out, COLUMNS, runs, measure)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,7 @@
 
 64 samples, forward, backward and fused Adam, one thread, processor time, eager and compiled. Ours
 reads segments of consecutive steps in TorchRL's recurrent mode: one of 64, or four of 16, which is
-the default of the PPO recipes. Beside it, ours and the straightforward network read 64 full windows
-of K frames. The floor is the time that our step's matrix products would take at the rate of one
-large product on this core.
+the default of the PPO recipes. The straightforward network reads 64 full windows of K frames.
 """
 
 from __future__ import annotations
@@ -20,7 +18,7 @@ from torchrl.modules import set_recurrent_mode
 
 from torchrl_tit import Backbone
 
-from .measuring import count_flops, empty_compile_cache, peak_flops, take_turns
+from .measuring import empty_compile_cache, take_turns
 from .straightforward import Case
 
 SAMPLES, ROUNDS, SECONDS = 64, 5, 0.5
@@ -92,10 +90,10 @@ def on_segments(case: Case, length: int, compiled: bool) -> Callable[[], None]:
     return make_descent(network, loss_of, make_segments(case, length), compiled)
 
 
-def on_windows(case: Case, network: nn.Module, compiled: bool = False) -> Callable[[], None]:
-    """Returns a training step on full windows."""
-    windows = case.frames(case.num_frames)
-    return make_descent(network, lambda x: network(x).square().mean(), windows, compiled)
+def on_windows(case: Case) -> Callable[[], None]:
+    """Returns a training step of the straightforward network on full windows."""
+    network, windows = case.straightforward(), case.frames(case.num_frames)
+    return make_descent(network, lambda x: network(x).square().mean(), windows)
 
 
 def measure(row: Row, rounds: int, seconds: float) -> dict[str, Any]:
@@ -104,19 +102,15 @@ def measure(row: Row, rounds: int, seconds: float) -> dict[str, Any]:
     case = row.case
     steps = {
         "segments": on_segments(case, row.length, False),
-        "full windows": on_windows(case, case.ours()),
-        "straightforward": on_windows(case, case.straightforward()),
+        "straightforward": on_windows(case),
     }
     if row.compiled:
         steps["segments, compiled"] = on_segments(case, row.length, True)
-        steps["full windows, compiled"] = on_windows(case, case.ours(), True)
-    flops = count_flops(on_segments(case, row.length, False))
     times = take_turns(steps, rounds, seconds)
-    return {**case.record(), "length": row.length, "ms": times, "flops": flops}
+    return {**case.record(), "length": row.length, "ms": times}
 
 
 def main() -> dict[str, Any]:
     """Measures with an empty compile cache."""
     with empty_compile_cache():
-        results = [measure(row, ROUNDS, SECONDS) for row in ROWS]
-    return {"rows": results, "flops_a_second": peak_flops()}
+        return {"rows": [measure(row, ROUNDS, SECONDS) for row in ROWS]}

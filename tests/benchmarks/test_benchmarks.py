@@ -60,7 +60,6 @@ def test_acting(case):
     row = acting.measure(case, rounds=2, seconds=0, compiled=False)
     ratios = measuring.ratios(row["straightforward_ms"], row["ours_ms"])
     assert row["ours_ratios"] == ratios
-    assert len(row.get("ours_growth", [])) == 2 * (case.num_frames == 4)
 
 
 def test_segments_hold_the_windows_that_the_peers_read():
@@ -78,7 +77,7 @@ def test_segments_hold_the_windows_that_the_peers_read():
 def test_segments_against_full_windows():
     row = segments.Row(Case("Enhanced", "arrays", 4, 32), length=16)
     result = segments.measure(row, rounds=2, seconds=0)
-    assert set(result["ms"]) == {"segments", "full windows", "straightforward"}
+    assert set(result["ms"]) == {"segments", "straightforward"}
     assert all(len(times) == 2 for times in result["ms"].values())
 
 
@@ -187,9 +186,6 @@ def test_rows_are_measured_once(tmp_path, capsys):
 
 def test_policies_are_ranked_by_discounted_returns():
     assert off_policy.discounted(np.array([2.0, 3.0]), 0.5).tolist() == [1.5, 1.75]
-    found = off_policy.rank_correlation(np.array([1.0, 5.0, 5.0, 9.0]), np.array([0, 1, 2, -7.0]))
-    # Ranks 1, 2.5, 2.5, 4 and 2, 3, 4, 1: covariance -1.5, variances 4.5 and 5.
-    assert found == pytest.approx(-1.5 / (4.5 * 5) ** 0.5)
 
 
 def test_nested_numbers_are_a_table():

@@ -72,7 +72,7 @@ def test_command(runs, tmp_path, capsys):
     text = (tmp_path / "figure_claims.md").read_text()
     assert text in capsys.readouterr().out
     assert "| tit | 2 | " in text
-    assert "Measured with `python -m benchmarks.figure_claims RUN ... --steps 4 " in text
+    assert "Measured with `python -m benchmarks.figure_claims RUN ... --steps 4`" in text
 
 
 def claims(share, attention):

@@ -38,13 +38,13 @@ def test_a_row_for_each_network_scale_and_seed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episodes: image_scale.Episodes
 ) -> None:
     def few(*arguments: Any, **settings: Any) -> tuple[int, float]:
-        return learned(*arguments, **settings, held_out=100)
+        return learned(*arguments, **settings, limit=1, held_out=100)
 
     learned = image_scale.gradient_steps
     monkeypatch.setattr(image_scale, "Episodes", lambda count: episodes)
     monkeypatch.setattr(image_scale, "gradient_steps", few)
     out = tmp_path / "rows" / "scale.csv"
-    image_scale.main(["--seeds", "3", "--limit", "1", "--out", str(out)])
+    image_scale.main(["--seeds", "3", "--out", str(out)])
     rows = list(csv.DictReader(out.open(encoding="utf-8")))
     assert len(rows) == 3 * len(image_scale.PIXELS)
     assert {(row["seed"], row["gradient_steps"]) for row in rows} == {("3", "1")}

@@ -14,13 +14,14 @@ def short(monkeypatch):
     for settings in recurrent_ppo.SETTINGS.values():
         monkeypatch.setitem(settings, "n_steps", 8)  # 128 steps in a batch
         monkeypatch.setitem(settings, "n_epochs", 1)
+    monkeypatch.setattr(recurrent_ppo, "TOTAL_STEPS", 256)
+    monkeypatch.setattr(recurrent_ppo, "EPISODES", 2)
 
 
 @pytest.mark.parametrize("settings", ["default", "recipe"])
 def test_a_row_a_run_and_none_twice(settings, short, tmp_path, monkeypatch, capsys):
     out = tmp_path / "new" / "recurrent.csv"
-    words = ["--total-steps", "256", "--episodes", "2", "--out", str(out), "--seeds", "0"]
-    words += ["--settings", settings]
+    words = ["--out", str(out), "--seeds", "0", "--settings", settings]
     recurrent_ppo.main(words)
     [row] = read_rows(out)
     assert list(row) == recurrent_ppo.COLUMNS
@@ -46,9 +47,10 @@ def test_the_environment_is_that_of_the_recipes():
     assert env.step(0)[2:4] == (False, True)
 
 
-def test_a_row_a_run(tmp_path, capsys):
+def test_a_row_a_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sb3_returns, "EPISODES", 2)
     out = tmp_path / "new" / "sb3.csv"
-    words = ["CartPole-v1", "--total-steps", "2048", "--episodes", "2", "--out", str(out)]
+    words = ["CartPole-v1", "--total-steps", "2048", "--out", str(out)]
     sb3_returns.main([*words, "--seeds", "0"])
     (row,) = read_rows(out)
     assert list(row) == sb3_returns.COLUMNS
