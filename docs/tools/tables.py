@@ -50,7 +50,6 @@ from recipes.tools.results.comparison import (
     interquartile_mean,
     normalize,
     probability_of_improvement,
-    read_references,
 )
 from recipes.tools.results.interval import FEWEST, interval_of
 from recipes.tools.results.numbers import mean_std, number, numbers
@@ -181,7 +180,7 @@ def _normalized(runs: Runs) -> dict[Any, list[float]]:
         else:
             recipe = RecordedRun(*pair).recipe
             task = (recipe.env, getattr(recipe, "hide_velocities", False))
-        found.setdefault(task, []).extend(normalize([value], task[0], read_references()))
+        found.setdefault(task, []).extend(normalize([value], task[0]))
     return found
 
 
