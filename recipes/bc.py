@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 from tensordict import TensorDictBase
@@ -60,11 +59,6 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
         policy = make_cloning_policy(self.make_backbone(env), self.action_spec)
         self._policy = policy.to(self.device)
         return LikelihoodBCLoss(self._policy)
-
-    def prepare(self, step: int, folder: Path) -> None:
-        """Builds optimizer and replay buffer."""
-        self.optimizer = self.make_adam({"": self.recipe.learning_rate})
-        self.buffer = self.make_buffer()
 
     def split(self, episodes: Episodes) -> Episodes:
         """Leaves out all but the best episodes, and holds some of the best out."""

@@ -15,7 +15,6 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.objectives import SoftUpdate
 
 from torchrl_tit.modules import make_squashed_actor
 from torchrl_tit.modules.action_specs import has_bounds
@@ -129,6 +128,11 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
     # The losses are in the order of the steps: the first that is not finite is the cause.
     columns = ("loss_alpha", "loss_qvalue", "loss_cql", "loss_actor", "alpha", "entropy")
     measures = ("action_error", "q", "advantage", "loss_cql")
+    rates: ClassVar = {
+        "log_alpha": "temperature_learning_rate",
+        "qvalue_network": "critic_learning_rate",
+        "": "actor_learning_rate",
+    }
     model: ContinuousCQLLoss
 
     def networks(self, env: EnvBase) -> nn.Module:
@@ -151,17 +155,8 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         return loss
 
     def prepare(self, step: int, folder: Path) -> None:
-        """Builds optimizer, target update and replay buffer."""
-        recipe = self.recipe
-        self.optimizer = self.make_adam(
-            {
-                "log_alpha": recipe.temperature_learning_rate,
-                "qvalue_network": recipe.critic_learning_rate,
-                "": recipe.actor_learning_rate,
-            }
-        )
-        self.target = SoftUpdate(self.model, tau=recipe.tau)
-        self.buffer = self.make_buffer()
+        """As :meth:`TransitionAlgorithm.prepare`; also compiles the losses, if that pays."""
+        super().prepare(step, folder)
         self._sample_policy = self.compiled(self.model.sample_policy, "the policy")
         self._loss = self.compiled(self.loss, "the critics' loss")
         self._actor_loss = self.compiled(self.actor_loss, "the actor's loss")
@@ -256,10 +251,8 @@ class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
         return loss
 
     def prepare(self, step: int, folder: Path) -> None:
-        """Builds optimizer, target update and replay buffer."""
-        self.optimizer = self.make_adam({"": self.recipe.learning_rate})
-        self.target = SoftUpdate(self.model, tau=self.recipe.tau)
-        self.buffer = self.make_buffer()
+        """As :meth:`TransitionAlgorithm.prepare`; also compiles the loss, if that pays."""
+        super().prepare(step, folder)
         self._loss = self.compiled(self.loss, "the loss")
 
     def loss(self, samples: TensorDictBase) -> Terms:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import ClassVar
 
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.objectives import DiscreteIQLLoss, IQLLoss, SoftUpdate
+from torchrl.objectives import DiscreteIQLLoss, IQLLoss
 
 from torchrl_tit.datasets import DatasetError, Episodes
 from torchrl_tit.settings.numbers import Inside, Rate, Weight
@@ -63,6 +63,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
     """
 
     clips_actions = True
+    rates: ClassVar = {"actor_network": "learning_rate", "": "learning_rate"}  # the first decays
     columns = ("loss_value", "loss_qvalue", "loss_actor", "nll")
     measures = ("action_error", "q", "advantage", "nll")
 
@@ -96,13 +97,6 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
             loss._make_vmap()
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss
-
-    def prepare(self, step: int, folder: Path) -> None:
-        """Builds optimizer, target update and replay buffer."""
-        rate = self.recipe.learning_rate
-        self.optimizer = self.make_adam({"actor_network": rate, "": rate})
-        self.target = SoftUpdate(self.model, tau=self.recipe.tau)
-        self.buffer = self.make_buffer()
 
     def load_data(self) -> Episodes:
         """As :meth:`TransitionAlgorithm.load_data`, with rewards scaled as in the paper.

@@ -21,6 +21,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import SoftUpdate
 
 from torchrl_tit.datasets import (
     DatasetError,
@@ -91,16 +92,18 @@ def read_data(recipe: DatasetRecipe) -> Episodes:
     path = Path(recipe.dataset)
     files = [path, *path.rglob("*")] if path.is_dir() else [path]
     stamps = {file: file.stat().st_mtime_ns for file in files if file.exists()}
-    key = recipe.dataset, path.absolute(), recipe.reading(), stamps
-    if key != _NEWEST.key:
-        _NEWEST.key, _NEWEST.episodes = None, None  # frees their memory first
-        _NEWEST.episodes = _load(recipe)
-        _NEWEST.key = key
-    episodes, spaces = _NEWEST.episodes, recipe.task_settings
-    assert episodes is not None
+    key = repr((recipe.dataset, path.absolute(), recipe.reading(), stamps))
+    if key not in _NEWEST:
+        _NEWEST.clear()  # frees their memory first
+        _NEWEST[key] = _load(recipe)
+    episodes, spaces = _NEWEST[key], recipe.task_settings
     if recipe.env or "observation_shape" not in spaces:
         return episodes
     return _checked(episodes, spaces)
+
+
+_NEWEST: dict[str, Episodes] = {}
+"""The episodes that were read last, by what they were read from: commands need them repeatedly."""
 
 
 def _load(recipe: DatasetRecipe) -> Episodes:
@@ -110,17 +113,6 @@ def _load(recipe: DatasetRecipe) -> Episodes:
     if np.any(start := getattr(spaces and spaces.action, "start", 0)):
         episodes.rows["action"] -= torch.as_tensor(start)
     return episodes
-
-
-@dataclass
-class _Newest:
-    """The episodes that were read last, and from what: commands need them more than once."""
-
-    key: Any = None
-    episodes: Episodes | None = None
-
-
-_NEWEST = _Newest()
 
 
 def _checked(episodes: Episodes, spaces: Mapping[str, Any]) -> Episodes:
@@ -414,8 +406,14 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
     terminal_observations: ClassVar[Literal["keep", "zero"]] = "keep"
     """Whether observations of terminal states are kept, or replaced by zeros."""
 
+    rates: ClassVar[Mapping[str, str]] = {"": "learning_rate"}
+    """The fields with Adam's learning rates by the beginning of the names of weights in the model;
+    the last one is that of all other weights."""
+
     optimizer: torch.optim.Optimizer
     """The optimizer of all weights, once :meth:`prepare` has made it."""
+    target: SoftUpdate
+    """The update of the target networks, if the recipe has a ``tau``, once it is made."""
 
     def __init__(self, recipe: RecipeT) -> None:
         super().__init__(recipe)
@@ -464,23 +462,19 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             **settings,
         ).to(self.device)
 
-    def make_adam(self, rates: Mapping[str, float], **settings: Any) -> torch.optim.Adam:
-        """Builds Adam with one learning rate for each network.
-
-        Args:
-            rates: learning rates by the beginning of the names of a network's weights in
-                :attr:`model`; the last one is that of all other weights.
-            **settings: further settings of Adam.
-        """
-        groups: dict[str, list[nn.Parameter]] = {name: [] for name in rates}
-        *_, last = rates
+    def prepare(self, step: int, folder: Path) -> None:
+        """Builds optimizer, target update (if there are targets) and replay buffer."""
+        recipe: Any = self.recipe
+        groups: dict[str, list[nn.Parameter]] = {start: [] for start in self.rates}
         for name, parameter in self.model.named_parameters():
-            groups[next((key for key in rates if name.startswith(key)), last)].append(parameter)
-        return torch.optim.Adam(
-            [{"params": groups[name], "lr": rate} for name, rate in rates.items()],
+            groups[next(start for start in groups if name.startswith(start))].append(parameter)
+        self.optimizer = torch.optim.Adam(
+            [{"params": groups[x], "lr": getattr(recipe, rate)} for x, rate in self.rates.items()],
             fused=True,
-            **settings,
         )
+        if hasattr(recipe, "tau"):
+            self.target = SoftUpdate(self.model, tau=recipe.tau)
+        self.buffer = self.make_buffer()
 
     def state(self) -> Mapping[str, Stateful]:
         """Optimizer, and the sampling state of the replay buffer."""

@@ -15,7 +15,6 @@ from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
-from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import OnlineDTLoss
 
@@ -28,7 +27,6 @@ from torchrl_tit.datasets import (
     make_replay_buffer,
     select_episodes,
 )
-from torchrl_tit.evaluation import check_rewards
 from torchrl_tit.extras import Missing
 from torchrl_tit.modules import acting, make_dt_actor
 from torchrl_tit.modules.tensor_module import TensorModule
@@ -47,7 +45,7 @@ from torchrl_tit.settings.numbers import (
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
 from .core.algorithm import Stateful, check_without_waiting, to_networks, total_loss
-from .core.task import seed_copies
+from .core.task import play_once, seed_copies
 from .decision_transformer import ActionSpace, SequenceAlgorithm, SequenceRecipe
 
 try:
@@ -245,10 +243,11 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
         actor = scale_noise(self.policy, recipe.exploration_scale)
         self.model.eval()
         with torch.no_grad(), acting(actor), set_exploration_type(ExplorationType.RANDOM):
-            episodes = play_episodes(env, actor)
+            steps, lengths = play_once(env, actor, _STEP)
         self.model.train()
         env.close()
-        return episodes
+        played = zip(steps, lengths, strict=True)
+        return join_episodes([_episode(rollout[:length]) for rollout, length in played])
 
 
 def make_lamb(parameters: list[nn.Parameter], learning_rate: float, weight_decay: float) -> Any:
@@ -372,31 +371,8 @@ def scale_noise(actor: TensorDictModuleBase, factor: float) -> TensorDictModuleB
     return ProbabilisticTensorDictSequential(*network, scale, draw)
 
 
-def play_episodes(env: EnvBase, policy: TensorDictModuleBase) -> Episodes:
-    """Plays one episode in each of several environments, which are stepped side by side.
-
-    Args:
-        env: the environments, [N].
-        policy: the policy that acts in them.
-
-    Raises:
-        FloatingPointError: if a reward of these episodes is NaN or infinite.
-    """
-    steps: list[TensorDictBase] = []
-    tensordict = env.reset()
-    playing = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
-    while playing.any():
-        step, tensordict = env.step_and_maybe_reset(policy(tensordict))
-        check_rewards(step["next", "reward"].squeeze(-1).masked_fill(~playing, 0))
-        steps.append(step.select(*_STEP).cpu())
-        playing &= ~step["next", "done"].squeeze(-1)
-    return join_episodes([_first_episode(rollout) for rollout in torch.stack(steps, dim=1)])
-
-
-def _first_episode(steps: TensorDictBase) -> Episodes:
-    """Builds an episode from the steps [T] of an environment, up to the first end."""
-    ends = steps["next", "done"].flatten().nonzero()
-    steps = steps[: int(ends[0]) + 1]
+def _episode(steps: TensorDictBase) -> Episodes:
+    """Builds an episode from its steps [T]."""
     terminated = steps["next", "terminated"].flatten()
     cut_off = ~terminated
     cut_off[:-1] = False

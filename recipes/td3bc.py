@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.objectives import SoftUpdate, TD3BCLoss
+from torchrl.objectives import TD3BCLoss
 
 from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.settings.numbers import Rate, Steps, Weight
@@ -57,6 +58,7 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
     """
 
     columns = ("loss_qvalue", "loss_actor", "loss_bc")
+    rates: ClassVar = {"qvalue_network": "critic_learning_rate", "": "actor_learning_rate"}
     model: TD3BCLoss
 
     def networks(self, env: EnvBase) -> nn.Module:
@@ -82,12 +84,8 @@ class TD3BCAlgorithm(TransitionAlgorithm[TD3BC]):
         return loss
 
     def prepare(self, step: int, folder: Path) -> None:
-        """Builds optimizer, target update and replay buffer."""
-        recipe = self.recipe
-        rates = {"qvalue_network": recipe.critic_learning_rate, "": recipe.actor_learning_rate}
-        self.optimizer = self.make_adam(rates)
-        self.target = SoftUpdate(self.model, tau=recipe.tau)
-        self.buffer = self.make_buffer()
+        """As :meth:`TransitionAlgorithm.prepare`, with the terms of the actor's last update."""
+        super().prepare(step, folder)
         self.actor_terms = nn.Module()
         """The actor's terms at its last update, which steps without an update report again."""
         self.actor_terms.register_buffer("values", torch.zeros(2, device=self.device))

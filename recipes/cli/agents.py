@@ -8,11 +8,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from torchrl_tit.settings.literals import parse_assignments
+from torchrl_tit.settings.numbers import Episodes, Seed, Threads
 
-from .arguments import Parser, add_agent, check_seed, fail, say
+from .arguments import Parser, add_agent, check_numbers, fail, say
 
 _EPISODES = 10
-_MOST = 1_000_000
 _MAPS = ("grad-cam", "integrated-gradients", "attention", "weights")
 
 
@@ -30,12 +30,7 @@ def play(arguments: list[str]) -> None:
     parser.add_argument("--device", default="cpu", help="such as cuda:1, or auto; default: cpu")
     parser.add_argument("--threads", type=int, default=1, help="default: 1")
     options = parser.parse_args(arguments)
-    for name in ("episodes", "threads"):
-        if (value := getattr(options, name)) is not None and value < 1:
-            fail(f"--{name} must be at least 1, not {value}")
-        if value is not None and value > _MOST:
-            fail(f"--{name} must be at most {_MOST}, not {value}")
-    check_seed(options.seed)
+    check_numbers(options, episodes=Episodes, seed=Seed, threads=Threads)
     if options.agent is None:
         _list()
         return
@@ -123,7 +118,7 @@ def explain(arguments: list[str]) -> None:
         "--layer", help="layer of grad-cam; default: the last that is laid out over the image"
     )
     options = parser.parse_args(arguments)
-    check_seed(options.seed)
+    check_numbers(options, seed=Seed)
     if options.dataset is None and options.episode is not None:
         fail("--episode is one of a data set: name it with --dataset FILE")
     if options.dataset is not None and options.seed is not None:

@@ -15,9 +15,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import torchrl_tit
-from torchrl_tit.settings.checks import printable
+from torchrl_tit.settings.checks import checked, printable
 from torchrl_tit.settings.imports import allow, import_allowed
-from torchrl_tit.settings.numbers import MAX_SEED
 
 from ..core.recipe import Recipe
 
@@ -103,10 +102,10 @@ def add_machine_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, help="default: the recipe's")
 
 
-def check_seed(seed: int | None) -> None:
-    """Exits with an error unless the seed is None or one that environments accept."""
-    if seed is not None and not 0 <= seed <= MAX_SEED:
-        fail(f"--seed must be from 0 to {MAX_SEED}, not {seed}")
+def check_numbers(options: argparse.Namespace, **kinds: Any) -> None:
+    """Raises ValueError if an option is out of the bounds of its type; None is not checked."""
+    for name, kind in kinds.items():
+        checked(option(name), getattr(options, name), kind | None)
 
 
 def option(field: str) -> str:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from .arguments import Parser, fail, note, option, say
+from torchrl_tit.settings.numbers import Copies
+
+from .arguments import Parser, check_numbers, fail, note, option, say
 
 # What needs PyTorch or an extra is imported once the arguments are read: help is fast.
 
@@ -40,8 +42,7 @@ def sweep(arguments: list[str]) -> None:
         help="folder of the runs; default: %(default)s",
     )
     options = parser.parse_args(arguments)
-    if options.workers is not None and options.workers < 1:
-        fail(f"--workers must be at least 1, not {options.workers}")
+    check_numbers(options, workers=Copies)
     from ..tools.sweeps.sweep import make_jobs, run_jobs
     from ..tools.wandb_metrics import check_wandb
 
@@ -90,7 +91,6 @@ def tune(arguments: list[str]) -> None:
     for name, default, words in (
         ("trials", 50, "trials of the whole search"),
         ("workers", 1, "trials at a time, each a process"),
-        ("startup_trials", 5, "trials that run before any is pruned"),
     ):
         help = f"{words}; default: {default}"
         parser.add_argument(option(name), type=int, default=default, metavar="N", help=help)
@@ -98,9 +98,7 @@ def tune(arguments: list[str]) -> None:
         "--out", type=Path, required=True, help="folder of the search; best.json is its result"
     )
     options, typed = parser.parse_known_args(arguments)
-    for name in ("trials", "workers", "startup_trials"):
-        if getattr(options, name) < 1:
-            fail(f"{option(name)} must be at least 1, not {getattr(options, name)}")
+    check_numbers(options, trials=Copies, workers=Copies)
     from ..core.algorithm import make_algorithm
     from ..core.registry import find_recipe
     from ..tools.sweeps.search_space import load_space
@@ -114,12 +112,7 @@ def tune(arguments: list[str]) -> None:
         if name in given:
             fail(f"{name} is searched, so it has no value: leave it out, or out of --space")
     make_algorithm(recipe).check()
-    settings = Settings(
-        recipe,
-        space,
-        seeds=tuple(dict.fromkeys(options.seeds)),
-        startup_trials=options.startup_trials,
-    )
+    settings = Settings(recipe, space, seeds=tuple(dict.fromkeys(options.seeds)))
     with Search(options.out, settings) as search:
         try:
             failed = search.run(options.trials, options.workers)

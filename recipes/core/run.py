@@ -354,9 +354,8 @@ class RecordedRun(Run):
 
     @property
     def initial_weights(self) -> str:
-        """As :attr:`Run.initial_weights`; "unknown" where a table of an earlier version has it."""
-        found = json.loads(self.read("changes") or b"{}").get("initial_weights", "")
-        return "unknown" if found is True else str(found)
+        """As :attr:`Run.initial_weights`."""
+        return str(json.loads(self.read("changes") or b"{}").get("initial_weights", ""))
 
 
 @contextmanager

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import torch
+from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import Compose, EnvBase
 
 from torchrl_tit.envs import make_env, time_limit
+from torchrl_tit.evaluation import check_rewards
 
 from .algorithm import torch_device
 from .recipe import Recipe
@@ -88,6 +92,45 @@ def seed_copies(env: EnvBase, seed: int, step: int = 0, first: int = 0) -> EnvBa
     streams = [np.random.SeedSequence(seed, spawn_key=(step, copy)) for copy in copies]
     env.reset(seed=[int(stream.generate_state(1)[0]) >> 1 for stream in streams])
     return env
+
+
+def play_once(
+    env: EnvBase,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    keys: Sequence[NestedKey],
+    *,
+    seed: int | None = None,
+    max_steps: int | None = None,
+) -> tuple[TensorDictBase, list[int]]:
+    """Plays one episode in each of several environments, which are stepped side by side.
+
+    Args:
+        env: the environments, [N], which are reset.
+        policy: writes the action into the tensordict that it is given.
+        keys: the entries of a step to keep, rewards and ends among them; with "game_over", an Atari
+            game is played to its end, and not to that of a life.
+        seed: seed of the first environment; None draws on.
+        max_steps: where longer episodes are cut off.
+
+    Returns:
+        The steps on the CPU, [N, T], and the length of each environment's episode; what follows is
+        of another one.
+
+    Raises:
+        FloatingPointError: if a reward of these episodes is NaN or infinite.
+    """
+    tensordict = env.reset(seed=seed)
+    playing = torch.ones(env.batch_size.numel(), dtype=torch.bool)
+    lengths = torch.zeros_like(playing, dtype=torch.int64)
+    steps: list[TensorDictBase] = []
+    while playing.any() and len(steps) != max_steps:
+        step, tensordict = env.step_and_maybe_reset(policy(tensordict))
+        steps.append(step.select(*keys, strict=False).cpu())
+        outcome = steps[-1]["next"]
+        check_rewards(outcome["reward"].flatten().masked_fill(~playing, 0))
+        lengths += playing
+        playing &= ~outcome.get("game_over", outcome["done"]).flatten()
+    return torch.stack(steps, 1), lengths.tolist()
 
 
 def task_limit(recipe: Recipe) -> int | None:

@@ -32,7 +32,6 @@ from torchrl_tit.datasets import (
 from torchrl_tit.envs import make_env
 from torchrl_tit.envs.actions import ActionWriter
 from torchrl_tit.envs.spaces import ObservationReader
-from torchrl_tit.evaluation import check_rewards
 from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.modules import acting
 
@@ -40,6 +39,7 @@ from ...core.algorithm import naming
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.run import locked, package_versions
+from ...core.task import play_once
 from .agents import AgentInTraining, DataAgent, as_fields, find_agent
 from .settings import KINDS, Collection, Kind
 
@@ -323,25 +323,11 @@ def play_episodes(
 def _play(
     env: EnvBase, policy: Policy, task: TaskSpaces, seed: int, max_steps: int
 ) -> list[dict[str, NDArray]]:
-    """Plays one episode in each environment, or a whole Atari game, which is several episodes.
-
-    Returns:
-        D4RL's fields of the transitions of each environment.
-    """
-    tensordict = env.reset(seed=seed)
-    playing = torch.ones(env.batch_size.numel(), dtype=torch.bool)
-    lengths = torch.zeros_like(playing, dtype=torch.int64)
-    steps: list[TensorDictBase] = []
-    while playing.any() and len(steps) < max_steps:
-        step, tensordict = env.step_and_maybe_reset(policy(tensordict))
-        steps.append(step.select(*_STEP, strict=False).cpu())
-        following = steps[-1]["next"]
-        check_rewards(following["reward"].flatten().masked_fill(~playing, 0))
-        lengths += playing
-        playing &= ~following.get("game_over", following["done"]).flatten()
-    fields = as_fields(torch.stack(steps, 1), task.action)
+    """Plays an episode or a whole game in each environment; returns D4RL's fields of each."""
+    steps, lengths = play_once(env, policy, _STEP, seed=seed, max_steps=max_steps)
+    fields = as_fields(steps, task.action)
     episodes = []
-    for index, length in enumerate(lengths.tolist()):
+    for index, length in enumerate(lengths):
         episode = {name: values[index, :length].numpy() for name, values in fields.items()}
         episode["timeouts"][-1] |= not episode["terminals"][-1]
         episodes.append(episode)

@@ -16,7 +16,6 @@ from datetime import timedelta
 from importlib import resources
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from textwrap import fill
 from typing import Any
 
 import imageio.v3 as imageio
@@ -56,7 +55,6 @@ from .plot import (
     curve_of,
     draw_curves,
     new_chart,
-    plain,
     short_runs,
     to_bytes,
 )
@@ -64,8 +62,6 @@ from .table import HEADER, Cell, make_table, to_columns
 
 _OFTEN = 0.25  # minimum share of batches outside a limit for a metric to be pointed out
 _ROWS = 10  # of the numbers below the learning curves
-_MOST_BOXES = 12
-_WIDEST = 30  # letters in a line below a box
 _MOST_PICTURES = 1500  # of a film: half a minute of CartPole, and a few megabytes at most
 _EXPLAINED = (0, 20, 100)  # steps of an episode
 _SHARP = 160  # dots per inch of explained steps
@@ -298,8 +294,6 @@ def _context(
     order = {column: place for place, column in enumerate(known_columns(recipe.algorithm))}
     health = sorted({*columns} - {*returns} - {*same}, key=lambda one: order.get(one, len(order)))
     curves = [_chart(groups, column) for column in returns]
-    drawn = [chart for chart, _ in curves]
-    episodes = _episode_chart(groups)
     common = common_part([group.experiment.name for group in groups]).rstrip("/")
     name = recipe.name if len(groups) == 1 else common if "/" in common else recipe.env
     return {
@@ -314,7 +308,7 @@ def _context(
         "compared_header": comparison.HEADER,
         "compared_words": comparison.WORDS,
         "compared": comparison.compare_with_first([(x.label, x.values) for x in cells]),
-        "returns": [*drawn, *([episodes] if episodes else [])],
+        "returns": [chart for chart, _ in curves],
         "numbers": _numbers(curves[0][1]) if curves else [],
         "labels": [group.label for group in groups],
         "health": [_chart(groups, column)[0] for column in health],
@@ -379,38 +373,6 @@ def _chart(groups: Sequence[Group], column: str) -> tuple[Chart, dict[str, Curve
     ]
     alt = f"Line chart of {column} over {_unit(recipe)}. {'. '.join(texts)}."
     return Chart(column, words, _svg(figure), alt, notes), bold
-
-
-def _episode_chart(groups: Sequence[Group]) -> Chart | None:
-    """A chart of the returns of all evaluation episodes; None if there are none."""
-    boxes = {
-        f"{group.label}, {one.name}" if groups[1:] else one.name: one.evaluation["returns"]
-        for group in groups
-        for one in group.runs
-        if one.evaluation
-    }
-    if len(boxes) > _MOST_BOXES:  # a box for each group
-        together = {g.label: [one.evaluation for one in g.runs if one.evaluation] for g in groups}
-        boxes = {k: [x for one in v for x in one["returns"]] for k, v in together.items() if v}
-    if not boxes:
-        return None
-    figure, axes = new_chart("", groups[0].recipe)
-    axes.boxplot([*boxes.values()], showmeans=True, meanline=True)
-    places = range(1, len(boxes) + 1)
-    labels = [fill(plain(name), _WIDEST) for name in boxes]
-    axes.set_xticks(places, labels, rotation=20, ha="right")
-    figure.set_figheight(4 + 0.15 * max(label.count("\n") for label in labels))
-    axes.set(xlabel="", ylabel="return of an episode")
-    quarters = {name: np.percentile(returns, [25, 50, 75]) for name, returns in boxes.items()}
-    texts = [
-        f"{name}: median {number(middle)}, half of them from {number(low)} to {number(high)}"
-        for name, (low, middle, high) in quarters.items()
-    ]
-    what = (
-        "Each box holds the middle half of the episodes. Lines are medians, and dashed lines means."
-    )
-    alt = f"Box plot of the returns of evaluation episodes. {'. '.join(texts)}."
-    return Chart("Evaluation episodes", MetricWords("", what), _svg(figure), alt)
 
 
 def _cut(axes: Axes, values: np.ndarray) -> bool:

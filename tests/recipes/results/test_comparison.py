@@ -106,7 +106,7 @@ def test_what_cannot_be_summarized(tasks, capsys):
     only = [str(tasks / "cartpole")]
     for words, message in {
         (str(tasks / "more"), *only): "mlp has two settings on CartPole-v1",
-        (str(tasks / "own"),): "no reference returns for Taxi-v4, but for Acrobot-v1",
+        (str(tasks / "own"),): "no reference returns for Taxi-v4, but for CartPole-v1",
         (*only, "--networks", "lstm"): "no evaluated run of lstm",
         (str(tasks / "mountaincar"), str(tasks / "cartpole" / "mlp")): "no task has runs of all",
     }.items():

@@ -108,7 +108,7 @@ def test_what_a_page_says_of_one_run(alone):
 
 def test_every_metric_is_drawn_and_described(alone):
     charts = alone.data("image/svg+xml")
-    assert len(charts) == len(alone.alts) == 7 + 1  # all but a constant one; and the episodes
+    assert len(charts) == len(alone.alts) == 7  # all but a constant one
     assert all(b"<svg" in chart for chart in charts)
     values = metrics_of(0)["kl_approx"]
     (kl,) = [alt for alt in alone.alts if alt.startswith("Line chart of kl_approx")]
@@ -121,7 +121,6 @@ def test_what_a_comparison_says(comparison):
         "2 experiments, 5 runs of 61,440 environment steps each",
         f"{TIT} 3 482 ± 3 15 - near 500 ± 0: backbone.frame",
         "mlp (epochs 5) 2 305 ± 0 5 - near 500 ± 0: num_envs 8",
-        "CleanRL 490",
         "Is it better?",
         "482 ± 3 177 1 0.2 4",  # of ten ways to choose two of five, the extreme one, twice
         f"What differs from the recipe {MLP}:",
@@ -132,20 +131,9 @@ def test_what_a_comparison_says(comparison):
         "torchrl-tit sweep recipe-1.json --seeds 0 1",
     ):
         assert text in comparison.text, text
-    (episodes,) = [alt for alt in comparison.alts if alt.startswith("Box plot")]
-    assert "mlp (epochs 5), seed 1: median 305, half of them from 300 to 310" in episodes
     last = np.mean([metrics_of(seed)["kl_approx"][-1] for seed in range(3)])
     (kl,) = [alt for alt in comparison.alts if alt.startswith("Line chart of kl_approx")]
     assert f"{number(last)} at step 61,440" in kl.partition("enhanced-tit:")[2]
-
-
-@pytest.mark.filterwarnings("error:constrained_layout not applied")
-def test_long_names_leave_room_for_boxes(tmp_path):
-    fields = {"num_envs": 4, "gamma": 0.97, "gae_lambda": 0.9, "max_grad_norm": 0.7}
-    fields |= {"reward_scale": 0.1, "adam_eps": 1e-6}
-    for of in (TIT, MLP):
-        write_run(tmp_path / of, of, returns=[300.0, 310.0], metrics=FEW, **fields)
-    report(tmp_path, "--out", tmp_path / "a.html", "--no-pictures")
 
 
 def test_metrics_that_are_not_healthy_are_pointed_out(tmp_path):
