@@ -11,15 +11,13 @@ There is
 
 - a row in ``runs.csv`` for each run; runs that have one are not repeated;
 - ``successes.csv`` in each run's folder: episodes and successes of each batch.
-
-At the end, a table of all rows is printed: interquartile means over the seeds, with 95% intervals.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from statistics import fmean
@@ -30,12 +28,11 @@ from recipes.core.callback import Callback
 from recipes.core.recipe import Recipe
 from recipes.core.registry import find_recipe
 from recipes.core.run import Run
-from recipes.tools.results.interval import interval_of
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.evaluation import finished_returns
 from torchrl_tit.files import write_text_atomic
 
-from .measuring import add_missing_rows, read_rows, table
+from .measuring import add_missing_rows, read_rows
 
 SOLVED, EPISODES = 0.98, 500
 REACHED, WINDOW = 0.9, 100
@@ -136,23 +133,6 @@ def measure(recipe: Recipe, folder: Path, threshold: float) -> list[object]:
     return [recipe.name, recipe.seed, weights, step, reached, success, returned]
 
 
-def to_markdown(rows: Sequence[dict[str, str]]) -> str:
-    """Writes a table of ``runs.csv``, a row for each recipe."""
-    lines = []
-    for name in dict.fromkeys(row["recipe"] for row in rows):
-        runs = [row for row in rows if row["recipe"] == name]
-        success, returned = (
-            interval_of([float(run[column]) for run in runs]) for column in ("success", "return")
-        )
-        reached = [float(run["steps_to_0.9"]) / 1000 for run in runs if run["steps_to_0.9"]]
-        steps = [str(interval_of(reached))] if reached else []
-        if missing := len(runs) - len(reached):
-            steps.append(f"not by {missing} of {len(runs)}")
-        lines.append([name, runs[0]["weights"], len(runs), success, returned, ", ".join(steps)])
-    header = ["recipe", "weights", "seeds", "success", "return", "steps to 0.9, thousands"]
-    return table(header, lines)
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Trains all recipes with all seeds that have no row yet."""
     parser = argparse.ArgumentParser("python -m benchmarks.memory_tasks")
@@ -171,9 +151,7 @@ def main(arguments: list[str] | None = None) -> None:
         return measure(recipe, options.out / name / f"seed-{seed}", options.threshold)
 
     runs = [(name, seed) for seed in options.seeds for name in recipes]
-    path = options.out / "runs.csv"
-    add_missing_rows(path, COLUMNS, runs, measure_run)
-    print(to_markdown(read_rows(path)), end="")
+    add_missing_rows(options.out / "runs.csv", COLUMNS, runs, measure_run)
 
 
 if __name__ == "__main__":

@@ -19,12 +19,11 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule
 from torchrl.objectives import DQNLoss, HardUpdate, SoftUpdate, TargetNetUpdater
 
-from torchrl_tit.envs import observation_specs
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.settings.numbers import Batch, Fraction, Rate, Steps, Weight
 
 from .core.algorithm import Stateful, Terms, descend
-from .core.networks import check_actions, is_discrete, make_backbone, make_value_policy
+from .core.networks import check_actions, is_discrete, make_value_policy
 from .replay import ReplayAlgorithm, ReplayRecipe
 
 
@@ -109,13 +108,8 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         instead = f"a {'sac or ' if spec.dtype.is_floating_point else ''}ppo recipe"
         check_actions(recipe, spec, is_discrete(spec), "a few discrete actions", instead)
         mask_key = MASK if recipe.mask_actions else None
-        backbone = make_backbone(
-            recipe.backbone,
-            observation_specs(env),
-            slices=recipe.slice_length > 1,
-            normalization=self.normalization,
-        )
-        self._policy = make_value_policy(backbone, spec, mask_key=mask_key).to(self.device)
+        policy = make_value_policy(self.make_backbone(env), spec, mask_key=mask_key)
+        self._policy = policy.to(self.device)
         self.exploration = EGreedyModule(
             spec,
             eps_end=recipe.final_epsilon,

@@ -36,8 +36,6 @@ from torchrl_tit.datasets import (
 )
 from torchrl_tit.datasets.checks import check_actions, check_bytes, check_shape
 from torchrl_tit.envs import make_env, observation_specs
-from torchrl_tit.evaluation import evaluate
-from torchrl_tit.modules import Backbone
 from torchrl_tit.networks.building import evaluating
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
@@ -45,7 +43,6 @@ from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
 from .core.algorithm import (
     Algorithm,
-    LearnsFromSamples,
     Stateful,
     Terms,
     check_without_waiting,
@@ -53,12 +50,11 @@ from .core.algorithm import (
     storage_device,
     to_networks,
 )
-from .core.evaluation import HeldOut, Outcome
+from .core.evaluation import HeldOut
 from .core.networks import (
+    LearnsFromSamples,
     arranging,
     check_normalizes,
-    make_backbone,
-    make_critic,
     set_statistics,
     state_transforms,
 )
@@ -400,6 +396,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             are not floats.
     """
 
+    normalized_by = BY_DATA
     measures: ClassVar[tuple[str, ...]] = ("action_error", "q", "advantage")
     clips_actions: ClassVar[bool] = False
     """Whether the task clips actions, because the policy may exceed the bounds."""
@@ -434,33 +431,6 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         """Builds the task, with histories, and with the state of a recurrent network."""
         state, clips = state_transforms(self.policy), self.clips_actions
         return make_task(self.recipe, num_envs, seed, state=state, clip_actions=clips, **settings)
-
-    def make_backbone(self, env: EnvBase, *, slices: bool = False) -> Backbone:
-        """Builds the policy's backbone.
-
-        Args:
-            env: the task.
-            slices: as in :func:`~recipes.core.networks.make_backbone`; always on if the recipe
-                draws slices.
-        """
-        recipe, slices = self.recipe, slices or self.recipe.slice_length > 1
-        observation = observation_specs(env)
-        return make_backbone(
-            recipe.backbone, observation, slices=slices, normalization=self.normalization
-        )
-
-    def make_critic(self, env: EnvBase, action_dim: int, **settings: Any) -> TensorDictModuleBase:
-        """Builds a value network; see :func:`~recipes.core.networks.make_critic`."""
-        recipe: Any = self.recipe
-        return make_critic(
-            observation_specs(env),
-            action_dim,
-            recipe.critic_hidden,
-            recipe.backbone if recipe.critic == "backbone" else None,
-            slices=recipe.slice_length > 1,
-            normalization=self.normalization,
-            **settings,
-        ).to(self.device)
 
     def prepare(self, step: int, folder: Path) -> None:
         """Builds optimizer, target update (if there are targets) and replay buffer."""
@@ -565,16 +535,3 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
         values = numbers(self.columns, terms)
         check_without_waiting(self.columns, values)
         return dict(zip(self.columns, values, strict=True))
-
-    def play(self, step: int) -> list[Outcome]:
-        """Plays full episodes side by side, each with its own seed, without dropout."""
-        if not self.recipe.env:
-            return []
-        seed, episodes = self.recipe.evaluation_seed, self.recipe.evaluation_episodes
-        returns = evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=True)
-        return [Outcome(step, returns.tolist())]
-
-    @property
-    def normalization(self) -> Mapping[str, float] | None:
-        """Settings of what normalizes the observations that networks read; None if nothing does."""
-        return BY_DATA if self.recipe.normalize_observations else None

@@ -17,13 +17,12 @@ from torch import Tensor
 from torchrl.collectors import BaseCollector, MultiSyncCollector
 from torchrl.envs import EnvBase
 
-from torchrl_tit.evaluation import evaluate, finished_returns
+from torchrl_tit.evaluation import finished_returns
 from torchrl_tit.modules import ActingCollector
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Copies, Fraction, Steps
 
 from .core.algorithm import Algorithm
-from .core.evaluation import Outcome
 from .core.networks import state_transforms
 from .core.ray_cluster import ask_for_machines, check_address, check_room
 from .core.recipe import Recipe
@@ -115,12 +114,6 @@ class OnlineAlgorithm(Algorithm[RecipeT]):
     def returns(self, batch: TensorDictBase) -> Tensor:
         """Returns of the episodes that ended in a batch."""
         return finished_returns(batch)
-
-    def play(self, step: int) -> list[Outcome]:
-        """Plays full episodes, each with its own seed: the most likely action, raw rewards."""
-        seed, episodes = self.recipe.evaluation_seed, self.recipe.evaluation_episodes
-        returns = evaluate(self.make_env, self.policy, episodes, seed=seed)
-        return [Outcome(step, returns.tolist())]
 
     def check(self) -> None:
         """As :meth:`Algorithm.check`; a cluster must have room for the collectors."""

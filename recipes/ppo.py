@@ -325,7 +325,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         )
         self.gae = GAE(gamma=recipe.gamma, lmbda=recipe.gae_lambda, value_network=None)
         trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
-        self.parameters = FlatParameters(trained).flat
+        self.parameters = flatten_parameters(trained)
         self.optimizer = torch.optim.Adam(
             [self.parameters], lr=recipe.learning_rate, eps=recipe.adam_eps, fused=True
         )
@@ -576,34 +576,33 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         check_finite(["weights"], self.parameters.detach().norm().unsqueeze(0))
 
 
-class FlatParameters:
+def flatten_parameters(parameters: Sequence[nn.Parameter]) -> nn.Parameter:
     """Stores parameters in one tensor, and their gradients in another.
 
     The parameters keep their values and become views. For a network of small layers, the gradient
-    norm, clipping and Adam's step take a third of the time if they run on ``flat`` alone.
+    norm, clipping and Adam's step take a third of the time if they run on this tensor alone.
 
     Args:
         parameters: parameters on one device and of one dtype. They must stay there: moving or
             casting a module gives it new memory.
 
+    Returns:
+        All values, float [P], with their gradients as ``grad``.
+
     Example:
         >>> linear = nn.Linear(2, 2)
-        >>> flat = FlatParameters(list(linear.parameters())).flat
+        >>> flat = flatten_parameters(list(linear.parameters()))
         >>> flat.shape
         torch.Size([6])
         >>> linear(torch.ones(1, 2)).sum().backward()
         >>> flat.grad
         tensor([1., 1., 1., 1., 1., 1.])
     """
-
-    def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
-        values = torch.cat([parameter.detach().flatten() for parameter in parameters])
-        gradients = torch.zeros_like(values)
-        self.flat = nn.Parameter(values)
-        """All values, float [P], with their gradients as ``grad``."""
-        self.flat.grad = gradients
-        sizes = [parameter.numel() for parameter in parameters]
-        views = zip(parameters, values.split(sizes), gradients.split(sizes), strict=True)
-        for parameter, value, gradient in views:
-            parameter.data = value.view_as(parameter)
-            parameter.grad = gradient.view_as(parameter).data  # no view of its base, for autograd
+    flat = nn.Parameter(torch.cat([parameter.detach().flatten() for parameter in parameters]))
+    flat.grad = torch.zeros_like(flat)
+    sizes = [parameter.numel() for parameter in parameters]
+    views = zip(parameters, flat.data.split(sizes), flat.grad.split(sizes), strict=True)
+    for parameter, value, gradient in views:
+        parameter.data = value.view_as(parameter)
+        parameter.grad = gradient.view_as(parameter).data  # no view of its base, for autograd
+    return flat

@@ -25,7 +25,6 @@ from torchrl_tit.settings.choices import Device
 from torchrl_tit.settings.numbers import Batch, Steps, Weight
 
 from .core.algorithm import (
-    LearnsFromSamples,
     Stateful,
     Terms,
     check_finite,
@@ -33,7 +32,13 @@ from .core.algorithm import (
     storage_device,
     to_networks,
 )
-from .core.networks import arranging, check_normalizes, set_statistics, state_transforms
+from .core.networks import (
+    LearnsFromSamples,
+    arranging,
+    check_normalizes,
+    set_statistics,
+    state_transforms,
+)
 from .core.recipe import SamplesRecipe
 from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
@@ -126,11 +131,6 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
             if recipe.normalize_observations:
                 check_normalizes(recipe.env, observation_specs(task))
             self.model = self.networks(task).to(self.device)
-
-    @property
-    def normalization(self) -> dict[str, Any] | None:
-        """Settings of what normalizes the observations that networks read; None if nothing does."""
-        return {} if self.recipe.normalize_observations else None
 
     @property
     def behavior(self) -> TensorDictModuleBase:

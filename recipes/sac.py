@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -18,14 +18,13 @@ from torchrl.envs import EnvBase
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from torchrl_tit.envs import observation_specs
 from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.numbers import Fraction, Rate, Widths
 
 from .core.algorithm import Terms, descend
-from .core.networks import check_actions, make_backbone, make_critic
+from .core.networks import check_actions
 from .replay import ReplayAlgorithm, ReplayRecipe
 
 
@@ -50,10 +49,9 @@ class SAC(ReplayRecipe, algorithm="sac"):
 
     @property
     def critic_backbone(self) -> Network | None:
-        """The settings of each critic's backbone; None if it reads the newest observation."""
-        if self.critic == "backbone" or (self.critic == "auto" and self.hide_velocities):
-            return self.backbone
-        return None
+        """As :attr:`SamplesRecipe.critic_backbone`, also if "auto" takes it."""
+        hidden = self.critic == "auto" and self.hide_velocities
+        return self.backbone if hidden else super().critic_backbone
 
 
 class SACAlgorithm(ReplayAlgorithm[SAC]):
@@ -73,13 +71,11 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
 
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with policy, critics, their targets and the temperature."""
-        recipe, spec, observation = self.recipe, env.action_spec_unbatched, observation_specs(env)
+        recipe, spec = self.recipe, env.action_spec_unbatched
         check_actions(
             recipe, spec, has_bounds(spec), "continuous actions within bounds", "a ppo recipe"
         )
-        size, slices = spec.shape[0], recipe.slice_length > 1
-        reading: Any = {"slices": slices, "normalization": self.normalization}
-        backbone = make_backbone(recipe.backbone, observation, **reading)
+        backbone, size = self.make_backbone(env), spec.shape[0]
         head = nn.Sequential(nn.Linear(backbone.features_dim, 2 * size), NormalParamExtractor())
         self._policy = ProbabilisticActor(
             TensorDictSequential(backbone, TensorModule(head, ["features"], ["loc", "scale"])),
@@ -87,16 +83,11 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
             distribution_class=TanhNormal,
             distribution_kwargs={"low": spec.space.low, "high": spec.space.high},
         ).to(self.device)
-        hidden, network = recipe.critic_hidden, recipe.critic_backbone
         # Two critics keep their initial weights; TorchRL would copy a single one and re-initialize
         # the copy.
-        critics = [
-            make_critic(observation, size, hidden, network, **reading).to(self.device)
-            for _ in range(2)
-        ]
         loss = SACLoss(
             self._policy,
-            critics,
+            [self.make_critic(env, size) for _ in range(2)],
             loss_function="l2",
             target_entropy=-float(size),
             deactivate_vmap=recipe.backbone.carries_state,  # it cannot map over an LSTM

@@ -102,7 +102,7 @@ def tune(arguments: list[str]) -> None:
     from ..core.algorithm import make_algorithm
     from ..core.registry import find_recipe
     from ..tools.sweeps.search_space import load_space
-    from ..tools.sweeps.tune import Search, Settings, importances, why_no_importances
+    from ..tools.sweeps.tune import Search, Settings, importances
     from .train import parse_recipe
 
     recipe, _ = parse_recipe(find_recipe(options.name), typed, f"tune {options.name}")
@@ -130,6 +130,4 @@ def tune(arguments: list[str]) -> None:
     if shares := importances(search.study):
         named = ", ".join(f"{field} {share:.0%}" for field, share in shares.items())
         say(f"what mattered: {named}")
-    else:
-        say(f"no importance.csv: {why_no_importances(search.study)}")
     say(f"all trials: {options.out / 'trials.csv'}")

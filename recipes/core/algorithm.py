@@ -14,6 +14,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from torchrl_tit.evaluation import evaluate
+
 from .evaluation import HeldOut, Outcome
 from .recipe import Recipe
 
@@ -129,15 +131,22 @@ class Algorithm(ABC, Generic[RecipeT]):
         """Gets the returns of episodes that ended in a batch, float [episodes]; None if offline."""
         return None
 
-    @abstractmethod
     def play(self, step: int) -> list[Outcome]:
         """Evaluates the current weights, for each target return if there are any.
 
-        Without an environment, there is nothing to play, and no outcome.
+        Full episodes are played, each with its own seed, with the most likely actions, raw rewards
+        and no dropout. Without an environment, there is nothing to play, and no outcome.
 
         Args:
             step: number of steps done so far.
         """
+        recipe = self.recipe
+        if not recipe.env:
+            return []
+        seed, episodes = recipe.evaluation_seed, recipe.evaluation_episodes
+        shrink = recipe.offline
+        returns = evaluate(self.make_env, self.policy, episodes, seed=seed, shrink=shrink)
+        return [Outcome(step, returns.tolist())]
 
     def measure(self, step: int) -> HeldOut | None:
         """Measures the current weights on held-out episodes; None if there are none.
@@ -158,39 +167,6 @@ class Algorithm(ABC, Generic[RecipeT]):
 
     def close(self) -> None:
         """Closes the environments and processes that :meth:`prepare` started."""
-
-
-class LearnsFromSamples(ABC):
-    """What algorithms have in common that learn from samples of transitions.
-
-    Their model is the loss, with the weights of all networks, the policy's among them.
-    """
-
-    _policy: TensorDictModuleBase
-
-    @abstractmethod
-    def networks(self, env: EnvBase) -> nn.Module:
-        """Builds the loss with all networks: the policy, critics, and what a subclass adds to it.
-
-        Args:
-            env: the task, for its observations and actions.
-        """
-
-    @abstractmethod
-    def loss(self, samples: TensorDictBase) -> Terms:
-        """Returns the terms of the loss, float [] each.
-
-        Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
-        add one, override this method and call it first.
-
-        Args:
-            samples: transitions [B], or slices of consecutive ones, [N, T].
-        """
-
-    @property
-    def policy(self) -> TensorDictModuleBase:
-        """The policy, from histories to actions; its weights are among those of the model."""
-        return self._policy
 
 
 def make_algorithm(recipe: Recipe) -> Algorithm[Any]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import (
     AddStateIndependentNormalScale,
@@ -17,9 +19,10 @@ from tensordict.nn import (
 )
 from torch import nn
 from torchrl.data import Bounded, Categorical, TensorSpec
-from torchrl.envs import Compose
+from torchrl.envs import Compose, EnvBase
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, QValueModule, TanhModule
 
+from torchrl_tit.envs import observation_specs
 from torchrl_tit.frames import NormalizedFrames, share_statistics
 from torchrl_tit.frames.observation import Observations, read_observations
 from torchrl_tit.modules import Backbone, as_sequences, history_keys, make_actor
@@ -30,7 +33,7 @@ from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
 from torchrl_tit.networks import HistoryNetwork, build_network, chosen_by_kind
 from torchrl_tit.settings import Flat, Network
 
-from .algorithm import Algorithm
+from .algorithm import Algorithm, Terms
 from .recipe import Recipe
 
 _MIN_LOG_STD = -5.0
@@ -318,3 +321,71 @@ def name_chosen_encoders(algorithm: Algorithm[Any]) -> tuple[Recipe, str]:
     if not (described := chosen_by_kind(recipe.backbone, chosen)):
         return recipe, ""
     return replace(recipe, backbone=replace(recipe.backbone, frames=chosen)), described
+
+
+class LearnsFromSamples(ABC):
+    """What algorithms have in common that learn from samples of transitions.
+
+    Their model is the loss, with the weights of all networks, the policy's among them.
+    """
+
+    recipe: Any
+    device: torch.device
+    normalized_by: ClassVar[Mapping[str, float]] = {}
+    """Settings of what normalizes observations, if the recipe says so."""
+    _policy: TensorDictModuleBase
+
+    @abstractmethod
+    def networks(self, env: EnvBase) -> nn.Module:
+        """Builds the loss with all networks: the policy, critics, and what a subclass adds to it.
+
+        Args:
+            env: the task, for its observations and actions.
+        """
+
+    @abstractmethod
+    def loss(self, samples: TensorDictBase) -> Terms:
+        """Returns the terms of the loss, float [] each.
+
+        Those whose names begin with "loss_" are added up and trained on; the others are metrics. To
+        add one, override this method and call it first.
+
+        Args:
+            samples: transitions [B], or slices of consecutive ones, [N, T].
+        """
+
+    @property
+    def policy(self) -> TensorDictModuleBase:
+        """The policy, from histories to actions; its weights are among those of the model."""
+        return self._policy
+
+    @property
+    def normalization(self) -> Mapping[str, float] | None:
+        """Settings of what normalizes the observations that networks read; None if nothing does."""
+        return self.normalized_by if self.recipe.normalize_observations else None
+
+    def make_backbone(self, env: EnvBase, *, slices: bool = False) -> Backbone:
+        """Builds the policy's backbone.
+
+        Args:
+            env: the task.
+            slices: as in :func:`make_backbone`; always on if the recipe draws slices.
+        """
+        recipe, slices = self.recipe, slices or self.recipe.slice_length > 1
+        observation = observation_specs(env)
+        return make_backbone(
+            recipe.backbone, observation, slices=slices, normalization=self.normalization
+        )
+
+    def make_critic(self, env: EnvBase, action_dim: int, **settings: Any) -> TensorDictModuleBase:
+        """Builds a value network on the networks' device; see :func:`make_critic`."""
+        recipe = self.recipe
+        return make_critic(
+            observation_specs(env),
+            action_dim,
+            recipe.critic_hidden,
+            recipe.critic_backbone,
+            slices=recipe.slice_length > 1,
+            normalization=self.normalization,
+            **settings,
+        ).to(self.device)

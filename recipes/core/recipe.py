@@ -198,6 +198,11 @@ class SamplesRecipe(Recipe):
             )
 
     @property
+    def critic_backbone(self) -> Network | None:
+        """The settings of each critic's backbone; None if it reads the newest observation."""
+        return self.backbone if getattr(self, "critic", "") == "backbone" else None
+
+    @property
     def drawn_length(self) -> int:
         """Number of consecutive steps that are drawn together, with those of the burn-in."""
         return self.burn_in + self.slice_length

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -13,19 +14,7 @@ from torchrl_tit.settings.checks import nearest
 from torchrl_tit.settings.imports import import_allowed
 from torchrl_tit.settings.parts import Names
 
-from ..presets.any_data import ANY_DATA_RECIPES
-from ..presets.cql import CQL_RECIPES
-from ..presets.decision_transformer import DT_RECIPES
-from ..presets.dqn import DQN_RECIPES
-from ..presets.offline import OFFLINE_RECIPES
-from ..presets.ppo_any_task import ANY_TASK_RECIPES
-from ..presets.ppo_arrays import ARRAY_RECIPES
-from ..presets.ppo_atari import ATARI_RECIPES
-from ..presets.ppo_memory import MEMORY_RECIPES
-from ..presets.ppo_minatar import MINATAR_RECIPES
-from ..presets.ppo_no_velocity import NO_VELOCITY_RECIPES
 from ..presets.preset import Preset
-from ..presets.sac import SAC_RECIPES
 from .recipe import Recipe, get_recipe_class
 from .recipe_json import recipe_from_json
 from .records import find_records
@@ -92,21 +81,15 @@ def register_recipes(*recipes: Recipe) -> None:
         RECIPES.add(recipe, home)
 
 
-for _preset in (
-    *ANY_TASK_RECIPES,
-    *ANY_DATA_RECIPES,
-    *ARRAY_RECIPES,
-    *NO_VELOCITY_RECIPES,
-    *MEMORY_RECIPES,
-    *ATARI_RECIPES,
-    *MINATAR_RECIPES,
-    *SAC_RECIPES,
-    *DQN_RECIPES,
-    *CQL_RECIPES,
-    *OFFLINE_RECIPES,
-    *DT_RECIPES,
-):
-    RECIPES.add(_preset, __name__)
+_PRESETS = (
+    *("ppo_any_task", "any_data", "ppo_arrays", "ppo_no_velocity", "ppo_memory", "ppo_atari"),
+    *("ppo_minatar", "sac", "dqn", "cql", "offline", "decision_transformer"),
+)
+"""The modules of this package's named recipes, in the order in which ``list`` prints them."""
+
+for _module in _PRESETS:
+    for _preset in importlib.import_module(f"..presets.{_module}", __package__).RECIPES:
+        RECIPES.add(_preset, __name__)
 
 
 def get_recipe(name: str) -> Recipe:

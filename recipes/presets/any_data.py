@@ -35,7 +35,7 @@ _DT: dict[str, Any] = {
     "warmup_updates": 1000,
 }
 
-ANY_DATA_RECIPES: list[Preset] = [
+RECIPES: list[Preset] = [
     *of_networks(BC, "bc", _NETWORKS, **_SETTINGS),
     *of_networks(IQL, "iql", _NETWORKS, **_SETTINGS),
     *of_networks(TD3BC, "td3bc", _NETWORKS, **_SETTINGS),

@@ -97,6 +97,6 @@ def _discrete() -> list[Preset]:
     return cartpole + pong
 
 
-CQL_RECIPES: list[Preset] = [*_discrete(), *_continuous()]
+RECIPES: list[Preset] = [*_discrete(), *_continuous()]
 """``cql/DATASET/mlp``, ``enhanced-tit`` (the authors' code) and ``enhanced-tit-paper`` (the paper's
 table) for D4RL's data of version 0, and ``discrete-cql/...`` for collected data."""

@@ -71,5 +71,5 @@ def _online() -> list[Preset]:
     return recipes
 
 
-DT_RECIPES: list[Preset] = [*_offline(), *_online()]
+RECIPES: list[Preset] = [*_offline(), *_online()]
 """``dt/DATASET/dt``, ``dt-tit``, ``dt-tit-paper`` for D4RL's sets of version 2, and ``odt/...``."""

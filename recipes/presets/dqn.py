@@ -56,5 +56,5 @@ def _named() -> list[Preset]:
     return [cartpole, cartpole_tit.replace(learning_rate=5e-4), *pong]
 
 
-DQN_RECIPES: list[Preset] = _named()
+RECIPES: list[Preset] = _named()
 """``dqn/TASK/NETWORK``."""

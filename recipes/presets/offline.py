@@ -43,5 +43,5 @@ def _named() -> Iterator[Preset]:
                 yield TD3BC(name=f"td3bc/{name}", **fields)
 
 
-OFFLINE_RECIPES: list[Preset] = [*_named()]
+RECIPES: list[Preset] = [*_named()]
 """``bc/DATASET/NETWORK``, ``iql/DATASET/NETWORK`` and ``td3bc/DATASET/NETWORK``."""

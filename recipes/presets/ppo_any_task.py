@@ -23,7 +23,7 @@ _ALGORITHMS = {
     "-gsde": (SmoothPPO, "Pendulum-v1"),  # smooth noise, for continuous actions
 }
 
-ANY_TASK_RECIPES: list[Preset] = [
+RECIPES: list[Preset] = [
     make(name=f"ppo/{network}{ending}", env=env, backbone=backbone, **settings_of(network))
     for ending, (make, env) in _ALGORITHMS.items()
     for network, backbone in _NETWORKS.items()

@@ -62,4 +62,4 @@ def _named() -> list[Preset]:
     return recipes
 
 
-ARRAY_RECIPES: list[Preset] = _named()
+RECIPES: list[Preset] = _named()

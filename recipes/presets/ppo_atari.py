@@ -106,4 +106,4 @@ _FLICKERING = of_networks(
     **PICTURE_SETTINGS,
 )
 
-ATARI_RECIPES: list[Preset] = [*(x for game in _GAMES for x in _named(game)), *_FLICKERING]
+RECIPES: list[Preset] = [*(x for game in _GAMES for x in _named(game)), *_FLICKERING]

@@ -145,4 +145,4 @@ def _named() -> list[Preset]:
     return recipes
 
 
-MEMORY_RECIPES: list[Preset] = _named()
+RECIPES: list[Preset] = _named()

@@ -17,7 +17,7 @@ _NETWORKS: dict[str, Network] = {
     **enhanced_tit_of_pictures(4, patch_size=2),
 }
 
-MINATAR_RECIPES: list[Preset] = [
+RECIPES: list[Preset] = [
     # Images have up to ten channels.
     recipe.replace(env=f"MinAtar/{game}-v1", image_layout="HWC", total_steps=1_000_000)
     for game in _GAMES

@@ -26,7 +26,7 @@ _NETWORKS: dict[str, Network] = {
     "enhanced-tit-wo-outer-k8": enhanced_tit(8, outer=False, patch_size=None),
 }
 
-NO_VELOCITY_RECIPES: list[Preset] = [
+RECIPES: list[Preset] = [
     recipe.replace(env=env, total_steps=total_steps, hide_velocities=True)
     for task, (env, total_steps) in _TASKS.items()
     for recipe in of_networks(PPO, f"ppo/{task}-no-velocity", _NETWORKS, **STEADY_PPO_SETTINGS)

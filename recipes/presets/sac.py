@@ -12,4 +12,4 @@ _NETWORKS = {
     "enhanced-tit": enhanced_tit(patch_size=None, embed_dim=64),
 }
 
-SAC_RECIPES: list[Preset] = of_networks(SAC, "sac/hopper", _NETWORKS, env="Hopper-v5")
+RECIPES: list[Preset] = of_networks(SAC, "sac/hopper", _NETWORKS, env="Hopper-v5")

@@ -27,7 +27,7 @@ from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.networks.building import evaluating
 from torchrl_tit.settings.networks import mlp
 
-from ..core.algorithm import storage_device, to_networks
+from ..core.algorithm import descend, storage_device, to_networks
 from ..core.networks import is_discrete, make_critic
 from ..core.optional import tqdm
 from ..core.recipe import DatasetRecipe, Recipe
@@ -185,7 +185,6 @@ def weighted_returns(
     log_ratio = torch.where(torch.cat(matches), 0.0, -torch.inf)
     log_ratio = log_ratio - (torch.cat(logs) if log_probs is None else log_probs)
     gamma, lengths = _gamma(recipe), episodes.lengths.cpu()
-    rewards = episodes.rows["reward"].squeeze(-1)[episodes.step_rows].double().cpu()
     weights = by_episode(log_ratio, lengths).cumsum(1)
     weights = (weights - weights.amax(0).clamp(min=torch.finfo(weights.dtype).min)).exp()
     if not weights[:, -1].any():
@@ -193,7 +192,7 @@ def weighted_returns(
             f"none of the {len(lengths)} episodes takes the policy's actions up to its end, so "
             "weighted importance sampling has nothing to weigh: use --ope fqe"
         )
-    paid = weights * by_episode(rewards, lengths) * gamma ** torch.arange(weights.shape[1])
+    paid = weights * rewards_by_episode(episodes) * gamma ** torch.arange(weights.shape[1])
 
     def value(counts: Tensor) -> Tensor:  # [B, E]; rewards that no drawn episode reaches are 0
         return ((counts @ paid) / (counts @ weights)).nan_to_num(0.0).sum(1)
@@ -247,9 +246,7 @@ def clone(behavior: TensorDictModuleBase, items: HistoryStorage, updates: int) -
                 lowest, best = error, copy.deepcopy(behavior.state_dict())
         index = rest[torch.randint(len(rest), (_BATCH,), device=items.device)]
         loss = _surprise(behavior, to_networks(items.get(index), device), "mean")
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        descend({"loss_behavior": loss}, optimizer)
     behavior.load_state_dict(best)
 
 
@@ -361,9 +358,7 @@ def fit_q(
             outcome["terminated"],
         ).squeeze(-1)
         loss = F.mse_loss(action_values(critic, batch, batch["action"]), goal)
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        descend({"loss_value": loss}, optimizer)
         for slow, fast in pairs:
             slow.lerp_(fast.detach(), _TAU)
 
@@ -386,12 +381,14 @@ def discounted_returns(episodes: Episodes, gamma: float) -> Tensor:
         >>> discounted_returns(data, 0.5)
         tensor([1.5000, 3.0000], dtype=torch.float64)
     """
-    lengths = episodes.lengths + 1  # with the final observation, whose reward is 0
-    rewards = episodes.rows["reward"].squeeze(-1).double()
-    steps = torch.arange(len(rewards), device=rewards.device)
-    steps -= episodes.first_rows.repeat_interleave(lengths)
-    number = torch.arange(len(lengths), device=rewards.device).repeat_interleave(lengths)
-    return rewards.new_zeros(len(lengths)).index_add(0, number, rewards * gamma**steps)
+    rewards = rewards_by_episode(episodes)
+    return rewards @ gamma ** torch.arange(rewards.shape[1], dtype=rewards.dtype)
+
+
+def rewards_by_episode(episodes: Episodes) -> Tensor:
+    """The rewards of episodes, float64 [E, T] on the CPU, with zeros after their ends."""
+    rewards = episodes.rows["reward"].squeeze(-1)[episodes.step_rows]
+    return by_episode(rewards.double().cpu(), episodes.lengths.cpu())
 
 
 @torch.no_grad()

@@ -15,9 +15,7 @@ from recipes.core.algorithm import make_algorithm
 from recipes.core.recipe import LENGTHS, DatasetRecipe, recipe_classes
 from recipes.core.registry import RECIPES, get_recipe
 from recipes.ppo import PPO
-from recipes.presets.ppo_atari import ATARI_RECIPES
-from recipes.presets.ppo_memory import MEMORY_RECIPES
-from recipes.presets.ppo_minatar import MINATAR_RECIPES
+from recipes.presets import ppo_atari, ppo_memory, ppo_minatar
 from recipes.presets.ppo_settings import PICTURE_SETTINGS, PPO_SETTINGS, STEADY_PPO_SETTINGS
 from torchrl_tit.settings import Inner
 from torchrl_tit.settings.networks import (
@@ -41,8 +39,8 @@ GAMES = {
     "breakout": "ALE/Breakout-v5", "mspacman": "ALE/MsPacman-v5", "pong": "ALE/Pong-v5",
     "spaceinvaders": "ALE/SpaceInvaders-v5",
 }  # fmt: skip
-PICTURES = [recipe.name for recipe in (*ATARI_RECIPES, *MINATAR_RECIPES)]
-MEMORIES = [recipe.name for recipe in MEMORY_RECIPES]
+PICTURES = [recipe.name for recipe in (*ppo_atari.RECIPES, *ppo_minatar.RECIPES)]
+MEMORIES = [recipe.name for recipe in ppo_memory.RECIPES]
 PAPERS = ("-protocol", "-paper", "-tuned")
 """How the names of recipes end that have the paper's settings."""
 ABLATED = ["enhanced-tit", *(f"enhanced-tit-wo-{part}" for part in ("dense", "inner", "outer"))]

@@ -23,14 +23,13 @@ from torchrl.envs import EnvBase
 from torchrl.objectives.value.functional import reward2go
 
 from torchrl_tit.envs import observation_specs
-from torchrl_tit.evaluation import evaluate, finished_returns
+from torchrl_tit.evaluation import finished_returns
 from torchrl_tit.frames import FrameEncoder
 from torchrl_tit.histories import HistoryEncoder, HistoryShape
 from torchrl_tit.modules import Backbone, history_keys, make_actor
 from torchrl_tit.networks import build_network
 from torchrl_tit.recipes import (
     Algorithm,
-    Outcome,
     Recipe,
     check_finite,
     make_task,
@@ -217,10 +216,6 @@ class ReinforceAlgorithm(Algorithm[Reinforce]):
         loss.backward()
         self.optimizer.step()
         return {"loss": loss.detach()}
-
-    def play(self, step: int) -> list[Outcome]:
-        seed, episodes = self.recipe.evaluation_seed, self.recipe.evaluation_episodes
-        return [Outcome(step, evaluate(self.make_env, self.agent, episodes, seed=seed).tolist())]
 
     def close(self) -> None:
         self.collector.shutdown()

@@ -210,12 +210,14 @@ def explain_episode(
             page = page or Page(step, title, dpi)
             show(number, step, page.draw(step, [*recent], values, number))
 
-    return len(play_steps(env, explainer.policy, steps[-1], look, seed=seed, actions=actions))
+    acted = play_steps(env, explainer.policy, steps[0], steps[-1], look, seed=seed, actions=actions)
+    return len(acted)
 
 
 def play_steps(
     env: EnvBase,
     policy: TensorDictModuleBase,
+    first: int,
     last: int,
     look: Callable[[int, TensorDictBase], None],
     *,
@@ -227,13 +229,17 @@ def play_steps(
     Args:
         env: the task, of one copy.
         policy: the policy.
-        last: the last step to play, counted from 0.
+        first: the step, counted from 0, that the episode must reach.
+        last: the last step to play.
         look: called at each step with its number and what the policy wrote.
         seed: seed of the episode.
         actions: the actions to take instead of the policy's.
 
     Returns:
         The actions that were taken; fewer than ``last + 1`` if the episode ended before.
+
+    Raises:
+        ValueError: if the episode has no step ``first``.
     """
     taken: list[Tensor] = []
 
@@ -250,6 +256,12 @@ def play_steps(
 
     with suppress(_Enough):
         evaluate(env, act, 1, seed=seed)
+    if len(taken) <= first:
+        played = "of the data" if isinstance(actions, Tensor) else f"of seed {seed}"
+        raise ValueError(
+            f"the episode {played} has {len(taken)} steps, so there is no step {first}: choose one "
+            f"below {len(taken)}"
+        )
     return taken
 
 
@@ -311,12 +323,6 @@ def explain_policy(
             seed=seed,
             actions=actions,
         )
-        if count <= first:
-            played = f"of seed {seed}" if actions is None else "of the data"
-            raise ValueError(
-                f"the episode {played} has {count} steps, so there is no step {first}: "
-                f"choose one below {count}"
-            )
     return min(count, steps.stop) - first
 
 

@@ -204,9 +204,7 @@ def match(recipe: Recipe) -> Match | None:
         -81 ± 11 | near -81 ± 11: epochs 4
     """
     cell = find_cell(recipe.name)
-    if cell is None:
-        return None
-    if not has_its_data(recipe):
+    if cell is None or not has_its_data(recipe):
         return None
     found = [_differences(recipe, get_recipe(name), cell) for name in cell.recipes]
     known = [differences for differences in found if differences is not None]

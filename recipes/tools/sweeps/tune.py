@@ -359,21 +359,13 @@ def importances(study: optuna.Study) -> dict[str, float]:
     trials with all of them. They add up to 1; the largest comes first.
 
     Returns:
-        The shares by the fields' names; empty if :func:`why_no_importances` gives a reason.
+        The shares by the fields' names; empty for fewer than four trials, or if all have the same
+        value.
     """
-    if why_no_importances(study):
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if len(complete) < _FEWEST or len({trial.value for trial in complete}) < 2:
         return {}
     return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
-
-
-def why_no_importances(study: optuna.Study) -> str:
-    """Says why nothing can be told about how much each field mattered; empty if it can be."""
-    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if len(complete) < _FEWEST:
-        return f"it takes {_FEWEST} complete trials, and {len(complete)} are complete"
-    if len({trial.value for trial in complete}) < 2:
-        return "all complete trials have the same value"
-    return ""
 
 
 def _read_space(text: str) -> dict[str, BaseDistribution]:

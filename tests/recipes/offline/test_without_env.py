@@ -22,7 +22,7 @@ from recipes.core.records import Records
 from recipes.core.registry import get_recipe
 from recipes.core.run import RecordedRun, Run
 from recipes.offline import read_data, with_spaces
-from recipes.presets.any_data import ANY_DATA_RECIPES
+from recipes.presets import any_data
 from tests.datasets.rollouts import write
 from tests.recipes.commands import fails
 from tests.recipes.small import (
@@ -294,7 +294,7 @@ def test_every_recipe_for_any_data_builds_what_it_needs(tmp_path):
         True: log_machine(tmp_path / "log.hdf5"),
         False: log_machine(tmp_path / "discrete.hdf5", actions=np.arange(200) % 3),
     }
-    for name in (recipe.name for recipe in ANY_DATA_RECIPES):
+    for name in (recipe.name for recipe in any_data.RECIPES):
         data_of_kind = str(data["discrete" not in name])
         recipe: Any = get_recipe(name)
         algorithm = make_algorithm(replace(recipe, dataset=data_of_kind))

@@ -14,7 +14,7 @@ from torch import nn
 
 from recipes.coberl import ContrastivePPO
 from recipes.core.metrics import read_metrics
-from recipes.ppo import PPO, FlatParameters, Minibatch, PPOAlgorithm
+from recipes.ppo import PPO, Minibatch, PPOAlgorithm, flatten_parameters
 from tests.recipes.ppo.algorithms import named, prepared
 from tests.recipes.small import Batches, train
 from torchrl_tit.checkpoint import load_checkpoint
@@ -200,7 +200,7 @@ def test_the_contrastive_loss_is_added_with_its_weight(tmp_path):
 
 def test_parameters_stay_views_when_weights_are_loaded():
     network, saved = nn.Linear(2, 2), nn.Linear(2, 2)
-    flat = FlatParameters(list(network.parameters())).flat
+    flat = flatten_parameters(list(network.parameters()))
     network.load_state_dict(saved.state_dict())
     assert torch.equal(flat, torch.cat([p.flatten() for p in saved.parameters()]))
     network(torch.ones(1, 2)).sum().backward()

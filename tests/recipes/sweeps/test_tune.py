@@ -337,15 +337,10 @@ def test_other_algorithms_need_a_space():
         load_space(None, get_recipe("dt/hopper-medium-v2/dt"))
 
 
-def test_fields_are_options_and_a_missing_table_of_importances_is_explained(
-    files, naps, capsys, monkeypatch
-):
+def test_fields_are_options(files, naps, capsys, monkeypatch):
     monkeypatch.setattr(tune, "start", complete)
     typed = ["--env", "Acrobot-v1", "--seed", "3", "--backbone.network", "lstm"]
     main([*words(files, 2), *typed])
-    assert "no importance.csv: it takes 4 complete trials, and 2 are complete" in (
-        capsys.readouterr().out
-    )
     recipe = recipe_from_json((files / "out" / "best.json").read_bytes(), "best.json")
     assert (recipe.env, recipe.seed) == ("Acrobot-v1", 3)
     assert recipe.backbone.history.name == "lstm"
