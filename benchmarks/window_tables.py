@@ -1,8 +1,8 @@
 """History encoders that project each frame once, compared with copies of all windows.
 
-A training step (forward, backward and Adam) on arrays, of
-Enhanced_TIT with rotary positions and of GTrXL with one block, on one thread, alternating. 512
-steps in sequences of 64, or of K steps where K is larger; in each sequence, one episode begins.
+A training step (forward, backward and Adam) on arrays, of Enhanced_TIT with rotary positions, on
+one thread, alternating. 512 steps in sequences of 64, or of K steps where K is larger; in each
+sequence, one episode begins.
 Both read the same table of frames and encode each frame once. They differ in the history encoder:
 ours multiplies all queries with all keys of a sequence; the other one gathers the K tokens of each
 window first.
@@ -12,21 +12,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from itertools import product
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_tit.modules.frame_tables import FrameTable, table_of_first
-from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, build_network
-from torchrl_tit.settings import GTrXL, Inner, Network
+from torchrl_tit.networks import EnhancedTIT, HistoryNetwork
 
 from .measuring import ratios, take_turns
 from .segments import make_descent
 
 SAMPLES, WIDTH, ROUNDS, SECONDS = 512, 4, 5, 0.5
-NETWORKS = ["Enhanced_TIT", "GTrXL"]
 NUM_FRAMES = [4, 16, 32, 64, 128, 256, 512]
 
 
@@ -46,23 +43,13 @@ def read(network: HistoryNetwork, in_table: bool, frames: FrameTable) -> Tensor:
     return network.encode_windows(frames.frames, windows).square().mean()
 
 
-def make_network(name: str, num_frames: int) -> HistoryNetwork:
-    """Builds a network on arrays, which are one patch."""
-    if name == "Enhanced_TIT":
-        return EnhancedTIT((WIDTH,), num_frames, patch_size=None, temporal_positions="rotary")
-    inner = Inner(patch_size=None, every_block=False)
-    settings = Network(frame=inner, history=GTrXL(num_blocks=1, num_heads=1), num_frames=num_frames)
-    network = build_network(settings, (WIDTH,))
-    assert isinstance(network, HistoryNetwork)
-    return network
-
-
 def main(num_frames: Sequence[int] = NUM_FRAMES, seconds: float = SECONDS) -> dict[str, Any]:
     """Measures, alternating."""
     numbers = {}
-    for name, k in product(NETWORKS, num_frames):
+    for k in num_frames:
         torch.manual_seed(0)
-        frames, network = make_table(k), make_network(name, k)
+        frames = make_table(k)
+        network = EnhancedTIT((WIDTH,), k, patch_size=None, temporal_positions="rotary")
         losses = [read(network, in_table, frames).item() for in_table in (True, False)]
         torch.testing.assert_close(*losses, rtol=1e-4, atol=1e-6)
         steps = {
@@ -71,5 +58,5 @@ def main(num_frames: Sequence[int] = NUM_FRAMES, seconds: float = SECONDS) -> di
         }
         times = take_turns(steps, ROUNDS, seconds)
         found = ratios(times["copies_ms"], times["table_ms"])
-        numbers[f"{name}, K = {k}"] = {**times, "ratios": found}
+        numbers[f"Enhanced_TIT, K = {k}"] = {**times, "ratios": found}
     return numbers

@@ -228,17 +228,9 @@ class Run:
         """Loads the newest checkpoint: (step, state), or None if there is none.
 
         Raises:
-            CheckpointError: if it is damaged, from an older version, or not one of ours.
+            CheckpointError: if it is damaged, or not one of ours.
         """
-        if not checkpoint_steps(self.checkpoints):
-            return None
-        step, state = load_checkpoint(self.checkpoints)
-        if not isinstance(state, dict) or "networks" not in state:
-            raise CheckpointError(
-                f"the checkpoint of step {step} in {self.checkpoints} is from an older version of "
-                "torchrl-tit, whose networks had other parts: train the run again"
-            )
-        return step, state
+        return load_checkpoint(self.checkpoints) if checkpoint_steps(self.checkpoints) else None
 
     def load_initial_weights(self) -> dict[str, Any]:
         """Loads the weights of another run that this one starts from; empty if there are none.
