@@ -68,7 +68,7 @@ MISTAKES = [
     (f"{EXPLAIN} a.gif --max-steps 0", "max_steps must be at least 1"),
     (f"{EXPLAIN} a.png --max-steps 3", "max_steps 3 is the length of a film"),
     (f"{EXPLAIN} a.png --step -1", "there is no step -1"),
-    (f"{EXPLAIN} a.png --seed -1", "--seed must be from 0"),
+    (f"{EXPLAIN} a.png --seed -1", "--seed must be at least 0"),
     (f"{EXPLAIN} no/a.png", "there is no folder"),
     (f"{EXPLAIN} mine.png", "exists already"),
     ("explain nothing --out a.png", "is neither an agent nor a run"),
