@@ -30,7 +30,7 @@ import msgspec
 
 from recipes.cli.main import COMMANDS, USAGE, main
 from recipes.core.recipe import recipe_classes
-from recipes.tools.results.metric_words import to_markdown
+from recipes.tools.results.metric_words import family, known_columns, words_of
 from torchrl_tit.settings import NETWORKS, FrameSettings, Head, HistorySettings, Network
 
 ROOT = Path(__file__).parents[2]
@@ -210,9 +210,24 @@ def _default(field: dataclasses.Field[Any]) -> str:
 # Metrics
 
 
+def metrics_of(algorithm: str) -> str:
+    """The table of an algorithm's metrics; of a subclass, those that it adds."""
+    _, *above = (name for name in family(algorithm) if name)
+    inherited = {column for name in above for column in known_columns(name)}
+    own = [column for column in known_columns(algorithm) if column not in inherited]
+    if above and not own:
+        return f"Those of `{above[0]}`.\n"
+    lines = [f"Beside those of `{above[0]}`:", ""] if above else []
+    lines += ["| column | what it is | healthy | otherwise |", "|---|---|---|---|"]
+    for column in own:
+        words = words_of(algorithm, column)
+        lines.append(f"| `{column}` | {words.what} | {words.healthy} | {words.otherwise} |")
+    return "\n".join(lines) + "\n"
+
+
 def _metrics() -> str:
     names = sorted(_algorithms(), key=lambda name: (name != "ppo", name))
-    sections = [f"## `{name}`\n\n{to_markdown(name)}" for name in names]
+    sections = [f"## `{name}`\n\n{metrics_of(name)}" for name in names]
     return "\n".join(sections)
 
 

@@ -46,7 +46,7 @@ def words_of(algorithm: str, column: str) -> MetricWords:
         'The mean return of the evaluation that aims for 3600.'
     """
     found = _read()
-    known = next((found[of, column] for of in _family(algorithm) if (of, column) in found), None)
+    known = next((found[of, column] for of in family(algorithm) if (of, column) in found), None)
     if known is None and _TARGET.fullmatch(column):
         target = column.removeprefix("return_")
         what = f"The mean return of the evaluation that aims for {target}."
@@ -56,33 +56,14 @@ def words_of(algorithm: str, column: str) -> MetricWords:
 
 def known_columns(algorithm: str) -> list[str]:
     """Lists the described columns of an algorithm, the most informative first."""
-    family = _family(algorithm)
-    return [column for of, column in _read() if of in family]
+    kinds = family(algorithm)
+    return [column for of, column in _read() if of in kinds]
 
 
-def own_columns(algorithm: str) -> list[str]:
-    """Lists those that an algorithm adds to the ones of the algorithm it is a subclass of."""
-    return [column for of, column in _read() if of == algorithm]
-
-
-def _family(algorithm: str) -> list[str]:
+def family(algorithm: str) -> list[str]:
     """An algorithm, those whose recipes its own is a subclass of, and all of them, ""."""
     kinds = get_recipe_class(algorithm).__mro__
     return [*(vars(kind)["algorithm"] for kind in kinds if "algorithm" in vars(kind)), ""]
-
-
-def to_markdown(algorithm: str) -> str:
-    """Writes the table of an algorithm's metrics for the documentation."""
-    _, *above = (name for name in _family(algorithm) if name)
-    own = own_columns(algorithm)
-    if above and not own:
-        return f"Those of `{above[0]}`.\n"
-    lines = [f"Beside those of `{above[0]}`:", ""] if above else []
-    lines += ["| column | what it is | healthy | otherwise |", "|---|---|---|---|"]
-    for column in own if above else known_columns(algorithm):
-        words = words_of(algorithm, column)
-        lines.append(f"| `{column}` | {words.what} | {words.healthy} | {words.otherwise} |")
-    return "\n".join(lines) + "\n"
 
 
 def limit(formula: str, recipe: Recipe) -> float | None:

@@ -454,30 +454,19 @@ def _short_runs(groups: Sequence[Group]) -> list[str]:
 def _settings(index: int, groups: Sequence[Group], media: Media) -> dict[str, Any]:
     """The settings of a group, how they differ from the recipe of that name, and the command."""
     group = groups[index]
-    recipe, backbone = group.recipe, group.recipe.backbone
+    recipe = group.recipe
     named = RECIPES.get(recipe.name)
     old = fields_of(named) if named else {}
     changes = changes_of(named, recipe) if named else {}
-    compared = (
-        f"What differs from the recipe {recipe.name}:"
-        if changes
-        else f"All settings are those of the recipe {recipe.name}."
-        if named
-        else "No recipe of that name comes with this version, so all settings stand below."
-    )
-    weights = media.weights.get(group.label)
-    network = (
-        f"Network: frame encoder {backbone.frame.name}, history encoder {backbone.history.name}, "
-        f"{backbone.num_frames} observation{'s' * (backbone.num_frames > 1)} at a time"
-        + (f", {weights:,} weights in the policy" if weights else "")
-    )
     file = "recipe.json" if len(groups) == 1 else f"recipe-{index + 1}.json"
     source = shlex.quote(recipe.name if named and not changes else file)
     seeds = " ".join(str(data.run.recipe.seed) for data in group.runs)
     command = f"sweep {source} --seeds" if group.runs[1:] else f"train {source} --seed"
     return {
         "label": group.label,
-        "text": f"{network}. {compared}",
+        "name": recipe.name if named else "",
+        "backbone": recipe.backbone,
+        "weights": media.weights.get(group.label),
         "changes": [(name, _text(old.get(name, "-")), _text(x)) for name, x in changes.items()],
         "settings": {name: _text(value) for name, value in fields_of(recipe).items()},
         "command": f"torchrl-tit {command} {seeds}",
@@ -486,12 +475,12 @@ def _settings(index: int, groups: Sequence[Group], media: Media) -> dict[str, An
     }
 
 
-def _differences(groups: Sequence[Group]) -> list[tuple[str, list[str]]]:
-    """The fields that all experiments have and in which they differ, with their values."""
+def _differences(groups: Sequence[Group]) -> list[list[str]]:
+    """The fields that all experiments have and in which they differ: the field, and its values."""
     settings = [fields_of(group.recipe) for group in groups]
     shared = [name for name in settings[0] if all(name in one for one in settings)]
-    rows = [(name, [_text(one[name]) for one in settings]) for name in shared if name != "name"]
-    return [(name, values) for name, values in rows if len({*values}) > 1]
+    rows = [[name, *(_text(one[name]) for one in settings)] for name in shared if name != "name"]
+    return [row for row in rows if len({*row[1:]}) > 1]
 
 
 def _run(group: Group, data: RunData) -> list[str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from docs.tools import reference
 from recipes.core import registry
 from recipes.core.algorithm import make_algorithm
 from recipes.core.recipe import Recipe
@@ -15,7 +16,7 @@ from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 from recipes.ppo import PPO
 from recipes.tools.results.experiments import find_runs, group_runs
-from recipes.tools.results.metric_words import known_columns, limit, to_markdown, words_of
+from recipes.tools.results.metric_words import known_columns, limit, words_of
 from torchrl_tit.settings.networks import mlp, nature_cnn
 
 RECIPE = PPO(name="a", env="CartPole-v1", backbone=mlp())
@@ -68,7 +69,7 @@ def test_every_column_is_described(algorithm):
 
 def test_the_documents_have_the_same_words():
     page = ROOT / "docs" / "reference" / "metrics.md"  # the site adds the other algorithms
-    assert to_markdown("ppo") in page.read_text()
+    assert reference.metrics_of("ppo") in page.read_text()
 
 
 def test_limits():
