@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
@@ -133,11 +132,9 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         return self._behavior
 
     def prepare(self, step: int, folder: Path) -> None:
-        """Builds optimizer, target update, collector and replay buffer."""
-        rate, tau = self.recipe.learning_rate, self.recipe.tau
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=rate, fused=True)
-        if tau < 1:
-            self.target = SoftUpdate(self.model, tau=tau)
+        """As :meth:`ReplayAlgorithm.prepare`, with the update of the target."""
+        if self.recipe.tau < 1:
+            self.target = SoftUpdate(self.model, tau=self.recipe.tau)
         else:  # copies at each of its steps
             self.target = HardUpdate(self.model, value_network_update_interval=0)
         super().prepare(step, folder)

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
-from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor
@@ -150,16 +149,12 @@ class SmoothPPOAlgorithm(PPOAlgorithm):
                 f"state-dependent noise is for continuous actions, not for {describe(spec)}: use a "
                 "ppo recipe"
             )
-        key = model.backbone.features_keys[0]
-        model.actor = self._actor(model.backbone.features_dim, spec, key)
-        return model
-
-    def _actor(self, features_dim: int, spec: TensorSpec, key: Any) -> TensorDictModuleBase:
+        key, features_dim = model.backbone.features_keys[0], model.backbone.features_dim
         mean = nn.Linear(features_dim, spec.shape[0])
         init_orthogonal_(mean, gain=0.01)
         scale = initial_scale(spec, spec.shape, self.recipe.initial_std)
         noise = StateDependentNoise(features_dim, spec.shape[0], self.recipe.noise_steps, scale)
-        return ProbabilisticActor(
+        model.actor = ProbabilisticActor(
             TensorDictSequential(
                 TensorModule(mean, [key], ["mean"]),
                 TensorModule(noise, ["mean", key], ["loc", "scale", "noise"]),
@@ -169,3 +164,4 @@ class SmoothPPOAlgorithm(PPOAlgorithm):
             return_log_prob=True,
             log_prob_key="action_log_prob",
         )
+        return model

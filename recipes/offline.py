@@ -44,9 +44,6 @@ from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 from .core.algorithm import (
     Algorithm,
     Stateful,
-    Terms,
-    check_without_waiting,
-    numbers,
     storage_device,
     to_networks,
 )
@@ -529,9 +526,3 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             with weights.to_module(network, preserve_module_state=False):
                 values.append(action_values(network, samples, action))
         return torch.stack(values).amin(0)
-
-    def numbers(self, terms: Terms) -> Mapping[str, Tensor]:
-        """Selects and checks the numbers that an update returns."""
-        values = numbers(self.columns, terms)
-        check_without_waiting(self.columns, values)
-        return dict(zip(self.columns, values, strict=True))

@@ -27,8 +27,6 @@ from torchrl_tit.settings.numbers import Batch, Steps, Weight
 from .core.algorithm import (
     Stateful,
     Terms,
-    check_finite,
-    numbers,
     storage_device,
     to_networks,
 )
@@ -142,8 +140,10 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         return super().make_env(num_envs, seed, clip_actions=False, **settings)
 
     def prepare(self, step: int, folder: Path) -> None:
-        """Builds collector and replay buffer."""
-        recipe = self.recipe
+        """Builds optimizer, collector and replay buffer."""
+        recipe: Any = self.recipe
+        rate = recipe.learning_rate
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=rate, fused=True)
         self.policy.eval()
         random_steps = recipe.random_steps if self.draws_random_steps else 0
         self.collector = self.make_collector(
@@ -191,11 +191,10 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         for number in range(done, done + recipe.updates_per_batch):
             terms = self.learn(to_networks(self.buffer.sample(), self.device), number)
         self.policy.eval()
-        values = numbers(self.columns, terms)
-        check_finite(self.columns, values)
+        numbers = self.numbers(terms)
         if not self.collects_here:
             self.collector.update_policy_weights_()
-        return dict(zip(self.columns, values, strict=True))
+        return numbers
 
     @abstractmethod
     def learn(self, samples: TensorDictBase, number: int) -> Terms:

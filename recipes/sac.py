@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import NormalParamExtractor, TensorDictSequential
 from torch import nn
@@ -96,9 +95,7 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
         return loss
 
     def prepare(self, step: int, folder: Path) -> None:
-        """Builds optimizer, target update, collector and replay buffer."""
-        rate = self.recipe.learning_rate
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=rate, fused=True)
+        """As :meth:`ReplayAlgorithm.prepare`, with the update of the targets."""
         self.target = SoftUpdate(self.model, tau=self.recipe.tau)
         super().prepare(step, folder)
 

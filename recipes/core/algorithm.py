@@ -282,11 +282,6 @@ def descend(terms: Terms, optimizer: torch.optim.Optimizer) -> Tensor:
     return total.detach()
 
 
-def numbers(columns: Sequence[str], terms: Terms) -> Tensor:
-    """Selects the numbers that an update returns from the terms of its losses; float [columns]."""
-    return torch.stack([terms[name].detach() for name in columns])
-
-
 def check_finite(names: Sequence[str], values: Tensor) -> None:
     """Checks that values are finite.
 

@@ -17,7 +17,7 @@ from tensordict.nn import (
     TensorDictModuleBase,
     TensorDictSequential,
 )
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl.envs import Compose, EnvBase
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, QValueModule, TanhModule
@@ -33,7 +33,7 @@ from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
 from torchrl_tit.networks import HistoryNetwork, build_network, chosen_by_kind
 from torchrl_tit.settings import Flat, Network
 
-from .algorithm import Algorithm, Terms
+from .algorithm import Algorithm, Terms, check_without_waiting
 from .recipe import Recipe
 
 _MIN_LOG_STD = -5.0
@@ -331,6 +331,7 @@ class LearnsFromSamples(ABC):
 
     recipe: Any
     device: torch.device
+    columns: Sequence[str]
     normalized_by: ClassVar[Mapping[str, float]] = {}
     """Settings of what normalizes observations, if the recipe says so."""
     _policy: TensorDictModuleBase
@@ -389,3 +390,9 @@ class LearnsFromSamples(ABC):
             normalization=self.normalization,
             **settings,
         ).to(self.device)
+
+    def numbers(self, terms: Terms) -> dict[str, Tensor]:
+        """Selects and checks the numbers that an update returns from the terms of its losses."""
+        values = torch.stack([terms[name].detach() for name in self.columns])
+        check_without_waiting(self.columns, values)
+        return dict(zip(self.columns, values, strict=True))
