@@ -143,7 +143,7 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         """Optimizer, replay buffer, and the probability of random actions."""
         return {**super().state(), "exploration": self.exploration}
 
-    def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
+    def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor | float]:
         """As :meth:`ReplayAlgorithm.update`; random actions then become less likely."""
         terms = super().update(batch, step)
         if step + batch.numel() > self.recipe.random_steps:

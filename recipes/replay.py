@@ -177,7 +177,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         self.buffer_state.storage.end_episodes()
         return iter(self.collector)
 
-    def update(self, batch: TensorDictBase, step: int) -> dict[str, Tensor | float]:
+    def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor | float]:
         """Stores a batch, then takes gradient steps on samples from the buffer."""
         recipe, count = self.recipe, batch.numel()
         if recipe.normalize_observations and step < recipe.random_steps:

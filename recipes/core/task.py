@@ -109,7 +109,7 @@ def play_once(
         policy: writes the action into the tensordict that it is given.
         keys: the entries of a step to keep, rewards and ends among them; with "game_over", an Atari
             game is played to its end, and not to that of a life.
-        seed: seed of the first environment; None draws on.
+        seed: seed of the first environment; with None, all keep the seeds that they have.
         max_steps: where longer episodes are cut off.
 
     Returns:

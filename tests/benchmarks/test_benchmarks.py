@@ -48,7 +48,7 @@ def test_pages_quote_what_make_bench_measures():
 
 def test_records_have_the_rows_of_the_benchmarks_in_order():
     """Pages read these rows by their places."""
-    places = {
+    places: dict[str, list[tuple[Case, dict[str, int]]]] = {
         "acting": [(case, {}) for case in acting.CASES],
         "segments": [(row.case, {"length": row.length}) for row in segments.ROWS],
     }
