@@ -7,8 +7,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from torchrl_tit.settings.checks import checked
 from torchrl_tit.settings.literals import parse_assignments
-from torchrl_tit.settings.numbers import Episodes, Seed, Threads
+from torchrl_tit.settings.numbers import Episodes, Seed, Steps, StepsOrNone, Threads
 
 from .arguments import Parser, add_agent, check_numbers, fail, say
 
@@ -118,7 +119,9 @@ def explain(arguments: list[str]) -> None:
         "--layer", help="layer of grad-cam; default: the last that is laid out over the image"
     )
     options = parser.parse_args(arguments)
-    check_numbers(options, seed=Seed)
+    check_numbers(options, seed=Seed, max_steps=Steps)
+    for step in options.step or ():
+        checked("--step", step, StepsOrNone)
     if options.dataset is None and options.episode is not None:
         fail("--episode is one of a data set: name it with --dataset FILE")
     if options.dataset is not None and options.seed is not None:

@@ -337,7 +337,3 @@ def check_explanation(out: Path, step: int | None, max_steps: int | None) -> Non
         raise ValueError(f"step {step} is one step, so it is a picture: write it to a .png")
     if max_steps is not None and out.suffix not in FILMS:
         raise ValueError(f"max_steps {max_steps} is the length of a film, not of a .png: use step")
-    if step is not None and step < 0:
-        raise ValueError(f"steps are counted from 0, so there is no step {step}")
-    if max_steps is not None and max_steps < 1:
-        raise ValueError(f"max_steps must be at least 1, not {max_steps}")

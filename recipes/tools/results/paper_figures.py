@@ -207,8 +207,6 @@ def _play(
     Raises:
         ValueError: if the episode has no such step.
     """
-    if min(steps) < 0:
-        raise ValueError(f"steps are counted from 0, so there is no step {min(steps)}")
 
     def at_steps(number: int, acted: TensorDictBase) -> None:
         if number in steps:

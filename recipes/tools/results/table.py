@@ -106,12 +106,8 @@ def make_table(folders: Iterable[Path]) -> tuple[list[Cell], list[str]]:
     order = {
         plain_name(name): place for place, cell in enumerate(paper_cells()) for name in cell.recipes
     }
-
-    def rank(cell: Cell) -> tuple[bool, int, str]:
-        place = order.get(plain_name(cell.recipe), len(order))
-        return cell.table == OTHER, place, cell.label
-
-    cells.sort(key=rank)
+    last = len(order)
+    cells.sort(key=lambda x: (x.table == OTHER, order.get(plain_name(x.recipe), last), x.label))
     return cells, notes
 
 
