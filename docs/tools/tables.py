@@ -50,6 +50,7 @@ from recipes.tools.results.comparison import (
     interquartile_mean,
     normalize,
     probability_of_improvement,
+    read_references,
 )
 from recipes.tools.results.interval import FEWEST, interval_of
 from recipes.tools.results.numbers import mean_std, number, numbers
@@ -180,7 +181,7 @@ def _normalized(runs: Runs) -> dict[Any, list[float]]:
         else:
             recipe = RecordedRun(*pair).recipe
             task = (recipe.env, getattr(recipe, "hide_velocities", False))
-        found.setdefault(task, []).extend(normalize([value], task[0]))
+        found.setdefault(task, []).extend(normalize([value], task[0], read_references()))
     return found
 
 

@@ -62,11 +62,18 @@ def summary(arguments: list[str]) -> None:
         help="which runs belong together, the first to compare with: patterns of the last part of "
         "a recipe's name, such as 'enhanced-tit*'; default: those with the same last part",
     )
+    parser.add_argument(
+        "--references",
+        type=Path,
+        metavar="FILE",
+        help="CSV file with the columns env, random and best, instead of the returns that come "
+        "with the package",
+    )
     options = parser.parse_args(arguments)
     from ..tools.results.comparison import SUMMARY, read_networks, summarize
     from ..tools.results.table import to_lines
 
-    networks, notes = read_networks(options.folders, options.networks)
+    networks, notes = read_networks(options.folders, options.networks, options.references)
     for line in notes:
         note(line)
     say("\n".join(to_lines(SUMMARY, summarize(networks))))
@@ -76,6 +83,7 @@ def table(arguments: list[str]) -> None:
     """Prints the paper's tables for the runs in the folders."""
     parser = Parser("table", "Print the paper's tables with all runs in the folders.")
     parser.add_argument("folders", type=Path, nargs="+", help="folders of runs, or tables of runs")
+    parser.add_argument("--format", choices=["md", "csv"], default="md", help="format to print")
     parser.add_argument("--out", type=Path, help="folder for table.md, table.csv and table.png")
     options = parser.parse_args(arguments)
     from torchrl_tit.files import write_text_atomic
@@ -85,7 +93,7 @@ def table(arguments: list[str]) -> None:
     cells, notes = make_table(options.folders)
     for line in notes:
         note(line)
-    say(to_markdown(cells).rstrip("\n"))
+    say((to_csv(cells) if options.format == "csv" else to_markdown(cells)).rstrip("\n"))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         write_text_atomic(options.out / "table.md", to_markdown(cells))

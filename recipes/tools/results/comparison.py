@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import cache
 from math import ceil, lcm, nan
 from pathlib import Path
 from typing import Any
@@ -179,34 +179,54 @@ def _resampled(values: np.ndarray, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).choice(values, (_RESAMPLES, len(values)))
 
 
-@cache
-def read_references() -> dict[str, tuple[float, float]]:
+def read_references(path: Path | None = None) -> dict[str, tuple[float, float]]:
     """Reads the returns of a random policy and of the best published PPO, by the task's name.
 
-    They are those of random actions over 100 episodes, and of RL Zoo's tuned agents or the PPO of
+    Ours are those of random actions over 100 episodes, and of RL Zoo's tuned agents or the PPO of
     TD3's authors (arXiv 1802.09477, table 1), on the version of the task that they had.
+
+    Args:
+        path: a CSV file with the columns env, random and best; by default ours.
+
+    Raises:
+        ValueError: if the file is not of this form.
     """
-    rows = read_rows("reference_returns.csv")
-    return {row["env"]: (float(row["random"]), float(row["best"])) for row in rows}
+    try:
+        rows: Iterable[Mapping[str, str]] = read_rows("reference_returns.csv")
+        if path is not None:
+            rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
+        references = {row["env"]: (float(row["random"]), float(row["best"])) for row in rows}
+        if same := [env for env, (random, best) in references.items() if not best > random]:
+            raise ValueError(f"best must be above random, but is not for {same[0]}")
+        return references
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{path} must be a CSV file with the columns env, random and best, and numbers in the "
+            f"last two: {error}"
+        ) from error
 
 
-def normalize(values: Sequence[float], env: str) -> list[float]:
+def normalize(
+    values: Sequence[float], env: str, references: Mapping[str, tuple[float, float]]
+) -> list[float]:
     """Returns as shares of the way from a random policy to the best published one.
 
     Raises:
         ValueError: if there are no reference returns for the task.
     """
-    references = read_references()
     if env not in references:
         raise ValueError(
-            f"no reference returns for {env}, but for {', '.join(references)}: leave its runs out"
+            f"no reference returns for {env}: give a CSV file with the columns env, random and "
+            "best, or leave its runs out"
         )
     random, best = references[env]
     return [(value - random) / (best - random) for value in values]
 
 
 def read_networks(
-    folders: Iterable[Path], patterns: Sequence[str] = ()
+    folders: Iterable[Path],
+    patterns: Sequence[str] = (),
+    references: Path | None = None,
 ) -> tuple[dict[str, dict[Task, list[float]]], list[str]]:
     """Reads the normalized returns of networks on several tasks.
 
@@ -214,6 +234,7 @@ def read_networks(
         folders: as for ``table``.
         patterns: which runs belong together, of the last part of their recipes' names, such as
             "enhanced-tit*"; by default those with the same last part.
+        references: a file for :func:`read_references`.
 
     Returns:
         By network, and then by task, the value of each run, and notes about runs and tasks that are
@@ -224,6 +245,7 @@ def read_networks(
             common to all.
     """
     experiments, notes = read_evaluations(folders)
+    returns = read_references(references)
     networks: dict[str, dict[Task, list[float]]] = {pattern: {} for pattern in patterns}
     for experiment, evaluations in experiments:
         settings = experiment.settings
@@ -240,7 +262,9 @@ def read_networks(
             )
         values = [value_of(evaluation) for evaluation in evaluations]
         scored = measure_of(settings, evaluations[0]) != "return"
-        found[task] = [x / 100 for x in values] if scored else normalize(values, settings.env)
+        found[task] = (
+            [x / 100 for x in values] if scored else normalize(values, settings.env, returns)
+        )
     if not networks:
         raise ValueError("; ".join(["no evaluated run", *notes]))
     if missing := [name for name, found in networks.items() if not found]:

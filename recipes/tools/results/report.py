@@ -304,7 +304,7 @@ def _context(
         "unit": _unit(recipe),
         "notes": notes + _short_runs(groups),
         "header": HEADER,
-        "cells": [to_columns(cell) for cell in cells],
+        "cells": [(to_columns(cell), cell.published) for cell in cells],
         "compared_header": comparison.HEADER,
         "compared_words": comparison.WORDS,
         "compared": comparison.compare_with_first([(x.label, x.values) for x in cells]),

@@ -1,9 +1,10 @@
-"""The tables of the paper for runs, beside what the paper reports."""
+"""The tables of the paper for runs, beside what the paper and others report."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from pathlib import Path
 from statistics import fmean, stdev
 from textwrap import fill
@@ -13,11 +14,12 @@ from torchrl_tit.scores import has_reference
 
 from ...core import records
 from ...core.recipe import Recipe
+from ...core.registry import RECIPES
 from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import FEWEST, Interval, interval_of
-from .numbers import mean_std, number
-from .paper import HEADINGS, match, paper_cells, plain_name
+from .numbers import mean_std, number, numbers, read_rows
+from .paper import HEADINGS, TASK, Match, has_its_data, match, paper_cells, plain_name
 from .plot import new_figure, plain, save_figure
 
 OTHER = "not in the paper"
@@ -28,6 +30,26 @@ HEADER = (
     *("interquartile mean [95%]", "paper"),
 )
 """The header of :func:`to_columns`."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """The result of another implementation with the same kind of network."""
+
+    source: str
+    """Who reports it."""
+    url: str
+    """Where."""
+    mean: float
+    std: float
+    """NaN if none is reported."""
+    note: str
+    """How it was measured: version of the task, steps, seeds."""
+
+    @property
+    def numbers(self) -> str:
+        """The mean, and the spread if there is one."""
+        return " ± ".join(numbers([self.mean, *([self.std] * (self.std == self.std))]))
 
 
 @dataclass(frozen=True)
@@ -69,6 +91,9 @@ class Cell:
 
     measure: str = "return"
     """What the values are: "return" or "normalized score"."""
+
+    published: tuple[Published, ...] = ()
+    """What others report for the same task and kind of network."""
 
     values: tuple[float, ...] = ()
     """The runs' values."""
@@ -160,14 +185,23 @@ def read_evaluations(
 def to_markdown(cells: Sequence[Cell]) -> str:
     """Writes cells as Markdown, one table for each of the paper's.
 
-    Where runs learned from data, the table has a column for their highest evaluations.
+    Where others have published results for the same task and network, the table has a column for
+    them, and where runs learned from data, one for their highest evaluations.
     """
     parts = []
     for table in dict.fromkeys(cell.table for cell in cells):
         rows = [cell for cell in cells if cell.table == table]
+        is_published = any(cell.published for cell in rows)
         has_best = any(cell.best == cell.best for cell in rows)
-        columns = [*HEADER, *["highest evaluation"] * has_best]
-        texts = ([*to_columns(cell), *[number(cell.best)] * has_best] for cell in rows)
+        columns = [*HEADER, *["highest evaluation"] * has_best, *["published"] * is_published]
+        texts = (
+            [
+                *to_columns(cell),
+                *[number(cell.best)] * has_best,
+                *[", ".join(map(_published, cell.published))] * is_published,
+            ]
+            for cell in rows
+        )
         lines = [f"### {table[0].upper()}{table[1:]}\n", *to_lines(columns, texts)]
         if any(cell.runs < FEWEST for cell in rows):
             lines += ["", FEW]
@@ -188,12 +222,16 @@ def to_columns(cell: Cell) -> list[str]:
 
 
 def to_csv(cells: Sequence[Cell]) -> str:
-    """Writes cells as CSV, one row each; unknown values are empty."""
+    """Writes cells as CSV, one row each; unknown values are empty, published ones are one text."""
     names = [field.name for field in fields(Cell)]
     rows = []
     for cell in cells:
         values = {name: getattr(cell, name) for name in names}
         values["values"] = "; ".join(map(str, cell.values))
+        values["published"] = "; ".join(
+            f"{result.source} {result.mean} ± {result.std} ({result.note}; {result.url})"
+            for result in cell.published
+        )
         rows.append(["" if value != value else value for value in values.values()])
     return records.to_csv([names, *rows])
 
@@ -243,6 +281,36 @@ def plot_table(cells: Sequence[Cell], picture: Path) -> None:
     save_figure(figure, picture)
 
 
+@cache
+def published_results() -> dict[str, tuple[Published, ...]]:
+    """What others have published, by the name of the recipe with the same task and network.
+
+    Example:
+        >>> [result.source for result in published_results()["ppo/acrobot/mlp"]]
+        ['CleanRL', 'RL Zoo']
+    """
+    results: dict[str, tuple[Published, ...]] = {}
+    for row in read_rows("published_results.csv"):
+        name = row["recipe"]
+        mean, std = float(row["mean"]), float(row["std"])
+        result = Published(row["source"], row["url"], mean, std, row["note"])
+        results[name] = (*results.get(name, ()), result)
+    return results
+
+
+def reported_of(recipe: Recipe) -> tuple[Match | None, tuple[Published, ...]]:
+    """What the paper reports about a run's cell, and others about the recipe of its name.
+
+    Args:
+        recipe: the settings of a run.
+    """
+    plain = plain_name(recipe.name)
+    named = RECIPES.get(recipe.name) or RECIPES.get(plain)
+    fields = [*TASK, "backbone"] if named and has_its_data(recipe) else []
+    same = all(getattr(recipe, x, None) == getattr(named, x, None) for x in fields)
+    return match(recipe), published_results().get(plain, ()) if fields and same else ()
+
+
 def value_of(evaluation: dict[str, Any]) -> float:
     """The number that a run counts with: the mean return, or the normalized score, at the end."""
     return float(evaluation["score"]["last"] if "score" in evaluation else evaluation["mean"])
@@ -263,7 +331,7 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
     values = [value_of(evaluation) for evaluation in evaluations]
     spreads = [evaluation.get("score_std", evaluation["std"]) for evaluation in evaluations]
     interval = interval_of(values)
-    found = match(experiment.settings)
+    found, published = reported_of(experiment.settings)
     paper = found.cell if found else None
     return Cell(
         table=HEADINGS[paper.tables[0]] if paper else OTHER,
@@ -281,9 +349,14 @@ def _cell(experiment: Experiment, evaluations: Sequence[dict]) -> Cell:
         paper=str(found or ""),
         changes=experiment.changes,
         measure=measure_of(experiment.settings, evaluations[0]),
+        published=published,
         values=tuple(values),
         best=fmean(x["score"]["best"] if "score" in x else float("nan") for x in evaluations),
     )
+
+
+def _published(result: Published) -> str:
+    return f"[{result.source}]({result.url}) {result.numbers} ({result.note})"
 
 
 def to_lines(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

@@ -96,18 +96,28 @@ def test_summary(tasks, capsys):
     assert "| mlp | 2 | 4 | 0.718 [0.718, 0.718] |  |" in printed.out
     assert "| enhanced-* | 2 | 4 | 0.992 [0.992, 0.992] | 1 [1, 1] |" in printed.out
     assert "MountainCar-v0 is left out of enhanced-*: not all networks have" in printed.err
-    main(["summary", str(tasks), "--networks", "mlp"])
+    file = tasks / "mine.csv"
+    file.write_text(
+        "env,random,best\nCartPole-v1,0,1000\nAcrobot-v1,-180,-80\nMountainCar-v0,0,1\n"
+    )
+    main(["summary", str(tasks), "--networks", "mlp", "--references", str(file)])
     assert "MountainCar-v0" not in capsys.readouterr().err
+    main(["summary", str(tasks / "cartpole"), "--references", str(file)])
+    assert "| mlp | 1 | 2 | 0.25 [0.25, 0.25] |" in capsys.readouterr().out
 
 
 def test_what_cannot_be_summarized(tasks, capsys):
     write_run(tasks / "more", "ppo/cartpole/mlp", 0, [1.0], epochs=5)
     write_run(tasks / "own" / "a", "ppo/enhanced-tit", 0, [1.0], env="Taxi-v4")
+    (tasks / "bad.csv").write_text("env,random\nCartPole-v1,0\n")
+    (tasks / "flat.csv").write_text("env,random,best\nCartPole-v1,5,5\n")
     only = [str(tasks / "cartpole")]
     for words, message in {
         (str(tasks / "more"), *only): "mlp has two settings on CartPole-v1",
-        (str(tasks / "own"),): "no reference returns for Taxi-v4, but for CartPole-v1",
+        (str(tasks / "own"),): "no reference returns for Taxi-v4: give a CSV file",
         (*only, "--networks", "lstm"): "no evaluated run of lstm",
+        (*only, "--references", str(tasks / "bad.csv")): "bad.csv must be a CSV file with the",
+        (*only, "--references", str(tasks / "flat.csv")): "is not for CartPole-v1",
         (str(tasks / "mountaincar"), str(tasks / "cartpole" / "mlp")): "no task has runs of all",
     }.items():
         assert message in fails(capsys, "summary", *words)

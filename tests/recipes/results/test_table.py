@@ -13,7 +13,7 @@ from recipes.core.registry import RECIPES
 from recipes.core.run import Run
 from recipes.tools.results import table
 from recipes.tools.results.paper import paper_cells
-from recipes.tools.results.table import make_table, to_markdown
+from recipes.tools.results.table import make_table, published_results, to_csv, to_markdown
 from tests.recipes.results.report_runs import write_run
 from torchrl_tit.settings import Linear
 from torchrl_tit.settings.networks import enhanced_tit, mlp
@@ -79,7 +79,9 @@ def test_last_scores_stand_beside_the_papers_in_its_order(tmp_path):
     assert "### Table 3: offline" in text
     assert "| cql/hopper-medium-replay-v0/enhanced-tit | 3 | 80 ± 10 | 3 | - |" in text
     assert text.count("| near 99.2 ± 1.7: evaluated on MuJoCo's v2, here v4 | 85 |") == 1
-    assert "| highest evaluation |" in text
+    assert "| highest evaluation | published |" in text
+    assert "[d3rlpy](https://github.com/takuseno/d3rlpy-benchmarks) 85.1 ± 16.2" in text
+    assert "[CQL's authors](https://arxiv.org/abs/2006.04779) 48.6 (no spread given)" in text
 
 
 def test_scores_and_returns_are_not_of_one_measure(tmp_path, monkeypatch):
@@ -169,13 +171,37 @@ def test_a_number_of_the_paper_stands_beside_what_it_was_measured_with(
 def test_every_value_of_the_paper_belongs_to_a_recipe():
     recipes = [name for cell in paper_cells() for name in cell.recipes]
     assert len(recipes) == len({*recipes})
-    assert {*recipes} <= set(RECIPES)
+    assert {*recipes, *published_results()} <= set(RECIPES)
     ours = [cell for cell in paper_cells() if cell.recipes]
     assert len([cell for cell in ours if cell.recipes[0].startswith("ppo/")]) == 30 + 32 + 12
     assert len(ours) == 30 + 32 + 12 + 12 + 12  # arrays, images, ablation; CQL, DT
     quoted = [cell for cell in paper_cells() if not cell.recipes]
     assert len(quoted) == 4 + 6 + 12 + 6
     assert all(cell.note.startswith("quoted from ") for cell in quoted)
+
+
+def test_published_results_stand_beside_the_same_task_and_network(tmp_path):
+    for number, (of, fields) in enumerate(
+        [
+            ("ppo/acrobot/mlp", {}),
+            ("ppo/acrobot/mlp", {"env": "CartPole-v1"}),
+            ("ppo/acrobot/enhanced-tit", {}),
+        ]
+    ):
+        write_run(tmp_path / str(number), of, 0, [-90.0, -80.0], **fields)
+    cells, _ = make_table([tmp_path])
+    assert {cell.label: [result.source for result in cell.published] for cell in cells} == {
+        "ppo/acrobot/mlp": ["CleanRL", "RL Zoo"],
+        "ppo/acrobot/mlp (env CartPole-v1)": [],
+        "ppo/acrobot/enhanced-tit": [],
+    }
+    cleanrl = published_results()["ppo/acrobot/mlp"][0]
+    assert (cleanrl.mean, cleanrl.std) == (-86.36, 1.32)
+    text = to_markdown(cells)
+    assert f"[CleanRL]({cleanrl.url}) -86.4 ± 1.3 (training return after 500k steps" in text
+    assert "| published |" in text
+    assert "CleanRL -86.36 ± 1.32" in to_csv(cells)
+    assert "published" not in to_markdown(make_table([tmp_path / "2"])[0])
 
 
 def test_command(runs, tmp_path, capsys):
@@ -189,6 +215,8 @@ def test_command(runs, tmp_path, capsys):
     assert rows[1]["low"] == ""
     assert float(rows[0]["paper_mean"]) == -81
     assert (out / "table.png").read_bytes().startswith(b"\x89PNG")
+    main(["table", str(runs / "ppo"), "--format", "csv"])
+    assert capsys.readouterr().out == (out / "table.csv").read_text()
 
 
 @pytest.mark.parametrize(
