@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import shlex
 import time
+import warnings
+from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any
 
 from torchrl_tit.settings.imports import import_options
 
@@ -21,6 +24,11 @@ from ..tools.results.plot import plot_run
 from ..tools.wandb_metrics import WandbMetrics, check_wandb
 from .arguments import note, option, override, program, say
 from .evaluate import one_line
+
+_SHARE = 5
+"""A run is checked after one part in this many, because the first episodes are often short."""
+_ENOUGH = 100
+"""Minimum number of episodes for a warning."""
 
 
 def start(
@@ -105,7 +113,7 @@ def _finish(run: Run, wandb: str | None) -> None:
         return
     try:
         with ExitStack() as stack:
-            callbacks: list[Callback] = []
+            callbacks: list[Callback] = [] if recipe.offline else [UnusedFrames(recipe)]
             if wandb is not None:
                 callbacks.append(stack.enter_context(closing(WandbMetrics(run, wandb))))
             runner.train(recipe, run, callbacks)
@@ -134,3 +142,40 @@ def _make_folder(recipe: Recipe) -> Path:
         except FileExistsError:
             number += 1
             folder = base.with_name(f"{base.name}-{number}")
+
+
+class UnusedFrames(Callback):
+    """Warns once if no episode in the first fifth of a run was as long as the history.
+
+    The network then reads more frames than the task's episodes have.
+
+    Args:
+        recipe: the settings of a run that learns from steps it collects.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._num_frames = recipe.backbone.num_frames
+        self._judged_at = recipe.final_step // _SHARE
+        self._over = self._num_frames == 1
+        self._running: defaultdict[int, int] = defaultdict(int)  # by environment
+        self._longest = self._episodes = 0
+
+    def collected(self, step: int, batch: Any) -> None:
+        """Measures the episodes of a batch [envs, time], and warns when it is time."""
+        if self._over:
+            return
+        for env, dones in enumerate(batch["next", "done"].squeeze(-1).tolist()):
+            for done in dones:
+                self._running[env] += 1
+                self._longest = max(self._longest, self._running[env])
+                if done:
+                    self._running[env] = 0
+                    self._episodes += 1
+        self._over = self._longest >= self._num_frames or step >= self._judged_at
+        if self._longest < self._num_frames and self._over and self._episodes >= _ENOUGH:
+            warnings.warn(
+                f"num_frames is {self._num_frames}, but no episode so far had more than "
+                f"{self._longest} steps: with num_frames {self._longest} the network sees as much, "
+                "and trains faster",
+                stacklevel=1,
+            )
