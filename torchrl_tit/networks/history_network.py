@@ -159,14 +159,10 @@ class HistoryNetwork(nn.Module):
         """Maps the tokens of K frames to features, float [..., K, L, D] -> [..., F]."""
         return self.head(self.history_encoder(self.as_floats(tokens), *context))
 
-    def encode_windows(
-        self,
-        frames: Sequence[Tensor],
-        windows: Windows,
-        *context: Tensor,
-        every_frame: bool = False,
-    ) -> Tensor:
+    def encode_windows(self, frames: Sequence[Tensor], windows: Windows) -> Tensor:
         """Maps windows on a table of frames to features, encoding each frame once.
+
+        Not for history encoders that read more than observations.
 
         The features and gradients are those of ``forward(*(windows.gather(x) for x in frames))``,
         up to rounding, at a cost that hardly grows with K. Dropout in the frame encoder is drawn
@@ -175,11 +171,9 @@ class HistoryNetwork(nn.Module):
         Args:
             frames: the table of each observation, [R, *observation_shape].
             windows: the rows of each window, [..., K].
-            *context: further inputs of the history encoder, [..., K, *entry] each.
-            every_frame: return the features of every frame of a window (see ``every_frame``).
 
         Returns:
-            float [..., F], or [..., K, F] of every frame.
+            float [..., F].
 
         Example:
             >>> from torchrl_tit import EnhancedTIT
@@ -199,13 +193,9 @@ class HistoryNetwork(nn.Module):
         tokens = [encoder(x) for encoder, x in zip(self.frames, frames, strict=True)]
         table = self.join_tokens(tokens)
         shares = windows.rows.shape[-1] > 1  # else a frame is in one window only
-        if shares and not every_frame and self.history_encoder.reads_tables(windows):
+        if shares and self.history_encoder.reads_tables(windows):
             return self.head(self.history_encoder.read_table(self.as_floats(table), windows))
-        gathered = windows.gather(table)
-        if every_frame:
-            encoded = self.history_encoder.every_frame(self.as_floats(gathered), *context)
-            return self.head(encoded)
-        return self.encode_history(gathered, *context)
+        return self.encode_history(windows.gather(table))
 
     def every_frame(self, *inputs: Tensor) -> Tensor:
         """Maps histories to features of every frame, each from that frame and the ones before it.
