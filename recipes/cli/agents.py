@@ -212,11 +212,6 @@ def export(arguments: list[str]) -> None:
     add_agent(parser)
     parser.add_argument("--out", type=Path, required=True, help="new file: .pt2 or .onnx")
     parser.add_argument(
-        "--format",
-        choices=["pt2", "onnx"],
-        help="torch.export's program or ONNX; default: as FILE ends",
-    )
-    parser.add_argument(
         "--step-by-step",
         action="store_true",
         help="read one observation and the tokens of those before it, so that each is encoded "
@@ -232,13 +227,12 @@ def export(arguments: list[str]) -> None:
     from torchrl_tit.export import export_policy
     from torchrl_tit.export.formats import find_format
 
-    find_format(options.out, options.format).check_installed()  # before an agent is loaded
+    find_format(options.out).check_installed()  # before an agent is loaded
     agent = load_agent(options.agent)
     facts = export_policy(
         agent.policy,
         agent.make_env,
         options.out,
-        format=options.format,
         step_by_step=options.step_by_step,
         sample=options.sample,
         facts=_facts(agent.recipe, agent.steps),

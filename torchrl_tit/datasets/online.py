@@ -9,13 +9,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import expand_right
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
 from torchrl_tit.datasets.storages import (
     Entries,
     StateCheckpointer,
-    expand_right,
     frame_entries,
     is_peek,
     nest,
@@ -118,11 +118,6 @@ class OnlineHistoryStorage(LazyTensorStorage):
         return self.max_size + (self._num_frames - 1) * self._envs
 
     @property
-    def num_end_frames(self) -> int:
-        """Number of frames that are stored because an episode ended."""
-        return self._end_frames.stop - self._end_frames.first
-
-    @property
     def oldest(self) -> int:
         """Index of the oldest step, in the first dimension."""
         return self._count % self._num_times if self._count > self._num_times else 0
@@ -163,7 +158,7 @@ class OnlineHistoryStorage(LazyTensorStorage):
             _, *leaf = (key,) if isinstance(key, str) else key
             following, last = take(frames, after), self._end_frames.table[key]
             following = torch.where(
-                expand_right(end < 0, following),
+                expand_right(end < 0, following.shape),
                 following,
                 take(last, end.clamp(min=0) % len(last)),
             )

@@ -224,11 +224,6 @@ def end_flags(*batch: int) -> Composite:
     return Composite({name: flag.clone() for name in names}, shape=batch)
 
 
-def categories_spec(sizes: Sequence[int]) -> MultiCategorical:
-    """The spec of categories, each from 0 to its size - 1; int64 [A]."""
-    return MultiCategorical(sizes, dtype=torch.int64)
-
-
 def array_spec(
     name: str, shape: Sequence[int], dtype: torch.dtype, layout: ImageLayout
 ) -> tuple[Unbounded, bool]:
@@ -330,13 +325,13 @@ def _is_supported(found: tuple[Any, Space]) -> bool:
 
 def _leaf(name: str, path: tuple[str | int, ...], space: Space, layout: ImageLayout) -> Leaf:
     if isinstance(space, Discrete):
-        return Leaf(path, categories_spec([int(space.n)]), start=int(space.start))
+        return Leaf(path, MultiCategorical([int(space.n)]), start=int(space.start))
     if isinstance(space, MultiDiscrete):
         return Leaf(
-            path, categories_spec(space.nvec.flatten().tolist()), start=space.start.flatten()
+            path, MultiCategorical(space.nvec.flatten().tolist()), start=space.start.flatten()
         )
     if isinstance(space, MultiBinary):
-        return Leaf(path, categories_spec([2] * int(np.prod(space.shape))))
+        return Leaf(path, MultiCategorical([2] * int(np.prod(space.shape))))
     assert space.shape is not None  # a Box
     dtype = torch.uint8 if space.dtype == np.uint8 else torch.float32
     spec, channels_last = array_spec(name, space.shape, dtype, layout)

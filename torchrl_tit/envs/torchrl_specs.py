@@ -24,7 +24,6 @@ from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.actions import box_action_spec
 from torchrl_tit.envs.spaces import (
     array_spec,
-    categories_spec,
     choose,
     group,
     leaf_name,
@@ -130,7 +129,7 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
         spec = Binary(shape.numel(), shape=(shape.numel(),), dtype=torch.int8)
         return spec, shaped
     if sizes:
-        spec = Categorical(sizes[0]) if len(sizes) == 1 else categories_spec(sizes)
+        spec = Categorical(sizes[0]) if len(sizes) == 1 else MultiCategorical(sizes)
         return spec, one_hot if isinstance(found, OneHot | MultiOneHot) else shaped
     if _is_array(found) and dtype.is_floating_point:
         bounded = isinstance(found, Bounded)
@@ -180,5 +179,5 @@ def _observation(name: str, spec: TensorSpec, layout: ImageLayout) -> tuple[Tens
 
         return ours, bring
     if isinstance(spec, OneHot | MultiOneHot):
-        return categories_spec(sizes), lambda value: spec.to_categorical(value).long().reshape(-1)
-    return categories_spec(sizes), lambda value: value.long().reshape(-1)
+        return MultiCategorical(sizes), lambda value: spec.to_categorical(value).long().reshape(-1)
+    return MultiCategorical(sizes), lambda value: value.long().reshape(-1)

@@ -63,7 +63,6 @@ MISTAKES = [
     ("export nothing --out a.pt2", "neither an agent nor a run"),
     ("export nobody --out a.pt2", "there is no agent or folder 'nobody'"),
     ("export run --out agent", "tells no format"),
-    ("export run --out a.pt2 --format torchscript", "invalid choice: 'torchscript'"),
     (f"{EXPLAIN} a.avi", "a picture of one step (.png), not 'a.avi'"),
     (f"{EXPLAIN} a.gif --step 3", "step 3 is one step"),
     (f"{EXPLAIN} a.gif --max-steps 0", "max_steps must be at least 1"),
