@@ -110,10 +110,7 @@ def watching_episodes(ended: Callable[[int], Any]) -> Iterator[None]:
 
 
 def _play(
-    env: EnvBase,
-    policy: Callable[[TensorDictBase], TensorDictBase],
-    seed: int,
-    shrink: bool,
+    env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase], seed: int, shrink: bool
 ) -> Tensor:
     """Computes the return of one episode in each environment, float64 [N]."""
     tensordict = env.reset(seed=seed)

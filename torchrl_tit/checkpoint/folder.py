@@ -26,12 +26,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from torchrl_tit.checkpoint.codec import decode, encode
-from torchrl_tit.files import (
-    fsync_directory,
-    hidden_beside,
-    remove_leftovers,
-    whole_or_not_at_all,
-)
+from torchrl_tit.files import fsync_directory, hidden_beside, remove_leftovers, whole_or_not_at_all
 
 _NAME = re.compile(r"(\d{12,})(\.new)?")
 _TENSORS = "tensors.safetensors"

@@ -26,14 +26,7 @@ from numpy.typing import NDArray
 
 from torchrl_tit.datasets.checks import DatasetError, task_spaces
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
-from torchrl_tit.datasets.hdf5_files import (
-    JoinedField,
-    check_size,
-    find,
-    h5py,
-    new_hdf5,
-    open_hdf5,
-)
+from torchrl_tit.datasets.hdf5_files import JoinedField, check_size, find, h5py, new_hdf5, open_hdf5
 from torchrl_tit.datasets.transitions import episodes_from_transitions
 from torchrl_tit.envs import is_atari
 from torchrl_tit.extras import Missing

@@ -13,13 +13,7 @@ from tensordict.utils import expand_right
 from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
-from torchrl_tit.datasets.storages import (
-    Entries,
-    StateCheckpointer,
-    frame_entries,
-    is_peek,
-    nest,
-)
+from torchrl_tit.datasets.storages import Entries, StateCheckpointer, frame_entries, is_peek, nest
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Frames

@@ -22,12 +22,7 @@ from torchrl.data import (
 
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.actions import box_action_spec
-from torchrl_tit.envs.spaces import (
-    array_spec,
-    choose,
-    group,
-    leaf_name,
-)
+from torchrl_tit.envs.spaces import array_spec, choose, group, leaf_name
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
 

@@ -97,11 +97,7 @@ def export_policy(
     path = Path(path)
     kind = find_format(path)
     kind.check_installed()
-    with (
-        whole_or_not_at_all(path) as hidden,
-        closing(make_env(COPIES)) as env,
-        evaluating(policy),
-    ):
+    with whole_or_not_at_all(path) as hidden, closing(make_env(COPIES)) as env, evaluating(policy):
         parts = read_parts(policy, env)
         precision, parts.backbone.autocast = parts.backbone.autocast, None
         try:

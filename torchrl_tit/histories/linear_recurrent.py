@@ -194,12 +194,7 @@ class _MatrixMixer(_Mixer):
     """
 
     def __init__(
-        self,
-        width: int,
-        settings: settings.MatrixMemorySettings,
-        *,
-        keys: int,
-        bias: bool = False,
+        self, width: int, settings: settings.MatrixMemorySettings, *, keys: int, bias: bool = False
     ) -> None:
         super().__init__()
         heads, values = settings.num_heads, settings.num_heads * settings.value_dim

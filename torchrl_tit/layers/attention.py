@@ -17,11 +17,7 @@ from torchrl_tit.settings.encoders import TemporalPositions
 Read = Literal["all", "first", "last"]
 """Positions of a sequence that are read: all, the first (class token), the last (newest step)."""
 
-READ_SLICES: dict[Read, slice] = {
-    "all": slice(None),
-    "first": slice(0, 1),
-    "last": slice(-1, None),
-}
+READ_SLICES: dict[Read, slice] = {"all": slice(None), "first": slice(0, 1), "last": slice(-1, None)}
 
 
 class _Heads(nn.Module):

@@ -257,10 +257,7 @@ class _Parts(NamedTuple):
 
 
 def _choices(
-    features_dim: int,
-    spec: Categorical | OneHot,
-    shape: torch.Size,
-    mask_key: NestedKey | None,
+    features_dim: int, spec: Categorical | OneHot, shape: torch.Size, mask_key: NestedKey | None
 ) -> _Parts:
     """Parts for actions whose components each are one of several options."""
     distribution: type[distributions.Distribution]
@@ -357,11 +354,7 @@ class _ChoicesHead(nn.Module):
     """
 
     def __init__(
-        self,
-        features_dim: int,
-        sizes: list[int],
-        shape: torch.Size,
-        mask_key: NestedKey | None,
+        self, features_dim: int, sizes: list[int], shape: torch.Size, mask_key: NestedKey | None
     ) -> None:
         super().__init__()
         self.linear = _Linear(features_dim, sum(sizes))
