@@ -16,6 +16,7 @@ from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec, U
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.modules.action_specs import describe
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
 from torchrl_tit.transforms.history import keys_of_histories, observation_ndim
@@ -278,7 +279,7 @@ def choose(
     }
     left_out = {name: value for name, value in chosen.items() if not supported(value)}
     kept = {name: value for name, value in chosen.items() if name not in left_out}
-    described = ", ".join(f"{name!r} ({_describe(value)})" for name, value in left_out.items())
+    described = ", ".join(f"{name!r} ({describe(value[1])})" for name, value in left_out.items())
     if not kept or (keys and left_out):
         raise ValueError(
             f"Observations of this kind are not supported: {described or 'none at all'}. Supported "
@@ -353,10 +354,3 @@ def _channels_last(name: str, shape: Sequence[int], layout: ImageLayout) -> bool
 
 def _belongs(name: str, key: str) -> bool:
     return name == key or name.startswith(f"{key}/")
-
-
-def _describe(value: Any) -> str:
-    kind = value[1]
-    if isinstance(kind, TensorSpec):  # whose repr has several lines
-        return f"{type(kind).__name__} {list(kind.shape)}"
-    return str(kind)

@@ -23,6 +23,7 @@ from torchrl.data import (
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.actions import box_action_spec
 from torchrl_tit.envs.spaces import array_spec, choose, group, leaf_name
+from torchrl_tit.modules.action_specs import describe
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
 
@@ -133,8 +134,8 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
         spec = box_action_spec(low.reshape(-1).numpy(), high.reshape(-1).numpy(), clip=clip)
         return spec, lambda x: shaped(x).clamp(low, high) if clip else shaped(x)
     raise ValueError(
-        f"Actions of the kind {type(found).__name__} {list(shape)} ({dtype}) are not supported, "
-        "only floats, Categorical, MultiCategorical, OneHot, MultiOneHot and Binary."
+        f"Actions of the kind {describe(found)} are not supported, only floats, Categorical, "
+        "MultiCategorical, OneHot, MultiOneHot and Binary."
     )
 
 

@@ -343,9 +343,8 @@ class Backbone(ActingModule):
             `TensorDictPrimer`, which starts it with a state of zeros. Empty if the network is not
             recurrent.
         """
-        if not self.is_recurrent:
-            return Compose()
-        return Compose(InitTracker(), self.make_tensordict_primer())
+        transforms = [InitTracker(), self.make_tensordict_primer()] if self.is_recurrent else []
+        return Compose(*transforms)
 
     def make_tensordict_primer(self) -> Transform:
         """Builds the transform that starts each episode with a state of zeros.

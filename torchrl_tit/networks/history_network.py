@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -13,7 +12,7 @@ from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.flat import Flat
 from torchrl_tit.frames.observation import Observation, Observations, read_observations
-from torchrl_tit.histories.encoder import HistoryShape, RecurrentEncoder
+from torchrl_tit.histories.encoder import HistoryShape, RecurrentEncoder, State
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.images import bytes_to_floats
 from torchrl_tit.layers.initialization import init_normal_
@@ -22,20 +21,6 @@ from torchrl_tit.networks.by_kind import frames_by_kind
 from torchrl_tit.settings.checks import checked
 from torchrl_tit.settings.numbers import Frames
 from torchrl_tit.windows import Windows
-
-
-@dataclass(frozen=True)
-class AttentionMaps:
-    """Attention weights of every block, rows (queries) summing to 1.
-
-    Attributes:
-        inner: of each inner block, float [..., K, heads, S, S] with S = 1 + patches and the class
-            token at position 0 (without K if frames are stacked as channels).
-        outer: of each outer block, float [..., heads, K, K], lower triangular.
-    """
-
-    inner: list[Tensor]
-    outer: list[Tensor]
 
 
 class HistoryNetwork(nn.Module):
@@ -213,8 +198,8 @@ class HistoryNetwork(nn.Module):
         return self.head(self.history_encoder.every_frame(tokens, *inputs[count:]))
 
     def step(
-        self, histories: Sequence[Tensor], state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+        self, histories: Sequence[Tensor], state: State, is_init: Tensor
+    ) -> tuple[Tensor, State]:
         """Reads the newest frame and the previous state; only for recurrent networks.
 
         Args:
@@ -237,25 +222,6 @@ class HistoryNetwork(nn.Module):
         if self.history_encoder.reads_frames:
             return tokens
         return bytes_to_floats(tokens, weights_dtype(self))
-
-    def attention_maps(self, *inputs: Tensor) -> AttentionMaps:
-        """Returns the attention weights of every inner and outer block.
-
-        This is a separate forward pass, because the usual one does not compute all attention
-        weights.
-
-        Args:
-            *inputs: as in ``forward``.
-        """
-        count = len(self.frame_encoders)
-        histories, context = inputs[:count], inputs[count:]
-        tokens = self.as_floats(self.encode_frames(*histories))
-        pairs = zip(self.frames, histories, strict=True)
-        inner = [maps for encoder, history in pairs for maps in encoder.attention_maps(history)]
-        outer = self.history_encoder.attention_maps(tokens, *context)
-        if self.history_encoder.reads_frames:  # its blocks are inner ones
-            return AttentionMaps([*inner, *outer], [])
-        return AttentionMaps(inner, outer)
 
     def check(self, *histories: Tensor) -> None:
         """Raises ValueError or TypeError if histories do not fit this network."""

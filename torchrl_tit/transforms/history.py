@@ -160,19 +160,9 @@ class History(CatFrames):
         return history
 
     def frames_before(self) -> dict[NestedKey, Tensor]:
-        """Returns the frames that precede the newest one of the environment it belongs to.
-
-        So a batch of consecutive steps needs no histories: read them before the first step.
-
-        Returns:
-            Copies of the K - 1 frames before the newest, oldest first, [..., K - 1, *obs], under
-            the key of the observation; empty if K = 1.
-        """
-        frames = self.N - 1
-        if not frames:
-            return {}
-        buffers = {key: getattr(self, _buffer_name(key)) for key in self.in_keys}
-        return {key: x.narrow(self._dims[key], 0, frames).clone() for key, x in buffers.items()}
+        """Returns the frames before the newest one: see the function of this name."""
+        buffers = {key: getattr(self, _buffer_name(key)) for key in self.in_keys if self.N > 1}
+        return {key: x.narrow(self._dims[key], 0, self.N - 1).clone() for key, x in buffers.items()}
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -249,11 +239,14 @@ def default_history_keys(observations: Sequence[NestedKey]) -> list[NestedKey]:
 def frames_before(env: EnvBase) -> dict[NestedKey, Tensor]:
     """Returns the frames that precede the newest one of an environment, from each `History` in it.
 
+    So a batch of consecutive steps needs no histories: read them before the first step.
+
     Args:
         env: an environment with transforms.
 
     Returns:
-        See :meth:`History.frames_before`.
+        Copies of the K - 1 frames before the newest, oldest first, [..., K - 1, *obs], under the
+        key of the observation; of a History with K = 1, none.
 
     Example:
         >>> from torchrl.envs import GymEnv
