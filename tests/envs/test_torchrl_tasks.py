@@ -273,5 +273,5 @@ def test_one_line_says_what_is_wrong(name, settings, kind, words):
     with pytest.raises(kind, match=words) as caught:
         make_env(f"{__name__}:{name}", **settings)
     assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match=r"UnboundedDiscrete .* are not supported, only floats"):
+    with pytest.raises(ValueError, match=r"UnboundedDiscrete.* are not supported, only floats"):
         action_spec(Unbounded((2,), dtype=torch.int64), clip=True)

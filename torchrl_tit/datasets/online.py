@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
 from torchrl_tit.datasets.storages import Entries, StateCheckpointer, frame_entries, is_peek, nest
+from torchrl_tit.modules.frame_tables import differs
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Frames
@@ -462,12 +463,8 @@ def _without_notice() -> Iterator[None]:
 
 def _same_observations(left: TensorDictBase, right: TensorDictBase) -> Tensor:
     """Whether all entries of observations [...] are the same, NaN included; bool [...]."""
-    same = torch.ones(left.shape, dtype=torch.bool, device=left.device)
-    for key, ours in left.items(True, True):
-        theirs = right[key]
-        equal = (ours == theirs) | ((ours != ours) & (theirs != theirs))
-        same &= equal.unsqueeze(-1).flatten(left.ndim).all(-1)
-    return same
+    pairs = ((entry, right[key]) for key, entry in left.items(True, True))
+    return ~torch.stack([differs(*pair, left.ndim) for pair in pairs]).any(0)
 
 
 def _table(entries: dict[str, Any], device: torch.device) -> TensorDict:

@@ -63,9 +63,13 @@ def check_fields(settings: object) -> None:
             checked(name, value, kind)
 
 
-@cache
 def field_types(kind: type) -> dict[str, Any]:
     """Returns the fields of a dataclass with their types, bounds included."""
+    return _field_types(kind)
+
+
+@cache
+def _field_types(kind: type) -> dict[str, Any]:  # mypy takes classes for unhashable
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in fields(kind)}
 
