@@ -136,7 +136,8 @@ def whole_or_not_at_all(path: str | os.PathLike[str], *, replace: bool = False) 
         with contextlib.suppress(OSError):
             hidden.unlink(missing_ok=True)
         raise
-    fsync_directory(path.parent)
+    with naming(path):
+        fsync_directory(path.parent)
 
 
 def hidden_beside(path: Path) -> Path:
