@@ -21,19 +21,12 @@ from recipes.core.run import Run
 from recipes.core.runner import load_trained
 from recipes.tools.results.experiments import group_runs
 from recipes.tools.results.interval import interval_of
-from torchrl_tit.analysis import (
-    Target,
-    find_objects,
-    grad_cam,
-    map_change,
-    outer_attention,
-    share_on_objects,
-)
+from torchrl_tit.analysis import Target, grad_cam, outer_attention
 from torchrl_tit.analysis.layers import image_layers
-from torchrl_tit.analysis.map_measures import Background
 from torchrl_tit.analysis.targets import find_network, histories_of
 from torchrl_tit.evaluation import evaluate
 
+from .map_measures import Background, find_objects, map_change, share_on_objects
 from .measuring import folder, publish, table
 
 _BATCH = 32
@@ -80,7 +73,7 @@ def measure_figure_claims(
     Args:
         run: a run on a task whose observation, or one of them, is an image.
         steps: number of steps to look at.
-        background: see :func:`~torchrl_tit.analysis.find_objects`.
+        background: see :func:`~benchmarks.map_measures.find_objects`.
         target: what maps explain; see :data:`~torchrl_tit.analysis.targets.Target`.
 
     Raises:

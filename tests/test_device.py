@@ -38,6 +38,7 @@ from recipes.ppo import PPO, Minibatch
 from recipes.replay import _STORED as STORED
 from recipes.replay import ReplayAlgorithm
 from tests.networks import test_pairs as pairs
+from tests.networks.maps import attention_maps
 from tests.recipes.small import RECIPES, make_algorithm, train
 from torchrl_tit.modules import Backbone, history_keys, make_actor, make_squashed_actor, make_value
 from torchrl_tit.networks import EnhancedTIT, masked_predictions
@@ -161,7 +162,7 @@ def test_maps_and_masked_predictions() -> None:
         network, [x.to(DEVICE) for x in inputs], mask.to(DEVICE)
     )
     check(network, predictions, expected[1])
-    maps = network.attention_maps(*(x.to(DEVICE) for x in inputs))
+    maps = attention_maps(network, *(x.to(DEVICE) for x in inputs))
     assert {x.device.type for x in [*maps.inner, *maps.outer, targets]} == {DEVICE.type}
 
 

@@ -19,12 +19,14 @@ from torchrl_tit.layers.standardize import widest_float
 from torchrl_tit.modules import acting
 from torchrl_tit.networks.building import evaluating
 
+Policy = Callable[[TensorDictBase], TensorDictBase]
+
 _WATCHER: ContextVar[Callable[[int], Any] | None] = ContextVar("watcher", default=None)
 
 
 def evaluate(
     env: EnvBase | Callable[[int], EnvBase],
-    policy: Callable[[TensorDictBase], TensorDictBase],
+    policy: Policy,
     episodes: int = 100,
     *,
     seed: int = 0,
@@ -109,12 +111,7 @@ def watching_episodes(ended: Callable[[int], Any]) -> Iterator[None]:
         _WATCHER.reset(token)
 
 
-def _play(
-    env: EnvBase,
-    policy: Callable[[TensorDictBase], TensorDictBase],
-    seed: int,
-    shrink: bool,
-) -> Tensor:
+def _play(env: EnvBase, policy: Policy, seed: int, shrink: bool) -> Tensor:
     """Computes the return of one episode in each environment, float64 [N]."""
     tensordict = env.reset(seed=seed)
     wide = torch.float64 if env.device is None else widest_float(env.device)
@@ -141,9 +138,7 @@ def _play(
     return returns
 
 
-def _act(
-    policy: Callable[[TensorDictBase], TensorDictBase], tensordict: TensorDictBase, playing: Tensor
-) -> TensorDictBase:
+def _act(policy: Policy, tensordict: TensorDictBase, playing: Tensor) -> TensorDictBase:
     """Calls the policy for the environments still playing; the others get a copy of an action."""
     if playing.all():
         return policy(tensordict)
@@ -203,9 +198,7 @@ def check_rewards(rewards: Tensor) -> None:
 
 
 @contextmanager
-def _acting(
-    policy: Callable[[TensorDictBase], TensorDictBase], seed: int, deterministic: bool
-) -> Iterator[None]:
+def _acting(policy: Policy, seed: int, deterministic: bool) -> Iterator[None]:
     """Acts without gradients, and restores all modes and random generators at the end."""
     exploration = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     mode = evaluating(policy) if isinstance(policy, nn.Module) else nullcontext()

@@ -17,9 +17,7 @@ _HIDDEN = re.compile(r"\.(.+)\.[0-9a-f]{8}\.tmp")
 def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
     """Writes a file atomically: readers see the old content or the new, never a part of it.
 
-    The bytes go to a hidden file next to the target, are flushed to the disk, and take the target's
-    name in one rename. If anything fails (a full disk, say), the hidden file is removed and the old
-    content stays at `path`.
+    If anything fails (a full disk, say), the old content stays at `path`.
 
     Args:
         path: the file to write; its folder must exist.
@@ -37,49 +35,8 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
         >>> target.read_bytes()
         b'all of it'
     """
-    path = Path(path)
-    _check_folder(path)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    with naming(path):
-        try:
-            with temporary.open("xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:  # Ctrl-C must leave nothing behind either
-            with contextlib.suppress(OSError):
-                temporary.unlink(missing_ok=True)
-            raise
-        fsync_directory(path.parent)
-
-
-@contextlib.contextmanager
-def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Adds the name of the file being written to system errors.
-
-    If the disk is full, flushing an open file fails, and the error does not name the file.
-
-    Args:
-        path: the file.
-
-    Raises:
-        OSError: the original error, with the file's name.
-
-    Example:
-        >>> import errno
-        >>> try:
-        ...     with naming("notes.txt"):
-        ...         raise OSError(errno.EIO, "Input/output error")
-        ... except OSError as error:
-        ...     print(error.filename)
-        notes.txt
-    """
-    try:
-        yield
-    except OSError as error:
-        error.filename, error.filename2 = str(path), None
-        raise
+    with whole_or_not_at_all(path, replace=True) as hidden, naming(path):
+        hidden.write_bytes(data)
 
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
@@ -132,11 +89,14 @@ def remove_leftovers(folder: str | os.PathLike[str], names: Collection[str] | No
 
 
 @contextlib.contextmanager
-def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
+def whole_or_not_at_all(path: str | os.PathLike[str], *, replace: bool = False) -> Iterator[Path]:
     """Makes a file or folder under a hidden name, and renames it when it is complete.
 
+    What was made is flushed to the disk first. If anything fails, it is removed.
+
     Args:
-        path: the file or folder to make, which must not exist yet; its parent folder must exist.
+        path: the file or folder to make; its parent folder must exist.
+        replace: whether it may be a file that exists already.
 
     Yields:
         The hidden name next to it, under which to make the file or folder.
@@ -158,23 +118,56 @@ def whole_or_not_at_all(path: str | os.PathLike[str]) -> Iterator[Path]:
         True
     """
     path = Path(path)
-    _check_folder(path)
-    hidden = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    # These errors name the file and its folder, not the hidden file.
+    if not path.absolute().parent.is_dir():
+        raise FileNotFoundError(f"{path} cannot be written: there is no folder {path.parent}")
+    hidden = hidden_beside(path)
     try:
-        if path.exists():
-            raise FileExistsError(f"{path} exists already; choose another name or delete it.")
+        _refuse_existing(path, replace)
         yield hidden
-        for made in [hidden, *hidden.rglob("*")]:
-            (fsync_directory if made.is_dir() else fsync_file)(made)
-        if path.exists():  # another process made it in the meantime
-            raise FileExistsError(f"{path} exists already; choose another name or delete it.")
-        os.replace(hidden, path)
+        with naming(path):
+            for made in [hidden, *hidden.rglob("*")]:
+                (fsync_directory if made.is_dir() else fsync_file)(made)
+        _refuse_existing(path, replace)  # another process may have made it in the meantime
+        with naming(path):
+            os.replace(hidden, path)
     except BaseException:  # Ctrl-C must leave nothing behind either
         shutil.rmtree(hidden, ignore_errors=True)
         with contextlib.suppress(OSError):
             hidden.unlink(missing_ok=True)
         raise
-    fsync_directory(path.parent)
+    with naming(path):
+        fsync_directory(path.parent)
+
+
+def hidden_beside(path: Path) -> Path:
+    """Returns a new hidden name, which :func:`remove_leftovers` finds if the process is killed."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+
+
+def _refuse_existing(path: Path, replace: bool) -> None:
+    if path.exists() and not replace:
+        raise FileExistsError(f"{path} exists already; choose another name or delete it.")
+
+
+@contextlib.contextmanager
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Adds the name of the file being written to system errors, which a full disk's lack.
+
+    Example:
+        >>> import errno
+        >>> try:
+        ...     with naming("notes.txt"):
+        ...         raise OSError(errno.EIO, "Input/output error")
+        ... except OSError as error:
+        ...     print(error.filename)
+        notes.txt
+    """
+    try:
+        yield
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
+        raise
 
 
 def fsync_file(path: str | os.PathLike[str]) -> None:
@@ -219,9 +212,3 @@ def fsync_directory(path: str | os.PathLike[str]) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _check_folder(path: Path) -> None:
-    """Raises an error that names the file and its folder, not the hidden file."""
-    if not path.absolute().parent.is_dir():
-        raise FileNotFoundError(f"{path} cannot be written: there is no folder {path.parent}")

@@ -34,7 +34,8 @@ class FrameCollector(ActingCollector):
         }
         batch = super().rollout()
         for key, entries in older.items():
-            batch[key] = _in_pieces(entries, batch.shape[1])
+            steps = batch.shape[1]  # the last pieces are padded
+            batch[key] = pad(entries, (0, -entries.shape[1] % steps)).unflatten(1, (steps, -1))
         return batch
 
 
@@ -169,8 +170,3 @@ class Rollout:
 
     def _windows(self, newest: Tensor, oldest: Tensor) -> Windows:
         return find_windows(newest, oldest, self.num_frames, self.padding)
-
-
-def _in_pieces(entries: Tensor, count: int) -> Tensor:
-    """Cuts rows into equal pieces and pads the last ones; [N, entries] -> [N, count, size]."""
-    return pad(entries, (0, -entries.shape[1] % count)).unflatten(1, (count, -1))

@@ -227,7 +227,7 @@ def export(arguments: list[str]) -> None:
     from torchrl_tit.export import export_policy
     from torchrl_tit.export.formats import find_format
 
-    find_format(options.out, None).check_installed()  # before an agent is loaded
+    find_format(options.out).check_installed()  # before an agent is loaded
     agent = load_agent(options.agent)
     facts = export_policy(
         agent.policy,

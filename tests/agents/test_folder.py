@@ -130,7 +130,7 @@ def test_nothing_is_left_of_a_folder_that_cannot_be_written(agent, tmp_path, mon
         write_agent(tmp_path / "missing" / "agent", FILES, steps=7)
 
     def full(*arguments):
-        raise OSError("no space left on device")
+        raise OSError(28, "no space left on device")
 
     monkeypatch.setattr("torchrl_tit.files.fsync_file", full)
     with pytest.raises(OSError, match="no space left"):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from tests.analysis.policies import IMAGE, IMAGE_NETWORKS
+from tests.networks.maps import attention_maps
 from tests.numerics import assert_near
 from torchrl_tit.analysis import inner_attention, map_attention, outer_attention, roll_out
 from torchrl_tit.networks import DecisionTransformer, HistoryNetwork, build_network
@@ -27,7 +28,7 @@ def test_inner_blocks(name: str) -> None:
     blocks = inner_attention(network, histories)["observation"]
     frames = 1 if name == "without outer" else 3
     assert [weights.shape for weights in blocks] == 2 * [(2, frames, 2, 13, 13)]
-    for weights, expected in zip(blocks, network.attention_maps(histories).inner, strict=True):
+    for weights, expected in zip(blocks, attention_maps(network, histories).inner, strict=True):
         assert_near(weights.reshape(expected.shape), expected.detach())
     maps = map_attention(network, histories)["observation"]
     assert maps.shape == (2, frames, 3, 4)
@@ -61,7 +62,7 @@ def test_outer_blocks(name: str, heads: int) -> None:
     shares = outer_attention(network, histories)
     assert shares.shape == (2, 2, heads, 3)
     assert_near(shares.sum(-1), torch.ones(2, 2, heads))
-    newest = [weights[..., -1, :] for weights in network.attention_maps(histories).outer]
+    newest = [weights[..., -1, :] for weights in attention_maps(network, histories).outer]
     assert_near(shares, torch.stack(newest, 1).detach())
 
 
@@ -83,7 +84,7 @@ def test_decision_transformer() -> None:
     assert_near(shares.sum(-1), torch.ones(3, 3, 2))
     assert not shares[..., :2].any(), "padding is read"
     assert (shares[..., 2:] > 0).all()
-    for weights in network.attention_maps(*inputs).outer:
+    for weights in attention_maps(network, *inputs).outer:
         assert weights.shape == (3, 2, 5, 5)
         assert not weights.triu(1).any(), "a step reads a later one"
 

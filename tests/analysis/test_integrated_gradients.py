@@ -54,15 +54,13 @@ def test_they_add_up(name: str, target: Any) -> None:
 
 
 @pytest.mark.usefixtures("float64")
-def test_baselines_and_chosen_actions() -> None:
+def test_chosen_actions() -> None:
     pytest.importorskip("captum")
     network = NETWORKS["enhanced"]
     policy, states = make_policy(network, OBSERVATION), make_states(network)
-    # Without an action it is the policy's own, also on the way from the baseline.
+    # Without an action it is the policy's own, also on the way from zeros.
     own = policy.eval()(states.clone())
     assert_near(integrated_gradients(policy, states), integrated_gradients(policy, own))
-    same = {"observation": states["history"]}
-    assert not integrated_gradients(policy, states, baselines=same)["observation"].any()
     one = integrated_gradients(policy, states[0])["observation"]
     assert_near(one, integrated_gradients(policy, states)["observation"][:1])
 
@@ -88,8 +86,6 @@ def test_categories_beside_an_array_stay_as_they_are() -> None:
     shares = integrated_gradients(policy, states)
     assert list(shares) == ["state"]
     assert shares["state"].any()
-    with pytest.raises(ValueError, match=r"a baseline for 'row', .*: name one of state"):
-        integrated_gradients(policy, states, baselines={"row": histories["row"]})
     alone = make_policy(NETWORKS["enhanced"], MultiCategorical([3, 2]))
     states = TensorDict({"history": histories["row"]}, [2])
     with pytest.raises(ValueError, match="reads categories only, which have no gradient"):

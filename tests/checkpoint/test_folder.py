@@ -99,8 +99,8 @@ def test_no_checkpoint(tmp_path: Path) -> None:
     ("owner", "name", "error"),
     [
         (folder, "save_file", SafetensorError("I/O error: No space left on device")),
-        (folder, "fsync_file", OSError(28, "No space left on device")),
-        (os, "rename", OSError(28, "No space left on device")),
+        (os, "fsync", OSError(28, "No space left on device")),
+        (os, "replace", OSError(28, "No space left on device")),
         (Path, "mkdir", OSError(28, "No space left on device")),
         (folder, "save_file", KeyboardInterrupt()),
     ],
@@ -232,7 +232,7 @@ def save_and_die(path: Path, step: int, after: int) -> None:
 
         return wrapper
 
-    for name in ("fsync", "rename", "mkdir", "unlink", "rmdir", "open"):
+    for name in ("fsync", "rename", "replace", "mkdir", "unlink", "rmdir", "open"):
         setattr(os, name, fragile(getattr(os, name)))
     folder.save_file = fragile(folder.save_file)
     save_checkpoint(path, step, make_state(2), keep=1)

@@ -64,8 +64,8 @@ def small(**settings):
 
 def test_what_a_file_says_and_how_many_it_takes(tmp_path):
     policy, task = small()
-    file = tmp_path / "policy"
-    said = export_policy(policy, task, file, format="pt2", sample=True, facts={"recipe": "mine"})
+    file = tmp_path / "policy.pt2"
+    said = export_policy(policy, task, file, sample=True, facts={"recipe": "mine"})
     about = {"torchrl_tit.json": ""}
     program = torch.export.load(file.open("rb"), extra_files=about).module()
     facts = json.loads(about["torchrl_tit.json"])
@@ -192,8 +192,6 @@ def test_bad_input(tmp_path):
         export_policy(policy, task, tmp_path / "missing" / "policy.pt2")
     with pytest.raises(ValueError, match=r"'policy.txt' tells no format: end it with .pt2 or .on"):
         export_policy(policy, task, tmp_path / "policy.txt")
-    with pytest.raises(ValueError, match="unknown format 'torchscript': choose one of pt2, onnx"):
-        export_policy(policy, task, tmp_path / "policy.pt2", format="torchscript")
     headless = TensorDictSequential(policy.module[0])
     with pytest.raises(ValueError, match="writes no 'action'"):
         export_policy(headless, task, tmp_path / "other.pt2")

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tests.networks.maps import attention_maps
 from tests.networks.reference import randomize
 from torchrl_tit.histories.coberl import CoBERL as CoBERLEncoder
 from torchrl_tit.layers import GRUGate, init_orthogonal_
@@ -79,7 +80,7 @@ def test_actor_path_is_causal_and_masks_nothing() -> None:
     history = torch.rand(2, 4, 20, 20)
     network(history).sum().backward()
     assert network.history_encoder.mask_token.grad is None
-    for weights in network.attention_maps(history).outer:
+    for weights in attention_maps(network, history).outer:
         assert weights.shape == (2, 3, 4, 4)
         assert torch.equal(weights, weights.tril())
 

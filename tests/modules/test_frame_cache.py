@@ -233,7 +233,7 @@ def test_tokens_of_inference_mode_are_used_in_inference_mode_only():
             assert frames.take() == 20 + 5
         for start in (2, 3):  # tokens of inference mode cannot be written
             assert_exact(backbone, stream[:, start : start + 4])
-            assert not cache_of(backbone).tokens.entries.is_inference()
+            assert not cache_of(backbone).tokens.is_inference()
 
 
 def test_active_dropout_draws_for_every_frame():

@@ -43,7 +43,7 @@ MODULES: dict[str, Callable[[], nn.Module]] = {
     "choice": lambda: make_actor(64, Categorical(3)),
     "masked choices": lambda: make_actor(64, MultiCategorical([3, 2]), mask_key="mask"),
     "switches": lambda: make_actor(64, Binary(3)),
-    "Gaussian": lambda: make_actor(64, Unbounded((3,)), gain=0.1),
+    "Gaussian": lambda: make_actor(64, Unbounded((3,))),
     "squashed": lambda: make_squashed_actor(64, Bounded(-1, 1, (3,))),
     "value": lambda: make_value(64),
     "Online DT": lambda: DTHead(64, 3, "gaussian"),

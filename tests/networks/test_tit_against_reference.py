@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
+from tests.networks.maps import attention_maps
 from tests.networks.reference import ReferenceTIT, copy_parameters, matched_parameters, randomize
 from tests.numerics import assert_near
 from torchrl_tit.networks import EnhancedTIT, HistoryNetwork, VanillaTIT
@@ -119,7 +120,7 @@ def test_attention_maps(network: str, leading: tuple[int, ...], case: str) -> No
     shape, num_frames, settings = CASES[case]
     ours, reference = make_pair(network, shape, num_frames, **settings)
     history = torch.randn(*leading, num_frames, *shape)
-    maps = ours.attention_maps(history)
+    maps = attention_maps(ours, history)
 
     blocks = settings.get("num_blocks", 2)
     assert len(maps.inner) == (0 if network == "without inner" else blocks)

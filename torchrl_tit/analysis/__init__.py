@@ -15,22 +15,18 @@ from torchrl_tit.analysis.attention import (
 from torchrl_tit.analysis.flows import Flows, count_flows, flow_table
 from torchrl_tit.analysis.grad_cam import grad_cam
 from torchrl_tit.analysis.integrated_gradients import integrated_gradients
-from torchrl_tit.analysis.map_measures import find_objects, map_change, share_on_objects
 from torchrl_tit.analysis.targets import Target
 
 __all__ = [
     "Flows",
     "Target",
     "count_flows",
-    "find_objects",
     "flow_table",
     "grad_cam",
     "inner_attention",
     "integrated_gradients",
     "map_attention",
-    "map_change",
     "outer_attention",
     "outer_weights",
     "roll_out",
-    "share_on_objects",
 ]

@@ -18,7 +18,6 @@ from torchrl_tit.analysis.targets import (
     check_gradient,
     compute_target,
     find_network,
-    gradients,
 )
 from torchrl_tit.networks.building import evaluating
 
@@ -93,7 +92,8 @@ def grad_cam(
         value = compute_target(policy, state, target)
     outputs = [recorder.output(layers[name]) for name, recorder in recorders.items()]
     check_gradient(value, target)
-    slopes = gradients(value, outputs)
+    # The states of a batch do not depend on each other, so this is the gradient of each.
+    slopes = torch.autograd.grad(value.sum(), outputs, allow_unused=True)
     maps = {}
     for (name, found), output, slope in zip(layers.items(), outputs, slopes, strict=True):
         if slope is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -29,24 +28,20 @@ def integrated_gradients(
     tensordict: TensorDictBase,
     *,
     target: Target = "action",
-    baselines: Mapping[str, Tensor] | None = None,
     steps: int = 32,
 ) -> dict[str, Tensor]:
     """Attributes a target to the entries of observations, with captum's integrated gradients.
 
     The attributions of a state add up to the difference in the target between its observations and
-    a baseline: gradients are averaged on the straight line from the baseline to the observations
-    (Sundararajan et al., "Axiomatic Attribution for Deep Networks", arXiv 1703.01365). The chosen
-    action, recurrent states and categories, which have no gradient, are left unchanged.
+    zeros: gradients are averaged on the straight line between them (Sundararajan et al., "Axiomatic
+    Attribution for Deep Networks", arXiv 1703.01365). The chosen action, recurrent states and
+    categories, which have no gradient, are left unchanged.
 
     Args:
         policy: a policy with a :class:`~torchrl_tit.modules.Backbone`; dropout is off.
         tensordict: what the policy reads, [N] or []; its "action", if there is one, is the chosen
             one.
         target: what is explained; see :data:`~torchrl_tit.analysis.targets.Target`.
-        baselines: observations to compare with, by name, broadcast to [N, K, *observation]; zeros
-            if not given. Bytes count as 0..1, as networks read them. In sets, the same rows are
-            entities as in the observation.
         steps: number of points on the line. With more points, the sum is more exact.
 
     Returns:
@@ -54,8 +49,8 @@ def integrated_gradients(
         images.
 
     Raises:
-        ValueError: if captum is missing, the network reads only categories, a baseline belongs to
-            no observation, or the policy does not compute the target.
+        ValueError: if captum is missing, the network reads only categories, or the policy does not
+            compute the target.
 
     Example:
         >>> from tensordict import TensorDict
@@ -82,26 +77,15 @@ def integrated_gradients(
             "this network reads categories only, which have no gradient to integrate: look at its "
             "attention"
         )
-    baselines = {} if baselines is None else baselines
-    if unknown := set(baselines) - set(keys):
-        raise ValueError(
-            f"a baseline for {sorted(unknown)[0]!r}, which is no array and no image that this "
-            f"network reads: name one of {', '.join(keys)}"
-        )
     method = _captum()
     state = as_batch(tensordict)
     if state.get("action", None) is None:
         with evaluating(policy), torch.no_grad():
             state = state.copy().set("action", run_policy(policy, state)[0]["action"])
     inputs = {name: bytes_to_floats(state[key]) for name, key in keys.items()}
-    starts = {
-        name: baselines[name].to(x).expand_as(x).clone()
-        if name in baselines
-        else torch.zeros_like(x)
-        for name, x in inputs.items()
-    }
+    starts = {name: torch.zeros_like(x) for name, x in inputs.items()}
     for name, encoder in zip(network.observations, network.frames, strict=True):
-        if encoder.reads_entities:
+        if encoder.reads_entities:  # the same rows are entities
             starts[name][..., -1] = inputs[name][..., -1]
 
     def compute(*histories: Tensor) -> Tensor:

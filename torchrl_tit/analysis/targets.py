@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal, TypeAlias
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 from torch import Tensor, distributions, nn
@@ -147,15 +146,3 @@ def check_gradient(value: Tensor, target: Target) -> None:
     if not value.requires_grad:
         name = target if isinstance(target, str) else getattr(target, "__name__", "the target")
         raise ValueError(f"{name} does not depend on what the network reads: choose another target")
-
-
-def gradients(value: Tensor, inputs: list[Tensor]) -> list[Tensor | None]:
-    """The gradient of the sum of a target by each input; None where it does not depend on it.
-
-    The states of a batch do not depend on each other, so this is the gradient of each.
-    """
-    return list(
-        torch.autograd.grad(
-            [value], inputs, grad_outputs=[torch.ones_like(value)], allow_unused=True
-        )
-    )

@@ -8,7 +8,7 @@ A checkpoint is a folder of two files::
             state.json          format, step, checksums, and the tree of codec.py
         000000020480/
         000000020480.new/       only for a moment, while a step is saved a second time
-        .tmp-.../               being written or being removed; left behind by a killed process
+        .000000020480.HEX.tmp/  being written or being removed; left behind by a killed process
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import hashlib
 import json
 import os
 import re
-import secrets
 import shutil
 from pathlib import Path
 from typing import Any
@@ -27,10 +26,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from torchrl_tit.checkpoint.codec import decode, encode
-from torchrl_tit.files import fsync_directory, fsync_file
+from torchrl_tit.files import fsync_directory, hidden_beside, remove_leftovers, whole_or_not_at_all
 
 _NAME = re.compile(r"(\d{12,})(\.new)?")
-_TEMPORARY = ".tmp-"
 _TENSORS = "tensors.safetensors"
 _STATE = "state.json"
 _FORMAT = "torchrl-tit checkpoint"
@@ -221,16 +219,10 @@ def _checkpoints(folder: Path) -> dict[int, Path]:
 
 def _add(folder: Path, step: int, tensors: dict[str, Any], tree: Any) -> Path:
     path = folder / _name(step)
-    temporary = folder / f"{_TEMPORARY}{path.name}-{secrets.token_hex(4)}"
-    temporary.mkdir()
-    try:
-        _write(temporary, step, tensors, tree)
-        complete = path.with_name(f"{path.name}.new") if path.exists() else path
-        os.rename(temporary, complete)
-    except BaseException:  # Ctrl-C must leave nothing behind either
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise
-    fsync_directory(folder)
+    complete = path.with_name(f"{path.name}.new") if path.exists() else path
+    with whole_or_not_at_all(complete) as hidden:
+        hidden.mkdir()
+        _write(hidden, step, tensors, tree)
     if complete != path:
         _promote(complete)
     return path
@@ -247,22 +239,21 @@ def _promote(new: Path) -> None:
 
 def _remove(path: Path) -> None:
     # Renamed first: a partly removed folder must not look like a checkpoint.
-    hidden = path.with_name(f"{_TEMPORARY}{path.name}-{secrets.token_hex(4)}")
+    hidden = hidden_beside(path)
     os.rename(path, hidden)
     shutil.rmtree(hidden)
 
 
 def _tidy(folder: Path) -> None:
     """Completes or removes the leftovers of a killed process."""
+    remove_leftovers(folder)
     for path in list(folder.iterdir()):
-        if path.name.startswith(_TEMPORARY):
-            shutil.rmtree(path)
-        elif (match := _NAME.fullmatch(path.name)) and match[2]:
+        if (match := _NAME.fullmatch(path.name)) and match[2]:
             _promote(path)
 
 
 def _write(path: Path, step: int, tensors: dict[str, Tensor], tree: Any) -> None:
-    """Writes a checkpoint's files into an empty folder and flushes them to the disk."""
+    """Writes a checkpoint's files into an empty folder."""
     save_file(tensors, path / _TENSORS)
     document = {
         "format": _FORMAT,
@@ -277,9 +268,6 @@ def _write(path: Path, step: int, tensors: dict[str, Tensor], tree: Any) -> None
     document["sha256"] = _sha256_of_document(document)
     (path / _STATE).write_text(json.dumps(document, allow_nan=False), encoding="utf-8")
     shutil.copymode(path / _STATE, path / _TENSORS)  # safetensors lets only the owner read
-    for name in (_TENSORS, _STATE):
-        fsync_file(path / name)
-    fsync_directory(path)
 
 
 def _read(path: Path, step: int) -> Any:

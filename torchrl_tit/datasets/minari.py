@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from math import prod
 from pathlib import Path
@@ -26,14 +26,7 @@ from numpy.typing import NDArray
 
 from torchrl_tit.datasets.checks import DatasetError, task_spaces
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
-from torchrl_tit.datasets.hdf5_files import (
-    JoinedField,
-    check_size,
-    find,
-    h5py,
-    new_hdf5,
-    open_hdf5,
-)
+from torchrl_tit.datasets.hdf5_files import JoinedField, check_size, find, h5py, new_hdf5, open_hdf5
 from torchrl_tit.datasets.transitions import episodes_from_transitions
 from torchrl_tit.envs import is_atari
 from torchrl_tit.extras import Missing
@@ -255,30 +248,31 @@ def _joined(
                 )
             if problem:
                 raise DatasetError(place, problem, _NAMES[name][0])
-            pieces[name].append((steps, partial(read, file, field.name, row, 0)))
+            pieces[name].append((steps, partial(read, file, field.name, row)))
             if more:
-                later = partial(read, file, field.name, row, 1)
+                later = partial(_later, pieces[name][-1][1])
                 pieces["next_observations"].append((steps, later))
     rows["next_observations"] = rows["observations"]
     fields = {name: JoinedField(parts, *rows[name]) for name, parts in pieces.items()}
     return fields, np.array([steps for steps, _ in pieces["rewards"]]), noted
 
 
-def _rows(
-    file: h5py.File, name: str, shape: tuple[int, ...], shift: int, start: int, stop: int
-) -> NDArray:
-    """Reads rows of a field, moved by some rows."""
-    return file[name][start + shift : stop + shift]
+def _rows(file: h5py.File, name: str, shape: tuple[int, ...], start: int, stop: int) -> NDArray:
+    """Reads rows of a field."""
+    return file[name][start:stop]
 
 
-def _images(
-    file: h5py.File, name: str, shape: tuple[int, ...], shift: int, start: int, stop: int
-) -> NDArray:
+def _later(read: Callable[[int, int], NDArray], start: int, stop: int) -> NDArray:
+    """Reads the rows that each follow one of these."""
+    return read(start + 1, stop + 1)
+
+
+def _images(file: h5py.File, name: str, shape: tuple[int, ...], start: int, stop: int) -> NDArray:
     """Reads and decodes JPEG images, each of which is a row of bytes."""
     field, images = file[name], np.empty((stop - start, *shape), np.uint8)
     for row in range(start, stop):
         try:
-            image = imread(bytes(field[row + shift]), extension=".jpg")
+            image = imread(bytes(field[row]), extension=".jpg")
         except Exception as error:  # whatever a damaged image raises, or one of too many pixels
             raise ValueError(str(error)) from error
         if image.shape != shape:

@@ -11,6 +11,7 @@ from typing import Any, Literal, NoReturn
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.utils import expand_right
 from torch import Tensor
 from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
@@ -243,7 +244,7 @@ class HistoryStorage(EpisodeStorage):
         following = take(frames, row + 1)
         if self._zero_terminals:
             terminated = entries["next", "terminated"].squeeze(-1)
-            following.masked_fill_(expand_right(terminated, following), 0)
+            following.masked_fill_(expand_right(terminated, following.shape), 0)
         windows = find_windows(row, self._first_rows[episode], self._num_frames, self._padding)
         entries |= frame_entries((), take(frames, row), windows.gather(frames), following, row.ndim)
         return entries, row.shape
@@ -301,7 +302,7 @@ class SequenceStorage(EpisodeStorage):
         padding, rows = step < 0, row + step.clamp(min=0)
 
         def fill(values: Tensor, value: float = 0) -> Tensor:
-            return values.masked_fill(expand_right(padding, values), value)
+            return values.masked_fill(expand_right(padding, values.shape), value)
 
         action = take(self._fields["action"], rows)  # [..., K, *action]
         if not action.is_floating_point():
@@ -364,8 +365,3 @@ def nest(entries: Entries, shape: torch.Size) -> TensorDict:
             group = group.setdefault(each, {})
         group[name] = value
     return TensorDict(nested, shape)
-
-
-def expand_right(mask: Tensor, values: Tensor) -> Tensor:
-    """Adds dimensions of size 1 to a mask [...] until it broadcasts to values [..., *entry]."""
-    return mask.view(*mask.shape, *[1] * (values.ndim - mask.ndim))

@@ -7,9 +7,7 @@ import torch
 from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete, Space
 from numpy.typing import NDArray
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, TensorSpec, Unbounded
-
-from torchrl_tit.envs.spaces import categories_spec
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, TensorSpec, Unbounded
 
 
 class ActionWriter:
@@ -41,7 +39,7 @@ class ActionWriter:
             self.spec: TensorSpec = Categorical(int(space.n), dtype=torch.int64)
             self.start = torch.tensor(int(space.start)) if space.start else None
         elif isinstance(space, MultiDiscrete):
-            self.spec = categories_spec(space.nvec.flatten().tolist())
+            self.spec = MultiCategorical(space.nvec.flatten().tolist())
             self.start = torch.from_numpy(space.start.flatten()) if space.start.any() else None
         elif isinstance(space, MultiBinary):
             size = int(np.prod(space.shape))

@@ -172,10 +172,7 @@ class AtariGames(VectorEnv):
         self._noops = np.zeros(num_envs, int)
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts episodes, each with a new game or with the next life.
 

@@ -101,13 +101,9 @@ def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
     made: Any = getattr(module, own, None)
     if issubclass(made, EnvBase) if isinstance(made, type) else callable(made):
         return made
-    found = "no such name" if made is None else f"a {type(made).__name__} of that name"
-    if isinstance(made, type):
-        found = "a class of that name that is no EnvBase"
     raise ValueError(
-        f"Task {name!r}: Gymnasium knows no {own!r} after importing {module.__name__}, which has "
-        f"{found}; expected a name that it registers with gymnasium.register, or a class or "
-        "function that makes a TorchRL EnvBase."
+        f"Task {name!r}: {module.__name__} neither registers {own!r} with Gymnasium nor has a "
+        "class or function of that name that makes a TorchRL EnvBase."
     )
 
 

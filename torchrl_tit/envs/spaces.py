@@ -16,6 +16,7 @@ from torchrl.data import Categorical, Composite, MultiCategorical, TensorSpec, U
 from torchrl.envs import EnvBase
 
 from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.modules.action_specs import describe
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
 from torchrl_tit.transforms.history import keys_of_histories, observation_ndim
@@ -224,11 +225,6 @@ def end_flags(*batch: int) -> Composite:
     return Composite({name: flag.clone() for name in names}, shape=batch)
 
 
-def categories_spec(sizes: Sequence[int]) -> MultiCategorical:
-    """The spec of categories, each from 0 to its size - 1; int64 [A]."""
-    return MultiCategorical(sizes, dtype=torch.int64)
-
-
 def array_spec(
     name: str, shape: Sequence[int], dtype: torch.dtype, layout: ImageLayout
 ) -> tuple[Unbounded, bool]:
@@ -283,7 +279,7 @@ def choose(
     }
     left_out = {name: value for name, value in chosen.items() if not supported(value)}
     kept = {name: value for name, value in chosen.items() if name not in left_out}
-    described = ", ".join(f"{name!r} ({_describe(value)})" for name, value in left_out.items())
+    described = ", ".join(f"{name!r} ({describe(value[1])})" for name, value in left_out.items())
     if not kept or (keys and left_out):
         raise ValueError(
             f"Observations of this kind are not supported: {described or 'none at all'}. Supported "
@@ -330,13 +326,13 @@ def _is_supported(found: tuple[Any, Space]) -> bool:
 
 def _leaf(name: str, path: tuple[str | int, ...], space: Space, layout: ImageLayout) -> Leaf:
     if isinstance(space, Discrete):
-        return Leaf(path, categories_spec([int(space.n)]), start=int(space.start))
+        return Leaf(path, MultiCategorical([int(space.n)]), start=int(space.start))
     if isinstance(space, MultiDiscrete):
         return Leaf(
-            path, categories_spec(space.nvec.flatten().tolist()), start=space.start.flatten()
+            path, MultiCategorical(space.nvec.flatten().tolist()), start=space.start.flatten()
         )
     if isinstance(space, MultiBinary):
-        return Leaf(path, categories_spec([2] * int(np.prod(space.shape))))
+        return Leaf(path, MultiCategorical([2] * int(np.prod(space.shape))))
     assert space.shape is not None  # a Box
     dtype = torch.uint8 if space.dtype == np.uint8 else torch.float32
     spec, channels_last = array_spec(name, space.shape, dtype, layout)
@@ -358,10 +354,3 @@ def _channels_last(name: str, shape: Sequence[int], layout: ImageLayout) -> bool
 
 def _belongs(name: str, key: str) -> bool:
     return name == key or name.startswith(f"{key}/")
-
-
-def _describe(value: Any) -> str:
-    kind = value[1]
-    if isinstance(kind, TensorSpec):  # whose repr has several lines
-        return f"{type(kind).__name__} {list(kind.shape)}"
-    return str(kind)

@@ -22,13 +22,8 @@ from torchrl.data import (
 
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.envs.actions import box_action_spec
-from torchrl_tit.envs.spaces import (
-    array_spec,
-    categories_spec,
-    choose,
-    group,
-    leaf_name,
-)
+from torchrl_tit.envs.spaces import array_spec, choose, group, leaf_name
+from torchrl_tit.modules.action_specs import describe
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
 
@@ -130,7 +125,7 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
         spec = Binary(shape.numel(), shape=(shape.numel(),), dtype=torch.int8)
         return spec, shaped
     if sizes:
-        spec = Categorical(sizes[0]) if len(sizes) == 1 else categories_spec(sizes)
+        spec = Categorical(sizes[0]) if len(sizes) == 1 else MultiCategorical(sizes)
         return spec, one_hot if isinstance(found, OneHot | MultiOneHot) else shaped
     if _is_array(found) and dtype.is_floating_point:
         bounded = isinstance(found, Bounded)
@@ -139,8 +134,8 @@ def action_spec(found: TensorSpec, *, clip: bool) -> tuple[TensorSpec, Convert]:
         spec = box_action_spec(low.reshape(-1).numpy(), high.reshape(-1).numpy(), clip=clip)
         return spec, lambda x: shaped(x).clamp(low, high) if clip else shaped(x)
     raise ValueError(
-        f"Actions of the kind {type(found).__name__} {list(shape)} ({dtype}) are not supported, "
-        "only floats, Categorical, MultiCategorical, OneHot, MultiOneHot and Binary."
+        f"Actions of the kind {describe(found)} are not supported, only floats, Categorical, "
+        "MultiCategorical, OneHot, MultiOneHot and Binary."
     )
 
 
@@ -180,5 +175,5 @@ def _observation(name: str, spec: TensorSpec, layout: ImageLayout) -> tuple[Tens
 
         return ours, bring
     if isinstance(spec, OneHot | MultiOneHot):
-        return categories_spec(sizes), lambda value: spec.to_categorical(value).long().reshape(-1)
-    return categories_spec(sizes), lambda value: value.long().reshape(-1)
+        return MultiCategorical(sizes), lambda value: spec.to_categorical(value).long().reshape(-1)
+    return MultiCategorical(sizes), lambda value: value.long().reshape(-1)

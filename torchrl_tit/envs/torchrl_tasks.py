@@ -215,7 +215,7 @@ def make_torchrl_tasks(
         num_envs: N.
         name: the task's name, for error messages.
         wrappers: TorchRL transforms around each copy, in the format of
-            :func:`~torchrl_tit.envs.wrappers.load_wrappers`.
+            :func:`~torchrl_tit.envs.names.load_wrappers`.
         vectorization_mode: ``"sync"`` steps the copies in this process (`SerialEnv`), ``"async"``
             in one process each (`ParallelEnv`).
         device: device of the tensors.

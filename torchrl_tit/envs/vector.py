@@ -138,10 +138,7 @@ class GymVectorEnv(EnvBase):
         )
 
     def _reset(
-        self,
-        tensordict: TensorDictBase | None = None,
-        *,
-        seed: int | Sequence[int] | None = None,
+        self, tensordict: TensorDictBase | None = None, *, seed: int | Sequence[int] | None = None
     ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         options = None if mask is None else {"reset_mask": mask.flatten().numpy(force=True)}

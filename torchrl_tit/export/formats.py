@@ -33,7 +33,6 @@ Run = Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
 class Format:
     """A file format."""
 
-    suffix: str
     write: Callable[[torch.export.ExportedProgram, Mapping[str, Any], Path], None]
     """Writes a program and the facts about its policy, whose "inputs" and "outputs" list its
     tensors in order; raises ValueError if the format cannot express it."""
@@ -104,36 +103,27 @@ def _read_onnx(path: Path) -> Run:
 
 
 FORMATS = {
-    "pt2": Format(".pt2", _write_pt2, _read_pt2),
-    "onnx": Format(".onnx", _write_onnx, _read_onnx, ("onnx", "onnxscript", "onnxruntime")),
+    "pt2": Format(_write_pt2, _read_pt2),
+    "onnx": Format(_write_onnx, _read_onnx, ("onnx", "onnxscript", "onnxruntime")),
 }
 """PyTorch's own format, which `torch.export.load` reads, for any device and AOTInductor; and ONNX,
 written by PyTorch's exporter for exported programs, which any ONNX runtime reads."""
 
 
-def find_format(path: Path, format: str | None = None) -> Format:
-    """Returns the format of a file.
-
-    Args:
-        path: the file.
-        format: its name; by default, it follows from the file's suffix.
+def find_format(path: Path) -> Format:
+    """Returns the format that the suffix of a file's name tells.
 
     Raises:
         ValueError: if it is unknown.
 
     Example:
-        >>> find_format(Path("agent.onnx")).suffix
-        '.onnx'
+        >>> find_format(Path("agent.onnx")) is FORMATS["onnx"]
+        True
     """
-    name = path.suffix.removeprefix(".") if format is None else format
+    name = path.suffix.removeprefix(".")
     if name not in FORMATS:
-        known = ", ".join(FORMATS)
         raise ValueError(
-            f"unknown format {name!r}: choose one of {known}"
-            if format is not None
-            else f"the name {path.name!r} tells no format: end it with "
-            f"{' or '.join(known.suffix for known in FORMATS.values())}, or choose one with "
-            "--format"
+            f"the name {path.name!r} tells no format: end it with .{' or .'.join(FORMATS)}"
         )
     return FORMATS[name]
 

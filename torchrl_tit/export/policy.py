@@ -28,7 +28,6 @@ def export_policy(
     make_env: Callable[[int], EnvBase],
     path: Path | str,
     *,
-    format: str | None = None,
     step_by_step: bool = False,
     sample: bool = False,
     facts: Mapping[str, Any] | None = None,
@@ -55,8 +54,8 @@ def export_policy(
         policy: a :class:`~torchrl_tit.modules.Backbone` and the modules after it, on a CPU. What
             is exported is its evaluation mode.
         make_env: makes the environment in which the policy acts, given the number of copies.
-        path: the file to write, which must not exist yet.
-        format: "pt2" (`torch.export`) or "onnx"; by default, given by the file's suffix.
+        path: the file to write, which must not exist yet: "NAME.pt2" (`torch.export`) or
+            "NAME.onnx".
         step_by_step: whether each frame is encoded only once.
         sample: whether actions are sampled, from an input "noise", instead of being the most likely
             ones.
@@ -96,13 +95,9 @@ def export_policy(
         (torch.Size([1]), torch.Size([1, 7, 1, 32]))
     """
     path = Path(path)
-    kind = find_format(path, format)
+    kind = find_format(path)
     kind.check_installed()
-    with (
-        whole_or_not_at_all(path) as hidden,
-        closing(make_env(COPIES)) as env,
-        evaluating(policy),
-    ):
+    with whole_or_not_at_all(path) as hidden, closing(make_env(COPIES)) as env, evaluating(policy):
         parts = read_parts(policy, env)
         precision, parts.backbone.autocast = parts.backbone.autocast, None
         try:

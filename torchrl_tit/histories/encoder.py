@@ -11,6 +11,9 @@ from torch import Tensor, nn
 from torchrl_tit.layers.attention import attention_maps
 from torchrl_tit.windows import Windows
 
+State = dict[str, Tensor]
+"""The state of a recurrent encoder: its entries by key, [*B, ...] each."""
+
 
 @dataclass(frozen=True)
 class HistoryShape:
@@ -143,9 +146,7 @@ class RecurrentEncoder(HistoryEncoder):
     state_shapes: dict[str, torch.Size]
     """Shape of each entry of the state, without batch dimensions."""
 
-    def step(
-        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def step(self, tokens: Tensor, state: State, is_init: Tensor) -> tuple[Tensor, State]:
         """Reads single steps, or whole sequences within ``torchrl.modules.set_recurrent_mode``.
 
         Args:
@@ -160,9 +161,7 @@ class RecurrentEncoder(HistoryEncoder):
         """
         raise NotImplementedError
 
-    def single_step(
-        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def single_step(self, tokens: Tensor, state: State, is_init: Tensor) -> tuple[Tensor, State]:
         """Like :meth:`step` on single steps, in a form that `torch.export` can trace."""
         return self.step(tokens, state, is_init)
 

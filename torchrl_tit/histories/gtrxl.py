@@ -23,11 +23,7 @@ class GatedTransformerEncoder(HistoryEncoder):
     """
 
     def __init__(
-        self,
-        settings: settings.GTrXL | settings.CoBERL,
-        shape: HistoryShape,
-        *,
-        out_features: int,
+        self, settings: settings.GTrXL | settings.CoBERL, shape: HistoryShape, *, out_features: int
     ) -> None:
         super().__init__(shape, out_features=out_features)
         self.one_token = OneToken(shape)

@@ -12,10 +12,11 @@ from torch.nn.functional import silu, softplus
 from torchrl.modules import recurrent_mode
 
 from torchrl_tit import settings
-from torchrl_tit.histories.encoder import HistoryShape, OneToken, RecurrentEncoder
+from torchrl_tit.histories.encoder import HistoryShape, OneToken, RecurrentEncoder, State
 from torchrl_tit.layers.linear_recurrences import ShortConvolution, scan_matrices, scan_vectors
 
 _EPS = 1e-5  # of all norms, as in both papers' code
+_Entries = list[Tensor]  # of a block's state, in the order of its shapes
 
 
 class LinearRecurrentEncoder(RecurrentEncoder):
@@ -60,9 +61,7 @@ class LinearRecurrentEncoder(RecurrentEncoder):
         outputs, _ = self.read(sequences, state, is_init)
         return outputs[:, -1].reshape(*x.shape[:-2], self.out_features)
 
-    def step(
-        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def step(self, tokens: Tensor, state: State, is_init: Tensor) -> tuple[Tensor, State]:
         """Tokens float [*B, L, D] and the state before -> float [*B, D] and the state after.
 
         In a sequence, the state after its last step stands at every step.
@@ -78,9 +77,7 @@ class LinearRecurrentEncoder(RecurrentEncoder):
             for key, value in after.items()
         }
 
-    def read(
-        self, x: Tensor, state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def read(self, x: Tensor, state: State, is_init: Tensor) -> tuple[Tensor, State]:
         """Reads sequences, float [N, T, D].
 
         Args:
@@ -122,9 +119,7 @@ class _Block(nn.Module):
             self.gate_and_value = nn.Linear(width, 2 * hidden, bias=False)
             self.output = nn.Linear(hidden, width, bias=False)
 
-    def forward(
-        self, x: Tensor, state: list[Tensor], is_init: Tensor
-    ) -> tuple[Tensor, list[Tensor]]:
+    def forward(self, x: Tensor, state: _Entries, is_init: Tensor) -> tuple[Tensor, _Entries]:
         mixed, state = self.mixer(self.norm1(x), state, is_init)
         x = x + mixed
         if self.has_ffn:
@@ -150,9 +145,7 @@ class _MinGRUMixer(_Mixer):
         with torch.no_grad():
             self.gate_bias.copy_(_rates(len(self.gate_bias)).logit())
 
-    def forward(
-        self, x: Tensor, state: list[Tensor], is_init: Tensor
-    ) -> tuple[Tensor, list[Tensor]]:
+    def forward(self, x: Tensor, state: _Entries, is_init: Tensor) -> tuple[Tensor, _Entries]:
         rate = (self.gate(x) + self.gate_bias).sigmoid()  # z, [N, T, H]
         decay = (1 - rate).masked_fill(is_init.unsqueeze(-1), 0)
         states = scan_vectors(decay, rate * self.candidate(x), state[0])
@@ -194,12 +187,7 @@ class _MatrixMixer(_Mixer):
     """
 
     def __init__(
-        self,
-        width: int,
-        settings: settings.MatrixMemorySettings,
-        *,
-        keys: int,
-        bias: bool = False,
+        self, width: int, settings: settings.MatrixMemorySettings, *, keys: int, bias: bool = False
     ) -> None:
         super().__init__()
         heads, values = settings.num_heads, settings.num_heads * settings.value_dim
@@ -241,9 +229,7 @@ class _GatedDeltaMixer(_MatrixMixer):
         self.norm = nn.RMSNorm(settings.value_dim, eps=_EPS)
         self.reset_parameters()
 
-    def forward(
-        self, x: Tensor, state: list[Tensor], is_init: Tensor
-    ) -> tuple[Tensor, list[Tensor]]:
+    def forward(self, x: Tensor, state: _Entries, is_init: Tensor) -> tuple[Tensor, _Entries]:
         memory, before = state
         beta = self.beta(x).sigmoid().mT
         gate, x, rate = self.inputs(x).split(self.sizes, dim=-1)
@@ -296,9 +282,7 @@ class _Mamba2Mixer(_MatrixMixer):
         super().reset_parameters()
         nn.init.ones_(self.skip)
 
-    def forward(
-        self, x: Tensor, state: list[Tensor], is_init: Tensor
-    ) -> tuple[Tensor, list[Tensor]]:
+    def forward(self, x: Tensor, state: _Entries, is_init: Tensor) -> tuple[Tensor, _Entries]:
         memory, before = state
         gate, x, rate = self.inputs(x).split(self.sizes, dim=-1)
         x, before = self.convolution(x, before, is_init)

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torchrl.modules import GRUModule, LSTMModule
 
 from torchrl_tit import settings
-from torchrl_tit.histories.encoder import HistoryShape, OneToken, RecurrentEncoder
+from torchrl_tit.histories.encoder import HistoryShape, OneToken, RecurrentEncoder, State
 
 
 class _TorchRLEncoder(RecurrentEncoder):
@@ -58,17 +58,13 @@ class _TorchRLEncoder(RecurrentEncoder):
         states, _ = self._layers(x.reshape(-1, *x.shape[-2:]))  # [N, K, E]
         return states[:, -1].reshape(*x.shape[:-2], self.out_features)
 
-    def step(
-        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def step(self, tokens: Tensor, state: State, is_init: Tensor) -> tuple[Tensor, State]:
         """Tokens float [*B, L, D] and the state before -> float [*B, E] and the state after."""
         entries = {"token": self.one_token(tokens), **state, "is_init": is_init}
         outcome = self.memory(TensorDict(entries, tokens.shape[:-2]))
         return outcome["memory"], {key: outcome["next", key] for key in self.state}
 
-    def single_step(
-        self, tokens: Tensor, state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def single_step(self, tokens: Tensor, state: State, is_init: Tensor) -> tuple[Tensor, State]:
         """Like :meth:`step` on single steps, without branches on values and batch sizes."""
         x = self.one_token(tokens)  # [*B, D]
         first = is_init.reshape(-1, 1)

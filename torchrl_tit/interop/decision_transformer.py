@@ -63,14 +63,8 @@ _RENAMING = [
     (r"embed_timestep\.(.*)", rf"{_HISTORY}.timestep_embedding.\1"),
     (r"embed_ln\.(.*)", rf"{_HISTORY}.embedding_norm.\1"),
     (r"transformer\.h\.(\d+)\.ln_(\d)\.(.*)", rf"{_HISTORY}.blocks.\1.norm\2.\3"),
-    (
-        r"transformer\.h\.(\d+)\.attn\.c_attn\.(.*)",
-        rf"{_HISTORY}.blocks.\1.attention.in_proj_\2",
-    ),
-    (
-        r"transformer\.h\.(\d+)\.attn\.c_proj\.(.*)",
-        rf"{_HISTORY}.blocks.\1.attention.out_proj.\2",
-    ),
+    (r"transformer\.h\.(\d+)\.attn\.c_attn\.(.*)", rf"{_HISTORY}.blocks.\1.attention.in_proj_\2"),
+    (r"transformer\.h\.(\d+)\.attn\.c_proj\.(.*)", rf"{_HISTORY}.blocks.\1.attention.out_proj.\2"),
     (r"transformer\.h\.(\d+)\.mlp\.c_fc\.(.*)", rf"{_HISTORY}.blocks.\1.ffn.0.\2"),
     (r"transformer\.h\.(\d+)\.mlp\.c_proj\.(.*)", rf"{_HISTORY}.blocks.\1.ffn.2.\2"),
     (r"transformer\.ln_f\.(.*)", rf"{_HISTORY}.norm.\1"),

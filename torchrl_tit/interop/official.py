@@ -10,13 +10,7 @@ from torch import Tensor, nn
 
 from torchrl_tit import settings
 from torchrl_tit.interop.decision_transformer import build_dt, build_dt_tit
-from torchrl_tit.interop.weights import (
-    Renaming,
-    count_layers,
-    load_renamed,
-    size_of,
-    strip_prefix,
-)
+from torchrl_tit.interop.weights import Renaming, count_layers, load_renamed, size_of, strip_prefix
 from torchrl_tit.networks import D2RL, EnhancedTIT, HistoryNetwork, OFENet, ResNet, VanillaTIT
 
 _Config: TypeAlias = Mapping[str, Any]

@@ -17,11 +17,7 @@ from torchrl_tit.settings.encoders import TemporalPositions
 Read = Literal["all", "first", "last"]
 """Positions of a sequence that are read: all, the first (class token), the last (newest step)."""
 
-READ_SLICES: dict[Read, slice] = {
-    "all": slice(None),
-    "first": slice(0, 1),
-    "last": slice(-1, None),
-}
+READ_SLICES: dict[Read, slice] = {"all": slice(None), "first": slice(0, 1), "last": slice(-1, None)}
 
 
 class _Heads(nn.Module):
@@ -266,14 +262,12 @@ class SelfAttention(_Heads):
 
         None if all scores are used unchanged.
         """
+        if self.relative is None and not causal:
+            return mask
         if self.relative is None:
-            return self._past(x) if causal else mask
+            return torch.ones(x.shape[1], x.shape[1], dtype=torch.bool, device=x.device).tril()
         bias = self.relative(x.shape[1])
         return bias if mask is None else bias.masked_fill(~mask, -math.inf)
-
-    def _past(self, x: Tensor) -> Tensor:
-        """The causal mask: bool [S, S], lower triangular."""
-        return torch.ones(x.shape[1], x.shape[1], dtype=torch.bool, device=x.device).tril()
 
     def _weights(self, query: Tensor, key: Tensor, mask: Tensor | None) -> Tensor:
         scores = query @ key.transpose(-2, -1) / math.sqrt(query.shape[-1])

@@ -62,7 +62,10 @@ class ActingModule(TensorModule):
             ...     for step in range(12):
             ...         td = backbone(TensorDict({"history": frames[:, step : step + 8]}, [5]))
         """
-        outer, self._acting = self._acting, self._make_acting()
+        outer = self._acting
+        if self.keeps_frames:
+            trunks = trunks_of(self.module).values()
+            self._acting = self._compiled or list(map(ActingNetwork, trunks))
         self.reset_cache()
         try:
             yield
@@ -102,12 +105,6 @@ class ActingModule(TensorModule):
     def _apply(self, *args: Any, **kwargs: Any) -> Any:
         self.reset_cache()  # moved or cast
         return super()._apply(*args, **kwargs)
-
-    def _make_acting(self) -> list[ActingNetwork] | None:
-        if not self.keeps_frames:
-            return None
-        # A compiled network clears its cache when it enters `acting`.
-        return self._compiled or list(map(ActingNetwork, trunks_of(self.module).values()))
 
     def _call_network(self, inputs: Sequence[Tensor]) -> Any:
         """Calls the network; in acting mode, it encodes the newest frames only."""

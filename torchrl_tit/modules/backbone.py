@@ -71,7 +71,8 @@ class Backbone(ActingModule):
     (``torchrl.modules.set_recurrent_mode(True)``, which TorchRL's losses switch on) it reads
     sequences, if the tensordict has ``is_init``: the last batch dimension is time, and each frame
     is encoded once, not once for each of the K windows that contain it. The features are the same
-    as those of single steps. A recurrent network reads its state only at the first step of each
+    as those of single steps. A network with further inputs, or with ``every_frame``, reads its
+    windows as ever. A recurrent network reads its state only at the first step of each
     sequence (slices of a replay buffer, which have none, are arranged by
     :func:`~torchrl_tit.modules.as_sequences`); any other network reads:
 
@@ -172,7 +173,7 @@ class Backbone(ActingModule):
                 f"{type(network.history_encoder).__name__} of one frame carries a state for one "
                 f"agent, not for those of {first!r}: give it num_frames of 2 or more"
             )
-        sequence_keys = _sequence_keys(trunks, in_keys, observation_keys, padding)
+        sequence_keys, context = _sequence_keys(trunks, in_keys, observation_keys, padding)
         step_keys = [*in_keys, *state_shapes, *(["is_init"] if state_shapes else [])]
         declared = [*sequence_keys.observations, "is_init"] if padding or observation_keys else []
         declared += ["sequence"] if declared and state_shapes else []
@@ -182,6 +183,8 @@ class Backbone(ActingModule):
             out_keys=[*out_keys, *(("next", key) for key in state_shapes)],
         )
         self._step_keys = step_keys  # keys that a single step reads
+        # Others read windows as they are stored, or have a state.
+        self._reads_sequences = not (context or every_frame or state_shapes)
         self.sequence_keys = sequence_keys
         """Keys of the entries read from sequences."""
         self.history_keys = in_keys
@@ -213,7 +216,7 @@ class Backbone(ActingModule):
         # A recurrent network reads sequences itself.
         if self.is_recurrent and tensordict.get("sequence", None) is not None:
             written = self._encode_arranged(tensordict["sequence"])
-        elif not self.is_recurrent and self.sequence_keys.in_sequence(tensordict):
+        elif self._reads_sequences and self.sequence_keys.in_sequence(tensordict):
             written = self.encode_sequences(tensordict)
         else:
             written = self.encode_steps(tensordict)
@@ -253,8 +256,8 @@ class Backbone(ActingModule):
             ValueError: if the steps are not consecutive, or an entry does not fit the network.
         """
         trunks = list(trunks_of(self.module).values())
-        table, context = self.sequence_keys.lay_out(tensordict, trunks)
-        outputs = self.encode_windows(table.frames, table.windows, *context)
+        table = self.sequence_keys.lay_out(tensordict, trunks)
+        outputs = self.encode_windows(table.frames, table.windows)
         *batch, steps = self.sequence_keys.shape_of(tensordict)
         group = self.sequence_keys.group_of(tensordict, trunks)
 
@@ -270,29 +273,22 @@ class Backbone(ActingModule):
             written[valid] = unflatten(table.valid.unsqueeze(-1))
         return written
 
-    def encode_windows(
-        self, frames: Sequence[Tensor], windows: Windows, *context: Tensor
-    ) -> tuple[Tensor, ...]:
+    def encode_windows(self, frames: Sequence[Tensor], windows: Windows) -> tuple[Tensor, ...]:
         """Maps windows on a table of frames to features, encoding each frame once.
 
         Args:
             frames: the table of each observation, [R, *observation_shape].
             windows: the rows of each window, [..., K].
-            *context: further inputs of the history encoder, [..., K, *entry] each.
 
         Returns:
-            One tensor for each of ``features_keys``, float [..., F], or [..., K, F] if
-            ``every_frame``.
+            One tensor for each of ``features_keys``, float [..., F].
         """
         trunks = trunks_of(self.module).values()
         with self.computing(windows.rows.device):
             if trunks:
-                outputs: Any = [
-                    trunk.encode_windows(frames, windows, *context, every_frame=self.every_frame)
-                    for trunk in trunks
-                ]
+                outputs: Any = [trunk.encode_windows(frames, windows) for trunk in trunks]
             else:
-                outputs = self.module(*(windows.gather(table) for table in frames), *context)
+                outputs = self.module(*(windows.gather(table) for table in frames))
         return self._in_full(outputs)
 
     @property
@@ -347,9 +343,8 @@ class Backbone(ActingModule):
             `TensorDictPrimer`, which starts it with a state of zeros. Empty if the network is not
             recurrent.
         """
-        if not self.is_recurrent:
-            return Compose()
-        return Compose(InitTracker(), self.make_tensordict_primer())
+        transforms = [InitTracker(), self.make_tensordict_primer()] if self.is_recurrent else []
+        return Compose(*transforms)
 
     def make_tensordict_primer(self) -> Transform:
         """Builds the transform that starts each episode with a state of zeros.
@@ -482,13 +477,13 @@ def _sequence_keys(
     in_keys: list[NestedKey],
     observation_keys: Sequence[NestedKey] | str | None,
     padding: Padding | None,
-) -> SequenceKeys:
-    """Keys of the entries that a backbone reads from sequences."""
+) -> tuple[SequenceKeys, list[NestedKey]]:
+    """Keys of the entries that a backbone reads from sequences, and those of further inputs."""
     count = max((len(trunk.frames) for trunk in trunks.values()), default=len(in_keys))
     histories, context = in_keys[:count], in_keys[count:]
     keys = default_observation_keys(histories) if observation_keys is None else observation_keys
     observations: list[NestedKey] = [keys] if isinstance(keys, str) else list(keys)
-    return SequenceKeys(histories, observations, context, padding)
+    return SequenceKeys(histories, observations, padding), context
 
 
 def _state_shapes(network: HistoryNetwork) -> dict[str, torch.Size]:

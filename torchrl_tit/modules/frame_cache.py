@@ -90,18 +90,14 @@ class FrameCache:
         frames = window.reshape(math.prod(leading), *window.shape[len(leading) :])  # [N, K, *obs]
         flat = _as_words(frames.flatten(2))  # [N, K, entries]
         newest = self._encode_newest(frames[:, -1]).unsqueeze(1)  # [N, 1, *token_shape]
-        if kept and torch.equal(flat[:, :-1], kept.frames.entries):
-            tokens = torch.cat([kept.tokens.entries, newest], dim=1)
-            kept.frames.append(flat[:, -1])
-            kept.tokens.append(newest[:, 0])
+        if kept and torch.equal(flat[:, :-1], kept.frames):
+            older = kept.tokens
         else:
-            tokens = torch.cat([self._encode_older(frames, flat, newest, kept), newest], dim=1)
-            self._kept = _Kept(
-                conditions,
-                self._weights.present(),
-                SlidingWindow(flat[:, 1:]),
-                SlidingWindow(tokens[:, 1:]),
-            )
+            older = self._encode_older(frames, flat, newest, kept)
+        tokens = torch.cat([older, newest], dim=1)
+        weights = kept.weights if kept else self._weights.present()
+        # Copies, because what is read and returned may be written to.
+        self._kept = _Kept(conditions, weights, flat[:, 1:].clone(), tokens[:, 1:].clone())
         return tokens.reshape(*leading, *tokens.shape[1:])
 
     def _encode_older(
@@ -112,8 +108,8 @@ class FrameCache:
         unknown = (older != flat[:, -1:]).any(-1)
         tokens = newest.repeat(1, older.shape[1], *[1] * (newest.ndim - 2))
         if kept is not None:
-            known = (older == kept.frames.entries).all(-1)
-            tokens[known] = kept.tokens.entries[known]
+            known = (older == kept.frames).all(-1)
+            tokens[known] = kept.tokens[known]
             unknown &= ~known
         if unknown.any():
             distinct, index = older[unknown].unique(dim=0, return_inverse=True)
@@ -199,48 +195,14 @@ class ActingNetwork:
         ]
 
 
-class SlidingWindow:
-    """The last M entries of a sequence: appending one drops the oldest.
-
-    Args:
-        entries: the first M entries, [N, M, ...], which are copied.
-
-    Example:
-        >>> window = SlidingWindow(torch.tensor([[1, 2, 3]]))
-        >>> window.append(torch.tensor([4]))
-        >>> window.entries
-        tensor([[2, 3, 4]])
-    """
-
-    def __init__(self, entries: Tensor) -> None:
-        self._count = entries.shape[1]
-        # Room for 2 M entries, so that they move to the front only when the end is reached.
-        self._room = entries.new_empty(len(entries), 2 * self._count, *entries.shape[2:])
-        self._room[:, : self._count] = entries
-        self._start = 0
-
-    @property
-    def entries(self) -> Tensor:
-        """The entries, [N, M, ...], as a view."""
-        return self._room[:, self._start : self._start + self._count]
-
-    def append(self, entry: Tensor) -> None:
-        """Appends an entry [N, ...] and drops the oldest."""
-        if self._start == self._count:
-            self._room[:, : self._count] = self.entries
-            self._start = 0
-        self._room[:, self._start + self._count] = entry
-        self._start += 1
-
-
 @dataclass
 class _Kept:
     """The last K - 1 frames and their tokens, and the conditions under which they can be reused."""
 
     conditions: tuple[object, ...]
     weights: list[Tensor]  # kept alive, because the conditions hold their ids
-    frames: SlidingWindow  # [N, K - 1, entries]
-    tokens: SlidingWindow  # float [N, K - 1, *token_shape]
+    frames: Tensor  # [N, K - 1, entries]
+    tokens: Tensor  # float [N, K - 1, *token_shape]
 
 
 def _as_words(frames: Tensor) -> Tensor:

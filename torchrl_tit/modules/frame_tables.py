@@ -145,14 +145,14 @@ def find_starts(is_init: Tensor, ends: Sequence[Tensor]) -> Tensor:
     return _after_first(is_init, True)
 
 
-def differs(one: Tensor, other: Tensor) -> Tensor:
-    """Where steps differ, [N, T, ...] each -> bool [N, T]; NaN equals NaN.
+def differs(one: Tensor, other: Tensor, ndim: int = 2) -> Tensor:
+    """Where observations differ, [*B, ...] each -> bool [*B] of ndim dimensions; NaN equals NaN.
 
     Example:
         >>> differs(torch.tensor([[[1.0, torch.nan]]]), torch.tensor([[[2.0, torch.nan]]]))
         tensor([[True]])
     """
-    return ((one != other) & ((one == one) | (other == other))).flatten(2).any(-1)
+    return ((one != other) & ((one == one) | (other == other))).flatten(ndim).any(-1)
 
 
 def _after_first(mask: Tensor, first: bool) -> Tensor:

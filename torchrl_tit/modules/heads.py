@@ -36,7 +36,7 @@ from torchrl_tit.modules.sequences import beside
 from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
 from torchrl_tit.modules.torch_internals import is_transformed
 from torchrl_tit.settings.checks import checked_arguments
-from torchrl_tit.settings.numbers import Positive, Size, Weight
+from torchrl_tit.settings.numbers import Positive, Size
 
 
 @checked_arguments
@@ -48,7 +48,6 @@ def make_actor(
     action_key: NestedKey | None = None,
     mask_key: NestedKey | None = None,
     batch_dims: int | None = None,
-    gain: Weight = 0.01,
     std: Positive | None = None,
 ) -> ProbabilisticActor:
     """Builds the policy head for an action space.
@@ -67,8 +66,9 @@ def make_actor(
 
     An action has the shape and dtype of the spec, and one log-probability and one entropy: the sums
     over its components. Gaussian actions are neither squashed nor clipped, so the environment
-    should clip them (as :func:`~torchrl_tit.envs.make_env` does). The weights start orthogonal, by
-    default with gain 0.01, as in Stable-Baselines3, which trained the paper's agents.
+    should clip them (as :func:`~torchrl_tit.envs.make_env` does). The weights start orthogonal with
+    gain 0.01, as in Stable-Baselines3, which trained the paper's agents: the initial policy has
+    almost the same probabilities in all states (recommended by arXiv 2006.05990).
 
     Args:
         features_dim: size of the features.
@@ -82,9 +82,6 @@ def make_actor(
         batch_dims: number of batch dimensions of ``action_spec``; the others are an action's. By
             default, all but the last dimension of ``OneHot``, ``MultiOneHot`` and
             ``MultiCategorical`` specs, all of a ``Categorical`` spec, none of other specs.
-        gain: gain of the initial weights. With a small gain, the initial policy has almost the same
-            probabilities in all states (recommended by arXiv 2006.05990); with 1, it differs by
-            state.
         std: initial standard deviation of continuous actions, as a share of half the range of each
             entry, or in its own units where it has no bounds. None is 1 in its own units, as in
             Stable-Baselines3.
@@ -113,17 +110,16 @@ def make_actor(
     """
     shape = action_shape(action_spec, batch_dims)
     if isinstance(action_spec, Categorical | OneHot) and not isinstance(action_spec, Binary):
-        parts = _choices(features_dim, action_spec, shape, mask_key, gain)
+        parts = _choices(features_dim, action_spec, shape, mask_key)
     elif mask_key is not None:
         raise ValueError(
             f"no action mask for the action space {describe(action_spec)}, only for Categorical, "
             "OneHot, MultiCategorical and MultiOneHot: leave out mask_key"
         )
     elif isinstance(action_spec, Binary):
-        parts = _switches(features_dim, action_spec, shape, gain)
+        parts = _switches(features_dim, action_spec, shape)
     else:
-        scale = initial_scale(action_spec, shape, std)
-        parts = _gaussian(features_dim, action_spec, shape, gain, scale)
+        parts = _gaussian(features_dim, action_spec, shape, initial_scale(action_spec, shape, std))
     in_keys = [in_key] if mask_key is None else [in_key, mask_key]
     parameters = {name: beside(in_key, key) for name, key in parts.parameters.items()}
     return ProbabilisticActor(
@@ -261,11 +257,7 @@ class _Parts(NamedTuple):
 
 
 def _choices(
-    features_dim: int,
-    spec: Categorical | OneHot,
-    shape: torch.Size,
-    mask_key: NestedKey | None,
-    gain: float,
+    features_dim: int, spec: Categorical | OneHot, shape: torch.Size, mask_key: NestedKey | None
 ) -> _Parts:
     """Parts for actions whose components each are one of several options."""
     distribution: type[distributions.Distribution]
@@ -286,24 +278,22 @@ def _choices(
     else:
         # Validating logits and samples takes a third of the head's time at each step.
         distribution, settings = distributions.Categorical, {"validate_args": False}
-        return _Parts(_Linear(features_dim, sizes[0], gain), parameters, distribution, settings)
-    network = _ChoicesHead(features_dim, sizes, shape, mask_key, gain)
+        return _Parts(_Linear(features_dim, sizes[0]), parameters, distribution, settings)
+    network = _ChoicesHead(features_dim, sizes, shape, mask_key)
     return _Parts(network, parameters, distribution, settings)
 
 
-def _switches(features_dim: int, spec: Binary, shape: torch.Size, gain: float) -> _Parts:
+def _switches(features_dim: int, spec: Binary, shape: torch.Size) -> _Parts:
     """Parts for actions whose components each are on or off."""
-    layer = _Linear(features_dim, math.prod(shape), gain)
+    layer = _Linear(features_dim, math.prod(shape))
     network = layer if len(shape) == 1 else nn.Sequential(layer, _Fit(shape))
     settings = {"event_dim": len(shape), "dtype": spec.dtype}
     return _Parts(network, {"logits": "logits"}, IndependentBernoulli, settings)
 
 
-def _gaussian(
-    features_dim: int, spec: TensorSpec, shape: torch.Size, gain: float, scale: Tensor
-) -> _Parts:
+def _gaussian(features_dim: int, spec: TensorSpec, shape: torch.Size, scale: Tensor) -> _Parts:
     """Parts for continuous actions."""
-    network = nn.Sequential(_Linear(features_dim, len(scale), gain), _Scale(scale))
+    network = nn.Sequential(_Linear(features_dim, len(scale)), _Scale(scale))
     if len(shape) != 1 or spec.dtype != torch.float32:
         network.append(_Fit(shape, spec.dtype))
     settings = {"event_dim": len(shape), "validate_args": False}
@@ -313,7 +303,7 @@ def _gaussian(
 class _Linear(nn.Linear):
     """A linear layer whose weights start orthogonal and whose bias starts at 0."""
 
-    def __init__(self, in_features: int, out_features: int, gain: float) -> None:
+    def __init__(self, in_features: int, out_features: int, gain: float = 0.01) -> None:
         self.gain = gain  # first, because nn.Linear initializes itself
         super().__init__(in_features, out_features)
 
@@ -361,19 +351,13 @@ class _ChoicesHead(nn.Module):
         sizes: number of options of each component.
         shape: the components' shape.
         mask_key: key of the action mask, for error messages; None if there is none.
-        gain: gain of the initial weights.
     """
 
     def __init__(
-        self,
-        features_dim: int,
-        sizes: list[int],
-        shape: torch.Size,
-        mask_key: NestedKey | None,
-        gain: float,
+        self, features_dim: int, sizes: list[int], shape: torch.Size, mask_key: NestedKey | None
     ) -> None:
         super().__init__()
-        self.linear = _Linear(features_dim, sum(sizes), gain)
+        self.linear = _Linear(features_dim, sum(sizes))
         self.mask_key = mask_key
         # The logit of each option of each component; the index after the last stands for none.
         columns = torch.full((len(sizes), max(sizes)), sum(sizes))

@@ -36,8 +36,6 @@ class SequenceKeys:
     """Keys of the histories."""
     observations: list[NestedKey]
     """Keys of the observations, one for each history."""
-    context: list[NestedKey]
-    """Keys of the history encoder's further inputs."""
     padding: Padding | None
     """Padding before an episode; None to read the stored histories instead."""
 
@@ -69,9 +67,7 @@ class SequenceKeys:
         own = len(next(iter(trunks[0].observations.values())).shape)
         return entry.shape[len(self.shape_of(tensordict)) : entry.ndim - own]
 
-    def lay_out(
-        self, tensordict: TensorDictBase, trunks: Sequence[HistoryNetwork]
-    ) -> tuple[FrameTable, list[Tensor]]:
+    def lay_out(self, tensordict: TensorDictBase, trunks: Sequence[HistoryNetwork]) -> FrameTable:
         """Lays the frames of sequences [*B, T] out in a table.
 
         Args:
@@ -79,8 +75,8 @@ class SequenceKeys:
             trunks: the networks that read them; empty for other modules.
 
         Returns:
-            The table, with windows [N, T, K], and the further inputs, [N, T, K, *entry] each. N
-            counts B, and the agents of each, if there are several.
+            The table, with windows [N, T, K]. N counts B, and the agents of each, if there are
+            several.
 
         Raises:
             KeyError: if an entry is missing.
@@ -102,7 +98,6 @@ class SequenceKeys:
             return flags.repeat_interleave(math.prod(group), 0) if group else flags
 
         observations = [flat(tensordict.get(key)) for key in self.observations]
-        context = [flat(tensordict.get(key)) for key in self.context]
         is_init = flags(tensordict.get("is_init"))
         ends = [tensordict.get(key, None) for key in ("done", ("next", "done"))]
         starts = find_starts(is_init, [flags(end) for end in ends if end is not None])
@@ -117,17 +112,16 @@ class SequenceKeys:
             first = [x.select(time, 0).reshape(count, *x.shape[own:]) for x in histories]
             table = table_of_first(first, observations, is_init, self.padding)
             _check_padding(table, [flat(x) for x in histories])
-            return table, context
+            return table
         if histories:
-            return table_of_stored([flat(x) for x in histories], observations, starts), context
+            return table_of_stored([flat(x) for x in histories], observations, starts)
         padding, num_frames = self.padding or "same", trunks[0].num_frames
-        table = table_without_histories(observations, is_init, starts, num_frames, padding)
-        return table, context
+        return table_without_histories(observations, is_init, starts, num_frames, padding)
 
     def _check(self, tensordict: TensorDictBase, trunks: Sequence[HistoryNetwork]) -> None:
         entries = tensordict.keys(True)
         named = ", ".join(sorted(map(str, entries)))
-        for key in (*self.observations, *self.context, "is_init"):
+        for key in (*self.observations, "is_init"):
             if key not in entries:
                 hint = "name the keys of the observations in observation_keys"
                 if key == "is_init":

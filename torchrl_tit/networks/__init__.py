@@ -3,7 +3,6 @@
 from torchrl_tit.networks import named
 from torchrl_tit.networks.by_kind import chosen_by_kind, frames_by_kind
 from torchrl_tit.networks.history_network import (
-    AttentionMaps,
     HistoryNetwork,
     TwoTrunks,
     build_network,
@@ -13,7 +12,6 @@ from torchrl_tit.networks.named import *  # noqa: F403
 
 __all__ = [
     *named.__all__,
-    "AttentionMaps",
     "HistoryNetwork",
     "TwoTrunks",
     "build_network",

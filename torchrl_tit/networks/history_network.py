@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -13,7 +12,7 @@ from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
 from torchrl_tit.frames.flat import Flat
 from torchrl_tit.frames.observation import Observation, Observations, read_observations
-from torchrl_tit.histories.encoder import HistoryShape, RecurrentEncoder
+from torchrl_tit.histories.encoder import HistoryShape, RecurrentEncoder, State
 from torchrl_tit.layers.activations import make_activation
 from torchrl_tit.layers.images import bytes_to_floats
 from torchrl_tit.layers.initialization import init_normal_
@@ -22,20 +21,6 @@ from torchrl_tit.networks.by_kind import frames_by_kind
 from torchrl_tit.settings.checks import checked
 from torchrl_tit.settings.numbers import Frames
 from torchrl_tit.windows import Windows
-
-
-@dataclass(frozen=True)
-class AttentionMaps:
-    """Attention weights of every block, rows (queries) summing to 1.
-
-    Attributes:
-        inner: of each inner block, float [..., K, heads, S, S] with S = 1 + patches and the class
-            token at position 0 (without K if frames are stacked as channels).
-        outer: of each outer block, float [..., heads, K, K], lower triangular.
-    """
-
-    inner: list[Tensor]
-    outer: list[Tensor]
 
 
 class HistoryNetwork(nn.Module):
@@ -159,14 +144,10 @@ class HistoryNetwork(nn.Module):
         """Maps the tokens of K frames to features, float [..., K, L, D] -> [..., F]."""
         return self.head(self.history_encoder(self.as_floats(tokens), *context))
 
-    def encode_windows(
-        self,
-        frames: Sequence[Tensor],
-        windows: Windows,
-        *context: Tensor,
-        every_frame: bool = False,
-    ) -> Tensor:
+    def encode_windows(self, frames: Sequence[Tensor], windows: Windows) -> Tensor:
         """Maps windows on a table of frames to features, encoding each frame once.
+
+        Not for history encoders that read more than observations.
 
         The features and gradients are those of ``forward(*(windows.gather(x) for x in frames))``,
         up to rounding, at a cost that hardly grows with K. Dropout in the frame encoder is drawn
@@ -175,11 +156,9 @@ class HistoryNetwork(nn.Module):
         Args:
             frames: the table of each observation, [R, *observation_shape].
             windows: the rows of each window, [..., K].
-            *context: further inputs of the history encoder, [..., K, *entry] each.
-            every_frame: return the features of every frame of a window (see ``every_frame``).
 
         Returns:
-            float [..., F], or [..., K, F] of every frame.
+            float [..., F].
 
         Example:
             >>> from torchrl_tit import EnhancedTIT
@@ -199,13 +178,9 @@ class HistoryNetwork(nn.Module):
         tokens = [encoder(x) for encoder, x in zip(self.frames, frames, strict=True)]
         table = self.join_tokens(tokens)
         shares = windows.rows.shape[-1] > 1  # else a frame is in one window only
-        if shares and not every_frame and self.history_encoder.reads_tables(windows):
+        if shares and self.history_encoder.reads_tables(windows):
             return self.head(self.history_encoder.read_table(self.as_floats(table), windows))
-        gathered = windows.gather(table)
-        if every_frame:
-            encoded = self.history_encoder.every_frame(self.as_floats(gathered), *context)
-            return self.head(encoded)
-        return self.encode_history(gathered, *context)
+        return self.encode_history(windows.gather(table))
 
     def every_frame(self, *inputs: Tensor) -> Tensor:
         """Maps histories to features of every frame, each from that frame and the ones before it.
@@ -223,8 +198,8 @@ class HistoryNetwork(nn.Module):
         return self.head(self.history_encoder.every_frame(tokens, *inputs[count:]))
 
     def step(
-        self, histories: Sequence[Tensor], state: dict[str, Tensor], is_init: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+        self, histories: Sequence[Tensor], state: State, is_init: Tensor
+    ) -> tuple[Tensor, State]:
         """Reads the newest frame and the previous state; only for recurrent networks.
 
         Args:
@@ -247,25 +222,6 @@ class HistoryNetwork(nn.Module):
         if self.history_encoder.reads_frames:
             return tokens
         return bytes_to_floats(tokens, weights_dtype(self))
-
-    def attention_maps(self, *inputs: Tensor) -> AttentionMaps:
-        """Returns the attention weights of every inner and outer block.
-
-        This is a separate forward pass, because the usual one does not compute all attention
-        weights.
-
-        Args:
-            *inputs: as in ``forward``.
-        """
-        count = len(self.frame_encoders)
-        histories, context = inputs[:count], inputs[count:]
-        tokens = self.as_floats(self.encode_frames(*histories))
-        pairs = zip(self.frames, histories, strict=True)
-        inner = [maps for encoder, history in pairs for maps in encoder.attention_maps(history)]
-        outer = self.history_encoder.attention_maps(tokens, *context)
-        if self.history_encoder.reads_frames:  # its blocks are inner ones
-            return AttentionMaps([*inner, *outer], [])
-        return AttentionMaps(inner, outer)
 
     def check(self, *histories: Tensor) -> None:
         """Raises ValueError or TypeError if histories do not fit this network."""

@@ -114,8 +114,6 @@ class EnhancedTIT(NamedNetwork, describe=networks.enhanced_tit):
         >>> tit = EnhancedTIT(observation_shape=(84, 84), num_frames=4, patch_size=12, embed_dim=64)
         >>> tit(torch.zeros(2, 4, 84, 84, dtype=torch.uint8)).shape
         torch.Size([2, 64])
-        >>> [weights.shape[-1] for weights in tit.attention_maps(torch.rand(2, 4, 84, 84)).inner]
-        [50, 50]
     """
 
 

@@ -31,7 +31,7 @@ def contrastive_prediction_loss(
     choices.
 
     Args:
-        encodings: y, float [N, K, D], see :meth:`~torchrl_tit.networks.CoBERL.predict_masked`.
+        encodings: y, float [N, K, D], see :func:`~torchrl_tit.networks.masked_predictions`.
         predictions: x, float [N, K, D].
         mask: bool [N, K], True where a step was masked.
         temperature: divides the similarities.

@@ -393,10 +393,7 @@ class DelayedDiscreteCQLLoss(DiscreteCQLLoss):
         """The squared error of a batch [*B], float [], and mean values to log."""
         next_state = tensordict["next"].select(*self.value_network.in_keys, strict=False)
         params = self.target_value_network_params
-        with (
-            torch.no_grad(),
-            params.to_module(self.value_network, preserve_module_state=False),
-        ):
+        with torch.no_grad(), params.to_module(self.value_network, preserve_module_state=False):
             value = self.value_network(next_state).get(self.tensor_keys.value)
         tensordict.set(("next", self.tensor_keys.value), value)
         return super().value_loss(tensordict)

@@ -69,7 +69,7 @@ def field_types(kind: type) -> dict[str, Any]:
 
 
 @cache
-def _field_types(kind: type) -> dict[str, Any]:
+def _field_types(kind: type) -> dict[str, Any]:  # mypy takes classes for unhashable
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in fields(kind)}
 

@@ -224,9 +224,7 @@ class SlidingOuterSettings(OuterSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class Outer(
-    SlidingOuterSettings,
-    name="outer",
-    builds="torchrl_tit.histories.outer:StackedOuterTransformer",
+    SlidingOuterSettings, name="outer", builds="torchrl_tit.histories.outer:StackedOuterTransformer"
 ):
     """The outer transformer of Vanilla_TIT: stacked causal blocks over one token per frame."""
 
@@ -238,9 +236,7 @@ class Outer(
 
 @dataclass(frozen=True, kw_only=True)
 class PairedOuter(
-    OuterSettings,
-    name="paired-outer",
-    builds="torchrl_tit.histories.outer:PairedOuterTransformer",
+    OuterSettings, name="paired-outer", builds="torchrl_tit.histories.outer:PairedOuterTransformer"
 ):
     """The outer blocks of Enhanced_TIT: one for each token of a frame, all outputs concatenated."""
 
@@ -397,9 +393,7 @@ class LinearRecurrentSettings(HistorySettings):
 
 @dataclass(frozen=True, kw_only=True)
 class MinGRU(
-    LinearRecurrentSettings,
-    name="mingru",
-    builds="torchrl_tit.histories.linear_recurrent:MinGRU",
+    LinearRecurrentSettings, name="mingru", builds="torchrl_tit.histories.linear_recurrent:MinGRU"
 ):
     """minGRU (arXiv 2410.01201): a GRU whose gate does not read the state."""
 
@@ -430,9 +424,7 @@ class GatedDeltaNet(
 
 @dataclass(frozen=True, kw_only=True)
 class Mamba2(
-    MatrixMemorySettings,
-    name="mamba2",
-    builds="torchrl_tit.histories.linear_recurrent:Mamba2",
+    MatrixMemorySettings, name="mamba2", builds="torchrl_tit.histories.linear_recurrent:Mamba2"
 ):
     """Mamba-2 (arXiv 2405.21060): a state space whose decay depends on the step."""
 

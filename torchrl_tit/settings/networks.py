@@ -6,31 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal
 
+from torchrl_tit.settings import encoders
 from torchrl_tit.settings.checks import check_fields
 from torchrl_tit.settings.encoders import (
-    D2RL,
-    GRU,
-    LSTM,
-    MLP,
     Activation,
-    Catformer,
-    CoBERL,
-    DecisionTransformer,
-    Flat,
     FrameSettings,
-    GatedDeltaNet,
-    GTrXL,
     HistorySettings,
-    Inner,
-    Linear,
-    Mamba2,
-    MinGRU,
-    OFENet,
-    Outer,
-    PairedOuter,
-    ResNetFrames,
-    StackedCNN,
-    StackedInner,
     TemporalPositions,
 )
 from torchrl_tit.settings.numbers import Frames, Width
@@ -150,7 +131,7 @@ def vanilla_tit(
         activation_head: activation of the head.
     """
     return Network(
-        frame=Inner(
+        frame=encoders.Inner(
             patch_size=patch_size,
             patch_weights=patch_weights,
             embed_dim=embed_dim,
@@ -164,7 +145,7 @@ def vanilla_tit(
             share_blocks=share_blocks,
             every_block=False,
         ),
-        history=Outer(
+        history=encoders.Outer(
             num_blocks=num_blocks,
             num_heads=num_heads_outer,
             ffn_expansion=ffn_expansion_outer,
@@ -213,16 +194,16 @@ def enhanced_tit(
             "temporal_positions are those of the outer blocks: set them to none, or outer to True"
         )
     vanilla = vanilla_tit(num_frames, **hyperparameters)
-    assert isinstance(vanilla.frame, Inner)
-    assert isinstance(vanilla.history, Outer)
+    assert isinstance(vanilla.frame, encoders.Inner)
+    assert isinstance(vanilla.history, encoders.Outer)
     if not outer:
-        stacked = StackedInner(**{**asdict(vanilla.frame), "every_block": dense})
-        return replace(vanilla, frame=Flat(), history=stacked)
+        stacked = encoders.StackedInner(**{**asdict(vanilla.frame), "every_block": dense})
+        return replace(vanilla, frame=encoders.Flat(), history=stacked)
     if not inner:
-        frame = Linear(embed_dim=vanilla.frame.embed_dim)
+        frame = encoders.Linear(embed_dim=vanilla.frame.embed_dim)
         return replace(vanilla, frame=frame, history=replace(vanilla.history, dense=dense))
     shared = asdict(vanilla.history)
-    paired = PairedOuter(**{f.name: shared[f.name] for f in fields(PairedOuter)})
+    paired = encoders.PairedOuter(**{f.name: shared[f.name] for f in fields(encoders.PairedOuter)})
     return replace(vanilla, frame=replace(vanilla.frame, every_block=dense), history=paired)
 
 
@@ -233,7 +214,9 @@ def nature_cnn(num_frames: int = 1, *, features_dim: int = 512) -> Network:
     baseline "NatureCNN + MLP" of arXiv 2212.14538.
     """
     head = Head(features_dim=features_dim, activation="relu", norm=False)
-    return Network(frame=Flat(), history=StackedCNN(), head=head, num_frames=num_frames)
+    return Network(
+        frame=encoders.Flat(), history=encoders.StackedCNN(), head=head, num_frames=num_frames
+    )
 
 
 def resnet(num_frames: int = 1, *, features_dim: int = 512) -> Network:
@@ -242,7 +225,8 @@ def resnet(num_frames: int = 1, *, features_dim: int = 512) -> Network:
     The baseline "ResNet + MLP" of arXiv 2212.14538.
     """
     return replace(
-        nature_cnn(num_frames, features_dim=features_dim), history=StackedCNN(torso="resnet")
+        nature_cnn(num_frames, features_dim=features_dim),
+        history=encoders.StackedCNN(torso="resnet"),
     )
 
 
@@ -260,7 +244,7 @@ def catformer(
         features_dim: size of the features.
         **hyperparameters: fields of :class:`Catformer`.
     """
-    return _on_images(num_frames, embed_dim, Catformer(**hyperparameters), features_dim)
+    return _on_images(num_frames, embed_dim, encoders.Catformer(**hyperparameters), features_dim)
 
 
 def gtrxl(
@@ -278,7 +262,7 @@ def gtrxl(
         features_dim: size of the features.
         **hyperparameters: fields of :class:`GTrXL`.
     """
-    return _on_images(num_frames, embed_dim, GTrXL(**hyperparameters), features_dim)
+    return _on_images(num_frames, embed_dim, encoders.GTrXL(**hyperparameters), features_dim)
 
 
 def coberl(
@@ -295,7 +279,7 @@ def coberl(
         features_dim: size of the LSTM's state, which is the features.
         **hyperparameters: further fields of :class:`CoBERL`.
     """
-    history = CoBERL(hidden_dim=features_dim, **hyperparameters)
+    history = encoders.CoBERL(hidden_dim=features_dim, **hyperparameters)
     return _on_images(num_frames, embed_dim, history, features_dim=None)
 
 
@@ -308,7 +292,7 @@ def mlp(num_frames: int = 1, **hyperparameters: Any) -> Network:
         num_frames: number K of observations.
         **hyperparameters: fields of :class:`MLP`.
     """
-    return _separate(num_frames, MLP(**hyperparameters))
+    return _separate(num_frames, encoders.MLP(**hyperparameters))
 
 
 def ofenet(num_frames: int = 1, **hyperparameters: Any) -> Network:
@@ -321,7 +305,7 @@ def ofenet(num_frames: int = 1, **hyperparameters: Any) -> Network:
         num_frames: number K of observations.
         **hyperparameters: fields of :class:`OFENet`.
     """
-    return _separate(num_frames, OFENet(**hyperparameters))
+    return _separate(num_frames, encoders.OFENet(**hyperparameters))
 
 
 def d2rl(num_frames: int = 1, **hyperparameters: Any) -> Network:
@@ -334,7 +318,7 @@ def d2rl(num_frames: int = 1, **hyperparameters: Any) -> Network:
         num_frames: number K of observations.
         **hyperparameters: fields of :class:`D2RL`.
     """
-    return _separate(num_frames, D2RL(**hyperparameters))
+    return _separate(num_frames, encoders.D2RL(**hyperparameters))
 
 
 def lstm(
@@ -352,8 +336,8 @@ def lstm(
         features_dim: size of the features.
     """
     return Network(
-        frame=Linear(embed_dim=embed_dim, bias=True, activation="tanh"),
-        history=LSTM(hidden_dim=hidden_dim),
+        frame=encoders.Linear(embed_dim=embed_dim, bias=True, activation="tanh"),
+        history=encoders.LSTM(hidden_dim=hidden_dim),
         head=Head(features_dim=features_dim),
         num_frames=num_frames,
     )
@@ -372,7 +356,7 @@ def gru(
     """
     return replace(
         lstm(num_frames, embed_dim=embed_dim, features_dim=features_dim),
-        history=GRU(hidden_dim=hidden_dim),
+        history=encoders.GRU(hidden_dim=hidden_dim),
     )
 
 
@@ -384,7 +368,9 @@ def mingru(num_frames: int = 1, *, embed_dim: int = 64, **hyperparameters: Any) 
         embed_dim: width of a token and of the blocks.
         **hyperparameters: fields of :class:`MinGRU`.
     """
-    return replace(lstm(num_frames, embed_dim=embed_dim), history=MinGRU(**hyperparameters))
+    return replace(
+        lstm(num_frames, embed_dim=embed_dim), history=encoders.MinGRU(**hyperparameters)
+    )
 
 
 def gated_deltanet(num_frames: int = 1, *, embed_dim: int = 64, **hyperparameters: Any) -> Network:
@@ -395,7 +381,9 @@ def gated_deltanet(num_frames: int = 1, *, embed_dim: int = 64, **hyperparameter
         embed_dim: width of a token and of the blocks.
         **hyperparameters: fields of :class:`GatedDeltaNet`.
     """
-    return replace(lstm(num_frames, embed_dim=embed_dim), history=GatedDeltaNet(**hyperparameters))
+    return replace(
+        lstm(num_frames, embed_dim=embed_dim), history=encoders.GatedDeltaNet(**hyperparameters)
+    )
 
 
 def mamba2(num_frames: int = 1, *, embed_dim: int = 64, **hyperparameters: Any) -> Network:
@@ -406,7 +394,9 @@ def mamba2(num_frames: int = 1, *, embed_dim: int = 64, **hyperparameters: Any) 
         embed_dim: width of a token and of the blocks.
         **hyperparameters: fields of :class:`Mamba2`.
     """
-    return replace(lstm(num_frames, embed_dim=embed_dim), history=Mamba2(**hyperparameters))
+    return replace(
+        lstm(num_frames, embed_dim=embed_dim), history=encoders.Mamba2(**hyperparameters)
+    )
 
 
 def decision_transformer(
@@ -423,8 +413,8 @@ def decision_transformer(
         **hyperparameters: fields of :class:`DecisionTransformer`.
     """
     return Network(
-        frame=Linear(embed_dim=embed_dim, bias=True),
-        history=DecisionTransformer(**hyperparameters),
+        frame=encoders.Linear(embed_dim=embed_dim, bias=True),
+        history=encoders.DecisionTransformer(**hyperparameters),
         head=Head(features_dim=None),
         num_frames=num_frames,
     )
@@ -457,7 +447,7 @@ def dt_tit(
         position_encoding: whether patches and class token get a learned position encoding.
         **hyperparameters: fields of :class:`DecisionTransformer`.
     """
-    inner = Inner(
+    inner = encoders.Inner(
         patch_size=patch_size,
         embed_dim=embed_dim,
         num_blocks=num_blocks_inner,
@@ -500,7 +490,7 @@ def _on_images(
     """A residual network on each image, a history encoder, and a head with relu, if any."""
     activation: Activation = "tanh" if features_dim is None else "relu"
     return Network(
-        frame=ResNetFrames(embed_dim=embed_dim),
+        frame=encoders.ResNetFrames(embed_dim=embed_dim),
         history=history,
         head=Head(features_dim=features_dim, activation=activation),
         num_frames=num_frames,
@@ -510,7 +500,7 @@ def _on_images(
 def _separate(num_frames: int, history: HistorySettings) -> Network:
     """Layers on the entries of K observations, without a head, separate for policy and value."""
     return Network(
-        frame=Flat(),
+        frame=encoders.Flat(),
         history=history,
         head=Head(features_dim=None),
         num_frames=num_frames,

@@ -1,6 +1,6 @@
 """The kinds of numbers in settings, each with the bounds of sensible values.
 
-:func:`~torchrl_tit.settings.fields.check_fields` enforces the bounds, and rejects numbers that are
+:func:`~torchrl_tit.settings.checks.check_fields` enforces the bounds, and rejects numbers that are
 not finite in any field.
 """
 

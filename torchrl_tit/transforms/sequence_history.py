@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
@@ -15,14 +15,15 @@ from torchrl_tit.settings.numbers import Positive, Size
 class SequenceHistory(Transform):
     """Writes the last K steps of the episode as Decision Transformer reads them.
 
-    Under ``out_key`` it writes the entries of an item of
+    Under "sequence" it writes the entries of an item of
     :class:`~torchrl_tit.datasets.SequenceStorage`: "observation" [..., K, *obs], "action"
     [..., K, *action], "return_to_go" [..., K, 1], "timestep" int64 [..., K] and "mask" bool
     [..., K]. The newest step comes last, with zeros for its action; steps before an episode's first
     are padding: masked zeros. The transform itself holds no state: it is all in the tensordict, so
     environments can be reset in any way.
 
-    Put TorchRL's `TargetReturn` before it, which writes the return that is still to be reached.
+    It reads "observation" [..., *obs], "action" and, from TorchRL's `TargetReturn` before it,
+    "target_return" [..., 1], the return that is still to be reached.
 
     TorchRL's `CatFrames` stacks one entry, without time steps or a mask, and would stack the action
     of a step with the observation that follows it.
@@ -30,10 +31,6 @@ class SequenceHistory(Transform):
     Args:
         num_frames: number K of steps, at least 1.
         return_scale: divisor of the returns-to-go.
-        observation_key: key of the observation [..., *obs].
-        action_key: key under which the policy writes the action [..., *action].
-        target_return_key: key of the return that is still to be reached [..., 1].
-        out_key: key of the sequence.
 
     Raises:
         ValueError: if ``num_frames`` is less than 1, ``return_scale`` is not positive, or the
@@ -57,36 +54,23 @@ class SequenceHistory(Transform):
     """
 
     @checked_arguments
-    def __init__(
-        self,
-        num_frames: Size = 20,
-        *,
-        return_scale: Positive = 1000.0,
-        observation_key: NestedKey = "observation",
-        action_key: NestedKey = "action",
-        target_return_key: NestedKey = "target_return",
-        out_key: NestedKey = "sequence",
-    ) -> None:
-        super().__init__(in_keys=[observation_key, target_return_key], out_keys=[out_key])
+    def __init__(self, num_frames: Size = 20, *, return_scale: Positive = 1000.0) -> None:
+        super().__init__(in_keys=["observation", "target_return"], out_keys=["sequence"])
         self.num_frames = num_frames
         self.return_scale = return_scale
-        self.action_key = action_key
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        (out_key,) = self.out_keys
         sequence = self._first(tensordict_reset)
-        reset, before = tensordict.get("_reset", None), tensordict.get(out_key, None)
+        reset, before = tensordict.get("_reset", None), tensordict.get("sequence", None)
         if reset is not None and before is not None:  # only some environments are reset
             sequence = sequence.where(reset.reshape(sequence.batch_size), before)
-        return tensordict_reset.set(out_key, sequence)
+        return tensordict_reset.set("sequence", sequence)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        (out_key,) = self.out_keys
-        before = tensordict.get(out_key)
+        before, action = tensordict["sequence"], tensordict["action"]
         axis = before.ndim
-        action = tensordict.get(self.action_key)
         expected = before["action"].select(axis, 0).shape
         if action.shape != expected:
             raise ValueError(
@@ -110,14 +94,13 @@ class SequenceHistory(Transform):
             before.batch_size,
             device=before.device,
         )
-        return next_tensordict.set(out_key, sequence)
+        return next_tensordict.set("sequence", sequence)
 
     def _newest(self, tensordict: TensorDictBase, axis: int) -> dict[str, Tensor]:
         """The entries of the environment's newest step; [..., 1, ...] each."""
-        observation_key, target_return_key = self.in_keys
-        to_go = tensordict.get(target_return_key).unsqueeze(axis) / self.return_scale
+        to_go = tensordict["target_return"].unsqueeze(axis) / self.return_scale
         return {
-            "observation": tensordict.get(observation_key).unsqueeze(axis),
+            "observation": tensordict["observation"].unsqueeze(axis),
             "return_to_go": to_go,
             "mask": torch.ones_like(to_go.squeeze(-1), dtype=torch.bool),
         }
@@ -128,8 +111,7 @@ class SequenceHistory(Transform):
         axis = tensordict.ndim
         step = self._newest(tensordict, axis)
         step["timestep"] = torch.zeros_like(step["mask"], dtype=torch.int64)
-        spec = self.parent.full_action_spec[self.action_key]
-        step["action"] = spec.zero().unsqueeze(axis)
+        step["action"] = self.parent.full_action_spec["action"].zero().unsqueeze(axis)
         padded = {}
         for name, value in step.items():
             shape = list(value.shape)
@@ -143,18 +125,17 @@ class SequenceHistory(Transform):
                 raise KeyError(
                     f"the environment has no {key!r}, only "
                     f"{sorted(map(str, entries.keys(True, True)))}: put TorchRL's TargetReturn "
-                    "before SequenceHistory, or name other keys"
+                    "before SequenceHistory"
                 )
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Adds the sequence to the environment's observations."""
-        observation_key, target_return_key = self.in_keys
         self._check_keys(observation_spec)
         axis = observation_spec.ndim
         specs = {
-            "observation": observation_spec[observation_key],
-            "action": self.parent.full_action_spec[self.action_key],
-            "return_to_go": observation_spec[target_return_key],
+            "observation": observation_spec["observation"],
+            "action": self.parent.full_action_spec["action"],
+            "return_to_go": observation_spec["target_return"],
         }
         steps = {
             name: Unbounded(
@@ -168,9 +149,7 @@ class SequenceHistory(Transform):
         device = observation_spec.device
         steps["timestep"] = Unbounded(leading, dtype=torch.int64, device=device)
         steps["mask"] = Unbounded(leading, dtype=torch.bool, device=device)
-        observation_spec[self.out_keys[0]] = Composite(
-            steps, shape=observation_spec.shape, device=device
-        )
+        observation_spec["sequence"] = Composite(steps, shape=observation_spec.shape, device=device)
         return observation_spec
 
 

@@ -139,7 +139,7 @@ def test_a_module_that_only_a_file_names_is_not_imported(own_modules, capsys):
     assert line.endswith("to allow it, add `--import own`")
     assert "own" not in sys.modules
     # Typed, it is the user's word.
-    assert "no 'Line-v0' after importing own" in fails(
+    assert "own neither registers 'Line-v0'" in fails(
         capsys, "train", "ppo/cartpole/mlp", "--env", "own:Line-v0"
     )
     assert get_recipe("own/acrobot")

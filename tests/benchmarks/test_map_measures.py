@@ -7,8 +7,8 @@ import math
 import pytest
 import torch
 
+from benchmarks.map_measures import find_objects, map_change, share_on_objects
 from tests.numerics import assert_near
-from torchrl_tit.analysis import find_objects, map_change, share_on_objects
 
 
 def test_objects_move_before_a_still_background() -> None:
