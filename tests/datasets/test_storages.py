@@ -44,7 +44,8 @@ def store(stream: TensorDictBase) -> Episodes:
 def test_windows_are_those_of_catframes(num_frames: int, padding: Any, images: bool) -> None:
     base: EnvBase = GymEnv("Hopper-v5", max_episode_steps=12)
     base = StreamEnv((), (6, 5), torch.uint8) if images else base
-    history = History(num_frames, padding=padding)
+    ndim = base.observation_spec["observation"].ndim
+    history = History(num_frames, observation_ndim=ndim, padding=padding)
     env = TransformedEnv(base, history)
     env.set_seed(0)
     stream = env.rollout(150, break_when_any_done=False)

@@ -27,6 +27,7 @@ ONLINE: dict[str, Callable[[], Transform]] = {
     "SequenceHistory": lambda: Compose(TargetReturn(100.0), SequenceHistory(3)),
 }
 OFFLINE: dict[str, Callable[[], Transform]] = {
+    "History": ONLINE["History"],
     "HideVelocities": lambda: HideVelocities(
         "CartPole-v1", ["observation", ("next", "observation")]
     ),
@@ -108,18 +109,14 @@ def test_in_a_replay_buffer(name: str, kind: type[ReplayBuffer]) -> None:
     assert_close(sample.select(*expected.keys(True, True)), expected, rtol=0, atol=0)
 
 
-@pytest.mark.parametrize("make", [lambda: History(3), lambda: SequenceHistory(3)])
-def test_histories_are_made_in_environments_only(make: Callable[[], Transform]) -> None:
-    """For stored steps, there are storages."""
+def test_sequences_are_made_in_environments_only() -> None:
+    """For stored steps, there is `SequenceStorage`."""
     _, stored = steps("SequenceHistory")
     stored["target_return"] = torch.ones(20, 1)
-    with pytest.raises(NotImplementedError, match="History"):
-        nn.Sequential(make(), nn.Identity())(stored)
+    with pytest.raises(NotImplementedError, match="SequenceHistory"):
+        nn.Sequential(SequenceHistory(3), nn.Identity())(stored)
     buffer = ReplayBuffer(storage=LazyTensorStorage(20), batch_size=4)
-    buffer.append_transform(make())
+    buffer.append_transform(SequenceHistory(3))
     buffer.extend(stored)
-    with pytest.raises(NotImplementedError, match="History"):
+    with pytest.raises(NotImplementedError, match="SequenceHistory"):
         buffer.sample()
-    if isinstance(history := make(), History):
-        with pytest.raises(NotImplementedError, match="OnlineHistoryStorage"):
-            history.make_rb_transform_and_sampler(batch_size=4)

@@ -14,10 +14,10 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage
 
 from torchrl_tit.datasets.storages import Entries, StateCheckpointer, frame_entries, is_peek, nest
-from torchrl_tit.modules.frame_tables import differs
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Frames
+from torchrl_tit.transforms.history import same_observations
 from torchrl_tit.windows import Windows, find_windows, take
 
 _STORED = [
@@ -213,10 +213,10 @@ class OnlineHistoryStorage(LazyTensorStorage):
         frames, following = (group.select("observation") for group in (steps, steps["next"]))
         done = steps["next", "done"].reshape(steps.shape)
         goes_on = torch.zeros_like(done)  # whether a step continues the episode of the one before
-        goes_on[1:] = ~done[:-1] & _same_observations(following[:-1], frames[1:])
+        goes_on[1:] = ~done[:-1] & same_observations(following[:-1], frames[1:])
         if begin:
             last, newest = self._newest()
-            goes_on[0] = (self._ends[last] < 0) & _same_observations(newest, frames[0])
+            goes_on[0] = (self._ends[last] < 0) & same_observations(newest, frames[0])
         if "is_init" in steps.keys():  # noqa: SIM118 (a tensordict)
             goes_on &= ~steps["is_init"].reshape(steps.shape)
         if begin:  # only the new steps show whether these ended an episode
@@ -459,12 +459,6 @@ def _without_notice() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
-
-
-def _same_observations(left: TensorDictBase, right: TensorDictBase) -> Tensor:
-    """Whether all entries of observations [...] are the same, NaN included; bool [...]."""
-    pairs = ((entry, right[key]) for key, entry in left.items(True, True))
-    return ~torch.stack([differs(*pair, left.ndim) for pair in pairs]).any(0)
 
 
 def _table(entries: dict[str, Any], device: torch.device) -> TensorDict:
