@@ -51,7 +51,7 @@ lint: $(VENV)/installed-test  ## Check style, formatting and which modules impor
 	$(BIN)/lint-imports --no-cache
 
 types: $(VENV)/installed-test  ## Check types
-	$(BIN)/mypy
+	MYPY_NUM_WORKERS=$(WORKERS) $(BIN)/mypy
 
 ON_DEVICE := tests/test_device.py tests/checkpoint/test_codec.py tests/datasets/test_online.py tests/datasets/test_storages.py tests/envs/test_vector.py
 
