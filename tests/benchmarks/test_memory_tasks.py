@@ -45,9 +45,7 @@ def test_a_row_a_run_and_none_twice(short, tmp_path, monkeypatch, capsys):
     batches = read_rows(tmp_path / NAME / "seed-0" / "successes.csv")
     assert [int(batch["step"]) for batch in batches] == [128, 256, 384, 512]
     assert sum(int(batch["episodes"]) for batch in batches) >= 44  # of 11 steps
-    printed = capsys.readouterr().out
-    assert printed.startswith(f"{NAME} 0 ")
-    assert f"| {NAME} | {row['weights']} | 1 | " in printed
+    assert capsys.readouterr().out.startswith(f"{NAME} 0 ")
     monkeypatch.setattr(memory_tasks, "measure", lambda *_: pytest.fail("measured again"))
     memory_tasks.main(words)
 

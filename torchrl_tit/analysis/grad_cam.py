@@ -90,10 +90,10 @@ def grad_cam(
     with evaluating(policy), torch.enable_grad(), ExitStack() as hooks:
         recorders = {name: _Recorder(found.module, hooks) for name, found in layers.items()}
         value = compute_target(policy, state, target)
+        total = value.sum()  # the states of a batch do not depend on each other
     outputs = [recorder.output(layers[name]) for name, recorder in recorders.items()]
     check_gradient(value, target)
-    # The states of a batch do not depend on each other, so this is the gradient of each.
-    slopes = torch.autograd.grad(value.sum(), outputs, allow_unused=True)
+    slopes = torch.autograd.grad(total, outputs, allow_unused=True)
     maps = {}
     for (name, found), output, slope in zip(layers.items(), outputs, slopes, strict=True):
         if slope is None:
