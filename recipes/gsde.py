@@ -140,6 +140,7 @@ class SmoothPPOAlgorithm(PPOAlgorithm):
     """
 
     recipe: SmoothPPO
+    graph_breaks = True  # in gSDEModule
 
     def networks(self, env: EnvBase) -> ActorCritic:
         """Builds the networks of PPO, with an actor whose noise depends on the state."""

@@ -75,7 +75,8 @@ def compile_and_time(function: Callable[P, T], name: str, owner: object) -> Call
 
     Between calls, only tensors change in the algorithms of this package, and no mode and no number.
     A user's subclass may change numbers, which code without guards would keep as they were in the
-    first call.
+    first call. Where a graph breaks, they would also take one module for another: such an algorithm
+    has the attribute ``graph_breaks``.
 
     Args:
         function: the function.
@@ -84,7 +85,8 @@ def compile_and_time(function: Callable[P, T], name: str, owner: object) -> Call
     """
     package = str(__package__).rpartition(".")[0]
     ours = type(owner).__module__.startswith(f"{package}.")
-    fast = torch.compile(function, **(ONLY_TENSORS if ours else STATIC_SHAPES))
+    guarded = not ours or getattr(owner, "graph_breaks", False)
+    fast = torch.compile(function, **(STATIC_SHAPES if guarded else ONLY_TENSORS))
     first = True
 
     @wraps(function)
