@@ -98,3 +98,9 @@ def test_it_trains_and_is_evaluated_without_noise(tmp_path, monkeypatch):
 def test_choices_are_refused():
     with pytest.raises(ValueError, match="noise is for continuous actions, not for discrete"):
         make_algorithm(replace(RECIPE, env="CartPole-v1"))
+
+
+@pytest.mark.slow
+def test_it_trains_compiled(tmp_path):
+    """Code without guards would take one module for another where the graph breaks."""
+    assert train(replace(RECIPE, compile="on"), tmp_path / "run").read("metrics.csv")
