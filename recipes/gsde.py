@@ -140,7 +140,7 @@ class SmoothPPOAlgorithm(PPOAlgorithm):
     """
 
     recipe: SmoothPPO
-    graph_breaks = True  # in gSDEModule
+    graph_breaks = True  # gSDEModule checks its numbers
 
     def networks(self, env: EnvBase) -> ActorCritic:
         """Builds the networks of PPO, with an actor whose noise depends on the state."""

@@ -402,7 +402,7 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
 
     rates: ClassVar[Mapping[str, str]] = {"": "learning_rate"}
     """The fields with Adam's learning rates by the beginning of the names of weights in the model;
-    the last one is that of all other weights."""
+    the first that fits counts, and the last, "", fits all names."""
 
     optimizer: torch.optim.Optimizer
     """The optimizer of all weights, once :meth:`prepare` has made it."""

@@ -119,6 +119,17 @@ def take(table: Tensor, rows: Tensor) -> Tensor:
     return table.index_select(0, rows.flatten()).view((*rows.shape, *table.shape[1:]))
 
 
+def differs(one: Tensor, other: Tensor, ndim: int = 2) -> Tensor:
+    """Where observations differ, [*B, *obs] each -> bool [*B] of ndim dimensions; NaN equals NaN.
+
+    Example:
+        >>> differs(torch.tensor([[[1.0, torch.nan]]]), torch.tensor([[[2.0, torch.nan]]]))
+        tensor([[True]])
+    """
+    different = (one != other) & ((one == one) | (other == other))
+    return different.unsqueeze(-1).flatten(ndim).any(-1)
+
+
 def find_windows(newest: Tensor, oldest: Tensor, num_frames: int, padding: Padding) -> Windows:
     """Finds the rows of windows.
 

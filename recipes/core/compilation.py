@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 import torch
 
+from .algorithm import Algorithm
 from .optional import tqdm
 from .recipe import Compile, Precision
 
@@ -23,10 +24,12 @@ STATIC_SHAPES: dict[str, Any] = {"dynamic": False}
 resumed run would differ in the last bit."""
 ONLY_TENSORS: dict[str, Any] = {
     **STATIC_SHAPES,
+    "fullgraph": True,
     "options": {"guard_filter_fn": torch.compiler.keep_tensor_guards_unsafe},
 }
 """The same for functions where only tensors change between calls. Guards on everything else would
-take as long as several small layers, at every call."""
+take as long as several small layers, at every call. Where a graph breaks, code without guards would
+take one module for another, so it must be one graph."""
 
 # Compiling takes about a minute, and each gradient step then saves a few milliseconds.
 _PAYS_FROM = 10_000
@@ -70,13 +73,12 @@ def check_compiler(setting: Compile) -> None:
         )
 
 
-def compile_and_time(function: Callable[P, T], name: str, owner: object) -> Callable[P, T]:
+def compile_and_time(function: Callable[P, T], name: str, owner: Algorithm[Any]) -> Callable[P, T]:
     """Compiles a function, and prints how long its first call took, which includes compilation.
 
     Between calls, only tensors change in the algorithms of this package, and no mode and no number.
     A user's subclass may change numbers, which code without guards would keep as they were in the
-    first call. Where a graph breaks, they would also take one module for another: such an algorithm
-    has the attribute ``graph_breaks``.
+    first call.
 
     Args:
         function: the function.
@@ -85,7 +87,7 @@ def compile_and_time(function: Callable[P, T], name: str, owner: object) -> Call
     """
     package = str(__package__).rpartition(".")[0]
     ours = type(owner).__module__.startswith(f"{package}.")
-    guarded = not ours or getattr(owner, "graph_breaks", False)
+    guarded = not ours or owner.graph_breaks
     fast = torch.compile(function, **(STATIC_SHAPES if guarded else ONLY_TENSORS))
     first = True
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchrl_tit.settings.choices import Padding
-from torchrl_tit.windows import Windows, find_windows
+from torchrl_tit.windows import Windows, differs, find_windows
 
 
 class FrameTable(NamedTuple):
@@ -143,16 +143,6 @@ def find_starts(is_init: Tensor, ends: Sequence[Tensor]) -> Tensor:
     for end in ends:
         is_init = is_init | end.roll(1, dims=1)
     return _after_first(is_init, True)
-
-
-def differs(one: Tensor, other: Tensor, ndim: int = 2) -> Tensor:
-    """Where observations differ, [*B, ...] each -> bool [*B] of ndim dimensions; NaN equals NaN.
-
-    Example:
-        >>> differs(torch.tensor([[[1.0, torch.nan]]]), torch.tensor([[[2.0, torch.nan]]]))
-        tensor([[True]])
-    """
-    return ((one != other) & ((one == one) | (other == other))).flatten(ndim).any(-1)
 
 
 def _after_first(mask: Tensor, first: bool) -> Tensor:

@@ -13,7 +13,6 @@ from torchrl.modules import recurrent_mode
 
 from torchrl_tit.modules.frame_tables import (
     FrameTable,
-    differs,
     find_starts,
     table_of_first,
     table_of_stored,
@@ -22,6 +21,7 @@ from torchrl_tit.modules.frame_tables import (
 from torchrl_tit.modules.torch_internals import is_transformed
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.settings.choices import Padding
+from torchrl_tit.windows import differs
 
 
 @dataclass(frozen=True)

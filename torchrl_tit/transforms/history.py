@@ -17,7 +17,7 @@ from torchrl.envs.transforms import CatFrames, Compose, ExcludeTransform, Transf
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Size
-from torchrl_tit.windows import Windows, find_windows
+from torchrl_tit.windows import Windows, differs, find_windows
 
 
 class History(CatFrames):
@@ -496,12 +496,8 @@ def same_observations(left: TensorDictBase, right: TensorDictBase) -> Tensor:
         >>> same_observations(x, x), same_observations(x[:1], x[1:])
         (tensor([True, True]), tensor([False]))
     """
-    same = torch.ones(left.shape, dtype=torch.bool, device=left.device)
-    for key, ours in left.items(True, True):
-        theirs = right[key]
-        equal = (ours == theirs) | ((ours != ours) & (theirs != theirs))
-        same &= equal.unsqueeze(-1).flatten(left.ndim).all(-1)
-    return same
+    pairs = ((entry, right[key]) for key, entry in left.items(True, True))
+    return ~torch.stack([differs(*pair, left.ndim) for pair in pairs]).any(0)
 
 
 def _breaks(
