@@ -76,3 +76,5 @@ def test_measures_over_tasks():
     # CartPole is a tie, and on MountainCar Stable-Baselines3 never sees the goal.
     assert tables.measure(f"improvement@{sb3}", several) == "0.75 [0.75, 0.75]"
     assert tables.measure("overall@sb3.csv MountainCar-v0", "") == "0 [0, 0]"
+    with pytest.raises(ValueError, match="no run ppo_settings/nothing"):
+        tables.measure("mean", "ppo_settings/cartpole/mlp ppo_settings/nothing")
