@@ -48,13 +48,12 @@ from .core.adaptive import AdvantageScale, ReturnScale, normalize_advantages
 from .core.algorithm import Stateful, check_finite
 from .core.compilation import (
     STATIC_SHAPES,
-    autocast_type,
     check_compiler,
     compile_and_time,
     should_compile,
 )
 from .core.networks import normalize_frames
-from .core.recipe import Compile, Precision
+from .core.recipe import Compile
 from .core.task import make_task
 from .online import OnlineAlgorithm, OnlineRecipe
 
@@ -79,6 +78,7 @@ class PPO(OnlineRecipe, algorithm="ppo"):
         "next_frame_coeff": 0.0,
         "normalize_values": False,
         "policy_gain": 0.01,
+        "precision": "auto",
         "reconstruction_coeff": 0.0,
         "residual_gain": 1.0,
         "value_gradient": 1.0,
@@ -159,9 +159,9 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     """Whether collection and update run through torch.compile, which needs a C++ compiler and about
     a minute at the start. "auto" compiles if that works and the run is long enough to be worth it.
     Recurrent networks are never compiled."""
-    precision: Precision = "auto"
-    """Dtype of the backbone's matrix products. "auto" is bfloat16 on a GPU that supports it, else
-    float32. Weights, heads and losses are float32."""
+    bfloat16: bool = False
+    """Whether the backbone's matrix products are in bfloat16; weights, heads and losses are
+    float32. Networks of the paper's sizes are slower with it, on a GPU, too."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -172,8 +172,8 @@ class PPO(OnlineRecipe, algorithm="ppo"):
             steps = self.steps_per_batch // self.num_envs
             self.check_divides("sequence_length", "minibatch_size", self.minibatch_size)
             self.check_divides("sequence_length", "steps_per_batch / num_envs", steps)
-        if self.backbone.carries_state and self.precision == "bfloat16":
-            raise ValueError("precision is bfloat16, but a recurrent network computes in float32")
+        if self.backbone.carries_state and self.bfloat16:
+            raise ValueError("bfloat16 is on, but a recurrent network computes in float32")
 
     def build(self) -> PPOAlgorithm:
         """Builds the algorithm."""
@@ -272,7 +272,7 @@ class PPOAlgorithm(OnlineAlgorithm[PPO]):
         super().__init__(recipe)
         with closing(make_task(recipe, clip_actions=False)) as task:  # its spec has the bounds
             self.model = self.networks(task).to(self.device)
-        self.model.backbone.autocast = autocast_type(recipe.precision, self.device)
+        self.model.backbone.autocast = torch.bfloat16 if recipe.bfloat16 else None
         means = ["feature_spread", "explained_variance", "epochs", *self.terms, "gradient_norm"]
         self.columns = ["learning_rate", *means]
         self.return_scale = ReturnScale(recipe.gamma)

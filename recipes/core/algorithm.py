@@ -227,7 +227,8 @@ def to_networks(batch: TensorDictBase, device: torch.device) -> TensorDictBase:
     if stored == device:
         return batch
     if device.type == "cuda" and stored.type == "cpu":
-        return batch.pin_memory().to(device, non_blocking=True)
+        # What is expanded, such as states of zeros, cannot be pinned.
+        return batch.contiguous().pin_memory().to(device, non_blocking=True)
     return batch.to(device)
 
 

@@ -14,7 +14,7 @@ import torch
 
 from .algorithm import Algorithm
 from .optional import tqdm
-from .recipe import Compile, Precision
+from .recipe import Compile
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -103,24 +103,6 @@ def compile_and_time(function: Callable[P, T], name: str, owner: Algorithm[Any])
         return result
 
     return timed
-
-
-def autocast_type(precision: Precision, device: torch.device) -> torch.dtype | None:
-    """Returns the dtype of matrix products for autocast; None is the dtype of the weights.
-
-    Args:
-        precision: "auto" is bfloat16 on a GPU that supports it, which is several times as fast.
-            CPUs gain from it only if they have instructions for it.
-        device: the device of the networks.
-
-    Example:
-        >>> autocast_type("auto", torch.device("cpu")) is None
-        True
-    """
-    if precision == "auto":
-        fast = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
-        return torch.bfloat16 if fast else None
-    return torch.bfloat16 if precision == "bfloat16" else None
 
 
 def _has_compiler() -> bool:

@@ -29,7 +29,6 @@ except ModuleNotFoundError:  # an extra: only the command line reads this mark
     Suppress = None  # type: ignore[misc]
 
 Compile = Literal["auto", "on", "off"]
-Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch._C._functorch import is_batchedtensor
 from torch.nn import functional as F
 
 from torchrl_tit.layers.positions import RelativeBias, Rotary, sinusoids
@@ -189,13 +190,14 @@ class SelfAttention(_Heads):
         """The output of attention at these positions, float [N, positions, D]."""
         query, key, value = self._heads(x, positions)  # [N, heads, positions or S, D / heads]
         everything = positions == READ_SLICES["all"]
-        fused = causal and everything and self.relative is None and not self._drops
+        # PyTorch's kernel for CPUs has no gradient for a bias added to the scores.
+        products = self._drops or self.relative is not None or _has_no_kernel(query)
+        fused = causal and everything and not products
         if not fused:
             mask = self._mask(x, mask, causal)
         if mask is not None:
             mask = mask[..., positions, :]
-        # PyTorch's kernel for CPUs has no gradient for a bias added to the scores.
-        if self._drops or self.relative is not None:
+        if products:
             mixed = self.dropout(self._weights(query, key, mask)) @ value
         else:
             mixed = F.scaled_dot_product_attention(query, key, value, mask, is_causal=fused)
@@ -231,10 +233,12 @@ class SelfAttention(_Heads):
         # The heads take the place of the positions: all read the same tokens.
         query = torch.bmm(query, key_weight).transpose(0, 1).unsqueeze(1)  # [N, 1, heads, D]
         tokens = x.unsqueeze(1)
-        if self.relative is None:
+        if self.relative is None and not _has_no_kernel(query):
             mixed = F.scaled_dot_product_attention(query, tokens, tokens, scale=scale)
         else:
-            scores = query @ tokens.mT * scale + self.relative.newest(x.shape[1])
+            scores = query @ tokens.mT * scale
+            if self.relative is not None:
+                scores = scores + self.relative.newest(x.shape[1])
             mixed = scores.softmax(dim=-1) @ tokens
         value = torch.baddbmm(value_bias, mixed.squeeze(1).transpose(0, 1), value_weight.mT)
         return value.transpose(0, 1).flatten(1).unsqueeze(1)
@@ -391,6 +395,11 @@ class RelativeSelfAttention(_Heads):
             future = torch.ones_like(self.index, dtype=torch.bool).triu(1)[rows]
             scores = scores.masked_fill(future, -math.inf)
         return scores.softmax(dim=-1)
+
+
+def _has_no_kernel(query: Tensor) -> bool:
+    """Whether PyTorch's attention has no gradient: in vmap on a GPU (pytorch/pytorch#191085)."""
+    return query.is_cuda and is_batchedtensor(query)
 
 
 def _flatten(x: Tensor) -> Tensor:
