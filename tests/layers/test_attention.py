@@ -14,6 +14,7 @@ from torchrl_tit.layers import (
     GatedTransformerBlock,
     SelfAttention,
     TransformerBlock,
+    attention,
     attention_maps,
 )
 
@@ -42,14 +43,21 @@ def make(causal: bool, heads: int = 3, **options: Any) -> tuple[SelfAttention, A
 @pytest.mark.parametrize("causal", [False, True])
 @pytest.mark.parametrize("length", [1, 2, 5])
 @pytest.mark.parametrize("mask", ["none", "one", "for every row"])
-@pytest.mark.parametrize("dropping", [False, True])
+@pytest.mark.parametrize("path", ["kernel", "dropping", "vmap on a GPU"])
 def test_equals_multihead_attention(
-    heads: int, causal: bool, length: int, mask: str, dropping: bool
+    heads: int,
+    causal: bool,
+    length: int,
+    mask: str,
+    path: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ours, reference = make(causal, heads)
-    if dropping:  # the path that drops weights, with a probability that drops none
+    if path == "dropping":  # with a probability that drops none
         ours.train()
         ours.dropout.p = 1e-30
+    if path == "vmap on a GPU":
+        monkeypatch.setattr(attention, "_has_no_kernel", lambda query: True)
     x = torch.randn(4, length, 12)
     seen = torch.ones(length, length, dtype=torch.bool)
     given: Tensor | None = None
