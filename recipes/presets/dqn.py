@@ -1,7 +1,6 @@
 """DQN, which the paper does not use, with TIT and with the usual networks.
 
-CartPole has the settings of rl-baselines3-zoo and Pong those of CleanRL, except for the number of
-environments and TIT's learning rate on CartPole.
+The settings are those of CleanRL, except for the number of environments.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from .preset import DQN, Preset, of_networks
 
 
 def _named() -> list[Preset]:
-    cartpole, cartpole_tit = of_networks(
+    cartpole = of_networks(
         DQN,
         "dqn/cartpole",
         {
@@ -22,17 +21,7 @@ def _named() -> list[Preset]:
         },
         env="CartPole-v1",
         num_envs=8,
-        total_steps=50_000,
-        random_steps=1024,
-        steps_per_batch=256,
-        updates_per_step=0.5,
-        buffer_size=100_000,
-        batch_size=64,
-        learning_rate=2.3e-3,
-        loss_function="smooth_l1",
-        final_epsilon=0.04,
-        exploration_fraction=0.16,
-        target_interval=128,
+        steps_per_batch=80,
     )
     pong = of_networks(
         DQN,
@@ -53,7 +42,7 @@ def _named() -> list[Preset]:
         target_interval=250,
         clip_rewards=True,
     )
-    return [cartpole, cartpole_tit.replace(learning_rate=5e-4), *pong]
+    return [*cartpole, *pong]
 
 
 RECIPES: list[Preset] = _named()
