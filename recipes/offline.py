@@ -85,7 +85,8 @@ def read_data(recipe: DatasetRecipe) -> Episodes:
     path = Path(recipe.dataset)
     files = [path, *path.rglob("*")] if path.is_dir() else [path]
     stamps = {file: file.stat().st_mtime_ns for file in files if file.exists()}
-    key = repr((recipe.dataset, path.absolute(), recipe.reading(), stamps))
+    task = (recipe.env, recipe.wrappers, recipe.env_settings) if recipe.env else ()
+    key = repr((recipe.dataset, path.absolute(), recipe.reading(), task, stamps))
     if key not in _NEWEST:
         _NEWEST.clear()  # frees their memory first
         _NEWEST[key] = _load(recipe)
@@ -101,8 +102,9 @@ _NEWEST: dict[str, Episodes] = {}
 
 def _load(recipe: DatasetRecipe) -> Episodes:
     """Loads a data set, with discrete actions counted from 0, as policies and losses count them."""
-    spaces = task_spaces(recipe.env) if recipe.env else None
-    episodes = load_episodes(recipe.dataset, **{**recipe.reading(), "task": spaces})
+    env, wrappers = recipe.env, recipe.wrappers
+    spaces = task_spaces(env, wrappers=wrappers, **recipe.task_settings) if env else None
+    episodes = load_episodes(recipe.dataset, task=spaces, **recipe.reading())
     if np.any(start := getattr(spaces and spaces.action, "start", 0)):
         episodes.rows["action"] -= torch.as_tensor(start)
     return episodes

@@ -240,10 +240,27 @@ def test_discrete_actions_count_from_0(tmp_path, monkeypatch):
     actions = 2 + np.arange(200) % 2
     data = log_machine(tmp_path / "log.hdf5", actions=actions)
     spaces = TaskSpaces(Box(-9, 9, (5,)), Discrete(3, start=1))
-    monkeypatch.setattr(offline, "task_spaces", lambda env: spaces)
+    monkeypatch.setattr(offline, "task_spaces", lambda env, **settings: spaces)
     episodes = read_data(BC(env="CartPole-v1", dataset=str(data), backbone=SMALL))
     found = episodes.rows["action"][episodes.step_rows].numpy()
     np.testing.assert_array_equal(found, actions - 1)
+
+
+def test_data_are_those_of_the_task_as_it_is_built(tmp_path):
+    """The policy acts in the wrapped task, in -1..1, where Pendulum itself takes -2..2."""
+    data = log_machine(
+        tmp_path / "a.hdf5", observations=np.zeros((200, 3)), actions=np.ones((200, 1))
+    )
+    raw = log_machine(
+        tmp_path / "b.hdf5", observations=np.zeros((200, 3)), actions=np.full((200, 1), 2.0)
+    )
+    rescale = "gymnasium.wrappers:RescaleAction(min_action=-1.0, max_action=1.0)"
+    recipe = BC(env="Pendulum-v1", dataset=str(raw), backbone=SMALL)
+    assert read_data(recipe).rows["action"].max() == 2
+    wrapped = replace(recipe, wrappers=(rescale,))
+    with pytest.raises(DatasetError, match=r"row 0: is 2.0, but .* from -1.0 to 1.0"):
+        read_data(wrapped)
+    assert read_data(replace(wrapped, dataset=str(data))).rows["action"].max() == 1
 
 
 def test_bad_settings_in_one_line(tmp_path, capsys):
