@@ -298,7 +298,7 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
             )
         starts = torch.arange(0, count, math.ceil(count / _MOST_MEASURED))
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
-        sums = dict.fromkeys(self.measures, 0.0)
+        sums, total = dict.fromkeys(self.measures, 0.0), 0
         with (
             ExitStack() as modes,
             torch.random.fork_rng(range(torch.cuda.device_count())),
@@ -312,10 +312,12 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
             torch.manual_seed(recipe.evaluation_seed)
             for part in index.to(items.device).split(max(1, _MEASURED_AT_ONCE // length)):
                 samples = to_networks(arrange(items.get(part)), self.device)
-                means = self.measure_batch(samples)
+                means, mask = self.measure_batch(samples), samples.get("mask", None)
+                count = len(part) if mask is None else int(mask.sum())  # padding does not count
+                total += count
                 for name in sums:
-                    sums[name] += means[name].item() * len(part)
-        values = {name: total / len(index) for name, total in sums.items()}
+                    sums[name] += means[name].item() * count
+        values = {name: value / total for name, value in sums.items()}
         return HeldOut(step, len(episodes.lengths), values)
 
     @abstractmethod

@@ -138,6 +138,17 @@ def test_no_more_items_are_measured_than_the_limit(tmp_path, monkeypatch):
     assert sum(counts) == 86  # every second of 9 * 19
 
 
+def test_every_step_of_windows_counts_the_same(tmp_path, monkeypatch):
+    """However many are measured at a time: windows of the first 20 episodes are mostly padding."""
+    ends = (np.arange(200) < 20) | (np.arange(200) % 60 == 59)
+    data = log_machine(tmp_path / "log.hdf5", timeouts=ends)
+    algorithm = make_algorithm(make_dt(tmp_path, env="", target_returns=(), dataset=str(data)))
+    episodes = read_data(algorithm.recipe)
+    together = algorithm.measure(0, episodes)
+    monkeypatch.setattr("recipes.offline._MEASURED_AT_ONCE", 10)
+    assert algorithm.measure(0, episodes).error == pytest.approx(together.error, rel=1e-5)
+
+
 def test_data_shorter_than_a_slice_are_not_measured(tmp_path):
     data = str(log_machine(tmp_path / "log.hdf5"))
     recipe = BC(dataset=data, backbone=gru(hidden_dim=8), slice_length=8)
