@@ -242,7 +242,8 @@ def test_spaces_of_images_and_discrete_actions(tmp_path):
     recipe = with_spaces(BC(dataset=str(data), backbone=SMALL))
     shape, dtype, count = recipe.task_settings.values()
     assert (shape, dtype, count) == ([20, 20], "uint8", 3)
-    for layout, expected in {"auto": [3, 20, 20], "CHW": [20, 20, 3]}.items():
+    layouts: dict[Any, list[int]] = {"auto": [3, 20, 20], "CHW": [20, 20, 3]}
+    for layout, expected in layouts.items():
         stored = np.stack([images] * 3, -1)
         rgb = log_machine(tmp_path / f"{layout}.hdf5", observations=stored)
         found = with_spaces(BC(dataset=str(rgb), backbone=SMALL, image_layout=layout))
