@@ -17,7 +17,7 @@ from gymnasium.spaces import Box, Discrete, Space
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import ReplayBuffer
+from torchrl.data import MultiCategorical, ReplayBuffer
 from torchrl.data.datasets.d4rl_infos import D4RL_DATASETS
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -35,9 +35,11 @@ from torchrl_tit.datasets import (
     task_spaces,
 )
 from torchrl_tit.datasets.checks import check_actions, check_bytes, check_shape
+from torchrl_tit.datasets.episodes import memory_mapped_rows, rows_per_chunk
 from torchrl_tit.envs import make_env, observation_specs
+from torchrl_tit.envs.spaces import ObservationReader
 from torchrl_tit.networks.building import evaluating
-from torchrl_tit.settings.choices import Padding
+from torchrl_tit.settings.choices import ImageLayout, Padding
 from torchrl_tit.settings.numbers import Batch, Fraction, Steps, Widths
 from torchrl_tit.settings.numbers import Episodes as EpisodeCount
 
@@ -85,7 +87,9 @@ def read_data(recipe: DatasetRecipe) -> Episodes:
     path = Path(recipe.dataset)
     files = [path, *path.rglob("*")] if path.is_dir() else [path]
     stamps = {file: file.stat().st_mtime_ns for file in files if file.exists()}
-    key = repr((recipe.dataset, path.absolute(), recipe.reading(), stamps))
+    task = (recipe.env, recipe.wrappers, recipe.env_settings) if recipe.env else ()
+    reading = (*recipe.reading().values(), recipe.image_layout, task)
+    key = repr((recipe.dataset, path.absolute(), reading, stamps))
     if key not in _NEWEST:
         _NEWEST.clear()  # frees their memory first
         _NEWEST[key] = _load(recipe)
@@ -100,12 +104,47 @@ _NEWEST: dict[str, Episodes] = {}
 
 
 def _load(recipe: DatasetRecipe) -> Episodes:
-    """Loads a data set, with discrete actions counted from 0, as policies and losses count them."""
-    spaces = task_spaces(recipe.env) if recipe.env else None
-    episodes = load_episodes(recipe.dataset, **{**recipe.reading(), "task": spaces})
+    """Loads a data set as the task writes it: channels first, all that is discrete from 0."""
+    env, wrappers = recipe.env, recipe.wrappers
+    spaces = task_spaces(env, wrappers=wrappers, **recipe.task_settings) if env else None
+    episodes = load_episodes(recipe.dataset, task=spaces, **recipe.reading())
     if np.any(start := getattr(spaces and spaces.action, "start", 0)):
         episodes.rows["action"] -= torch.as_tensor(start)
+    stored = episodes.rows["observation"]
+    if spaces is not None:
+        _convert(episodes, spaces.observation, recipe.image_layout)
+    elif stored.ndim == 4:  # images with channels
+        kind = np.uint8 if stored.dtype == torch.uint8 else np.float32
+        _convert(episodes, Box(0, 255, tuple(stored.shape[1:]), kind), recipe.image_layout)
     return episodes
+
+
+def _convert(episodes: Episodes, space: Space, layout: ImageLayout) -> None:
+    """Replaces the observations by those that an environment with this space writes.
+
+    Raises:
+        DatasetError: if categories are no integers, or there is none of that number.
+        ValueError: if it is not clear where images have their channels.
+    """
+    [leaf] = ObservationReader(space, image_layout=layout).leaves.values()
+    spec, stored = leaf.spec, episodes.rows["observation"]
+    categories = isinstance(spec, MultiCategorical)
+    if not categories and (stored.shape[1:], stored.dtype) == (spec.shape, spec.dtype):
+        return
+    if categories and stored.is_floating_point():
+        problem = "are floats, but the task counts categories: store integers."
+        raise DatasetError(episodes.source, problem, "observations")
+    field = {"observation": (tuple(spec.shape), spec.dtype)}
+    found = memory_mapped_rows(len(stored), field)["observation"]
+    size = rows_per_chunk(8 * stored[0].numel())
+    for part in (slice(start, start + size) for start in range(0, len(stored), size)):
+        found[part] = torch.from_numpy(leaf.read(stored[part].numpy()))
+    if categories:
+        found[episodes.last_rows[~episodes.final_known] + 1] = 0  # zeros before the shift
+        if len(wrong := found[((found < 0) | (found >= spec.nvec)).any(-1)]):
+            problem = f"are {(wrong[0] + leaf.start).tolist()}, which {space} does not have."
+            raise DatasetError(episodes.source, problem, "observations")
+    episodes.rows["observation"] = found
 
 
 def _checked(episodes: Episodes, spaces: Mapping[str, Any]) -> Episodes:
@@ -259,7 +298,7 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
             )
         starts = torch.arange(0, count, math.ceil(count / _MOST_MEASURED))
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
-        sums = dict.fromkeys(self.measures, 0.0)
+        sums, total = dict.fromkeys(self.measures, 0.0), 0
         with (
             ExitStack() as modes,
             torch.random.fork_rng(range(torch.cuda.device_count())),
@@ -273,10 +312,12 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
             torch.manual_seed(recipe.evaluation_seed)
             for part in index.to(items.device).split(max(1, _MEASURED_AT_ONCE // length)):
                 samples = to_networks(arrange(items.get(part)), self.device)
-                means = self.measure_batch(samples)
+                means, mask = self.measure_batch(samples), samples.get("mask", None)
+                count = len(part) if mask is None else int(mask.sum())  # padding does not count
+                total += count
                 for name in sums:
-                    sums[name] += means[name].item() * len(part)
-        values = {name: total / len(index) for name, total in sums.items()}
+                    sums[name] += means[name].item() * count
+        values = {name: value / total for name, value in sums.items()}
         return HeldOut(step, len(episodes.lengths), values)
 
     @abstractmethod

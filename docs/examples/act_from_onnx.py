@@ -39,6 +39,9 @@ class Agent:
             if (missing.reshape(len(frames), -1).any(1) & self.first).any():
                 raise ValueError("the first observation of an episode is missing or has NaN")
             frames = np.where(missing, self.last, frames)
+        kind = self.facts["inputs"]["observation"]["dtype"]
+        if kind != "float32" and (frames.astype(kind) != frames).any():
+            raise ValueError(f"expected observations of {kind}; images range from 0 to 255")
         self.last = frames
         given = {"observation": frames, "is_init": self.first, "reward": reward, **self.state}
         given |= {"action_mask": action_mask, "target_return": self.facts.get("target_return")}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -149,10 +151,16 @@ def explain(arguments: list[str]) -> None:
         from torchrl_tit.agents.acting import make_given_env
         from torchrl_tit.datasets import load_episodes
 
+        from ..core.recipe import DatasetRecipe
+        from ..core.recipe_json import recipe_from_json
+        from ..offline import read_data
         from ..tools.results.recorded import Recording
 
-        own = {k: agent.recipe[k] for k in ("max_episode_steps", "gaps") if k in agent.recipe}
-        episodes = load_episodes(options.dataset, **own)
+        recipe = recipe_from_json(json.dumps(agent.recipe), agent.name)
+        if isinstance(recipe, DatasetRecipe):
+            episodes = read_data(replace(recipe, dataset=options.dataset))
+        else:
+            episodes = load_episodes(options.dataset)
         recording = Recording(episodes, options.episode or 0)
         actions, which = recording.actions, f"episode {options.episode or 0} of {options.dataset}"
 

@@ -255,11 +255,7 @@ class DatasetRecipe(Recipe):
 
     def reading(self) -> dict[str, Any]:
         """How the data are read: arguments of :func:`~torchrl_tit.datasets.load_episodes`."""
-        return {
-            "task": self.env or None,
-            "max_episode_steps": self.max_episode_steps,
-            "gaps": self.gaps,
-        }
+        return {"max_episode_steps": self.max_episode_steps, "gaps": self.gaps}
 
     @property
     def held_out_fraction(self) -> float:

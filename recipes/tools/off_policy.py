@@ -28,7 +28,7 @@ from torchrl_tit.networks.building import evaluating
 from torchrl_tit.settings.networks import mlp
 
 from ..core.algorithm import descend, storage_device, to_networks
-from ..core.networks import is_discrete, make_critic
+from ..core.networks import describe, is_continuous, is_discrete, make_critic
 from ..core.optional import tqdm
 from ..core.recipe import DatasetRecipe, Recipe
 from ..core.run import Run
@@ -113,9 +113,14 @@ def fitted_q(
         which ends at time limits.
 
     Raises:
-        ValueError: if the discount factor is 1.
+        ValueError: if the discount factor is 1, or an action consists of several choices.
     """
-    recipe = algorithm.recipe
+    recipe, spec = algorithm.recipe, algorithm.action_spec
+    if not (is_discrete(spec) or is_continuous(spec)):
+        raise ValueError(
+            "fitted Q evaluation values arrays of continuous actions or a few discrete ones, but "
+            f"those of {recipe.task_name} are {describe(spec)}: leave out --ope"
+        )
     if _gamma(recipe) == 1:
         raise ValueError(
             "fitted Q evaluation of a run with gamma 1 has no scale, and where episodes need not "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import gymnasium
@@ -12,6 +13,7 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from recipes.bc import BC
 from recipes.iql import IQL
 from recipes.offline import with_spaces
 from recipes.ppo import PPO
@@ -111,6 +113,23 @@ def test_missing_values_are_held(made):
         agent.act(np.array(["a"] * 11))
     with pytest.raises(ValueError, match="there are 2 rewards, but 1 copies"):
         agent.act(frames[0], reward=[1.0, 2.0])
+
+
+def test_images_are_not_cut_to_bytes(tmp_path):
+    """An image scaled to 0..1 would be black."""
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("onnxscript")
+    images = np.random.default_rng(0).integers(0, 256, (200, 12, 12), np.uint8)
+    data = log_machine(tmp_path / "log.hdf5", observations=images)
+    recipe = with_spaces(BC(dataset=str(data), backbone=tit(2), total_updates=1))
+    agent, file = load_agent(train(recipe, tmp_path / "run").folder), tmp_path / "agent.onnx"
+    export_policy(agent.policy, agent.make_env, file, step_by_step=True)
+    exported = runpy.run_path(str(EXAMPLE))["Agent"](str(file))
+    found, expected = exported.act(images[0]), agent.act(images[0].astype(float))
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+    for act, value in product((agent.act, exported.act), (0.5, 256, -1)):
+        with pytest.raises(ValueError, match="0 to 255"):
+            act(np.full((12, 12), value))
 
 
 def test_an_agent_without_an_environment(tmp_path):

@@ -10,6 +10,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from torch import nn
+from torchrl.envs import Compose, TargetReturn
 
 from tests.export.policies import make_policy, program_of, shake
 from tests.recipes.ppo import tasks  # noqa: F401 - registers its tasks
@@ -17,7 +18,10 @@ from torchrl_tit.envs import make_env
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.export import NotTheSameError, export_policy
 from torchrl_tit.export import policy as exporting
+from torchrl_tit.modules import DTHead, make_dt_actor
+from torchrl_tit.networks import DecisionTransformer
 from torchrl_tit.settings import LSTM, MLP, Flat, Linear
+from torchrl_tit.transforms import SequenceHistory
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 
@@ -90,6 +94,20 @@ def test_what_a_file_says_and_how_many_it_takes(tmp_path):
     for size in (1, 7):
         outputs = program(noise=torch.zeros(size, 2), history=torch.randn(size, 3, 4))
         assert outputs["action"].shape == (size,)
+
+
+def test_a_file_says_how_many_steps_it_reads(tmp_path):
+    """A Decision Transformer can act on fewer than it learns from."""
+    network = DecisionTransformer((4,), action_dim=2, num_frames=5)
+    policy = make_dt_actor(network, DTHead(network.features_dim, 2, "discrete")).eval()
+
+    def task(copies):
+        transforms = TargetReturn(50.0), SequenceHistory(2)
+        return make_env("CartPole-v1", copies).append_transform(Compose(*transforms))
+
+    said = export_policy(policy, task, tmp_path / "policy.pt2")
+    assert said["inputs"]["observation"]["shape"] == [2, 4]
+    assert said["num_frames"] == 2
 
 
 def test_nothing_is_left_of_a_file_that_acts_differently(tmp_path, monkeypatch):

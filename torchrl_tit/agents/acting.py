@@ -73,8 +73,9 @@ class Actor:
             The action in the task's own form, clipped to its bounds; [N, ...] for several copies.
 
         Raises:
-            ValueError: if the observation has another shape, the number of copies changes without
-                :meth:`reset`, or there is no last value to hold.
+            ValueError: if the observation has another shape, or numbers that its integers cannot
+                hold, the number of copies changes without :meth:`reset`, or there is no last value
+                to hold.
         """
         if self._env is None:
             self._start(observation)
@@ -153,6 +154,13 @@ class Actor:
                 )
             numbers = torch.as_tensor(np.ascontiguousarray(array)).reshape(shape)
             missing, frame = numbers.isnan(), numbers.to(spec.dtype)
+            changed = numbers[(frame != numbers) & ~missing]
+            if len(changed) and not spec.dtype.is_floating_point:
+                kind = str(spec.dtype).removeprefix("torch.")
+                raise ValueError(
+                    f"the {name} is {kind}, but has {changed[0].item():g}: give it as the task "
+                    "writes it, images from 0 to 255"
+                )
         if missing.any():
             begins = self._begins if last is not None else torch.ones_like(self._begins)
             if (missing.flatten(1).any(1, keepdim=True) & begins).any():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from torchrl_tit.envs import is_atari, make_games
 from torchrl_tit.envs.gymnasium_tasks import make_unchecked
+from torchrl_tit.envs.names import load_wrappers
 from torchrl_tit.settings.checks import checked_arguments
 
 FLAGS = ("terminals", "timeouts")
@@ -60,13 +62,15 @@ class TaskSpaces(NamedTuple):
 
 
 @checked_arguments
-def task_spaces(env_name: str) -> TaskSpaces:
+def task_spaces(env_name: str, *, wrappers: Sequence[str] = (), **settings: Any) -> TaskSpaces:
     """Returns the spaces of a Gymnasium task.
 
     Args:
         env_name: a name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
             "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one gray
             image of 84 x 84.
+        wrappers: Gymnasium wrappers around it; see :func:`~torchrl_tit.envs.make_env`.
+        **settings: passed to `gymnasium.make`.
 
     Returns:
         Its spaces.
@@ -79,14 +83,16 @@ def task_spaces(env_name: str) -> TaskSpaces:
         (1,)
     """
     if is_atari(env_name):
-        games = make_games(env_name)
+        games = make_games(env_name, **settings)
         games.close()
         return TaskSpaces(games.single_observation_space, games.single_action_space, env_name)
     try:
-        env = make_unchecked(env_name)
-    except (gymnasium.error.Error, ImportError) as error:
+        env = make_unchecked(env_name, **settings)
+    except Exception as error:  # a package is missing, the task has no such setting, ...
         raise ValueError(f"Task {env_name!r} cannot be made: {error}") from error
     try:
+        for wrap in load_wrappers(wrappers)[0]:
+            env = wrap(env)
         return TaskSpaces(env.observation_space, env.action_space, env_name)
     finally:
         env.close()

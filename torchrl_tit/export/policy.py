@@ -125,7 +125,7 @@ def _describe(program: Program, env: EnvBase) -> dict[str, Any]:
         "outputs": {name: _written(entry) for name, entry in made.items()},
         "state": program.state,
         "noise": program.noise,
-        "num_frames": program.trunk.num_frames,
+        "num_frames": program.num_frames,
         "padding": program.parts.observed[0].padding,
         "torch": torch.__version__,
     }

@@ -88,6 +88,8 @@ class Program(nn.Module, ABC):
             )
         self.parts = parts
         self.trunk = parts.trunk
+        self.num_frames = parts.trunk.num_frames
+        """Number K of steps that it reads, which of a Decision Transformer may be fewer."""
         self.head = parts.head
         self.to_task = parts.to_task
         self.preparations = nn.ModuleList(seen.layers for seen in parts.observed)

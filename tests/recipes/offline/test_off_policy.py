@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -13,6 +14,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.data import MultiCategorical
 
 from recipes.cli import main
 from recipes.iql import IQL
@@ -108,6 +110,14 @@ def test_without_a_discount_there_is_no_fitted_value(tmp_path):
     algorithm = make_algorithm(IQL(dataset=str(data), backbone=SMALL, gamma=1.0))
     with pytest.raises(ValueError, match="of a run with gamma 1 has no scale"):
         fitted_q(algorithm, algorithm.load_data(), 1)
+
+
+def test_actions_of_several_choices_have_no_fitted_value(tmp_path):
+    spec = MultiCategorical([2, 3])
+    algorithm: Any = SimpleNamespace(recipe=BC(dataset="a", backbone=SMALL), action_spec=spec)
+    episodes = load_episodes(str(log_machine(tmp_path / "log.hdf5")))
+    with pytest.raises(ValueError, match=r"those of a are discrete \(MultiCategorical.*leave out"):
+        fitted_q(algorithm, episodes, 1)
 
 
 def test_weights_are_those_of_the_formula(tmp_path):

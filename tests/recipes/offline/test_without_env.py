@@ -43,6 +43,7 @@ from tests.recipes.small import (
 )
 from torchrl_tit import load_agent
 from torchrl_tit.datasets import DatasetError, TaskSpaces, load_episodes
+from torchrl_tit.envs.spaces import ObservationReader
 from torchrl_tit.evaluation_file import check_evaluation
 from torchrl_tit.settings.networks import gru
 
@@ -135,6 +136,17 @@ def test_no_more_items_are_measured_than_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr(algorithm, "measure_batch", counted)
     algorithm.measure(0)
     assert sum(counts) == 86  # every second of 9 * 19
+
+
+def test_every_step_of_windows_counts_the_same(tmp_path, monkeypatch):
+    """However many are measured at a time: windows of the first 20 episodes are mostly padding."""
+    ends = (np.arange(200) < 20) | (np.arange(200) % 60 == 59)
+    data = log_machine(tmp_path / "log.hdf5", timeouts=ends)
+    algorithm = make_algorithm(make_dt(tmp_path, env="", target_returns=(), dataset=str(data)))
+    episodes = read_data(algorithm.recipe)
+    together = algorithm.measure(0, episodes)
+    monkeypatch.setattr("recipes.offline._MEASURED_AT_ONCE", 10)
+    assert algorithm.measure(0, episodes).error == pytest.approx(together.error, rel=1e-5)
 
 
 def test_data_shorter_than_a_slice_are_not_measured(tmp_path):
@@ -230,6 +242,12 @@ def test_spaces_of_images_and_discrete_actions(tmp_path):
     recipe = with_spaces(BC(dataset=str(data), backbone=SMALL))
     shape, dtype, count = recipe.task_settings.values()
     assert (shape, dtype, count) == ([20, 20], "uint8", 3)
+    layouts: dict[Any, list[int]] = {"auto": [3, 20, 20], "CHW": [20, 20, 3]}
+    for layout, expected in layouts.items():
+        stored = np.stack([images] * 3, -1)
+        rgb = log_machine(tmp_path / f"{layout}.hdf5", observations=stored)
+        found = with_spaces(BC(dataset=str(rgb), backbone=SMALL, image_layout=layout))
+        assert found.task_settings["observation_shape"] == expected
     other = log_machine(tmp_path / "f.hdf5", observations=images / 1.0, actions=np.arange(200) % 3)
     with pytest.raises(DatasetError, match="is float32, but in the recipe it is uint8"):
         read_data(replace(recipe, dataset=str(other)))
@@ -240,10 +258,54 @@ def test_discrete_actions_count_from_0(tmp_path, monkeypatch):
     actions = 2 + np.arange(200) % 2
     data = log_machine(tmp_path / "log.hdf5", actions=actions)
     spaces = TaskSpaces(Box(-9, 9, (5,)), Discrete(3, start=1))
-    monkeypatch.setattr(offline, "task_spaces", lambda env: spaces)
+    monkeypatch.setattr(offline, "task_spaces", lambda env, **settings: spaces)
     episodes = read_data(BC(env="CartPole-v1", dataset=str(data), backbone=SMALL))
     found = episodes.rows["action"][episodes.step_rows].numpy()
     np.testing.assert_array_equal(found, actions - 1)
+
+
+def test_data_are_those_of_the_task_as_it_is_built(tmp_path):
+    """The policy acts in the wrapped task, in -1..1, where Pendulum itself takes -2..2."""
+    data = log_machine(
+        tmp_path / "a.hdf5", observations=np.zeros((200, 3)), actions=np.ones((200, 1))
+    )
+    raw = log_machine(
+        tmp_path / "b.hdf5", observations=np.zeros((200, 3)), actions=np.full((200, 1), 2.0)
+    )
+    rescale = "gymnasium.wrappers:RescaleAction(min_action=-1.0, max_action=1.0)"
+    recipe = BC(env="Pendulum-v1", dataset=str(raw), backbone=SMALL)
+    assert read_data(recipe).rows["action"].max() == 2
+    wrapped = replace(recipe, wrappers=(rescale,))
+    with pytest.raises(DatasetError, match=r"row 0: is 2.0, but .* from -1.0 to 1.0"):
+        read_data(wrapped)
+    assert read_data(replace(wrapped, dataset=str(data))).rows["action"].max() == 1
+
+
+@pytest.mark.parametrize(
+    "space",
+    [Box(0, 255, (6, 8, 3), np.uint8), Box(-9, 9, (5,), np.int64), Discrete(4, start=1)],
+    ids=["channels last", "integers", "categories"],
+)
+def test_observations_are_those_that_the_task_writes(tmp_path, monkeypatch, space):
+    """Channels come first, integers are floats, and categories count from 0."""
+    spaces = TaskSpaces(space, Discrete(2))
+    monkeypatch.setattr(offline, "task_spaces", lambda env, **settings: spaces)
+    space.seed(0)
+    stored = np.stack([space.sample() for _ in range(200)]).reshape(200, *(space.shape or (1,)))
+
+    def read(name, observations):
+        data = log_machine(tmp_path / name, observations=observations, actions=np.arange(200) % 2)
+        return read_data(BC(env="CartPole-v1", dataset=str(data), backbone=SMALL))
+
+    episodes, written = read("log.hdf5", stored), ObservationReader(space)(stored)
+    found = episodes.rows["observation"]
+    np.testing.assert_array_equal(found[episodes.step_rows], written, strict=True)
+    if isinstance(space, Discrete):
+        assert found.min() >= 0
+        with pytest.raises(DatasetError, match="which Discrete"):
+            read("other.hdf5", stored + 4)
+        with pytest.raises(DatasetError, match="store integers"):
+            read("floats.hdf5", stored / 1.0)
 
 
 def test_bad_settings_in_one_line(tmp_path, capsys):
