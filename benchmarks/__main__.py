@@ -24,9 +24,10 @@ BENCHMARKS = [
     "history_windows",
     "export",
     "ppo_cartpole",
+    "ppo_pong",
     "off_policy",
 ]
-ON_DEVICE = ["acting", "segments", "memories", "sliding"]
+ON_DEVICE = ["acting", "segments", "memories", "sliding", "ppo_pong"]
 """The benchmarks that can run on another device than the CPU."""
 
 

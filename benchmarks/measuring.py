@@ -35,15 +35,17 @@ def milliseconds(step: Callable[[], Any], seconds: float) -> float:
     On a CPU it is processor time, which other programs on the machine hardly affect. On another
     default device it is time on the clock, until the device has done all that it was given.
     """
-    count, start = 0, _clock()
-    while count == 0 or _clock() - start < seconds:
+    device = torch.get_default_device()
+    count, start = 0, clock(device)
+    while count == 0 or clock(device) - start < seconds:
         step()
         count += 1
-    return 1000 * (_clock() - start) / count
+    return 1000 * (clock(device) - start) / count
 
 
-def _clock() -> float:
-    if torch.get_default_device().type == "cpu":
+def clock(device: torch.device) -> float:
+    """Returns processor time on a CPU, and the time at which another device has done its work."""
+    if device.type == "cpu":
         return time.process_time()
     torch.accelerator.synchronize()
     return time.perf_counter()

@@ -10,12 +10,12 @@ compile.
 from __future__ import annotations
 
 import tempfile
-import time
 from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
@@ -27,13 +27,14 @@ from torch import Tensor
 from recipes import ppo
 from recipes.core import runner
 from recipes.core.callback import Callback
-from recipes.core.recipe import Compile
+from recipes.core.recipe import Compile, Recipe
 from recipes.core.registry import get_recipe
 from recipes.core.run import Run
 
-from .measuring import empty_compile_cache
+from .measuring import clock, empty_compile_cache
 from .straightforward import StraightforwardTIT
 
+CPU = torch.device("cpu")
 STEPS, ENVS = 2048, 8
 SETTINGS = {1: (5, 5), 8: (3, 3)}
 """How many batches a run has, and how many rounds there are, by the number of frames."""
@@ -41,17 +42,23 @@ MODES: dict[str, Compile] = {"compiled": "on", "ours": "off"}
 
 
 class Laps:
-    """The processor time at the end of each batch, in seconds."""
+    """The time at the end of each batch, in seconds.
 
-    def __init__(self) -> None:
+    Args:
+        steps: environment steps of a batch.
+        device: of the networks.
+    """
+
+    def __init__(self, steps: int, device: torch.device = CPU) -> None:
+        self.steps, self.device = steps, device
         self.ends: list[float] = []
 
     def add(self) -> None:
-        self.ends.append(time.process_time())
+        self.ends.append(clock(self.device))
 
     def speed(self) -> float:
-        """Environment steps per second."""
-        return (len(self.ends) - 1) * STEPS / (self.ends[-1] - self.ends[0])
+        """Environment steps per second, without the first batch."""
+        return (len(self.ends) - 1) * self.steps / (self.ends[-1] - self.ends[0])
 
 
 class Extractor(BaseFeaturesExtractor):
@@ -69,9 +76,9 @@ class Extractor(BaseFeaturesExtractor):
 class TheirLaps(BaseCallback):
     """Records when each batch and its update end."""
 
-    def __init__(self) -> None:
+    def __init__(self, laps: Laps) -> None:
         super().__init__()
-        self.laps = Laps()
+        self.laps = laps
 
     def _on_step(self) -> bool:
         return True
@@ -87,8 +94,8 @@ class TheirLaps(BaseCallback):
 class OurLaps(Callback):
     """Records when each update ends."""
 
-    def __init__(self) -> None:
-        self.laps = Laps()
+    def __init__(self, laps: Laps) -> None:
+        self.laps = laps
 
     def updated(self, step: int, policy: TensorDictModuleBase) -> bool:
         self.laps.add()
@@ -111,13 +118,13 @@ def run_sb3(num_frames: int, batches: int, seed: int) -> float:
         device="cpu",
         policy_kwargs=network,
     )
-    callback = TheirLaps()
-    agent.learn(batches * STEPS, callback=callback)
-    return callback.laps.speed()
+    laps = Laps(STEPS)
+    agent.learn(batches * STEPS, callback=TheirLaps(laps))
+    return laps.speed()
 
 
 def run_ours(num_frames: int, batches: int, seed: int, compile: Compile) -> float:
-    """Trains the recipe as the command line does, with checkpoints and metrics."""
+    """Trains the recipe; returns the speed."""
     named = get_recipe("ppo/cartpole/enhanced-tit-protocol")
     assert isinstance(named, ppo.PPO)
     recipe = replace(
@@ -129,10 +136,14 @@ def run_ours(num_frames: int, batches: int, seed: int, compile: Compile) -> floa
         seed=seed,
         compile=compile,
     )
-    callback = OurLaps()
+    return train(recipe, Laps(STEPS))
+
+
+def train(recipe: Recipe, laps: Laps) -> float:
+    """Trains as the command line does, with checkpoints and metrics; returns the speed."""
     with tempfile.TemporaryDirectory() as folder, Run.create(Path(folder, "run"), recipe) as run:
-        runner.train(recipe, run, [callback])
-    return callback.laps.speed()
+        runner.train(recipe, run, [OurLaps(laps)])
+    return laps.speed()
 
 
 def main() -> dict[str, Any]:

@@ -96,7 +96,8 @@ def test_segments_against_full_windows():
 
 def test_on_another_device_nothing_is_on_the_cpu(monkeypatch, capsys):
     """On "meta", a mixture of devices is refused."""
-    monkeypatch.setattr(measuring, "_clock", iter(range(1000)).__next__)
+    ticks = iter(range(1000))
+    monkeypatch.setattr(measuring, "clock", lambda device: next(ticks))
     monkeypatch.setattr(torch.optim, "Adam", lambda weights, fused: torch.optim.SGD(weights))
     with torch.device("meta"):
         segments.measure(segments.Row(Case("Enhanced", "images", 4, 32), length=16), 1, 0)
