@@ -35,6 +35,8 @@ class Agent:
         if frames.shape[several:] != shape:
             raise ValueError(f"expected observations {shape} or N of them, not {frames.shape}")
         frames = frames.reshape(-1, *shape)
+        if self.last is not None and len(frames) != len(self.last):
+            raise ValueError(f"{len(frames)} copies act, not {len(self.last)}: call reset() first")
         if (missing := np.isnan(frames)).any():
             if (missing.reshape(len(frames), -1).any(1) & self.first).any():
                 raise ValueError("the first observation of an episode is missing or has NaN")

@@ -127,6 +127,8 @@ def test_images_are_not_cut_to_bytes(tmp_path):
     exported = runpy.run_path(str(EXAMPLE))["Agent"](str(file))
     found, expected = exported.act(images[0]), agent.act(images[0].astype(float))
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+    with pytest.raises(ValueError, match="2 copies act, not 1"):
+        exported.act(images[:2])
     for act, value in product((agent.act, exported.act), (0.5, 256, -1)):
         with pytest.raises(ValueError, match="0 to 255"):
             act(np.full((12, 12), value))
