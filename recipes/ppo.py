@@ -161,7 +161,7 @@ class PPO(OnlineRecipe, algorithm="ppo"):
     Recurrent networks are never compiled."""
     bfloat16: bool = False
     """Whether the backbone's matrix products are in bfloat16; weights, heads and losses are
-    float32. Networks of the paper's sizes are slower with it, on a GPU, too."""
+    float32. On an H200, networks of the paper's sizes were slower with it."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

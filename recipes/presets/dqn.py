@@ -1,6 +1,6 @@
 """DQN, which the paper does not use, with TIT and with the usual networks.
 
-The settings are those of CleanRL, except for the number of environments.
+The settings are those of CleanRL, except for the number of environments and the MLP's width.
 """
 
 from __future__ import annotations

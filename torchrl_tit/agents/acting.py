@@ -154,8 +154,8 @@ class Actor:
                 )
             numbers = torch.as_tensor(np.ascontiguousarray(array)).reshape(shape)
             missing, frame = numbers.isnan(), numbers.to(spec.dtype)
-            changed = numbers[(frame != numbers) & ~missing]
-            if len(changed) and not spec.dtype.is_floating_point:
+            floats = spec.dtype.is_floating_point
+            if not floats and len(changed := numbers[(frame != numbers) & ~missing]):
                 kind = str(spec.dtype).removeprefix("torch.")
                 raise ValueError(
                     f"the {name} is {kind}, but has {changed[0].item():g}: give it as the task "
