@@ -110,7 +110,7 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     steps = episodes.step_rows
     kept = zip(FIELDS, ("observation", "action", "reward", "terminated", "truncated"), strict=False)
     fields = {name: (episodes.rows[field], steps) for name, field in kept}
-    if episodes.final_known.any() or episodes.terminated.all():
+    if episodes.final_known.any():
         fields["next_observations"] = (episodes.rows["observation"], steps + 1)
     with whole_or_not_at_all(path) as hidden, new_hdf5(hidden, path) as (file, check):
         file.attrs.update(episodes.attributes)
