@@ -14,6 +14,8 @@ import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
 EVALUATION = "evaluation.json"
+BEST_EVALUATION = "evaluation_best.json"
+"""That of a run's best weights, which an agent has under the first name."""
 MOST_BYTES = 2**24
 """Far more than any file of text in a run or an agent has, so that none fills the memory."""
 MOST_STEPS = 2**53

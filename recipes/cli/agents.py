@@ -13,7 +13,7 @@ from torchrl_tit.settings.checks import checked
 from torchrl_tit.settings.literals import parse_assignments
 from torchrl_tit.settings.numbers import Episodes, Seed, Steps, StepsOrNone, Threads
 
-from .arguments import Parser, add_agent, check_numbers, fail, say
+from .arguments import Parser, add_agent, add_best, check_numbers, fail, say
 
 _EPISODES = 10
 _MAPS = ("grad-cam", "integrated-gradients", "attention", "weights")
@@ -46,7 +46,7 @@ def play(arguments: list[str]) -> None:
     if options.out is not None:
         check_film(options.out)
     torch.set_num_threads(options.threads)
-    agent = load_agent(options.agent, device=options.device)
+    agent = load_agent(options.agent, device=options.device, best=options.best)
     if options.out is None:
         returns = agent.evaluate(options.episodes or _EPISODES, seed=options.seed)
     else:
@@ -136,7 +136,7 @@ def explain(arguments: list[str]) -> None:
 
     steps = options.step or [None]
     check_explanation(options.out, steps[0], options.max_steps)
-    agents = [load_agent(name) for name in options.agent]
+    agents = [load_agent(name, best=options.best) for name in options.agent]
     agent = agents[0]
     torch.set_num_threads(agent.recipe["threads"])
     seed = agent.first_seed if options.seed is None else options.seed
@@ -236,7 +236,7 @@ def export(arguments: list[str]) -> None:
     from torchrl_tit.export.formats import find_format
 
     find_format(options.out).check_installed()  # before an agent is loaded
-    agent = load_agent(options.agent)
+    agent = load_agent(options.agent, best=options.best)
     facts = export_policy(
         agent.policy,
         agent.make_env,
@@ -270,6 +270,7 @@ def share(arguments: list[str]) -> None:
     )
     parser.add_argument("run", metavar="RUN", help="run folder that is evaluated, or an agent")
     parser.add_argument("repository", nargs="?", metavar="REPO", help="user/name on the Hub")
+    add_best(parser)
     parser.add_argument("--out", type=Path, help="folder to make for the agent")
     parser.add_argument("--name", help="name on the card; default: that of REPO or of the folder")
     parser.add_argument("--license", help="license on the card, such as mit; default: none")
@@ -286,7 +287,8 @@ def share(arguments: list[str]) -> None:
     if repository is not None:
         check_repository(repository)
     if is_agent(found):
-        if repository is None or (options.out, options.name, options.license) != (None, None, None):
+        others = (options.out, options.name, options.license, options.best or None)
+        if repository is None or any(other is not None for other in others):
             fail(f"{options.run} is an agent already: share it as REPO, without other options")
         _upload(found, repository, options.private)
         return
@@ -294,7 +296,7 @@ def share(arguments: list[str]) -> None:
 
     source = f"{PREFIX}{repository}" if repository is not None else options.out.name
     name = options.name or source.rpartition("/")[2]
-    files, steps = pack(found, name, source=source, license=options.license)
+    files, steps = pack(found, name, source=source, license=options.license, best=options.best)
     with TemporaryDirectory() as temporary:
         folder = options.out or Path(temporary, name)
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -91,9 +91,16 @@ def _named(arguments: list[str]) -> Iterator[str]:
 
 
 def add_agent(parser: argparse.ArgumentParser, **settings: Any) -> None:
-    """Adds the argument that names a trained agent."""
+    """Adds the arguments that name a trained agent."""
     words = "run folder, or a name that `play` lists, folder of an agent, hf:user/name on the Hub"
     parser.add_argument("agent", metavar="AGENT", help=words, **settings)
+    add_best(parser)
+
+
+def add_best(parser: argparse.ArgumentParser) -> None:
+    """Adds the choice between the weights of a run."""
+    words = "of a run: the weights with the highest return so far, not the last ones"
+    parser.add_argument("--best", action="store_true", help=words)
 
 
 def add_machine_options(parser: argparse.ArgumentParser) -> None:

@@ -177,11 +177,11 @@ def load_trained(
         ValueError: if the checkpoint has no best weights yet.
     """
     step, state = run.load_trained()
-    step, algorithm = _load_networks(run, recipe or run.recipe, step, state, best=best)
+    step, algorithm = load_networks(run, recipe or run.recipe, step, state, best=best)
     return step, algorithm, state
 
 
-def _load_networks(
+def load_networks(
     run: Run, recipe: Recipe, step: int, state: dict[str, Any], *, best: bool
 ) -> tuple[int, Algorithm[Any]]:
     """Builds an algorithm with the weights of a checkpoint; returns their step, and it."""
@@ -194,7 +194,7 @@ def _load_networks(
     if step is None:
         raise ValueError(
             f"{run.folder} has no best weights yet: fewer than {EPISODES} training episodes ended, "
-            "or none was evaluated; evaluate the last ones (without --best)"
+            "or none was evaluated; take the last ones (without --best)"
         )
     with run.restoring(step):
         load_weights(algorithm.model, weights)
@@ -237,9 +237,9 @@ def evaluate(
         record = read_state(state["record"], recipe)
     outcomes = record.outcomes
     if best:
-        recipe = replace(recipe, evaluation_seed=_fresh_seed(recipe, record))
+        recipe = with_fresh_seed(recipe, record)
         outcomes = []  # by which the weights were chosen
-    step, algorithm = _load_networks(run, recipe, step, state, best=best)
+    step, algorithm = load_networks(run, recipe, step, state, best=best)
     recipe = algorithm.recipe
     same_seed = record.evaluation_seed == recipe.evaluation_seed
     targets: list[float | None] = [*recipe.target_columns] or [None]
@@ -270,12 +270,12 @@ def evaluate(
     }
 
 
-def _fresh_seed(recipe: Recipe, record: RecordState) -> int:
-    """The recipe's evaluation seed, or the first one after those of the evaluations in training."""
+def with_fresh_seed(recipe: Recipe, record: RecordState) -> Recipe:
+    """Moves the evaluation seed behind those of the evaluations in training, if they overlap."""
     used = max((len(outcome.returns) for outcome in record.outcomes), default=0)
     first, end = recipe.evaluation_seed, record.evaluation_seed + used
     overlaps = first < end and record.evaluation_seed < first + recipe.evaluation_episodes
-    return end if overlaps else first
+    return replace(recipe, evaluation_seed=end if overlaps else first)
 
 
 def _naming(where: str, saved_step: int) -> AbstractContextManager[None]:

@@ -1,8 +1,10 @@
 """The weights with the highest return are kept, and evaluated on new episodes."""
 
 import json
+from dataclasses import replace
 
 import pytest
+import torch
 from torch import nn
 
 from recipes.cli import main
@@ -12,6 +14,8 @@ from recipes.dqn import DQN
 from recipes.ppo import PPO
 from tests.recipes.small import train
 from tests.recipes.states import assert_same
+from torchrl_tit import load_agent
+from torchrl_tit.agents import AgentError
 from torchrl_tit.checkpoint import load_checkpoint
 from torchrl_tit.settings.networks import mlp
 
@@ -92,3 +96,53 @@ def test_the_best_weights_are_those_that_collected_the_best_episodes(run, capsys
     assert said in capsys.readouterr().out
     assert json.loads((run.folder / "evaluation_best.json").read_text()) == best
     assert not (run.folder / "evaluation.json").exists()
+
+
+def test_the_best_weights_are_packed_exported_and_drawn(run, tmp_path, capsys):
+    step, algorithm, _ = load_trained(run, best=True)
+    folder, out = str(run.folder), tmp_path / "agent"
+    unevaluated = load_agent(folder, best=True)
+    assert (unevaluated.steps, unevaluated.evaluation) == (step, {})
+    for weights in ([], ["--best"]):
+        with pytest.raises(SystemExit):
+            main(["share", folder, "--out", str(out), *weights])
+        assert f"run `evaluate {' '.join([folder, *weights])}` first" in capsys.readouterr().err
+        main(["evaluate", folder, *weights])
+    main(["share", folder, "--out", str(out), "--best"])
+    packed = load_agent(out)
+    for agent in (load_agent(folder, best=True), packed):
+        assert_same(dict(agent.policy.state_dict()), dict(algorithm.policy.state_dict()))
+        assert (agent.steps, agent.evaluation["weights"]) == (step, "best")
+        assert agent.evaluate().tolist() == agent.evaluation["returns"]
+    assert "had the highest return in training" in (out / "README.md").read_text()
+
+    capsys.readouterr()
+    main(["export", folder, "--out", str(tmp_path / "best.pt2"), "--best"])
+    exported = torch.export.load(tmp_path / "best.pt2").module()
+    observation = torch.rand(3, 4)
+    outputs = exported(observation=observation)
+    history = packed.make_env(3).reset().set("history", observation.unsqueeze(1))
+    torch.testing.assert_close(outputs["logits"], packed.policy(history)["logits"])
+    main(["explain", folder, "--out", str(tmp_path / "best.png"), "--best"])
+    assert (tmp_path / "best.png").is_file()
+
+    with pytest.raises(AgentError, match="is an agent, with one set of weights"):
+        load_agent(out, best=True)
+
+
+def test_best_weights_that_evaluations_chose_play_new_episodes(tmp_path):
+    run = train(replace(RECIPE, evaluation_interval=512), tmp_path / "run")
+    assert load_agent(run.folder).first_seed == RECIPE.evaluation_seed
+    assert load_agent(run.folder, best=True).first_seed == RECIPE.evaluation_seed + 2
+
+
+def test_a_run_without_best_weights_is_refused_in_one_line(tmp_path, capsys):
+    run = train(replace(RECIPE, total_steps=256), tmp_path / "run")
+    capsys.readouterr()
+    for command, name in (("share", "agent"), ("export", "agent.pt2"), ("explain", "a.png")):
+        with pytest.raises(SystemExit):
+            main([command, str(run.folder), "--out", str(tmp_path / name), "--best"])
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "has no best weights yet" in said
+        assert not (tmp_path / name).exists()

@@ -149,7 +149,9 @@ def agent_names() -> list[str]:
     return sorted(path.name for path in _PACKAGED.iterdir() if is_agent(path))
 
 
-def load_agent(source: str | os.PathLike[str], *, device: Device = "cpu") -> TrainedAgent:
+def load_agent(
+    source: str | os.PathLike[str], *, device: Device = "cpu", best: bool = False
+) -> TrainedAgent:
     """Loads a trained agent. Nothing in its files is executed.
 
     Args:
@@ -158,16 +160,19 @@ def load_agent(source: str | os.PathLike[str], *, device: Device = "cpu") -> Tra
             ``"hf:user/name"``, a repository of the Hugging Face Hub, where
             ``"hf:user/name@revision"`` names a branch, a tag or a commit.
         device: device of the policy and of the environments; ``"auto"`` is the GPU if there is one.
+        best: whether to load a run's best weights instead of its last ones, as ``evaluate --best``
+            does; it then plays new episodes.
 
     Returns:
         The policy, its task and its transforms.
 
     Raises:
-        AgentError: if there is no such agent, one of its files was changed after it was written, or
-            its weights do not fit its recipe.
+        AgentError: if there is no such agent, one of its files was changed after it was written,
+            its weights do not fit its recipe, or ``best`` is set for an agent, which has one set.
         FileNotFoundError: if the run has no checkpoint.
-        ValueError: if its task or a part of its network cannot be built here, for example because a
-            package is missing, or because the user did not import a module that the recipe names.
+        ValueError: if the run has no best weights yet, or its task or a part of its network cannot
+            be built here, for example because a package is missing, or because the user did not
+            import a module that the recipe names.
 
     Example:
         >>> agent = load_agent("cartpole")
@@ -181,8 +186,10 @@ def load_agent(source: str | os.PathLike[str], *, device: Device = "cpu") -> Tra
     """
     folder = find_agent(source)
     if is_agent(folder):
+        if best:
+            raise AgentError(f"{source} is an agent, with one set of weights: leave out best")
         return _recipes("agent_from_files")(read_agent(folder), str(source), device)
-    return _recipes("agent_from_run")(folder, device)
+    return _recipes("agent_from_run")(folder, device, best=best)
 
 
 def find_agent(source: str | os.PathLike[str]) -> Path:

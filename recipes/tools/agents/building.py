@@ -13,15 +13,15 @@ import torch
 
 from torchrl_tit.agents import AgentError, TrainedAgent
 from torchrl_tit.agents.folder import RECIPE, AgentFiles
-from torchrl_tit.checkpoint import latest_step
-from torchrl_tit.evaluation_file import read_evaluation
+from torchrl_tit.evaluation_file import BEST_EVALUATION, EVALUATION, parse_evaluation
 from torchrl_tit.settings.choices import Device
 
 from ...core.algorithm import Algorithm, load_weights, make_algorithm
+from ...core.progress import read_state
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_from_json, recipe_to_json
 from ...core.run import Run
-from ...core.runner import load_trained
+from ...core.runner import load_networks, with_fresh_seed
 from ...decision_transformer import SequenceRecipe
 
 
@@ -56,31 +56,39 @@ def agent_from_files(files: AgentFiles, name: str, device: Device) -> TrainedAge
     return _agent(name, recipe, algorithm, files.steps, files.evaluation, files.versions)
 
 
-def agent_from_run(folder: Path, device: Device) -> TrainedAgent:
+def agent_from_run(folder: Path, device: Device, *, best: bool = False) -> TrainedAgent:
     """Builds an agent from a run's newest checkpoint.
 
     Args:
         folder: the run folder.
         device: device of the policy and of the environments.
+        best: whether to take the best weights of the checkpoint instead of the last ones.
 
     Raises:
         FileNotFoundError: if there is no run or no checkpoint.
         CheckpointError: if it cannot be used.
-        ValueError: as in :func:`agent_from_files`.
+        ValueError: as in :func:`agent_from_files`, or if there are no best weights yet.
     """
     run = Run.open(folder)
-    evaluation = evaluation_of(folder, latest_step(run.checkpoints))
-    recipe = _acting(run.recipe, evaluation, device)
+    recipe, (step, state) = run.recipe, run.load_trained()
+    trained = step
+    if best:
+        with run.restoring(step):
+            trained = state["best"]["step"]
+            recipe = with_fresh_seed(recipe, read_state(state["record"], recipe))
+    evaluation = evaluation_of(run, trained, best=best)
     # Loading sets the number of PyTorch's threads, which is up to the caller here.
-    steps, algorithm, _ = load_trained(run, replace(recipe, threads=torch.get_num_threads()))
-    return _agent(str(folder), run.recipe, algorithm, steps, evaluation, run.versions())
+    acting = replace(_acting(recipe, evaluation, device), threads=torch.get_num_threads())
+    trained, algorithm = load_networks(run, acting, step, state, best=best)
+    return _agent(str(folder), recipe, algorithm, trained, evaluation, run.versions())
 
 
-def evaluation_of(folder: Path, steps: int | None) -> dict[str, Any]:
-    """Reads a run's evaluation of the checkpoint of a step; empty if there is none."""
+def evaluation_of(run: Run, steps: int | None, *, best: bool = False) -> dict[str, Any]:
+    """Reads a run's evaluation of its last or best weights, of a step; empty if there is none."""
     with suppress(OSError, ValueError):
-        evaluation = read_evaluation(folder)
-        if evaluation is not None and evaluation["steps"] == steps:
+        content = run.read(BEST_EVALUATION if best else EVALUATION)
+        evaluation = {} if content is None else parse_evaluation(content, run.folder)
+        if evaluation.get("steps") == steps:
             return evaluation
     return {}
 

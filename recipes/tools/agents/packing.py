@@ -26,7 +26,12 @@ from .building import evaluation_of
 
 
 def pack(
-    folder: Path, name: str, *, source: str | None = None, license: str | None = None
+    folder: Path,
+    name: str,
+    *,
+    source: str | None = None,
+    license: str | None = None,
+    best: bool = False,
 ) -> tuple[dict[str, bytes], int]:
     """Makes the files of an agent from a run's newest checkpoint and its evaluation.
 
@@ -39,6 +44,7 @@ def pack(
         source: what :func:`~torchrl_tit.agents.load_agent` will find it by, for its card; its name
             if None.
         license: identifier of its license, such as "mit", for its card; none is named if None.
+        best: whether to take the best weights of the checkpoint instead of the last ones.
 
     Returns:
         The files by name, as :func:`~torchrl_tit.agents.folder.write_agent` takes them, and the
@@ -46,20 +52,21 @@ def pack(
 
     Raises:
         FileNotFoundError: if there is no run or no checkpoint.
-        AgentError: if the newest checkpoint was not evaluated, a name is invalid, or
-            huggingface_hub, which writes the card's metadata, is missing.
-        ValueError: if the run's networks cannot be built.
+        AgentError: if these weights were not evaluated, a name is invalid, or huggingface_hub,
+            which writes the card's metadata, is missing.
+        ValueError: if the run's networks cannot be built, or it has no best weights yet.
     """
     _check_words("name", name)
     if license is not None:
         _check_words("license", license)
     run = Run.open(folder)
-    steps, algorithm, _ = load_trained(run)
-    evaluation = evaluation_of(folder, steps)
+    steps, algorithm, _ = load_trained(run, best=best)
+    evaluation = evaluation_of(run, steps, best=best)
     if not evaluation:
+        which = "best weights, those" if best else "newest checkpoint, that"
         raise AgentError(
-            f"{folder} has no evaluation of its newest checkpoint, that of step {steps}: run "
-            f"`evaluate {folder}` first"
+            f"{folder} has no evaluation of its {which} of step {steps}: run "
+            f"`evaluate {folder}{' --best' * best}` first"
         )
     networks = algorithm.policy
     recipe = without_places(run.recipe)
@@ -163,6 +170,8 @@ def _results(evaluation: Mapping[str, Any]) -> str:
     target, first, episodes = "", evaluation["seed"], evaluation["episodes"]
     if "target_return" in evaluation:
         target = f" The policy was told to aim for a return of {evaluation['target_return']:g}."
+    if evaluation.get("weights") == "best":
+        target += " The weights had the highest return in training; these episodes are new."
     return (
         f"Mean return **{evaluation['mean']:.1f} ± {evaluation['std']:.1f}** (standard deviation) "
         f"over\n{episodes} whole episodes, each with its own seed ({first} to "
