@@ -7,7 +7,13 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler
-from torchrl.envs import Compose, DTypeCastTransform, ObservationNorm, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    DTypeCastTransform,
+    ObservationNorm,
+    PendulumEnv,
+    TransformedEnv,
+)
 from torchrl.envs.utils import check_env_specs
 
 from tests.transforms.streams import StreamEnv, assert_histories
@@ -27,6 +33,16 @@ def test_without_a_batch():
     check_env_specs(env)
     first = env.reset()
     assert torch.equal(first["history"], first["observation"].expand(3, 2))
+
+
+def test_an_environment_that_takes_any_batch_size():
+    env = TransformedEnv(PendulumEnv(), History(3, "th"))
+    for batch in ([5], [], [2, 3], [5]):
+        first = env.reset(env.base_env.gen_params(batch_size=batch))
+        steps = env.rollout(4, auto_reset=False, tensordict=first).refine_names(..., "time")
+        made = History(3, "th")(steps.exclude("history", ("next", "history")))
+        assert torch.equal(steps["history"], made["history"])
+        assert steps["history"].shape == (*batch, 4, 3)
 
 
 def test_a_transform_before_it_may_change_the_dtype():

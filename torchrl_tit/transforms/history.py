@@ -141,8 +141,13 @@ class History(CatFrames):
             if self.N > 1:
                 name = _buffer_name(in_key)
                 buffer = getattr(self, name, None)
-                # No environment has made it, or one to which a transform was added since.
-                if buffer is None or buffer.dtype != history.dtype:
+                # No environment has made it, one to which a transform was added since, or one that
+                # takes any batch size and begins with another.
+                if (
+                    buffer is None
+                    or buffer.dtype != history.dtype
+                    or (_reset is not None and buffer.shape[:dim] != history.shape[:dim])
+                ):
                     zeros = torch.zeros_like(history).repeat_interleave(self.N, dim)
                     self._make_buffer(name, zeros)
                 history = self._push(getattr(self, name), history, _reset, dim)
