@@ -5,13 +5,17 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.modules import get_primers_from_module, set_recurrent_mode
+from torchrl.data import Bounded
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.modules import RandomPolicy, get_primers_from_module, set_recurrent_mode
 
 from tests.numerics import assert_near
+from tests.transforms.streams import StreamEnv
 from torchrl_tit import Backbone, settings
 from torchrl_tit.envs import make_env
-from torchrl_tit.modules import make_actor
+from torchrl_tit.modules import as_sequences, make_actor
 from torchrl_tit.networks import HistoryNetwork, build_network
+from torchrl_tit.transforms import History
 
 pytestmark = pytest.mark.numerics
 
@@ -104,6 +108,21 @@ def test_a_collector_registers_what_the_policy_needs(name, trunks, num_frames):
     for key in backbone.features_keys:
         assert_near(again[key], batch[key])
     collector.shutdown()
+
+
+@pytest.mark.parametrize("name", ["lstm", "mamba2"])
+@torch.no_grad()
+def test_the_state_has_the_dtype_of_the_weights(name):
+    pixels = Bounded(0, 255, (3,), dtype=torch.uint8)
+    backbone = Backbone(build_network(settings.NETWORKS[name](), pixels).double())
+    transforms = Compose(History(1), backbone.make_transforms())
+    env = TransformedEnv(StreamEnv([N], dtype=torch.uint8), transforms)
+    steps = env.rollout(T, TensorDictSequential(backbone, RandomPolicy(env.action_spec)))
+    for key in backbone.state_shapes:
+        assert env.observation_spec[key].dtype == torch.float64
+        assert steps[key].dtype == steps["next", key].dtype == torch.float64
+    again = backbone(as_sequences(steps))["features"]
+    torch.testing.assert_close(again, steps["features"], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("trunks", TRUNKS)

@@ -31,6 +31,7 @@ from torchrl_tit.histories.encoder import RecurrentEncoder
 from torchrl_tit.modules.acting import ActingModule, trunks_of
 from torchrl_tit.modules.sequences import SequenceKeys, beside, default_observation_keys
 from torchrl_tit.networks import HistoryNetwork
+from torchrl_tit.networks.history_network import weights_dtype
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.windows import Windows
@@ -357,7 +358,8 @@ class Backbone(ActingModule):
         """
         if not self.is_recurrent:
             return Compose()
-        specs = {key: Unbounded(shape=shape) for key, shape in self.state_shapes.items()}
+        dtype = weights_dtype(self.module)
+        specs = {key: Unbounded(shape, dtype=dtype) for key, shape in self.state_shapes.items()}
         return TensorDictPrimer(specs, expand_specs=True)
 
     def computing(self, device: torch.device) -> AbstractContextManager[object]:
@@ -419,9 +421,7 @@ class Backbone(ActingModule):
     ) -> tuple[list[Tensor], list[Tensor]]:
         """Reads sequences [N, S] from a state -> features [N, S, F] and the state after them."""
         frames = [steps[key] for key in self.sequence_keys.observations]
-        like: dict[str, Any] = {"device": frames[0].device}
-        if frames[0].is_floating_point():
-            like["dtype"] = frames[0].dtype
+        like: dict[str, Any] = {"device": frames[0].device, "dtype": weights_dtype(self.module)}
         is_init, states = steps["is_init"], []
         for index, shape in enumerate(self.state_shapes.values()):
             entry = torch.zeros(1, 1, *[1] * len(shape), **like).expand(*steps.shape, *shape)
