@@ -206,6 +206,8 @@ def test_other_modules_read_the_windows() -> None:
          r"observations of shape \(5,\) do not fit this network: expected \(6,\)"),
         (lambda td: td.set("history", td["history"][:, :, :2]), ValueError,
          "which is 3 observations of shape"),
+        (lambda td: td.set("observation", td["observation"] * 2), ValueError,
+         "'observation', but it is not the newest frame of 'history': name .* observation_keys"),
         (lambda td: td.set("observation", td["observation"].int()), TypeError,
          "int32 does not fit this network"),
     ],

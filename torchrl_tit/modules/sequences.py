@@ -81,8 +81,8 @@ class SequenceKeys:
         Raises:
             KeyError: if an entry is missing.
             ValueError: if there is no time dimension, an entry does not fit a network, the next
-                observation of a step is not that of the step after it, or padding makes other
-                histories than the stored ones.
+                observation of a step is not that of the step after it, an observation is not the
+                newest frame of its history, or padding makes other histories than the stored ones.
         """
         self._check(tensordict, trunks)
         *batch, steps = self.shape_of(tensordict)
@@ -106,6 +106,10 @@ class SequenceKeys:
             if after is not None:
                 _check_consecutive(now, flat(after), starts)
         stored = [tensordict.get(key, None) for key in self.histories]
+        pairs = zip(self.histories, self.observations, strict=True)
+        for keys, now, history in zip(pairs, observations, stored, strict=True):
+            if history is not None:
+                _check_newest(keys, now, flat(history))
         histories = [history for history in stored if history is not None]
         if histories and self.padding is not None:
             own = time + len(group) + 1
@@ -236,6 +240,23 @@ def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -
             "step is not the observation of the step after it: leave is_init out of shuffled steps "
             "(or read them within set_recurrent_mode(False)), and set it where a sequence begins"
         )
+
+
+def _check_newest(keys: tuple[NestedKey, NestedKey], observation: Tensor, history: Tensor) -> None:
+    """Raises ValueError if an observation [N, T, ...] is not the newest frame of its history.
+
+    Of a history that is expanded over time, only the first step counts.
+    """
+    if is_transformed() or observation.is_meta:
+        return
+    if history.ndim == observation.ndim + 1:
+        steps = slice(None if history.stride(1) else 1)
+        if not differs(observation[:, steps], history[:, steps, -1]).any():
+            return
+    raise ValueError(
+        f"in recurrent mode sequences are read from {keys[1]!r}, but it is not the newest frame of "
+        f"{keys[0]!r}: name the observation that this stacks in observation_keys"
+    )
 
 
 def _check_padding(table: FrameTable, histories: Sequence[Tensor]) -> None:
