@@ -3,6 +3,7 @@
 import math
 import random
 from contextlib import nullcontext
+from functools import partial
 
 import gymnasium
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential
 from tensordict.nn import TensorDictModule as Module
 from torch import nn
-from torchrl.envs import GymEnv
+from torchrl.envs import GymEnv, SerialEnv, StepCounter, TransformedEnv
 from torchrl.modules import IndependentNormal
 
 from tests.envs.reference import wrapped
@@ -87,8 +88,10 @@ def test_shrinking_asks_only_about_what_still_counts(num_envs):
 
 
 def test_torchrls_own_environments():
-    single = GymEnv("CartPole-v1", categorical_action_encoding=True)
-    for env in (single, wrapped("CartPole-v1", 3, 0, 2, "same")):
+    make = partial(GymEnv, "CartPole-v1", categorical_action_encoding=True)
+    pairs = SerialEnv(2, partial(make_env, "CartPole-v1", 2))
+    copies = TransformedEnv(SerialEnv(3, make), StepCounter())
+    for env in (make(), copies, pairs, wrapped("CartPole-v1", 3, 0, 2, "same")):
         assert torch.equal(evaluate(env, lean, episodes=4, seed=7), by_leaning(4))
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_tit.layers.standardize import widest_float
@@ -44,10 +45,11 @@ def evaluate(
 
     Args:
         env: an environment of any batch size whose `reset` takes a seed, as those of
-            :func:`~torchrl_tit.envs.make_env` and TorchRL's `GymWrapper` do, and whose rewards are
-            the task's own, not clipped. It is reset, which ends its current episodes. Or a function
-            that makes an environment with a given number of copies; it is called with ``episodes``,
-            and the environment is closed at the end.
+            :func:`~torchrl_tit.envs.make_env` and TorchRL's `GymWrapper` do, also within its
+            `SerialEnv` and `ParallelEnv`, and whose rewards are the task's own, not clipped. It is
+            reset, which ends its current episodes. Or a function that makes an environment with a
+            given number of copies; it is called with ``episodes``, and the environment is closed at
+            the end.
         policy: writes the action into the tensordict. It acts in evaluation mode.
         episodes: number of episodes.
         seed: seed of the first episode.
@@ -113,7 +115,7 @@ def watching_episodes(ended: Callable[[int], Any]) -> Iterator[None]:
 
 def _play(env: EnvBase, policy: Policy, seed: int, shrink: bool) -> Tensor:
     """Computes the return of one episode in each environment, float64 [N]."""
-    tensordict = env.reset(seed=seed)
+    tensordict = _reset(env, seed)
     wide = torch.float64 if env.device is None else widest_float(env.device)
     returns = torch.zeros(env.batch_size.numel(), dtype=wide, device=env.device)
     playing = torch.ones_like(returns, dtype=torch.bool)
@@ -136,6 +138,18 @@ def _play(env: EnvBase, policy: Policy, seed: int, shrink: bool) -> Tensor:
         if left < before and (watcher := _WATCHER.get()) is not None:
             watcher(before - left)
     return returns
+
+
+def _reset(env: EnvBase, seed: int) -> TensorDictBase:
+    """Begins an episode in each environment, seeded one after the other from a first seed."""
+    base = env
+    while isinstance(base, TransformedEnv):
+        base = base.base_env
+    if not isinstance(base, BatchedEnvBase):
+        return env.reset(seed=seed)
+    # TorchRL gives all of its workers the same seed.
+    seeds = range(seed, seed + env.batch_size.numel(), env.batch_size[1:].numel())
+    return env.reset(list_of_kwargs=[{"seed": each} for each in seeds])
 
 
 def _act(policy: Policy, tensordict: TensorDictBase, playing: Tensor) -> TensorDictBase:
