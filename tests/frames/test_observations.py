@@ -1,5 +1,7 @@
 """What networks know of observations, the patch size "auto", and categories: one-hot vectors."""
 
+import re
+
 import pytest
 import torch
 from torch.nn import functional as F
@@ -33,6 +35,15 @@ def test_one_hot_vectors_stand_side_by_side() -> None:
     flat = build_frame(settings.Flat(), OBSERVATION)
     assert (flat.width, flat.num_tokens) == (12, 1)
     assert torch.equal(flat(x).long(), one_hot(x).unsqueeze(-2))
+
+
+@pytest.mark.parametrize("row", [[4, 0, 0], [0, -1, 0], [0, 3, 0], [-1, 0, 0], [0, 0, 5]])
+@pytest.mark.parametrize("frame", [settings.Flat(), settings.Linear(), settings.Inner()])
+def test_a_value_of_a_neighboring_entry_is_refused(frame, row) -> None:
+    encoder = build_frame(frame, OBSERVATION)
+    expected = rf"has the categories {re.escape(str(row))}, .* below that of \[4, 3, 5\]"
+    with pytest.raises(ValueError, match=expected):
+        encoder(torch.tensor([[0, 0, 0], row]))
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.int32, torch.uint8])

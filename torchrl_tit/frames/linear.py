@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from torchrl_tit import settings
 from torchrl_tit.frames.encoder import FrameEncoder
@@ -65,6 +64,6 @@ class LinearFrameEncoder(FrameEncoder):
             x = observation.flatten(-len(self.observation_shape)).unsqueeze(-2)  # [..., 1, entries]
             token = embed(x, self.linear.weight)
         else:  # for one-hot vectors, all other products are zero
-            weights = F.embedding(self.index(observation), self.linear.weight.t())
+            weights = self.index.embed(observation, self.linear.weight.t())
             token = weights.sum(-2, keepdim=True)
         return self.activation(token if self.linear.bias is None else token + self.linear.bias)

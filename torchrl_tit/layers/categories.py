@@ -23,22 +23,50 @@ class CategoryIndex(nn.Module):
                 [3, 6]])
     """
 
+    counts: Tensor
     first: Tensor
 
     def __init__(self, counts: Sequence[int]) -> None:
         super().__init__()
         first = torch.tensor([0, *accumulate(counts)][:-1])
+        self.register_buffer("counts", torch.tensor(counts), persistent=False)
         self.register_buffer("first", first, persistent=False)
         self.total = sum(counts)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Integers [..., D] -> int64 [..., D]."""
-        return x.long() + self.first
+        """Integers [..., D] -> int64 [..., D].
+
+        A value that an entry does not have, which would be one of a neighboring entry, becomes the
+        number after the last, so that looking it up is an error.
+        """
+        return torch.where(self._wrong(x), self.total, x.long() + self.first)
+
+    def embed(self, x: Tensor, weight: Tensor) -> Tensor:
+        """Looks integers [..., D] up in a table [total, width] -> [..., D, width]."""
+        try:
+            return F.embedding(self(x), weight)
+        except IndexError as error:  # raised on a CPU only; a GPU reports a failed assertion
+            raise self._error(x) from error
 
     def one_hot(self, x: Tensor) -> Tensor:
         """Integers [..., D] -> the one-hot vectors of all entries, bool [..., total]."""
         zeros = x.new_zeros(*x.shape[:-1], self.total, dtype=torch.bool)
-        return zeros.scatter(-1, self(x), True)
+        try:
+            return zeros.scatter(-1, self(x), True)
+        except RuntimeError as error:  # as above
+            if self._wrong(x).any():
+                raise self._error(x) from error
+            raise
+
+    def _wrong(self, x: Tensor) -> Tensor:
+        return (x < 0) | (x >= self.counts)
+
+    def _error(self, x: Tensor) -> ValueError:
+        row = x[self._wrong(x).any(-1)][0].tolist()
+        return ValueError(
+            f"an observation has the categories {row}, but each must be at least 0 and below that "
+            f"of {self.counts.tolist()}: build the network with the spec of what is observed"
+        )
 
 
 class CategoryPatchEmbedding(nn.Module):
@@ -68,7 +96,7 @@ class CategoryPatchEmbedding(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Integers [N, 1, D] -> tokens [N, ceil(D / P), embed_dim]."""
-        entries = self.embedding(self.index(x.squeeze(1)))  # [N, D, embed_dim]
+        entries = self.index.embed(x.squeeze(1), self.embedding.weight)  # [N, D, embed_dim]
         if self.patch_size == 1:
             return entries
         entries = F.pad(entries, (0, 0, 0, self.padding))
