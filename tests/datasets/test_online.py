@@ -251,6 +251,11 @@ def test_what_is_refused() -> None:
         storage.set(range(9, 10), steps[:2, :1].transpose(0, 1))
     with pytest.raises(ValueError, match=r"ndim=1 takes steps \[T\], but these are \[3, 12\]"):
         make(None, 31, 2).extend(steps)
+    whole = play_several(3, 12, 2, "same")
+    make(3, 31, 2).extend(whole)
+    whole["observation"].apply_(lambda x: x.add_(1))
+    with pytest.raises(ValueError, match="not the newest frame of the histories"):
+        make(3, 31, 2).extend(whole)
     other = make(3, 33, 4)
     with pytest.raises(ValueError, match="num_frames=2, but this storage has num_frames=4"):
         other.storage.load_state_dict(storage.state_dict())

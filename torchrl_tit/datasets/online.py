@@ -18,7 +18,7 @@ from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Batch, Frames
 from torchrl_tit.transforms.history import same_observations
-from torchrl_tit.windows import Windows, find_windows, take
+from torchrl_tit.windows import Windows, differs, find_windows, take
 
 _STORED = [
     "observation",
@@ -176,7 +176,8 @@ class OnlineHistoryStorage(LazyTensorStorage):
 
         Raises:
             RuntimeError: if items are to be changed, or written out of order.
-            ValueError: if the steps do not cover all environments.
+            ValueError: if the steps do not cover all environments, or have histories of another
+                entry than "observation".
         """
         if not set_cursor:
             raise RuntimeError("Stored steps cannot be changed, only added.")
@@ -188,6 +189,7 @@ class OnlineHistoryStorage(LazyTensorStorage):
                 f"A storage of ndim={self.ndim} takes steps {names}, but these are "
                 f"{list(data.shape)} as stored; choose the ndim of the collector's batches."
             )
+        _check_histories(data)
         steps = data.select(*_STORED).update(data.select(*_OPTIONAL, strict=False))
         steps = steps.to(self.device)
         steps = steps if self.ndim == 2 else steps.unsqueeze(-1)  # [T, envs]
@@ -447,6 +449,20 @@ class EndFrames:
     def read(self, first: int) -> TensorDict:
         """Copies the frames from number ``first`` on."""
         return self.table[torch.arange(first, self.stop) % len(self.table)]
+
+
+def _check_histories(steps: TensorDictBase) -> None:
+    """Raises ValueError if histories that will be made again [T, ...] are not of what is stored."""
+    for key, frames in steps.select("observation").items(True, True):
+        history = steps.get(("history", *key[1:]) if isinstance(key, tuple) else "history", None)
+        if history is None:
+            continue
+        newest = history.select(steps.ndim, -1)
+        if newest.shape != frames.shape or differs(newest, frames, steps.ndim).any():
+            raise ValueError(
+                f"{key!r} is stored, but it is not the newest frame of the histories of these "
+                "steps: let the environment write what History stacks under this key"
+            )
 
 
 @contextlib.contextmanager
