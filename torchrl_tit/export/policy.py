@@ -35,9 +35,10 @@ def export_policy(
     """Writes a policy to a file that needs neither this library nor TorchRL.
 
     The file holds everything between the task's observation and its action: normalization, hidden
-    velocities, the network, the choice of an action and its clipping. The batch size N is free, but
-    at least 1; weights are float32, on a CPU. A policy that reads K > 1 observations can have two
-    forms:
+    velocities, the network, the choice of an action and its clipping. It reads what other
+    transforms of the environment write, such as TorchRL's `ObservationNorm`: they are not in the
+    file. The batch size N is free, but at least 1; weights are float32, on a CPU. A policy that
+    reads K > 1 observations can have two forms:
 
     - by default, it reads the last K observations, ``history`` [N, K, *obs], and carries no state;
     - with ``step_by_step``, it reads the newest ``observation`` [N, *obs], whether an episode
