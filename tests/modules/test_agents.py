@@ -15,7 +15,7 @@ from docs.examples.several_agents import Meet
 from tests.networks.reference import randomize
 from torchrl_tit import Backbone, EnhancedTIT, History
 from torchrl_tit.envs import observation_keys, observation_specs
-from torchrl_tit.modules import make_actor, make_squashed_actor, make_value
+from torchrl_tit.modules import history_keys, make_actor, make_squashed_actor, make_value
 from torchrl_tit.networks import build_network
 from torchrl_tit.settings.networks import lstm
 
@@ -90,3 +90,6 @@ def test_a_state_is_that_of_one_agent() -> None:
     with pytest.raises(ValueError, match=r"state for one agent, .* num_frames of 2 or more"):
         Backbone(build_network(lstm(), Unbounded(2)), [HISTORY])
     Backbone(build_network(lstm(2), Unbounded(2)), [HISTORY])
+    # One of several observations is no group of agents, whatever its name.
+    several = {"price_history": Unbounded(2), "state": Unbounded(3)}
+    assert Backbone(build_network(lstm(), several), history_keys(several)).out_keys[0] == "features"

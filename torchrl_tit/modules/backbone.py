@@ -154,7 +154,8 @@ class Backbone(ActingModule):
     ) -> None:
         in_keys = [in_keys] if isinstance(in_keys, str) else list(in_keys)
         first = in_keys[0] if in_keys else "history"
-        of_agents = isinstance(first, tuple) and "history" in first[-1]
+        # ("history", NAME) is one of several observations, whatever its name.
+        of_agents = isinstance(first, tuple) and first[0] != "history" and "history" in first[-1]
         if out_keys is None:
             out_keys = [beside(first, "features") if of_agents else "features"]
         out_keys = [out_keys] if isinstance(out_keys, str) else list(out_keys)
