@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import Bounded
-from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.modules import RandomPolicy, get_primers_from_module, set_recurrent_mode
 
 from tests.numerics import assert_near
@@ -123,6 +123,16 @@ def test_the_state_has_the_dtype_of_the_weights(name):
         assert steps[key].dtype == steps["next", key].dtype == torch.float64
     again = backbone(as_sequences(steps))["features"]
     torch.testing.assert_close(again, steps["features"], rtol=0, atol=1e-9)
+
+
+def test_slices_of_another_entry_than_the_history_are_refused():
+    env = TransformedEnv(StreamEnv([N]), Compose(InitTracker(), History(1)))
+    steps = env.rollout(T, break_when_any_done=False)
+    as_sequences(steps)
+    for part in (steps, steps["next"]):
+        part["observation"] = part["observation"] + 1
+    with pytest.raises(ValueError, match="'observation', but it is not the newest frame of 'histo"):
+        as_sequences(steps)
 
 
 @pytest.mark.parametrize("trunks", TRUNKS)

@@ -109,7 +109,8 @@ class SequenceKeys:
         pairs = zip(self.histories, self.observations, strict=True)
         for keys, now, history in zip(pairs, observations, stored, strict=True):
             if history is not None:
-                _check_newest(keys, now, flat(history))
+                hint = "name the observation that this stacks in observation_keys"
+                _check_newest(keys, now, flat(history), hint)
         histories = [history for history in stored if history is not None]
         if histories and self.padding is not None:
             own = time + len(group) + 1
@@ -179,8 +180,8 @@ def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
         The last T steps, [N, T], with "sequence", also under "next".
 
     Raises:
-        ValueError: if these are no slices of more than B steps, or the next observation of a step
-            is not that of the step after it.
+        ValueError: if these are no slices of more than B steps, the next observation of a step is
+            not that of the step after it, or "observation" is not the newest frame of "history".
 
     Example:
         >>> from torchrl_tit.datasets import ConsecutiveSampler, OnlineHistoryStorage
@@ -206,6 +207,10 @@ def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
     begins = samples["is_init"].reshape(samples.shape)
     for key, now in seen.exclude("is_init").items(True, True):
         _check_consecutive(now, after[key], begins)
+        history_key = "history" if isinstance(key, str) else ("history", *key[1:])
+        if (history := samples.get(history_key, None)) is not None:
+            hint = "let the environment write what History stacks under this key"
+            _check_newest((history_key, key), now, history, hint)
     before, (seen, after, begins) = (
         seen[:, :burn_in],
         (x[:, burn_in:] for x in (seen, after, begins)),
@@ -242,7 +247,9 @@ def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -
         )
 
 
-def _check_newest(keys: tuple[NestedKey, NestedKey], observation: Tensor, history: Tensor) -> None:
+def _check_newest(
+    keys: tuple[NestedKey, NestedKey], observation: Tensor, history: Tensor, hint: str
+) -> None:
     """Raises ValueError if an observation [N, T, ...] is not the newest frame of its history.
 
     Of a history that is expanded over time, only the first step counts.
@@ -255,7 +262,7 @@ def _check_newest(keys: tuple[NestedKey, NestedKey], observation: Tensor, histor
             return
     raise ValueError(
         f"in recurrent mode sequences are read from {keys[1]!r}, but it is not the newest frame of "
-        f"{keys[0]!r}: name the observation that this stacks in observation_keys"
+        f"{keys[0]!r}: {hint}"
     )
 
 
