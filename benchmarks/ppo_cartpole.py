@@ -10,8 +10,9 @@ compile.
 from __future__ import annotations
 
 import tempfile
-from collections import defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -150,19 +151,20 @@ def main() -> dict[str, Any]:
     """Measures with an empty compile cache."""
     numbers = {}
     for num_frames, (batches, rounds) in SETTINGS.items():
-        with empty_compile_cache():
-            runs = take_turns(num_frames, batches, rounds)
+        programs = {"sb3": partial(run_sb3, num_frames, batches)}
+        for name, mode in MODES.items():
+            programs[name] = partial(run_ours, num_frames, batches, compile=mode)
         numbers[f"K = {num_frames}"] = {
-            name: {"steps_per_second_of_processor_time": speeds} for name, speeds in runs.items()
+            name: {"steps_per_second_of_processor_time": speeds}
+            for name, speeds in run_in_turns(programs, rounds).items()
         }
     return numbers
 
 
-def take_turns(num_frames: int, batches: int, rounds: int) -> dict[str, list[float]]:
-    """Runs both libraries in turns."""
-    runs: dict[str, list[float]] = defaultdict(list)
-    for seed in range(rounds):
-        runs["sb3"].append(run_sb3(num_frames, batches, seed))
-        for name, mode in MODES.items():
-            runs[name].append(run_ours(num_frames, batches, seed, mode))
-    return runs
+def run_in_turns(
+    programs: Mapping[str, Callable[[int], float]], rounds: int
+) -> dict[str, list[float]]:
+    """Runs programs in turns, with the seeds 0, 1, ..., and an empty compile cache."""
+    with empty_compile_cache():
+        runs = [{name: run(seed) for name, run in programs.items()} for seed in range(rounds)]
+    return {name: [one[name] for one in runs] for name in programs}

@@ -9,7 +9,6 @@ of one thread, and on a GPU on the clock.
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -30,8 +29,7 @@ from recipes import ppo
 from recipes.core.recipe import Compile
 from recipes.core.registry import get_recipe
 
-from .measuring import empty_compile_cache
-from .ppo_cartpole import Laps, TheirLaps, train
+from .ppo_cartpole import Laps, TheirLaps, run_in_turns, train
 from .straightforward import Case
 
 STEPS, ENVS = 1024, 8
@@ -95,7 +93,7 @@ def run_ours(seed: int, device: torch.device, *, network: str, compile: Compile 
     return train(recipe, Laps(STEPS, device))
 
 
-PROGRAMS: dict[str, Callable[[int, torch.device], float]] = {
+PROGRAMS: dict[str, Callable[..., float]] = {
     "sb3": partial(run_theirs, num_frames=4),
     "sb3, Enhanced_TIT": partial(run_theirs, num_frames=4, features_extractor_class=Extractor),
     "sb3-contrib, CNN-LSTM": partial(
@@ -110,16 +108,13 @@ PROGRAMS: dict[str, Callable[[int, torch.device], float]] = {
 def main() -> dict[str, Any]:
     """Measures all programs in turns; on a GPU, eager ones."""
     device = torch.get_default_device()
-    programs = dict(PROGRAMS)
+    programs = {name: partial(program, device=device) for name, program in PROGRAMS.items()}
     if device.type != "cpu":
         del programs["Enhanced_TIT, compiled"]
     # Environments and agents choose the device of their tensors themselves.
     default: AbstractContextManager[Any] = (
         nullcontext() if device.type == "cpu" else torch.device("cpu")
     )
-    runs: dict[str, list[float]] = defaultdict(list)
-    with empty_compile_cache(), default:
-        for seed in range(ROUNDS):
-            for name, program in programs.items():
-                runs[name].append(program(seed, device))
+    with default:
+        runs = run_in_turns(programs, ROUNDS)
     return {name: {"steps_per_second": speeds} for name, speeds in runs.items()}
