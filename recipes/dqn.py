@@ -21,7 +21,7 @@ from torchrl.objectives import DQNLoss, HardUpdate, SoftUpdate, TargetNetUpdater
 from torchrl_tit.envs.action_masks import MASK
 from torchrl_tit.settings.numbers import Batch, Fraction, Rate, Steps, Weight
 
-from .core.algorithm import Stateful, Terms, descend
+from .core.algorithm import Terms, descend
 from .core.networks import check_actions, is_discrete, make_value_policy
 from .replay import ReplayAlgorithm, ReplayRecipe
 
@@ -109,13 +109,7 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         mask_key = MASK if recipe.mask_actions else None
         policy = make_value_policy(self.make_backbone(env), spec, mask_key=mask_key)
         self._policy = policy.to(self.device)
-        self.exploration = EGreedyModule(
-            spec,
-            eps_end=recipe.final_epsilon,
-            annealing_num_steps=recipe.exploration_steps,
-            action_mask_key=mask_key,
-            device=self.device,
-        )
+        self.exploration = EGreedyModule(spec, action_mask_key=mask_key, device=self.device)
         self._behavior = TensorDictSequential(self._policy, self.exploration)
         loss = DQNLoss(
             self._policy,
@@ -137,17 +131,13 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
             self.target = SoftUpdate(self.model, tau=self.recipe.tau)
         else:  # copies at each of its steps
             self.target = HardUpdate(self.model, value_network_update_interval=0)
+        self._set_epsilon(step)
         super().prepare(step, folder)
-
-    def state(self) -> Mapping[str, Stateful]:
-        """Optimizer, replay buffer, and the probability of random actions."""
-        return {**super().state(), "exploration": self.exploration}
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor | float]:
         """As :meth:`ReplayAlgorithm.update`; random actions then become less likely."""
         terms = super().update(batch, step)
-        if step + batch.numel() > self.recipe.random_steps:
-            self.exploration.step(batch.numel())
+        self._set_epsilon(step + batch.numel())
         return terms
 
     def collected(self, batch: TensorDictBase) -> TensorDictBase:
@@ -170,3 +160,13 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
         if (number + 1) % self.recipe.target_interval == 0:
             self.target.step()
         return {**terms, "loss": total, "epsilon": self.exploration.eps}
+
+    def _set_epsilon(self, step: int) -> None:
+        """Sets the probability of random actions in the batch that begins at a step.
+
+        TorchRL's module would subtract a little at each step, which float32 rounds: over 32 million
+        steps, to nothing.
+        """
+        recipe = self.recipe
+        done = min(1, max(0, step - recipe.random_steps) / recipe.exploration_steps)
+        self.exploration.eps.fill_(1 - done * (1 - recipe.final_epsilon))

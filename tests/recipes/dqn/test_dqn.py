@@ -156,6 +156,20 @@ def test_exploration(tmp_path: Path) -> None:
     assert algorithm.play(60)[0].returns == algorithm.play(60)[0].returns
 
 
+def test_exploration_follows_the_length_of_the_run(tmp_path: Path) -> None:
+    run = train(SMALL, tmp_path / "run")
+    run.lengthen(120)
+    train(run.recipe, run.folder)
+    rows = read_metrics(run.folder / "metrics.csv")
+    epsilons = [row["epsilon"] for row in rows[6:]]  # 60 steps were done, 40 of them not random
+    expected = [1 - 0.95 * min(1, done / 60) for done in range(40, 100, 10)]
+    assert epsilons == pytest.approx(expected, abs=1e-6)
+    algorithm = make(replace(SMALL, total_steps=100_000_020))
+    algorithm.prepare(25_000_020, tmp_path)
+    algorithm.close()
+    assert algorithm.exploration.eps == pytest.approx(1 - 0.95 / 2)
+
+
 def test_forbidden_actions_are_neither_taken_nor_valued(tmp_path: Path) -> None:
     recipe = replace(SMALL, env="Taxi-v4", mask_actions=True, num_envs=2, total_steps=40)
     train(recipe, tmp_path / "run", batches := Batches())
