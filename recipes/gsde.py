@@ -6,6 +6,7 @@ function of the features whose random weights stay the same for several steps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,11 +63,12 @@ class StateDependentNoise(nn.Module):
 
     def __init__(self, features_dim: int, action_dim: int, steps: int, scale: Tensor) -> None:
         super().__init__()
-        self.gsde = gSDEModule(action_dim, features_dim)
+        # Where gSDEModule clamps, deviations would be others than asked for, and have no gradient.
+        self.gsde = gSDEModule(action_dim, features_dim, scale_min=0.0, scale_max=math.inf)
         # gSDEModule means to do the same, but its argument sigma_init has no effect.
         sigma = scale.unsqueeze(-1) * features_dim**-0.5
         with torch.no_grad():
-            self.gsde.log_sigma.copy_(sigma.expm1().log())
+            self.gsde.log_sigma.copy_(sigma + (-sigma).expm1().neg().log())
         self.steps = steps
         self._weights: Tensor | None = None
         self._left = 0

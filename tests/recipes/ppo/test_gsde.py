@@ -86,6 +86,15 @@ def test_noise_and_log_probabilities_are_those_by_hand(backbone, float64, monkey
         assert len(drawn) == 20  # none in the update
 
 
+@pytest.mark.parametrize("std", [0.05, 200.0, 2000.0])
+def test_every_deviation_can_be_asked_for_and_learns(std):
+    noise = StateDependentNoise(64, 1, steps=4, scale=torch.tensor([std]))
+    _, scale, _ = noise(torch.zeros(1, 1), torch.ones(1, 64))
+    assert_near(scale, torch.tensor([[std]]))
+    scale.sum().backward()
+    assert noise.gsde.log_sigma.grad.all()
+
+
 def test_it_trains_and_is_evaluated_without_noise(tmp_path, monkeypatch):
     run = train(RECIPE, tmp_path / "run")
     trained: Any = load_trained(run)[1]
