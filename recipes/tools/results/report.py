@@ -423,12 +423,12 @@ def _findings(groups: Sequence[Group], columns: Iterable[str]) -> list[tuple[Met
 
 
 def _share_outside(data: RunData, words: MetricWords, bound: float, sign: int) -> float:
-    """The share of rows in which a metric is beyond a limit."""
+    """The share of the rows with a metric in which it is beyond a limit."""
     values = data.values(words.column)
     outside = sign * (values - bound) > 0
     if words.needs in data.rows[0]:  # without changes of that one, it says nothing
         outside &= np.diff(data.values(words.needs), prepend=np.nan) != 0
-    return float(outside.mean())
+    return float(outside.sum() / max(1, np.isfinite(values).sum()))
 
 
 def _description(groups: Sequence[Group]) -> str:
