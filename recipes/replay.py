@@ -175,7 +175,10 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
     def batches(self) -> Iterator[TensorDictBase]:
         """Yields collected batches, [envs, time]; the environments begin new episodes."""
         self.buffer_state.storage.end_episodes()
-        return iter(self.collector)
+        for batch in self.collector:
+            yield batch
+            if not self.collects_here:  # after random steps, too: they may change statistics
+                self.collector.update_policy_weights_()
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor | float]:
         """Stores a batch, then takes gradient steps on samples from the buffer."""
@@ -191,10 +194,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         for number in range(done, done + recipe.updates_per_batch):
             terms = self.learn(to_networks(self.buffer.sample(), self.device), number)
         self.policy.eval()
-        numbers = self.numbers(terms)
-        if not self.collects_here:
-            self.collector.update_policy_weights_()
-        return numbers
+        return self.numbers(terms)
 
     @abstractmethod
     def learn(self, samples: TensorDictBase, number: int) -> Terms:

@@ -160,7 +160,6 @@ def test_sac_stores_the_steps_of_all_environments_in_order(cluster: str, tmp_pat
             *_, weight, bias = algorithm.policy.parameters()
             weight.data.zero_()  # from now on, it pushes as far as it can
             bias.data.copy_(torch.tensor([10.0, -10.0]))
-            algorithm.collector.update_policy_weights_()
     assert len(batches) == 3
     assert all(torch.isfinite(torch.as_tensor(loss)) for loss in losses.values())
     random, *later = (batch["action"] for batch in batches)
