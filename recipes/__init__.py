@@ -6,10 +6,12 @@ When installed, this package is named ``torchrl_tit.recipes``; import it by that
 from __future__ import annotations
 
 import importlib
+import os
 from typing import Any
 
 from .core.package_alias import share_modules
 
+os.environ.setdefault("RAY_AUTH_MODE", "token")  # here: Ray reads it when TorchRL imports it
 share_modules(__name__)
 
 _HOMES = {

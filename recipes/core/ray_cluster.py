@@ -20,7 +20,6 @@ from torchrl_tit.extras import missing
 from torchrl_tit.settings.imports import allowed_modules
 
 _MODE, _LOOPBACK = "RAY_AUTH_MODE", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
-os.environ.setdefault(_MODE, "token")  # here, since Ray reads it when TorchRL imports it
 _PATIENCE = 30.0  # seconds to wait for a cluster's answer, which takes two or three
 _ASK = """
 import json, sys, ray
