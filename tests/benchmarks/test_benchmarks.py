@@ -125,8 +125,8 @@ def test_memories_forget_where_an_episode_begins(monkeypatch):
         seen = steps["observation"].clone()
         seen[:, :2] = 1
         other = steps.copy().set("observation", seen)
-        if backbone.is_recurrent:
-            other["history"] = seen.unsqueeze(2)
+        first = seen if backbone.is_recurrent else seen[:, :1]
+        other["history"] = first.unsqueeze(2).expand_as(steps["history"])
         with set_recurrent_mode(True):
             features = [backbone(x)["features"] for x in (steps, other)]
         assert_near(features[0][:, 2:], features[1][:, 2:])
