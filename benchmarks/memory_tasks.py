@@ -7,7 +7,7 @@ fits MiniGrid-Memory and the T-Maze.
 Training ends early once 98% of the last 500 episodes were successful, and then 98% of as many
 episodes as the recipe's evaluation has, with the most likely actions and seeds of their own. If
 those fail, training goes on for at least 500 episodes. In the end, the final weights are evaluated.
-There is
+With ``--init-from``, training starts with the weights of the runs of another, easier task. There is
 
 - a row in ``runs.csv`` for each run; runs that have one are not repeated;
 - ``successes.csv`` in each run's folder: episodes and successes of each batch.
@@ -24,7 +24,9 @@ from statistics import fmean
 from typing import Any
 
 from recipes.core import runner
+from recipes.core.algorithm import make_algorithm
 from recipes.core.callback import Callback
+from recipes.core.initial_weights import weights_from
 from recipes.core.recipe import Recipe
 from recipes.core.registry import find_recipe
 from recipes.core.run import Run
@@ -106,14 +108,21 @@ class Successes(Callback):
         self._last += [True] * right + [False] * (episodes - right)
 
 
-def measure(recipe: Recipe, folder: Path, threshold: float) -> list[object]:
-    """Trains and evaluates in a run folder, from its newest checkpoint; returns the row."""
+def measure(
+    recipe: Recipe, folder: Path, threshold: float, init_from: Path | None = None
+) -> list[object]:
+    """Trains and evaluates in a run folder, from its newest checkpoint; returns the row.
+
+    A new run starts with the weights of ``init_from``, the folder of another run, if there is one.
+    """
 
     def succeeded(evaluation: dict[str, Any]) -> float:
         return fmean(value > threshold for value in evaluation["returns"])
 
-    started = (folder / "recipe.json").exists()
-    with Run.open(folder) if started else Run.create(folder, recipe) as run:
+    if not (folder / "recipe.json").exists():
+        weights = None if init_from is None else weights_from(init_from, make_algorithm(recipe))[0]
+        Run.create(folder, recipe, weights)
+    with Run.open(folder) as run:
         validation = replace(run.recipe, evaluation_seed=VALIDATION_SEED)
         step = max(checkpoint_steps(run.checkpoints), default=0)
         successes = Successes(folder / "successes.csv", step, threshold)
@@ -141,6 +150,12 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2, 3, 4])
     parser.add_argument("--threshold", type=float, default=0.0, help="successes return more")
+    parser.add_argument(
+        "--init-from",
+        type=Path,
+        metavar="FOLDER",
+        help="runs of another task: each seed starts with the weights of FOLDER/seed-N",
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs and runs.csv")
     options = parser.parse_args(arguments)
 
@@ -148,7 +163,8 @@ def main(arguments: list[str] | None = None) -> None:
 
     def measure_run(name: str, seed: int) -> list[object]:
         recipe = replace(recipes[name], seed=seed)
-        return measure(recipe, options.out / name / f"seed-{seed}", options.threshold)
+        start = options.init_from and options.init_from / f"seed-{seed}"
+        return measure(recipe, options.out / name / f"seed-{seed}", options.threshold, start)
 
     runs = [(name, seed) for seed in options.seeds for name in recipes]
     add_missing_rows(options.out / "runs.csv", COLUMNS, runs, measure_run)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks import memory_tasks, memory_variants
 from benchmarks.measuring import read_rows
@@ -14,6 +15,7 @@ from benchmarks.memory_tasks import EPISODES, Successes
 from recipes.core.algorithm import make_algorithm
 from recipes.core.recipe_json import recipe_to_json
 from recipes.core.registry import find_recipe, get_recipe
+from recipes.core.run import Run
 
 NAME = "ppo/tmaze-10/frames-4"
 SHORT: dict[str, Any] = {
@@ -57,6 +59,20 @@ def test_training_ends_where_the_task_is_solved(short, tmp_path, monkeypatch):
     [row] = read_rows(tmp_path / "runs.csv")
     assert (row["steps"], row["success"]) == ("256", "1.0")
     assert row["steps_to_0.9"] == ""  # that takes a hundred episodes
+
+
+def test_each_seed_starts_with_the_weights_of_its_run_on_another_task(short, tmp_path):
+    words = [NAME, "--seeds", "0", "--out"]
+    memory_tasks.main([*words, str(tmp_path / "first")])
+    memory_tasks.main(
+        [*words, str(tmp_path / "next"), "--init-from", str(tmp_path / "first" / NAME)]
+    )
+    first, then = (Run.open(tmp_path / name / NAME / "seed-0") for name in ("first", "next"))
+    start, trained = then.load_initial_weights(), first.load_trained()[1]["networks"]
+    assert start and start.keys() <= trained.keys()
+    for name, weight in start.items():
+        assert torch.equal(weight, trained[name])
+    assert not first.initial_weights
 
 
 def test_when_nine_in_ten_are_reached(tmp_path):
