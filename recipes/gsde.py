@@ -19,11 +19,11 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.modules.models.exploration import gSDEModule
 
 from torchrl_tit.layers import init_orthogonal_
-from torchrl_tit.modules.action_specs import initial_scale
+from torchrl_tit.modules.action_specs import describe, initial_scale
 from torchrl_tit.modules.tensor_module import TensorModule
 from torchrl_tit.settings.numbers import Steps
 
-from .core.networks import describe, is_continuous
+from .core.networks import is_continuous
 from .ppo import PPO, ActorCritic, PPOAlgorithm
 
 

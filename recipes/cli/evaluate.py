@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,16 @@ def evaluate(arguments: list[str]) -> None:
     """Evaluates the newest checkpoint of a run: its last weights, or its best ones."""
     parser = Parser("evaluate", "Evaluate a run's newest checkpoint.")
     parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument(
+        "--env",
+        help="another task to play, with the same observations and actions; default: the recipe's",
+    )
+    parser.add_argument(
+        "--env-settings",
+        nargs="+",
+        metavar="NAME=VALUE",
+        help="settings of the task; default: the recipe's",
+    )
     parser.add_argument("--episodes", type=int, help="episodes; default: the recipe's")
     parser.add_argument("--seed", type=int, help="seed of the first episode; default: the recipe's")
     parser.add_argument(
@@ -37,8 +48,9 @@ def evaluate(arguments: list[str]) -> None:
     parser.add_argument(
         "--out",
         type=Path,
-        help="file to write; default: RUN/evaluation.json, with _best and other --episodes, "
-        "--seed, --dataset or --ope in its name: it never replaces the run's own evaluation",
+        help="file to write; default: RUN/evaluation.json, with _best and other --env, "
+        "--env-settings, --episodes, --seed, --dataset or --ope in its name: it never replaces the "
+        "run's own evaluation",
     )
     add_machine_options(parser)
     options = parser.parse_args(arguments)
@@ -46,8 +58,13 @@ def evaluate(arguments: list[str]) -> None:
     from ..core.run import Run
 
     run = Run.open(options.run)
+    task_settings = options.env_settings
+    if options.env and not run.recipe.env:
+        task_settings = task_settings or []  # those of the recipe say what the data are
     recipe = override(
         run.recipe,
+        env=options.env,
+        env_settings=None if task_settings is None else tuple(task_settings),
         evaluation_episodes=options.episodes,
         evaluation_seed=options.seed,
         device=options.device,
@@ -59,7 +76,9 @@ def evaluate(arguments: list[str]) -> None:
         fail(f"--out {options.out} is a folder: name a file in it, such as evaluation.json")
     if options.ope is not None and options.dataset is None:
         fail("--ope estimates returns from data: name them with --dataset FILE")
-    if options.episodes is not None and (options.dataset is not None or not run.recipe.env):
+    if options.dataset is not None and (options.env or options.env_settings):
+        fail("--env and --env-settings name what is played: leave them out where data are measured")
+    if options.episodes is not None and (options.dataset is not None or not recipe.env):
         fail("--episodes are those that are played: leave it out where data are measured")
     # Only one process at a time may write to the run folder.
     lock: AbstractContextManager[Any] = run if options.out is None else nullcontext()
@@ -85,13 +104,17 @@ def _file_name(
 ) -> str:
     """Builds a file name from the settings that differ from the run's own evaluation."""
     parts = ["evaluation", *(["best"] if best else [])]
+    if recipe.env != own.env:
+        parts.append(f"env-{recipe.env}")
+    if recipe.env_settings != own.env_settings:
+        parts += recipe.env_settings
     for field in ("episodes", "seed"):
         value = getattr(recipe, f"evaluation_{field}")
         if value != getattr(own, f"evaluation_{field}"):
             parts.append(f"{field}-{value}")
     if dataset is not None:
         parts += [f"dataset-{Path(dataset).stem}", *([ope] if ope else [])]
-    return f"{'_'.join(parts)}.json"
+    return re.sub(r"[^.=\w-]+", "-", "_".join(parts)) + ".json"
 
 
 def _free(path: Path, dataset: str | None) -> Path:
@@ -118,8 +141,8 @@ def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
     held_out = f"\n{_measured(evaluation)}" if "held_out" in evaluation else ""
     return (
         f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
-        f"{evaluation['episodes']} episodes after {evaluation['steps']} {recipe.unit} "
-        f"({evaluation['weights']} weights{new}){held_out}"
+        f"{evaluation['episodes']} episodes of {recipe.env} after {evaluation['steps']} "
+        f"{recipe.unit} ({evaluation['weights']} weights{new}){held_out}"
     )
 
 

@@ -26,7 +26,7 @@ from torchrl_tit.envs import observation_specs
 from torchrl_tit.frames import NormalizedFrames, share_statistics
 from torchrl_tit.frames.observation import Observations, read_observations
 from torchrl_tit.modules import Backbone, as_sequences, history_keys, make_actor
-from torchrl_tit.modules.action_specs import has_bounds
+from torchrl_tit.modules.action_specs import describe, has_bounds
 from torchrl_tit.modules.backbone import trunks_of
 from torchrl_tit.modules.sequences import default_observation_keys
 from torchrl_tit.modules.tensor_module import TensorModule, TensorValue
@@ -251,15 +251,6 @@ def is_continuous(spec: TensorSpec) -> bool:
 def is_discrete(spec: TensorSpec) -> bool:
     """Whether an action is a single discrete choice; TorchRL's specs of several are subclasses."""
     return type(spec) is Categorical and spec.ndim == 0
-
-
-def describe(spec: TensorSpec) -> str:
-    """Describes actions, for messages."""
-    kind = "continuous" if spec.dtype.is_floating_point else "discrete"
-    within = ""
-    if isinstance(spec, Bounded):
-        within = f", from {spec.space.low.tolist()} to {spec.space.high.tolist()}"
-    return f"{kind} ({type(spec).__name__}, shape {list(spec.shape)}{within})"
 
 
 def check_actions(recipe: Recipe, spec: TensorSpec, fit: bool, needed: str, instead: str) -> None:

@@ -16,7 +16,9 @@ import torch
 from torch import nn
 
 from torchrl_tit.checkpoint import checkpoint_steps, global_rng_state, set_global_rng_state
+from torchrl_tit.envs import observation_specs
 from torchrl_tit.evaluation import watching_episodes
+from torchrl_tit.modules.action_specs import describe
 
 from .algorithm import Algorithm, Stateful, check_weights, load_weights, make_algorithm, naming
 from .callback import Callback
@@ -218,7 +220,8 @@ def evaluate(
 
     Args:
         run: a run folder with a checkpoint.
-        recipe: the run's recipe, if some of its settings are overridden.
+        recipe: the run's recipe, if some of its settings are overridden, also its task: the policy
+            stays as it was trained.
         callbacks: hooks that are given the outcomes.
         best: whether to evaluate the best weights of the checkpoint instead of the last ones.
 
@@ -228,18 +231,24 @@ def evaluate(
 
     Raises:
         FileNotFoundError: if there is no checkpoint.
-        ValueError: if the checkpoint has no best weights yet.
+        ValueError: if the checkpoint has no best weights yet, or another task has other
+            observations or actions.
         FloatingPointError: if a reward is NaN or infinite.
     """
     recipe = recipe or run.recipe
+    task = {"env": recipe.env, "env_settings": recipe.env_settings}
+    own: dict[str, Any] = {name: getattr(run.recipe, name) for name in task}
     step, state = run.load_trained()
     with run.restoring(step):
         record = read_state(state["record"], recipe)
     outcomes = record.outcomes
     if best:
         recipe = with_fresh_seed(recipe, record)
-        outcomes = []  # by which the weights were chosen
-    step, algorithm = load_networks(run, recipe, step, state, best=best)
+    if best or task != own:
+        outcomes = []  # by which the weights were chosen, or of another task
+    step, algorithm = load_networks(run, replace(recipe, **own), step, state, best=best)
+    if task != own:
+        _change_task(algorithm, **task)
     recipe = algorithm.recipe
     same_seed = record.evaluation_seed == recipe.evaluation_seed
     targets: list[float | None] = [*recipe.target_columns] or [None]
@@ -268,6 +277,30 @@ def evaluate(
         "seed": recipe.evaluation_seed,
         "weights": "best" if best else "last",
     }
+
+
+def _change_task(algorithm: Algorithm[Any], **task: Any) -> None:
+    """Changes the task that a policy plays, whose networks stay as they were built.
+
+    Raises:
+        ValueError: if its observations or actions are others.
+    """
+    before = algorithm.recipe
+    specs = []
+    for recipe in (before, replace(before, **task)):
+        algorithm.recipe = recipe
+        with closing(algorithm.make_env(1)) as env:
+            observation = observation_specs(env)
+            named = observation if isinstance(observation, dict) else {"observation": observation}
+            specs.append({**named, "action": env.action_spec_unbatched})
+    own, new = specs
+    for name in {**own, **new}:
+        if own.get(name) != new.get(name):
+            own_kind, kind = (describe(found[name]) if name in found else "none" for found in specs)
+            raise ValueError(
+                f"{algorithm.recipe.env} has the {name} {kind}, but the policy was trained in "
+                f"{before.task_name} with {own_kind}: it can play only tasks that have the same"
+            )
 
 
 def with_fresh_seed(recipe: Recipe, record: RecordState) -> Recipe:

@@ -24,11 +24,12 @@ from torchrl_tit.datasets import DatasetError, Episodes, HistoryStorage
 from torchrl_tit.datasets.hdf5_files import damage_named, find, open_hdf5
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.frames import NormalizedFrames
+from torchrl_tit.modules.action_specs import describe
 from torchrl_tit.networks.building import evaluating
 from torchrl_tit.settings.networks import mlp
 
 from ..core.algorithm import descend, storage_device, to_networks
-from ..core.networks import describe, is_continuous, is_discrete, make_critic
+from ..core.networks import is_continuous, is_discrete, make_critic
 from ..core.optional import tqdm
 from ..core.recipe import DatasetRecipe, Recipe
 from ..core.run import Run

@@ -69,7 +69,8 @@ def test_each_seed_starts_with_the_weights_of_its_run_on_another_task(short, tmp
     )
     first, then = (Run.open(tmp_path / name / NAME / "seed-0") for name in ("first", "next"))
     start, trained = then.load_initial_weights(), first.load_trained()[1]["networks"]
-    assert start and start.keys() <= trained.keys()
+    assert start
+    assert start.keys() <= trained.keys()
     for name, weight in start.items():
         assert torch.equal(weight, trained[name])
     assert not first.initial_weights

@@ -289,6 +289,26 @@ def test_of_two_that_begin_at_once_one_gets_the_folder(tmp_path, monkeypatch):
     assert Run.open(folder).recipe == SMALL
 
 
+def test_the_policy_plays_other_tasks_as_it_was_trained(run, capsys):
+    own = run.read("evaluation.json")
+    for options, episode, name in (
+        (["--env", "CartPole-v0"], None, "evaluation_env-CartPole-v0.json"),
+        (["--env-settings", "sutton_barto_reward=True"], -1.0, None),  # -1 at the end alone
+        (["--env-settings", "max_episode_steps=3"], 3.0, "evaluation_max_episode_steps=3.json"),
+    ):
+        main(["evaluate", str(run.folder), *options])
+        written = Path(capsys.readouterr().out.split("written to ")[1].strip())
+        assert name in (None, written.name)
+        evaluation = json.loads(written.read_text())
+        assert evaluation["env"] == ("CartPole-v0" if "v0" in written.name else "CartPole-v1")
+        assert episode is None or {*evaluation["returns"]} == {episode}
+    assert run.read("evaluation.json") == own
+    message = fails(capsys, "evaluate", run.folder, "--env", "MountainCar-v0")
+    assert "MountainCar-v0 has the observation Unbounded(shape=[2], dtype=float32)" in message
+    message = fails(capsys, "evaluate", run.folder, "--env", "Nowhere-v0")
+    assert "Unknown task 'Nowhere-v0'" in message
+
+
 def test_a_run_in_use_is_evaluated_into_another_file_only(tmp_path, capsys):
     run = untrained(tmp_path / "run", SMALL)
     record = Record(SMALL, make_algorithm(SMALL)).state_dict()

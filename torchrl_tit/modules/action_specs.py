@@ -150,10 +150,22 @@ def describe(spec: TensorSpec) -> str:
     Example:
         >>> describe(Binary(3))
         'Binary(shape=[3], dtype=int8)'
+        >>> describe(Bounded(-2.0, 2.0, (1,)))
+        'Bounded(shape=[1], dtype=float32, low=[-2.0], high=[2.0])'
+        >>> describe(MultiCategorical([3, 2]))
+        'MultiCategorical(shape=[2], dtype=int64, n=[3, 2])'
     """
     if not isinstance(spec, TensorSpec):
         return repr(spec)
     if isinstance(spec, Composite):
         return f"Composite({', '.join(map(str, spec.keys()))})"
-    dtype = str(spec.dtype).removeprefix("torch.")
-    return f"{type(spec).__name__}(shape={list(spec.shape)}, dtype={dtype})"
+    said = {"shape": list(spec.shape), "dtype": str(spec.dtype).removeprefix("torch.")}
+    if isinstance(spec, Bounded):
+        ends = {"low": spec.space.low, "high": spec.space.high}
+        said |= {end: bound.unique().tolist() for end, bound in ends.items()}
+    if isinstance(spec, MultiCategorical):
+        said["n"] = spec.nvec.tolist()
+    elif isinstance(spec, Categorical):
+        said["n"] = spec.space.n
+    kind = type(spec).__name__.removesuffix("Continuous").removesuffix("Discrete")
+    return f"{kind}({', '.join(f'{name}={value}' for name, value in said.items())})"

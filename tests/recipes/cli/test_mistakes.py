@@ -44,6 +44,10 @@ MISTAKES = [
     (f"{BACKBONE}.network enhanced", "did you mean enhanced-tit"),
     ("evaluate nowhere", "is not a run folder"),
     ("evaluate run --dataset a.hdf5 --episodes 3", "--episodes are those that are played"),
+    (
+        "evaluate run --dataset a.hdf5 --env Other-v0",
+        "--env and --env-settings name what is played",
+    ),
     (f"tune {MLP} --out new --seeds 0 -1", "seed must be at least 0, not -1"),
     (f"tune {MLP} --out new --epochs 4", "--epochs is searched, so it has no value: leave it out"),
     ("play cart", "no agent or folder 'cart': did you mean cartpole"),
