@@ -21,8 +21,8 @@ from unittest.mock import patch
 
 import torch
 
-from recipes.tools.results.numbers import number
-from recipes.tools.results.numbers import numbers as format_all
+from recipes.core.numbers import number
+from recipes.core.numbers import numbers as format_all
 from torchrl_tit.files import write_text_atomic
 
 _PACKAGES = ["torch", "torchrl", "tensordict", "gymnasium", "stable-baselines3", "transformers"]

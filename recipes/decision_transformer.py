@@ -48,6 +48,7 @@ from torchrl_tit.transforms import SequenceHistory
 from .core.algorithm import Stateful, Terms, check_without_waiting, storage_device, total_loss
 from .core.evaluation import Outcome
 from .core.networks import normalize_frames
+from .core.numbers import number
 from .core.recipe import DatasetRecipe
 from .core.task import make_task, task_limit
 from .offline import DatasetAlgorithm, action_error, read_data
@@ -411,8 +412,8 @@ def warn_of_targets(target_returns: Sequence[float], episodes: Episodes) -> None
     if outside:
         warnings.warn(
             f"target_returns {', '.join(f'{target:g}' for target in outside)}: no episode in "
-            f"{episodes.source} has such a return; they range from {low:.1f} to {high:.1f}, with a "
-            f"mean of {returns.mean().item():.1f}",
+            f"{episodes.source} has such a return; they range from {number(low)} to "
+            f"{number(high)}, with a mean of {number(returns.mean().item())}",
             stacklevel=2,
         )
 

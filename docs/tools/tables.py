@@ -44,6 +44,7 @@ from typing import Any
 import numpy as np
 
 from docs.tools import paper
+from recipes.core.numbers import mean_std, number, numbers
 from recipes.core.records import Records
 from recipes.core.run import RecordedRun
 from recipes.tools.results.comparison import (
@@ -53,7 +54,6 @@ from recipes.tools.results.comparison import (
     read_references,
 )
 from recipes.tools.results.interval import FEWEST, interval_of
-from recipes.tools.results.numbers import mean_std, number, numbers
 from recipes.tools.results.paper import match
 from torchrl_tit.files import write_text_atomic
 

@@ -13,6 +13,7 @@ from torchrl_tit.settings.checks import checked
 from torchrl_tit.settings.literals import parse_assignments
 from torchrl_tit.settings.numbers import Episodes, Seed, Steps, StepsOrNone, Threads
 
+from ..core.numbers import plus_minus
 from .arguments import Parser, add_agent, add_best, check_numbers, fail, say
 
 _EPISODES = 10
@@ -56,12 +57,13 @@ def play(arguments: list[str]) -> None:
         returns = torch.tensor(played, dtype=torch.float64)
     known = agent.evaluation
     before = (
-        f"; its evaluation: {known['mean']:.1f} ± {known['std']:.1f} over {known['episodes']}"
+        f"; its evaluation: {plus_minus(known['mean'], known['std'])} over {known['episodes']}"
         if known
         else ""
     )
+    now = plus_minus(returns.mean().item(), returns.std(correction=0).item())
     say(
-        f"{agent.name}: return {returns.mean():.1f} ± {returns.std(correction=0):.1f} over "
+        f"{agent.name}: return {now} over "
         f"{len(returns)} episode{'s' * (len(returns) > 1)} of {agent.recipe['env']}{before}"
     )
     if options.out is not None:
@@ -78,9 +80,9 @@ def _list() -> None:
         fail("no agents come with this copy of torchrl-tit: name a folder or hf:user/name")
     for name in names:
         evaluation = read_agent(find_agent(name)).evaluation
+        returned = plus_minus(evaluation["mean"], evaluation["std"])
         say(
-            f"{name}: {evaluation['env']}, return {evaluation['mean']:.1f} ± "
-            f"{evaluation['std']:.1f} over {evaluation['episodes']} episodes"
+            f"{name}: {evaluation['env']}, return {returned} over {evaluation['episodes']} episodes"
         )
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..core.numbers import plus_minus
 from ..core.recipe import Recipe
 from .arguments import Parser, add_machine_options, fail, override, say
 
@@ -140,7 +141,7 @@ def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
     new = f", on new episodes from seed {evaluation['seed']}" if best else ""
     held_out = f"\n{_measured(evaluation)}" if "held_out" in evaluation else ""
     return (
-        f"{recipe.name}: return {evaluation['mean']:.1f} ± {evaluation['std']:.1f} over "
+        f"{recipe.name}: return {plus_minus(evaluation['mean'], evaluation['std'])} over "
         f"{evaluation['episodes']} episodes of {recipe.env} after {evaluation['steps']} "
         f"{recipe.unit} ({evaluation['weights']} weights{new}){held_out}"
     )

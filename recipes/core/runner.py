@@ -25,6 +25,7 @@ from .callback import Callback
 from .evaluation import summarize
 from .interrupt import Interrupt
 from .metrics import Metrics
+from .numbers import number
 from .optional import tqdm
 from .progress import EPISODES, Best, Record, RecordState, read_state
 from .recipe import Recipe
@@ -154,7 +155,7 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
 def _shown(row: Mapping[str, float], algorithm: Algorithm[Any]) -> str:
     """What the progress line shows of a row of metrics; nothing if it has no evaluation."""
     if not math.isnan(row["return_mean"]):
-        return f"return {row['return_mean']:.1f}"
+        return f"return {number(row['return_mean'])}"
     known = {x: row[x] for x in algorithm.held_out_columns if not math.isnan(row[x])}
     words = [f"{name.removeprefix('held_out_')} {value:.3g}" for name, value in known.items()]
     return f"held out: {', '.join(words)}" if words else ""

@@ -47,8 +47,12 @@ at the junction."""
 _REPEATS = {"easy": 500_000, "medium": 500_000}
 """The number of steps of POPGym's RepeatPrevious by difficulty: 4 or 32 steps back."""
 
-_MINIGRIDS = {7: 1_000_000, 9: 2_000_000, 11: 4_000_000}
-"""The number of steps by the size of the maze."""
+_MINIGRIDS = {
+    "S7": 1_000_000,
+    "S9": 2_000_000,
+    **dict.fromkeys(("S11", "S13", "S17Random"), 4_000_000),
+}
+"""The number of steps by the maze: its size, which varies up to it where it is random."""
 
 VIEW = (
     "minigrid.wrappers:RGBImgPartialObsWrapper(tile_size=8)",
@@ -131,12 +135,12 @@ def _named() -> list[Preset]:
     # As in arXiv 2505.15040: a view of 3 x 3 tiles, and episodes are truncated after 96 steps.
     # `max_steps=96` would truncate them too, but a step would then cost 0.9 / 96 of the reward
     # instead of 0.9 / 245 on S7, and looking at the cue would not pay. A patch is a tile.
-    for size, total_steps in _MINIGRIDS.items():
+    for maze, total_steps in _MINIGRIDS.items():
         recipes += of_networks(
             PPO,
-            f"ppo/memory-s{size}",
+            f"ppo/memory-{maze.lower()}",
             memory_networks(32, patch_size=8),
-            env=f"MiniGrid-MemoryS{size}-v0",
+            env=f"MiniGrid-Memory{maze}-v0",
             env_settings=("agent_view_size=3", "max_episode_steps=96"),
             wrappers=VIEW,
             total_steps=total_steps,

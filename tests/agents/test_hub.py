@@ -8,6 +8,7 @@ import pytest
 from huggingface_hub import errors
 
 from recipes.cli import main
+from recipes.core.numbers import plus_minus
 from tests.agents.hub import LocalHub
 from tests.agents.runs import make_run
 from tests.recipes.commands import fails
@@ -59,7 +60,7 @@ def test_the_card_has_metadata_that_the_hub_reads(hub, run):
     assert result.metric_value == f"{evaluation['mean']:.2f} +/- {evaluation['std']:.2f}"
     assert (result.metric_type, result.dataset_name) == ("mean_reward", "CartPole-v1")
     assert 'load_agent("hf:me/small")' in card.text
-    assert f"**{evaluation['mean']:.1f} ± {evaluation['std']:.1f}**" in card.text
+    assert f"**{plus_minus(evaluation['mean'], evaluation['std'])}**" in card.text
     assert "(5 to 7)" in card.text  # the seeds of three episodes
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from recipes.cli import main
 from recipes.core.metrics import read_metrics
+from recipes.core.numbers import number
 from recipes.core.recipe_json import recipe_from_json, recipe_to_json
 from recipes.core.registry import RECIPES
 from recipes.core.run import Run
@@ -74,7 +75,7 @@ def test_a_removed_field_is_read_only_where_it_did_nothing(written, field):
 def test_an_agent_plays_as_it_did(kind, capsys):
     assert load_agent(DATA / kind).evaluate().tolist() == RETURNS
     main(["play", str(DATA / kind), "--episodes", "3"])
-    assert f"return {sum(RETURNS) / 3:.1f}" in capsys.readouterr().out
+    assert f"return {number(sum(RETURNS) / 3)}" in capsys.readouterr().out
 
 
 def test_a_run_is_evaluated_and_trained_further(run):

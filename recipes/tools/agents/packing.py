@@ -18,6 +18,7 @@ from torchrl_tit.agents.folder import CARD, RECIPE, VERSIONS, WEIGHTS
 from torchrl_tit.agents.hub import import_hub
 from torchrl_tit.evaluation_file import EVALUATION
 
+from ...core.numbers import plus_minus
 from ...core.recipe import DatasetRecipe, Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.run import Run
@@ -80,6 +81,7 @@ def pack(
         source=source or name,
         steps=steps,
         versions=run.versions(),
+        start=", starting with the weights of another run" if run.initial_weights else "",
         parameters=sum(weight.numel() for weight in networks.parameters()),
     )
     files = {
@@ -173,7 +175,7 @@ def _results(evaluation: Mapping[str, Any]) -> str:
     if evaluation.get("weights") == "best":
         target += " The weights had the highest return in training; these episodes are new."
     return (
-        f"Mean return **{evaluation['mean']:.1f} ± {evaluation['std']:.1f}** (standard deviation) "
+        f"Mean return **{plus_minus(evaluation['mean'], evaluation['std'])}** (standard deviation) "
         f"over\n{episodes} whole episodes, each with its own seed ({first} to "
         f"{first + episodes - 1}), always the most\nlikely action, in the task's own "
         f"rewards.{target} The return of each episode is in\n`evaluation.json`."

@@ -23,6 +23,7 @@ from torchrl_tit.settings.networks import mlp
 
 from ...core.algorithm import Algorithm, make_algorithm, naming
 from ...core.callback import Callback
+from ...core.numbers import number
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.registry import find_recipe
@@ -123,7 +124,7 @@ class FinishedRun(DataAgent):
         if mark is not None and score.mean < mark:
             raise ValueError(
                 f"{name} {mark:g} is not reached by the run in {self.settings.agent}: its agent "
-                f"has a mean return of {score.mean:.1f} after {self._step} steps"
+                f"has a mean return of {number(score.mean)} after {self._step} steps"
             )
         return score
 
@@ -239,8 +240,8 @@ class AgentInTraining(DataAgent, Callback):
         best = max(score.mean for score in self._scores)
         return (
             f"{name} {mark:g} was never reached in {self._step} steps: the best of "
-            f"{len(self._scores)} evaluations had a mean return of {best:.1f}. Raise total_steps, "
-            "and the same command resumes; or choose another mark and another folder"
+            f"{len(self._scores)} evaluations had a mean return of {number(best)}. Raise "
+            "total_steps, and the same command resumes; or choose another mark and another folder"
         )
 
 

@@ -36,6 +36,7 @@ from torchrl_tit.files import remove_leftovers, write_text_atomic
 from torchrl_tit.modules import acting
 
 from ...core.algorithm import naming
+from ...core.numbers import number
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.run import locked, package_versions
@@ -217,7 +218,7 @@ class _Sets:
         shutil.rmtree(parts.folder)
         return (
             f"{kind}: {episodes.num_transitions} transitions in {len(episodes.lengths)} episodes, "
-            f"mean return {episodes.returns.mean():.1f}: {hdf5} and {minari.name}"
+            f"mean return {number(episodes.returns.mean().item())}: {hdf5} and {minari.name}"
         )
 
     def _random(self, parts: TransitionParts) -> Episodes:

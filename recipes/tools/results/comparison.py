@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm, permutation_test, trim_mean
 
+from ...core.numbers import mean_std, number
 from ...core.recipe import Recipe
 from .experiments import TASK
 from .interval import FEWEST, Interval
-from .numbers import mean_std, number, read_rows
+from .package_rows import read_rows
 from .table import measure_of, read_evaluations, value_of
 
 Task = tuple[Any, ...]

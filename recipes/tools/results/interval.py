@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import bootstrap, trim_mean
 
-from .numbers import number, numbers
+from ...core.numbers import number, numbers
 
 FEWEST = 5
 """Of fewer runs, the quarters at both ends are no runs, and intervals say nothing."""

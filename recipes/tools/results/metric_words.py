@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from ...core.recipe import Recipe, get_recipe_class
-from .numbers import read_rows
+from .package_rows import read_rows
 
 _TARGET = re.compile(r"return_-?[\d.]+(e[+-]?\d+)?")
 _TIMES = " * "

@@ -12,7 +12,7 @@ from torchrl_tit.settings.checks import printable
 from ...core.recipe import DatasetRecipe, Recipe
 from ...core.registry import RECIPES, get_recipe
 from .experiments import TASK, changes_of, fields_of
-from .numbers import read_rows
+from .package_rows import read_rows
 
 HEADINGS = {
     "1": "table 1: online, images",

@@ -29,6 +29,7 @@ from torchrl_tit.agents import TrainedAgent
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.files import write_text_atomic
 
+from ...core.numbers import number, numbers
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.registry import RECIPES
@@ -47,7 +48,6 @@ from .experiments import (
 from .explanation import ExplainedStep, Explainer, explain_episode
 from .film import film_policy, make_rendered
 from .metric_words import MetricWords, known_columns, limit, words_of
-from .numbers import number, numbers
 from .plot import (
     WINDOW,
     Curve,

@@ -13,12 +13,13 @@ from typing import Any
 from torchrl_tit.scores import has_reference
 
 from ...core import records
+from ...core.numbers import mean_std, number, numbers
 from ...core.recipe import Recipe
 from ...core.registry import RECIPES
 from ...core.run import Run
 from .experiments import Experiment, find_runs, group_runs, label
 from .interval import FEWEST, Interval, interval_of
-from .numbers import mean_std, number, numbers, read_rows
+from .package_rows import read_rows
 from .paper import HEADINGS, TASK, Match, has_its_data, match, paper_cells, plain_name
 from .plot import new_figure, plain, save_figure
 

@@ -29,6 +29,7 @@ from ...core.evaluation import score_of
 from ...core.interrupt import raise_on_signals
 from ...core.metrics import read_metrics
 from ...core.networks import name_chosen_encoders
+from ...core.numbers import number
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.records import to_csv
@@ -226,7 +227,7 @@ class Search:
 
     def _show_best(self, progress: tqdm[Any]) -> None:
         if best := self.best():
-            progress.set_postfix_str(f"best {best.value:.1f}, trial {best.number}")
+            progress.set_postfix_str(f"best {number(best.value)}, trial {best.number}")
 
     def best(self) -> FrozenTrial | None:
         """The best trial so far, whose recipe is in ``best.json``; None before the first."""

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from recipes.cli import main
+from recipes.core.numbers import number, plus_minus
 from tests.agents.runs import make_run
 from tests.recipes.commands import fails
 from torchrl_tit.agents import agent_names, load_agent
@@ -23,7 +24,7 @@ def test_the_list_of_agents(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [line.partition(":")[0] for line in lines] == agent_names()
     [cartpole] = [line for line in lines if line.startswith("cartpole:")]
-    assert "CartPole-v1, return 500.0 ± 0.0 over 100 episodes" in cartpole
+    assert "CartPole-v1, return 500 ± 0 over 100 episodes" in cartpole
 
 
 def test_an_agent_plays_and_is_filmed(run, tmp_path, capsys):
@@ -34,13 +35,13 @@ def test_an_agent_plays_and_is_filmed(run, tmp_path, capsys):
     for source in (tmp_path / "agent", run):
         main(["play", str(source), "--episodes", "3"])
         [line] = capsys.readouterr().out.splitlines()
-        mean = f"{evaluation['mean']:.1f} ± {evaluation['std']:.1f} over 3"
+        mean = f"{plus_minus(evaluation['mean'], evaluation['std'])} over 3"
         expected = f"return {mean} episodes of CartPole-v1; its evaluation: {mean}"
         assert line == f"{source}: {expected}"
     film = tmp_path / "film.gif"
     main(["play", str(tmp_path / "agent"), "--out", str(film), "--seed", "6"])
     returned = evaluation["returns"][1]  # of the second episode, whose seed is 5 + 1
-    assert f"return {returned:.1f} ± 0.0 over 1 episode of" in capsys.readouterr().out
+    assert f"return {number(returned)} ± 0 over 1 episode of" in capsys.readouterr().out
     shown = [imageio.immeta(film, index=i)["duration"] for i in range(len(imageio.imread(film)))]
     assert sum(shown) == 20 * returned  # a picture a step, at 50 a second
     assert f"{film} exists already" in fails(capsys, "play", run, "--out", film)

@@ -8,6 +8,7 @@ from PIL import Image, ImageSequence
 
 from recipes.cli import main
 from recipes.core.algorithm import make_algorithm
+from recipes.core.numbers import plus_minus
 from recipes.core.runner import load_trained
 from recipes.ppo import PPO
 from recipes.tools.results.film import film_policy
@@ -40,7 +41,8 @@ def test_one_picture_a_step(cartpole, tmp_path, capsys, suffix):
     main(["play", str(cartpole.folder), "--out", str(film), "--episodes", "2", "--seed", "5"])
     _, algorithm, _ = load_trained(cartpole)
     returns = evaluate(algorithm.make_env, algorithm.policy, 2, seed=5)
-    assert f"return {returns.mean():.1f} ± " in capsys.readouterr().out
+    returned = plus_minus(returns.mean().item(), returns.std(correction=0).item())
+    assert f"return {returned} over 2 episodes" in capsys.readouterr().out
     pictures = imageio.imread(film)
     assert pictures.shape[1:] == (400, 600, 3)
     if suffix == ".gif":  # where two pictures are the same, one is shown for longer

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from recipes.cli import main
+from recipes.core.numbers import number
 from recipes.core.recipe_json import recipe_from_json
 from recipes.tools.results import report as reports
-from recipes.tools.results.numbers import number
 from tests.recipes.commands import fails
 from tests.recipes.results.report_runs import metrics_of, write_run
 from tests.recipes.untrained import untrained

@@ -120,10 +120,10 @@ def test_a_search_that_was_killed_goes_on(files, capsys, monkeypatch):
     means = [
         json.loads((out / f"trial-{n}/seed-0/evaluation.json").read_text())["mean"] for n in (0, 1)
     ]
-    number = means.index(max(means))
-    assert best == recipe_from_json((out / f"trial-{number}.json").read_bytes(), "")
-    assert best.name == f"ppo/cartpole/mine/trial-{number}"
-    assert f"best of 2 trials: {max(means):.1f} with learning_rate" in capsys.readouterr().out
+    chosen = means.index(max(means))
+    assert best == recipe_from_json((out / f"trial-{chosen}.json").read_bytes(), "")
+    assert best.name == f"ppo/cartpole/mine/trial-{chosen}"
+    assert f"best of 2 trials: {number(max(means))} with learning_rate" in capsys.readouterr().out
 
     main(["table", str(out)])  # where each trial stands under its name
     assert "| ppo/cartpole/mine/trial-1 | 1 |" in capsys.readouterr().out

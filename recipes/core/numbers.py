@@ -1,14 +1,8 @@
-"""Numbers for people: three significant digits, and the same decimals side by side.
-
-And the tables of numbers that come with this package.
-"""
+"""Numbers for people: three significant digits, and the same decimals side by side."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterator, Sequence
-from importlib import resources
+from collections.abc import Sequence
 from math import floor, isfinite, log10
 from statistics import fmean, stdev
 
@@ -57,6 +51,16 @@ def number(value: float) -> str:
     return numbers([value])[0]
 
 
+def plus_minus(mean: float, spread: float) -> str:
+    """Writes a mean and its spread.
+
+    Example:
+        >>> plus_minus(0.9724, 0.0119), plus_minus(7.32, 16.8), plus_minus(500, 0)
+        ('0.972 ± 0.012', '7.3 ± 16.8', '500 ± 0')
+    """
+    return " ± ".join(numbers([mean, spread]))
+
+
 def mean_std(values: Sequence[float]) -> str:
     """Writes a mean and the sample standard deviation; of one value, the value.
 
@@ -66,10 +70,4 @@ def mean_std(values: Sequence[float]) -> str:
     """
     if len(values) == 1:
         return number(values[0])
-    return " ± ".join(numbers([fmean(values), stdev(values)]))
-
-
-def read_rows(file: str) -> Iterator[dict[str, str]]:
-    """Reads a CSV file that lies beside this module."""
-    text = resources.files(__package__).joinpath(file).read_text(encoding="utf-8")
-    yield from csv.DictReader(io.StringIO(text))
+    return plus_minus(fmean(values), stdev(values))
