@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from recipes.cli import main
+from recipes.core.numbers import number
 from recipes.core.recipe_json import recipe_from_json, recipe_to_json
 from recipes.core.registry import get_recipe
 from recipes.core.run import Run
