@@ -1,6 +1,7 @@
 """Agents play mazes that they were not trained in."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -10,7 +11,7 @@ from recipes.core.registry import get_recipe
 from tests.recipes.small import train
 
 NAME = "ppo/memory-s7/frames-4"
-SHORT = {
+SHORT: dict[str, Any] = {
     "total_steps": 64,
     "num_envs": 2,
     "steps_per_batch": 64,
