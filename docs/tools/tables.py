@@ -307,6 +307,7 @@ MEASURES: dict[str, Callable[..., str]] = {
     # Rows of benchmarks.memory_tasks
     "weights": lambda runs: f"{int(runs.rows[0]['weights']):,}",
     "success": _successes,
+    "trained": lambda runs: ", ".join(_thousands(row["steps"]) for row in runs.rows),
     "reached": _reached,
     "reached_by": _reached_by,
     "column": lambda runs, column: _list(runs.numbers(column)),

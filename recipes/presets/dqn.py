@@ -5,10 +5,21 @@ The settings are those of CleanRL, except for the number of environments and the
 
 from __future__ import annotations
 
-from torchrl_tit.settings.networks import enhanced_tit, mlp, nature_cnn
+from typing import Any
+
+from torchrl_tit.settings.networks import lstm, mlp, nature_cnn
 
 from .ppo_atari import TIT_PROTOCOL
+from .ppo_settings import reliable_tit
 from .preset import DQN, Preset, of_networks
+
+_CARTPOLE: dict[str, Any] = {"env": "CartPole-v1", "num_envs": 8, "steps_per_batch": 80}
+
+_SLICES: dict[str, dict[str, Any]] = {
+    "lstm": {"slice_length": 16, "burn_in": 8},
+    "enhanced-tit-k8": {"slice_length": 4},
+}
+"""The steps that are drawn together, because they share a state, or frames."""
 
 
 def _named() -> list[Preset]:
@@ -17,12 +28,24 @@ def _named() -> list[Preset]:
         "dqn/cartpole",
         {
             "mlp": mlp(hidden_dim=256, activation="relu"),
-            "enhanced-tit": enhanced_tit(patch_size=2),
+            "enhanced-tit": reliable_tit("enhanced-tit"),
         },
-        env="CartPole-v1",
-        num_envs=8,
-        steps_per_batch=80,
+        **_CARTPOLE,
     )
+    no_velocity = of_networks(
+        DQN,
+        "dqn/cartpole-no-velocity",
+        {
+            "mlp-stack-8": mlp(8, hidden_dim=256, activation="relu"),
+            "lstm": lstm(),
+            "enhanced-tit-k8": reliable_tit("enhanced-tit", 8),
+        },
+        **_CARTPOLE,
+        hide_velocities=True,
+    )
+    no_velocity = [
+        recipe.replace(**_SLICES.get(recipe.name.rpartition("/")[2], {})) for recipe in no_velocity
+    ]
     pong = of_networks(
         DQN,
         "dqn/pong",
@@ -42,7 +65,7 @@ def _named() -> list[Preset]:
         target_interval=250,
         clip_rewards=True,
     )
-    return [*cartpole, *pong]
+    return [*cartpole, *no_velocity, *pong]
 
 
 RECIPES: list[Preset] = _named()
