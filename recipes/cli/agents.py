@@ -13,7 +13,7 @@ from torchrl_tit.settings.checks import checked
 from torchrl_tit.settings.literals import parse_assignments
 from torchrl_tit.settings.numbers import Episodes, Seed, Steps, StepsOrNone, Threads
 
-from ..core.numbers import plus_minus
+from ..core.numbers import number, plus_minus
 from .arguments import Parser, add_agent, add_best, check_numbers, fail, say
 
 _EPISODES = 10
@@ -61,7 +61,8 @@ def play(arguments: list[str]) -> None:
         if known
         else ""
     )
-    now = plus_minus(returns.mean().item(), returns.std(correction=0).item())
+    mean, spread = returns.mean().item(), returns.std(correction=0).item()
+    now = plus_minus(mean, spread) if len(returns) > 1 else number(mean)
     say(
         f"{agent.name}: return {now} over "
         f"{len(returns)} episode{'s' * (len(returns) > 1)} of {agent.recipe['env']}{before}"
