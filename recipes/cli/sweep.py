@@ -126,7 +126,7 @@ def tune(arguments: list[str]) -> None:
     if best is None:
         fail(f"no trial in {options.out} is complete")
     values = ", ".join(f"{field} {value}" for field, value in best.params.items())
-    say(f"best of {len(search.study.trials)} trials: {number(best.value)} with {values}")
+    say(f"best of {len(search.study.trials)} trials: {number(best.values[0])} with {values}")
     say(f"its recipe: {options.out / 'best.json'}")
     if shares := importances(search.study):
         named = ", ".join(f"{field} {share:.0%}" for field, share in shares.items())

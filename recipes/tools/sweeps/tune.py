@@ -227,7 +227,7 @@ class Search:
 
     def _show_best(self, progress: tqdm[Any]) -> None:
         if best := self.best():
-            progress.set_postfix_str(f"best {number(best.value)}, trial {best.number}")
+            progress.set_postfix_str(f"best {number(best.values[0])}, trial {best.number}")
 
     def best(self) -> FrozenTrial | None:
         """The best trial so far, whose recipe is in ``best.json``; None before the first."""

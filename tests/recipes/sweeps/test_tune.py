@@ -187,9 +187,9 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, naps, monkeypatch):
     assert search.study.trials[-1].intermediate_values == {64: 10, 128: (10 + 12) / 2}
     last = read(tmp_path / "trials.csv")[-1]
     assert (last["state"], last["value"], last["step"]) == ("pruned", "11.0", "128")
-    for trial in (0, 1):  # told, not run: they would be begun again
+    for index in (0, 1):  # told, not run: they would be begun again
         (tmp_path / "trials.csv").write_text(
-            (tmp_path / "trials.csv").read_text().replace(f"{trial},complete", f"{trial},fail")
+            (tmp_path / "trials.csv").read_text().replace(f"{index},complete", f"{index},fail")
         )
     with Search(tmp_path, settings) as search:
         pruned = search.study.trials[-1]
