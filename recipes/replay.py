@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase
 from torchrl_tit.checkpoint import load_checkpoint, remove_checkpoint, save_checkpoint
 from torchrl_tit.datasets import OnlineHistoryStorage, make_sampler
 from torchrl_tit.envs import observation_specs
+from torchrl_tit.frames import NormalizedFrames
 from torchrl_tit.settings.choices import Device
 from torchrl_tit.settings.numbers import Batch, Steps, Weight
 
@@ -66,7 +67,8 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
     normalize_observations: bool = False
     """Whether to normalize observations by their mean and standard deviation in the random steps,
-    and to clip them to +-10; only for arrays of floats."""
+    and to clip them to +-10; only for arrays of floats. Entries that are constant in these steps
+    have a deviation of 1."""
     storage_device: Device = "cpu"
     """Device of the stored data, from which batches are moved to the networks; those on the CPU
     store data there, too. "cuda" is faster if all data fit on the GPU."""
@@ -185,7 +187,13 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
         recipe, count = self.recipe, batch.numel()
         if recipe.normalize_observations and step < recipe.random_steps:
             seen = batch["observation"].flatten(0, 1).to(self.device)
-            set_statistics(self.policy, self.model, lambda frames: frames.update(seen))
+
+            def add(frames: NormalizedFrames) -> None:
+                frames.update(seen)
+                if step + count >= recipe.random_steps:
+                    frames.fix_constant()
+
+            set_statistics(self.policy, self.model, add)
         self.buffer.extend(self.collected(batch).select(*_STORED, strict=False))
         if step + count <= recipe.random_steps:
             return dict.fromkeys(self.columns, torch.nan)

@@ -89,6 +89,15 @@ class NormalizedFrames(FrameEncoder):
             self._add(bytes_to_floats(self.samples(part), self.mean.dtype))
         self._keep_mask()
 
+    @torch.no_grad()
+    def fix_constant(self) -> None:
+        """Lets entries that never changed have a deviation of 1, once nothing is added anymore.
+
+        Otherwise they are clipped to +-``limit`` as soon as they change.
+        """
+        rounding = (1e-6 * self.mean).square()
+        self.variance.masked_fill_(self.variance <= rounding, 1.0)
+
     def _add(self, observations: Tensor) -> None:
         if not (size := observations.shape[0]):  # sets without entities
             return
