@@ -15,6 +15,9 @@ from .preset import DQN, Preset, of_networks
 
 _CARTPOLE: dict[str, Any] = {"env": "CartPole-v1", "num_envs": 8, "steps_per_batch": 80}
 
+_HEAD: dict[str, Any] = {"activation_head": "gelu"}
+"""A value is a hundred rewards, which features between -1 and 1 are slow to add up to."""
+
 _SLICES: dict[str, dict[str, Any]] = {
     "lstm": {"slice_length": 16, "burn_in": 8},
     "enhanced-tit-k8": {"slice_length": 4},
@@ -28,7 +31,7 @@ def _named() -> list[Preset]:
         "dqn/cartpole",
         {
             "mlp": mlp(hidden_dim=256, activation="relu"),
-            "enhanced-tit": reliable_tit("enhanced-tit"),
+            "enhanced-tit": reliable_tit("enhanced-tit", **_HEAD),
         },
         **_CARTPOLE,
     )
@@ -38,7 +41,7 @@ def _named() -> list[Preset]:
         {
             "mlp-stack-8": mlp(8, hidden_dim=256, activation="relu"),
             "lstm": lstm(),
-            "enhanced-tit-k8": reliable_tit("enhanced-tit", 8),
+            "enhanced-tit-k8": reliable_tit("enhanced-tit", 8, **_HEAD),
         },
         **_CARTPOLE,
         hide_velocities=True,
