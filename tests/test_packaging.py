@@ -129,7 +129,7 @@ def test_links_of_the_description_hold_outside_of_the_repository(metadata: Messa
         match = re.fullmatch(rf"{ADDRESS}/(raw|blob)/{tag}/(.*)", link)
         assert match is not None, link
         assert (ROOT / match[2].partition("#")[0]).exists(), link
-        assert (match[1] == "raw") == link.endswith(".png")
+        assert (match[1] == "raw") == link.endswith((".png", ".gif"))
     assert re.sub(r"\]\(.*?\)", "", page) == re.sub(r"\]\(.*?\)", "", readme)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import runpy
-from functools import cache
+from functools import cache, reduce
 from itertools import product
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from tests.recipes.offline.test_without_env import log_machine
 from tests.recipes.small import make_dt, tit, train
 from torchrl_tit import load_agent
 from torchrl_tit.agents import agent_names
+from torchrl_tit.envs.names import load_wrappers
 from torchrl_tit.export import export_policy
 from torchrl_tit.settings.literals import parse_assignments
 from torchrl_tit.settings.networks import dt_tit, lstm, mlp
@@ -51,7 +52,14 @@ def made(tmp_path_factory):
 
 def tasks(agent, count):
     settings = parse_assignments(agent.recipe["env_settings"])
-    return [gymnasium.make(agent.recipe["env"], **settings) for _ in range(count)]
+    wraps, _ = load_wrappers(agent.recipe["wrappers"])
+    made = [gymnasium.make(agent.recipe["env"], **settings) for _ in range(count)]
+    return [reduce(lambda env, wrap: wrap(env), wraps, env) for env in made]
+
+
+def seen(observation):
+    """An observation as the agent's environment writes it, images with their channels first."""
+    return np.moveaxis(observation, -1, 0) if observation.ndim == 3 else observation
 
 
 @pytest.mark.parametrize("name", [*agent_names(), "dt", "lstm"])
@@ -64,7 +72,7 @@ def test_one_by_one_as_in_an_evaluation(made, name):
     [env] = tasks(agent, 1)
     observation, reward = env.reset(seed=4)[0], 0.0
     for expected, expected_reward in zip(steps["action"], steps["next", "reward"], strict=True):
-        action = agent.act(observation.tolist(), reward=reward)
+        action = agent.act(seen(observation).tolist(), reward=reward)
         bounds = getattr(env.action_space, "low", None), getattr(env.action_space, "high", None)
         expected = expected.numpy() if bounds[0] is None else expected.numpy().clip(*bounds)
         np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-5)

@@ -149,7 +149,7 @@ def describe(spec: TensorSpec) -> str:
 
     Example:
         >>> describe(Binary(3))
-        'Binary(shape=[3], dtype=int8)'
+        'Binary(shape=[3], dtype=int8, n=2)'
         >>> describe(Bounded(-2.0, 2.0, (1,)))
         'Bounded(shape=[1], dtype=float32, low=[-2.0], high=[2.0])'
         >>> describe(MultiCategorical([3, 2]))
@@ -167,5 +167,5 @@ def describe(spec: TensorSpec) -> str:
         said["n"] = spec.nvec.tolist()
     elif isinstance(spec, Categorical):
         said["n"] = spec.space.n
-    kind = type(spec).__name__.removesuffix("Continuous").removesuffix("Discrete")
+    kind = type(spec).__name__
     return f"{kind}({', '.join(f'{name}={value}' for name, value in said.items())})"

@@ -57,7 +57,7 @@ def test_the_agent_of_a_finished_run(cartpole: Path, tmp_path: Path) -> None:
         ({"env": "Pendulun-v1"}, "'Pendulun-v1' cannot be made: .*Did you mean: `Pendulum`"),
         (
             {"env": "CartPole-v1"},
-            "sac needs continuous .*, but those of CartPole-v1 are discrete .*: use a ppo recipe",
+            "sac needs continuous .*, but those of CartPole-v1 are Categorical.*: use a ppo recipe",
         ),
         ({"env": "Blackjack-v1", "sets": ("random",)}, r"Blackjack-v1 has observations Tuple\("),
         ({"agent": "ppo/pendulum/mlp"}, "unknown recipe 'ppo/pendulum/mlp': did you mean"),

@@ -105,7 +105,7 @@ def test_it_trains_and_is_evaluated_without_noise(tmp_path, monkeypatch):
 
 
 def test_choices_are_refused():
-    with pytest.raises(ValueError, match="noise is for continuous actions, not for discrete"):
+    with pytest.raises(ValueError, match="noise is for continuous actions, not for Categorical"):
         make_algorithm(replace(RECIPE, env="CartPole-v1"))
 
 
