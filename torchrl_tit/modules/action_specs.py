@@ -151,7 +151,7 @@ def describe(spec: TensorSpec) -> str:
         >>> describe(Binary(3))
         'Binary(shape=[3], dtype=int8, n=2)'
         >>> describe(Bounded(-2.0, 2.0, (1,)))
-        'Bounded(shape=[1], dtype=float32, low=[-2.0], high=[2.0])'
+        'BoundedContinuous(shape=[1], dtype=float32, low=[-2.0], high=[2.0])'
         >>> describe(MultiCategorical([3, 2]))
         'MultiCategorical(shape=[2], dtype=int64, n=[3, 2])'
     """
