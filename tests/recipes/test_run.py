@@ -304,7 +304,10 @@ def test_the_policy_plays_other_tasks_as_it_was_trained(run, capsys):
         assert episode is None or {*evaluation["returns"]} == {episode}
     assert run.read("evaluation.json") == own
     message = fails(capsys, "evaluate", run.folder, "--env", "MountainCar-v0")
-    assert "MountainCar-v0 has the observation Unbounded(shape=[2], dtype=float32)" in message
+    assert (
+        "MountainCar-v0 has the observation UnboundedContinuous(shape=[2], dtype=float32)"
+        in message
+    )
     message = fails(capsys, "evaluate", run.folder, "--env", "Nowhere-v0")
     assert "Unknown task 'Nowhere-v0'" in message
 
