@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -151,7 +152,9 @@ def describe(spec: TensorSpec) -> str:
         >>> describe(Binary(3))
         'Binary(shape=[3], dtype=int8, n=2)'
         >>> describe(Bounded(-2.0, 2.0, (1,)))
-        'BoundedContinuous(shape=[1], dtype=float32, low=[-2.0], high=[2.0])'
+        'BoundedContinuous(shape=[1], dtype=float32, low=-2.0, high=2.0)'
+        >>> describe(Bounded(torch.tensor([-1.0, -2.0]), torch.tensor([1.0, 1.0])))
+        'BoundedContinuous(shape=[2], dtype=float32, low=[-1.0, -2.0], high=1.0)'
         >>> describe(MultiCategorical([3, 2]))
         'MultiCategorical(shape=[2], dtype=int64, n=[3, 2])'
     """
@@ -159,10 +162,14 @@ def describe(spec: TensorSpec) -> str:
         return repr(spec)
     if isinstance(spec, Composite):
         return f"Composite({', '.join(map(str, spec.keys()))})"
-    said = {"shape": list(spec.shape), "dtype": str(spec.dtype).removeprefix("torch.")}
+    said: dict[str, Any] = {
+        "shape": list(spec.shape),
+        "dtype": str(spec.dtype).removeprefix("torch."),
+    }
     if isinstance(spec, Bounded):
-        ends = {"low": spec.space.low, "high": spec.space.high}
-        said |= {end: bound.unique().tolist() for end, bound in ends.items()}
+        for end, bound in (("low", spec.space.low), ("high", spec.space.high)):
+            values = bound.unique().tolist()
+            said[end] = values[0] if len(values) == 1 else bound.tolist()
     if isinstance(spec, MultiCategorical):
         said["n"] = spec.nvec.tolist()
     elif isinstance(spec, Categorical):
