@@ -225,7 +225,7 @@ def with_spaces(recipe: DatasetRecipeT) -> DatasetRecipeT:
 BY_DATA: Mapping[str, float] = {"limit": math.inf, "eps": 1e-3}
 """Normalization by the statistics of a data set, as the authors of TD3+BC and d3rlpy do it."""
 _MOST_MEASURED = 10_000
-"""Items of held-out episodes that are measured at a time, evenly spaced if there are more."""
+"""Items of held-out episodes that are measured, evenly spaced if there are more."""
 _MEASURED_AT_ONCE = 500
 
 
@@ -296,7 +296,9 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
                 f"{episodes.source} has {len(items)} transitions, but the recipe measures slices "
                 f"of {length}: use longer episodes"
             )
-        starts = torch.arange(0, count, math.ceil(count / _MOST_MEASURED))
+        size = getattr(recipe, "slice_length", 1)
+        stride = max(size, math.ceil(count * size / _MOST_MEASURED))  # a step counts once
+        starts = torch.arange(0, count + stride - 1, stride).clamp(max=count - 1)
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
         sums, total = dict.fromkeys(self.measures, 0.0), 0
         with (

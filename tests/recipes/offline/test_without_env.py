@@ -138,6 +138,24 @@ def test_no_more_items_are_measured_than_the_limit(tmp_path, monkeypatch):
     assert sum(counts) == 86  # every second of 9 * 19
 
 
+def test_slices_of_held_out_episodes_hardly_overlap(tmp_path, monkeypatch):
+    data = str(log_machine(tmp_path / "log.hdf5"))
+    recipe = BC(dataset=data, backbone=gru(hidden_dim=8), slice_length=8)
+    algorithm = make_algorithm(recipe)
+    items = algorithm.measured_items(read_data(algorithm.recipe))
+    rows, measure_batch = [], algorithm.measure_batch
+
+    def seen(samples):
+        rows.append(samples["action"])
+        return measure_batch(samples)
+
+    monkeypatch.setattr(algorithm, "measure_batch", seen)
+    algorithm.measure(0, read_data(algorithm.recipe))
+    measured = torch.cat(rows).flatten(0, 1)
+    assert len(items) <= len(measured) < len(items) + 8
+    assert all((measured == row).all(-1).any() for row in items[:]["action"])
+
+
 def test_every_step_of_windows_counts_the_same(tmp_path, monkeypatch):
     """However many are measured at a time: windows of the first 20 episodes are mostly padding."""
     ends = (np.arange(200) < 20) | (np.arange(200) % 60 == 59)
