@@ -5,7 +5,9 @@ The paper's runs on arrays see one observation (K = 1), which does not test the 
 
 from __future__ import annotations
 
-from torchrl_tit.settings import Network
+from dataclasses import replace
+
+from torchrl_tit.settings import GTrXL, Inner, Network
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
 from .ppo_settings import STEADY_PPO_SETTINGS, reliable_tit
@@ -16,12 +18,18 @@ _TASKS = {
     "acrobot": ("Acrobot-v1", 100_000),
     "hopper": ("Hopper-v5", 1_000_000),
 }
+_TIT = reliable_tit("enhanced-tit", 8)
 _NETWORKS: dict[str, Network] = {
     "mlp": mlp(),
     "mlp-stack-8": mlp(8),
     "lstm": lstm(),
+    "gtrxl-k8": replace(
+        _TIT,
+        frame=Inner(patch_size="auto", patch_weights="own", every_block=False),
+        history=GTrXL(num_blocks=1, num_heads=1),
+    ),
     "enhanced-tit-k1": reliable_tit("enhanced-tit"),
-    "enhanced-tit-k8": reliable_tit("enhanced-tit", 8),
+    "enhanced-tit-k8": _TIT,
     "enhanced-tit-k8-no-positions": reliable_tit("enhanced-tit", 8, temporal_positions="none"),
     "enhanced-tit-wo-outer-k8": enhanced_tit(8, outer=False, patch_size=None),
 }
