@@ -44,6 +44,8 @@ class Agent:
         kind = self.facts["inputs"]["observation"]["dtype"]
         if kind != "float32" and (frames.astype(kind) != frames).any():
             raise ValueError(f"expected observations of {kind}; images range from 0 to 255")
+        if np.isinf(frames.astype(kind)).any():
+            raise ValueError(f"the observation is infinite in {kind}")
         self.last = frames
         given = {"observation": frames, "is_init": self.first, "reward": reward, **self.state}
         given |= {"action_mask": action_mask, "target_return": self.facts.get("target_return")}

@@ -187,6 +187,9 @@ def test_a_file_acts_as_its_agent(made, tmp_path, name):
     for frames in (np.zeros(2 * size), np.zeros((3, 2 * size)), np.zeros((2, 3, size))):
         with pytest.raises(ValueError, match="expected observations"):
             exported.act(frames)
+    for act, value in product((agent.act, exported.act), (np.inf, -np.inf, 1e300)):
+        with np.errstate(over="ignore"), pytest.raises(ValueError, match="is infinite in"):
+            act(np.full((3, size), value))
     exported.reset([False, True, False])
     frames = np.zeros((3, size))
     frames[1, 0] = np.nan

@@ -73,9 +73,9 @@ class Actor:
             The action in the task's own form, clipped to its bounds; [N, ...] for several copies.
 
         Raises:
-            ValueError: if the observation has another shape, or numbers that its integers cannot
-                hold, the number of copies changes without :meth:`reset`, or there is no last value
-                to hold.
+            ValueError: if the observation has another shape, is infinite, or has numbers that its
+                integers cannot hold, the number of copies changes without :meth:`reset`, or there
+                is no last value to hold.
         """
         if self._env is None:
             self._start(observation)
@@ -155,6 +155,11 @@ class Actor:
             numbers = torch.as_tensor(np.ascontiguousarray(array)).reshape(shape)
             missing, frame = numbers.isnan(), numbers.to(spec.dtype)
             floats = spec.dtype.is_floating_point
+            if floats and frame.isinf().any():
+                raise ValueError(
+                    f"the {name} is infinite in {spec.dtype}: give what the data of training have "
+                    "there, or NaN to hold the last value"
+                )
             if not floats and len(changed := numbers[(frame != numbers) & ~missing]):
                 kind = str(spec.dtype).removeprefix("torch.")
                 raise ValueError(
