@@ -45,6 +45,10 @@ def _named() -> list[Preset]:
         },
         **_CARTPOLE,
         hide_velocities=True,
+        total_steps=200_000,
+        buffer_size=100_000,
+        # A pole tilts by a tenth of a radian, and moves a tenth of that in a step.
+        normalize_observations=True,
     )
     no_velocity = [
         recipe.replace(**_SLICES.get(recipe.name.rpartition("/")[2], {})) for recipe in no_velocity
