@@ -1,6 +1,7 @@
 """DQN, which the paper does not use, with TIT and with the usual networks.
 
-The settings are those of CleanRL, except for the number of environments and the MLP's width.
+The settings are those of CleanRL, except for the number of environments, the MLP's width, and those
+of tasks without velocities.
 """
 
 from __future__ import annotations
