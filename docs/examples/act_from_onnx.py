@@ -42,9 +42,10 @@ class Agent:
                 raise ValueError("the first observation of an episode is missing or has NaN")
             frames = np.where(missing, self.last, frames)
         kind = self.facts["inputs"]["observation"]["dtype"]
-        if kind != "float32" and (frames.astype(kind) != frames).any():
+        converted = frames.astype(kind)
+        if kind != "float32" and (converted != frames).any():
             raise ValueError(f"expected observations of {kind}; images range from 0 to 255")
-        if np.isinf(frames.astype(kind)).any():
+        if np.isinf(converted).any():
             raise ValueError(f"the observation is infinite in {kind}")
         self.last = frames
         given = {"observation": frames, "is_init": self.first, "reward": reward, **self.state}
