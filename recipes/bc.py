@@ -26,8 +26,8 @@ class BC(TransitionRecipe, algorithm="bc"):
     learning_rate: Rate = 3e-4
     """Learning rate of Adam."""
     best_fraction: Share = 1.0
-    """Share of the finished episodes that are learned from: those with the highest returns
-    (filtered behavior cloning, as in arXiv 2106.01345)."""
+    """Share of the whole episodes, finished and not cut at a gap, that are learned from: those with
+    the highest returns (filtered behavior cloning, as in arXiv 2106.01345)."""
     time_limits: Literal["keep", "drop"] = "keep"
     """Whether to keep the last transition of an episode that a time limit truncated."""
     unfinished: Literal["keep", "drop"] = "keep"
@@ -63,8 +63,8 @@ class BCAlgorithm(TransitionAlgorithm[BC]):
     def split(self, episodes: Episodes) -> Episodes:
         """Leaves out all but the best episodes, and holds some of the best out."""
         if (fraction := self.recipe.best_fraction) < 1:
-            finished = episodes.finished.nonzero().squeeze(-1)
-            order = finished[episodes.returns[finished].argsort(descending=True, stable=True)]
+            whole = episodes.whole
+            order = whole[episodes.returns[whole].argsort(descending=True, stable=True)]
             best = order[: max(1, round(fraction * len(order)))]
             episodes = select_episodes(episodes, best)
         return super().split(episodes)

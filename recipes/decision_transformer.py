@@ -73,7 +73,7 @@ class SequenceRecipe(DatasetRecipe):
     predicts the mean and standard deviation of a tanh-squashed Gaussian; "discrete" predicts
     logits."""
     target_returns: tuple[Real, ...] = ()
-    """Target returns of the evaluations; by default the highest return in the data."""
+    """Target returns of the evaluations; by default the highest of the data's whole episodes."""
     return_scale: Positive = 1000.0
     """Divisor of the returns-to-go."""
     acting_num_frames: Frames | None = None
@@ -163,7 +163,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
         if not recipe.target_returns:
             episodes = read_data(recipe)
             check_data(recipe, episodes)
-            best = episodes.returns[episodes.finished].max().item()
+            best = episodes.returns[episodes.whole].max().item()
             self.recipe = recipe = replace(recipe, target_returns=(best,))
         with closing(make_task(recipe, num_frames=1, clip_actions=False)) as task:
             self.model = self.networks(task).to(self.device).eval()
@@ -406,7 +406,7 @@ def check_data(recipe: SequenceRecipe, episodes: Episodes) -> None:
 
 def warn_of_targets(target_returns: Sequence[float], episodes: Episodes) -> None:
     """Warns about target returns that lie outside the returns of the data's episodes."""
-    returns = episodes.returns[episodes.finished.cpu()]
+    returns = episodes.returns[episodes.whole]
     low, high = returns.min().item(), returns.max().item()
     outside = [target for target in target_returns if not low <= target <= high]
     if outside:

@@ -38,8 +38,8 @@ class IQL(ActorCriticRecipe, algorithm="iql"):
     temperature: Weight = 3.0
     """Inverse temperature of the weights exp(temperature * advantage) of the actor's loss."""
     normalize_rewards: bool = False
-    """Whether rewards are divided by the range of the episodes' returns and multiplied by 1000, as
-    in the paper for MuJoCo."""
+    """Whether rewards are divided by the range of the whole episodes' returns and multiplied by
+    1000, as in the paper for MuJoCo."""
 
     def build(self) -> IQLAlgorithm:
         """Builds the algorithm."""
@@ -107,12 +107,12 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         episodes = super().load_data()
         if not self.recipe.normalize_rewards:
             return episodes
-        returns = episodes.returns[episodes.finished.cpu()]
-        spread = (returns.max() - returns.min()).item() if len(returns) else 0.0
+        returns = episodes.returns[episodes.whole]
+        spread = (returns.max() - returns.min()).item()
         if not spread > 0:
             raise DatasetError(
                 episodes.source,
-                "normalize_rewards is on, but no two finished episodes differ in return: switch it "
+                "normalize_rewards is on, but no two whole episodes differ in return: switch it "
                 "off",
             )
         rows = episodes.rows.copy()

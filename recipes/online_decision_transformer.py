@@ -333,6 +333,7 @@ class OnlineData:
             state["rows"] = dict(self._episodes.rows.items())
             state["lengths"] = self._episodes.lengths
             state["final_known"] = self._episodes.final_known
+            state["cut"] = self._episodes.cut
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any], /) -> None:
@@ -345,7 +346,8 @@ class OnlineData:
             self._episodes = Episodes(
                 rows=rows,
                 lengths=state_dict["lengths"],
-                final_known=state_dict["final_known"],
+                final_known=(known := state_dict["final_known"]),
+                cut=state_dict.get("cut", torch.zeros_like(known)),  # as before 0.2
                 source=self._episodes.source,
             ).to(self._episodes.lengths.device)
             self._buffer = self._make_buffer()

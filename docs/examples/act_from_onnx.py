@@ -24,8 +24,10 @@ class Agent:
         """Begins an episode with the next observation: in all copies, or where bool [N] says so."""
         if which is None:
             self.first, self.state, self.last = True, {}, None
-        else:
+        elif np.asarray(which).dtype == bool:
             self.first = np.logical_or(self.first, which)
+        else:
+            raise ValueError(f"which must be bool, one for each copy, not {which}")
 
     def act(self, observation, *, reward=0.0, action_mask=True):
         """Maps an observation, or those of N copies, [N, ...], to actions; holds values for NaN."""

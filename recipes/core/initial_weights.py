@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
+from types import UnionType
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torchrl.modules import TanhModule
 from torchrl.objectives import LossModule
 from torchrl.objectives.value import ValueEstimatorBase
 
-from .algorithm import Algorithm, Stateful
+from .algorithm import Algorithm
 from .run import Run
 
 _IN_A_BACKBONE = re.compile(r"(.*?)(frame_encoders?|history_encoder)\.")
@@ -42,7 +44,7 @@ def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Ten
     with run.restoring(step):
         theirs = _tensors(checkpoint["networks"])
     own = _tensors(algorithm.model.state_dict())
-    names = {name: name for name in own.keys() - _hyperparameters(algorithm.model)}
+    names = {name: name for name in own.keys() - _hyperparameters(own, algorithm)}
     if run.recipe.algorithm == algorithm.recipe.algorithm:
         unexpected = theirs.keys() - own.keys()
     else:
@@ -93,16 +95,17 @@ def _kind(tensor: Tensor) -> str:
     return f"{list(tensor.shape)}{dtype}"
 
 
-def _hyperparameters(networks: Stateful) -> set[str]:
-    """Names of tensors that are not weights: the buffers of the losses themselves."""
-    if not isinstance(networks, nn.Module):
-        return set()
-    return {
-        f"{prefix}.{name}".lstrip(".")
-        for prefix, module in networks.named_modules()
-        if isinstance(module, LossModule | ValueEstimatorBase)
-        for name, _ in module.named_buffers(recurse=False)
-    }
+def _hyperparameters(names: Iterable[str], algorithm: Algorithm[Any]) -> set[str]:
+    """Names of tensors that are not weights: buffers of the losses, and bounds of the actions."""
+    bounds = tuple(_buffers(algorithm.policy, TanhModule))  # a loss keeps them under its own name
+    of_losses = _buffers(algorithm.model, LossModule | ValueEstimatorBase)
+    return {*of_losses, *(name for name in names if name.endswith(bounds))}
+
+
+def _buffers(networks: nn.Module, kind: type[nn.Module] | UnionType) -> Iterator[str]:
+    for prefix, module in networks.named_modules():
+        if isinstance(module, kind):
+            yield from (f"{prefix}.{x}".lstrip(".") for x, _ in module.named_buffers(recurse=False))
 
 
 def _policy_backbone(names: Iterable[str]) -> str:

@@ -190,6 +190,9 @@ def test_a_file_acts_as_its_agent(made, tmp_path, name):
     for act, value in product((agent.act, exported.act), (np.inf, -np.inf, 1e300)):
         with np.errstate(over="ignore"), pytest.raises(ValueError, match="is infinite in"):
             act(np.full((3, size), value))
+    for reset, which in product((agent.reset, exported.reset), ([0, 1], 1)):
+        with pytest.raises(ValueError, match="which must be "):  # bool, not the numbers of copies
+            reset(which)
     exported.reset([False, True, False])
     frames = np.zeros((3, size))
     frames[1, 0] = np.nan

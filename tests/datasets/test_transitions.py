@@ -192,11 +192,23 @@ def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:
     with pytest.raises(DatasetError, match=f"'next_observations', row {row}: .* gaps=\"cut\""):
         episodes_from_arrays(**arrays)
     data = episodes_from_arrays(**arrays, gaps="cut")
+    pieces = data.cut.nonzero().flatten().tolist()
+    assert data.lengths[pieces].tolist() == [row + 1 - start, stop - row - 1]
+    whole = [i for i in range(len(data.lengths)) if i not in pieces and data.finished[i]]
+    assert data.whole.tolist() == whole
+    single = {name: array[start:stop] for name, array in arrays.items()}
+    with pytest.raises(
+        DatasetError, match="has no whole episode, only unfinished ones or parts of others"
+    ):
+        _ = episodes_from_arrays(**single, gaps="cut").whole
+    del single["timeouts"]  # then gaps are where episodes end
+    assert len(episodes_from_arrays(**single, gaps="cut", max_episode_steps=10_000).whole)
 
     arrays["timeouts"][row] = True
-    expected = episodes_from_arrays(**arrays).rows
+    marked = episodes_from_arrays(**arrays)
+    assert not marked.cut.any()
+    expected = marked.rows
     assert (data.rows == expected).all()
-    assert (row + 1 - start) in data.lengths
     arrays["timeouts"][row] = False
     arrays["next_observations"][row, 4] -= 1
     times = np.arange(len(arrays["rewards"])) * 0.01
@@ -206,6 +218,7 @@ def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:
     arrays["next_observations"][row, 4] += 1
     data = episodes_from_arrays(**arrays, timestamps=times, gaps="cut")
     assert (data.rows == expected).all()
+    assert data.cut.nonzero().flatten().tolist() == pieces
 
 
 def test_writing_is_lossless_and_never_overwrites(tmp_path: Path, rolled: Transitions) -> None:

@@ -5,18 +5,23 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
+from recipes.bc import BC
 from recipes.cli import main, training
 from recipes.core import runner
 from recipes.core.algorithm import make_algorithm
 from recipes.core.initial_weights import weights_from
 from recipes.core.run import Run
+from recipes.iql import IQL
 from recipes.sac import SAC
+from recipes.td3bc import TD3BC
 from tests.recipes.commands import fails
 from tests.recipes.small import TINY
 from torchrl_tit.checkpoint import load_checkpoint
+from torchrl_tit.datasets import episodes_from_arrays, write_hdf5
 from torchrl_tit.settings import Network
 from torchrl_tit.settings.networks import mlp
 
@@ -108,6 +113,36 @@ def test_hyperparameters_are_the_recipes_own(tmp_path):
     left = theirs.keys() - weights.keys()
     assert left == {"_value_estimator.gamma", "alpha_init", "_target_entropy"}
     assert ";" not in line
+
+
+@pytest.mark.parametrize("make", [BC, IQL, TD3BC])
+def test_the_bounds_of_actions_are_the_tasks_own(make, tmp_path):
+    data = {scale: log(tmp_path / f"{scale}.hdf5", scale) for scale in (0.5, 6.0)}
+    narrow, wide = (
+        make(dataset=str(path), backbone=PPO.backbone, validation_fraction=0.5)
+        for path in data.values()
+    )
+    theirs = begin(tmp_path / "other", narrow)
+    algorithm = make_algorithm(wide)
+    weights, line = weights_from(tmp_path / "other", algorithm)
+    algorithm.model.load_state_dict({**algorithm.model.state_dict(), **weights})
+    ends = ("_low", "_high")
+    bounds = [value for name, value in algorithm.policy.named_buffers() if name.endswith(ends)]
+    assert [value.abs().tolist() for value in bounds] == [[6, 6], [6, 6]]
+    left = [name for name in theirs.keys() - weights.keys() if not name.endswith("gamma")]
+    assert all(name.endswith(("_low", "_high", "_action")) for name in left)
+    assert ";" not in line
+
+
+def log(path, scale):
+    """Writes two episodes of four steps with actions of a scale."""
+    draw = np.random.default_rng(0)
+    actions = draw.uniform(-scale, scale, (8, 2))
+    actions[0], actions[1], actions[4], actions[5] = scale, -scale, scale, -scale
+    ends = np.arange(8) % 4 == 3
+    observations = draw.normal(size=(8, 3))
+    write_hdf5(episodes_from_arrays(observations, actions, draw.normal(size=8), ends), path)
+    return path
 
 
 def test_a_run_of_which_nothing_fits_is_refused(tmp_path, capsys):

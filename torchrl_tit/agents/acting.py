@@ -52,11 +52,20 @@ class Actor:
         Args:
             which: in which of several copies, bool [N]; by default in all, of which there may then
                 be another number.
+
+        Raises:
+            ValueError: if it is not bool [N].
         """
         if which is None or self._env is None:
             self._env = self._steps = None
         else:
-            self._begins |= torch.as_tensor(np.asarray(which, bool)).reshape(self._begins.shape)
+            begins = torch.as_tensor(np.asarray(which))
+            if begins.dtype != torch.bool or begins.numel() != len(self._begins):
+                raise ValueError(
+                    f"which must be {len(self._begins)} bools, whether each copy begins an "
+                    f"episode, not {which}"
+                )
+            self._begins |= begins.reshape(self._begins.shape)
 
     def act(self, observation: Any, *, reward: Any = 0.0, action_mask: Any = None) -> NDArray:
         """Returns the most likely action.

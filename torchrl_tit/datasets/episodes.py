@@ -35,6 +35,8 @@ class Episodes:
         lengths: number of steps of each episode; int64 [E], all at least 1.
         final_known: whether the final observation of each episode is known (otherwise it is zeros);
             bool [E].
+        cut: whether each episode ends or begins at a gap in the data, so that its return says
+            nothing; bool [E].
         source: name of the source, for error messages.
         attributes: the source's metadata, as strings and numbers.
         left_out: names of the source's fields that were not read.
@@ -56,6 +58,7 @@ class Episodes:
     rows: TensorDictBase
     lengths: Tensor
     final_known: Tensor
+    cut: Tensor
     source: str = "the data"
     attributes: Mapping[str, Any] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
@@ -103,6 +106,19 @@ class Episodes:
         """Whether each episode was terminated or truncated; bool [E]."""
         return self.terminated | self.truncated
 
+    @property
+    def whole(self) -> Tensor:
+        """Indices of the episodes that are finished and not cut at a gap; int64 [M], on the CPU.
+
+        Raises:
+            DatasetError: if there are none.
+        """
+        whole = (self.finished & ~self.cut).nonzero().squeeze(-1).cpu()
+        if not len(whole):
+            problem = "has no whole episode, only unfinished ones or parts of others: record more."
+            raise DatasetError(self.source, problem)
+        return whole
+
     def to(self, device: torch.device | str) -> Episodes:
         """Copies the data to a device; windows are then gathered there.
 
@@ -117,6 +133,7 @@ class Episodes:
             rows=self.rows.to(device),
             lengths=self.lengths.to(device),
             final_known=self.final_known.to(device),
+            cut=self.cut.to(device),
         )
 
     def observation_statistics(
@@ -200,6 +217,7 @@ def select_episodes(episodes: Episodes, index: Tensor) -> Episodes:
         rows=episodes.rows[rows],
         lengths=episodes.lengths[index],
         final_known=episodes.final_known[index],
+        cut=episodes.cut[index],
     )
 
 
@@ -307,6 +325,7 @@ def join_episodes(parts: Sequence[Episodes]) -> Episodes:
         rows=torch.cat([part.rows for part in parts]),
         lengths=torch.cat([part.lengths for part in parts]),
         final_known=torch.cat([part.final_known for part in parts]),
+        cut=torch.cat([part.cut for part in parts]),
     )
 
 

@@ -146,7 +146,7 @@ def episodes_from_transitions(
     reader = _Reader(fields, source, task, dtype)
     terminated, times = reader.flags("terminals"), _times(reader)
     if lengths is None:
-        truncated = _truncations(reader, terminated, max_episode_steps, gaps, times)
+        truncated, cuts = _truncations(reader, terminated, max_episode_steps, gaps, times)
         ends = terminated | truncated
         if not ends.any():
             hint = "" if "timeouts" in fields else ", or give max_episode_steps"
@@ -154,7 +154,7 @@ def episodes_from_transitions(
             raise DatasetError(source, f"{problem} in 'timeouts'{hint}.")
         ends[-1] = True
     else:
-        truncated = reader.flags("timeouts")
+        truncated, cuts = reader.flags("timeouts"), np.zeros_like(terminated)
         ends = np.zeros_like(terminated)
         ends[lengths.cumsum() - 1] = True
         if (inside := (terminated | truncated) & ~ends).any():
@@ -184,6 +184,7 @@ def episodes_from_transitions(
         rows=rows,
         lengths=torch.from_numpy(np.diff(last_steps, prepend=-1)),
         final_known=torch.full((len(last_steps),), has_next),
+        cut=torch.from_numpy(cuts[last_steps] | np.append(False, cuts[last_steps[:-1]])),
         source=source,
         attributes=attributes or {},
         left_out=tuple(sorted(set(fields) - set(FIELDS))),
@@ -310,20 +311,22 @@ def _truncations(
     max_episode_steps: int | None,
     gaps: Gaps,
     times: NDArray | None,
-) -> NDArray:
-    """Where episodes were truncated; bool [N]."""
+) -> tuple[NDArray, NDArray]:
+    """Where episodes were truncated, and where that is only because of a gap; bool [N] each."""
     marked = "timeouts" in reader.fields
     truncated = reader.flags("timeouts") if marked else np.zeros_like(terminated)
+    ends = terminated | truncated
     if "next_observations" in reader.fields and (gaps == "cut" or not marked):
         truncated |= _gaps(reader) & ~terminated
     if times is not None and gaps == "cut":
         truncated |= _pauses(times)[0] & ~terminated
+    cuts = truncated & ~ends & marked  # otherwise gaps are where episodes end
     if max_episode_steps is not None and not marked:
         ends = np.flatnonzero(terminated | truncated)
         for before, last in pairwise([-1, *ends, reader.num_rows - 1]):
             truncated[before + max_episode_steps : last + 1 : max_episode_steps] = True
         truncated &= ~terminated
-    return truncated
+    return truncated, cuts
 
 
 def _times(reader: _Reader) -> NDArray | None:

@@ -121,7 +121,7 @@ def interquartile_mean(values: Values) -> Interval:
 
     Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", arXiv
     2108.13264: the interval is a bootstrap of the runs within each task. Where a task has a single
-    run, there is none.
+    run, or all tasks fewer than five, there is none.
 
     Args:
         values: normalized returns.
@@ -164,8 +164,10 @@ def probability_of_improvement(ours: Values, others: Values) -> Interval:
 
 
 def _with_interval(value: np.ndarray, draws: np.ndarray, groups: list[np.ndarray]) -> Interval:
-    """A number with the interval of its resamples, or with none if a group has a single run."""
-    low, high = np.quantile(draws, [0.025, 0.975]) if min(map(len, groups)) > 1 else (nan, nan)
+    """A number with the interval of its resamples, or with none of too few runs."""
+    counts = [*map(len, groups)]
+    enough = min(counts) > 1 and sum(counts) >= FEWEST
+    low, high = np.quantile(draws, [0.025, 0.975]) if enough else (nan, nan)
     return Interval(float(value), float(low), float(high))
 
 
@@ -239,7 +241,7 @@ def read_networks(
 
     Returns:
         By network, and then by task, the value of each run, and notes about runs and tasks that are
-        left out. All networks have the same tasks.
+        left out, changed settings and different lengths. All networks have the same tasks.
 
     Raises:
         ValueError: if a pattern has no run, a network has two settings on a task, or no task is
@@ -248,6 +250,7 @@ def read_networks(
     experiments, notes = read_evaluations(folders)
     returns = read_references(references)
     networks: dict[str, dict[Task, list[float]]] = {pattern: {} for pattern in patterns}
+    lengths: dict[Task, set[int]] = {}
     for experiment, evaluations in experiments:
         settings = experiment.settings
         last = experiment.name.rpartition("/")[2]
@@ -261,6 +264,9 @@ def read_networks(
                 f"{name} has two settings on {settings.env}, also {experiment.label}: name folders "
                 "or patterns that hold one of them"
             )
+        lengths.setdefault(task, set()).add(settings.final_step)
+        if experiment.changes:
+            notes.append(f"{name} has changed settings on {settings.env}: {experiment.changes}")
         values = [value_of(evaluation) for evaluation in evaluations]
         scored = measure_of(settings, evaluations[0]) != "return"
         found[task] = (
@@ -278,6 +284,11 @@ def read_networks(
         for name, found in networks.items()
         for task in found
         if task not in common
+    ]
+    notes += [
+        f"runs of {task[0]} have different lengths: {', '.join(map(str, sorted(found)))} steps"
+        for task, found in lengths.items()
+        if task in common and len(found) > 1
     ]
     return {
         name: {task: values for task, values in found.items() if task in common}

@@ -21,6 +21,7 @@ from recipes.core.metrics import read_metrics
 from recipes.core.records import Records
 from recipes.core.registry import get_recipe
 from recipes.core.run import RecordedRun, Run
+from recipes.decision_transformer import warn_of_targets
 from recipes.offline import read_data, with_spaces
 from recipes.presets import any_data
 from tests.datasets.rollouts import write
@@ -393,6 +394,28 @@ def test_cloning_of_the_best_episodes(tmp_path):
     assert len(learned) == held_out.episodes == 1
     found = sorted([*learned, *algorithm._held_out.returns.tolist()], reverse=True)
     assert found == load_episodes(data).returns.sort(descending=True).values[:2].tolist()
+
+
+def test_the_returns_of_parts_that_a_gap_cut_do_not_count(tmp_path):
+    """Where each step costs, a part of an episode returns the most."""
+    draw = np.random.default_rng(1)
+    costs, following = -draw.uniform(1, 2, 200), draw.normal(size=(201, 5))[1:]
+    file = log_machine(tmp_path / "log.hdf5", rewards=costs)
+    following[:-1] = load_episodes(file).rows["observation"][load_episodes(file).step_rows][1:]
+    following[17] += 1  # after which the first of ten episodes lost a step
+    data = tmp_path / "lost.hdf5"
+    log_machine(data, rewards=costs, next_observations=following.astype(np.float32))
+    whole = costs.reshape(10, 20).sum(1)[1:]
+
+    shared: dict[str, Any] = {"dataset": str(data), "gaps": "cut", "validation_fraction": 0.5}
+    best = make_algorithm(BC(**shared, backbone=SMALL, best_fraction=0.5)).load_data()
+    assert not best.cut.any()
+    dt = make_dt(tmp_path, env="", target_returns=(), dataset=str(data), gaps="cut")
+    assert make_algorithm(dt).recipe.target_returns == pytest.approx((whole.max(),))
+    with pytest.warns(UserWarning, match="target_returns -3: no episode"):
+        warn_of_targets((-3.0,), load_episodes(data, gaps="cut"))
+    iql = make_algorithm(IQL(**shared, backbone=SMALL, normalize_rewards=True)).load_data()
+    assert np.ptp(iql.returns[iql.whole].numpy()) == pytest.approx(1000)
 
 
 def test_the_command_line(tmp_path, capsys):
