@@ -39,7 +39,7 @@ from torchrl_tit.analysis import Flows, count_flows
 from torchrl_tit.scores import REFERENCE_RETURNS
 
 RESULTS = Path(__file__).parents[1] / "results"
-NOT_RUN = "*not run*"
+NOT_RUN = "*open*"
 
 _PAGES = {
     "cartpole": "results/classic_control.md",

@@ -46,7 +46,7 @@ def test_every_cell_has_the_papers_number_and_a_result_or_not_run(table):
         own += re.findall("not run", " ".join(heads))
         assert bool(cell.recipes) == bool(ours)
         assert own, f"{cell} has neither a result nor {paper.NOT_RUN}"
-        assert all(re.fullmatch(rf"((code|paper|near):? )?({RESULT}|\*not run\*)", x) for x in ours)
+        assert all(re.fullmatch(rf"((code|paper|near):? )?({RESULT}|\*open\*)", x) for x in ours)
 
 
 def test_every_recipe_that_the_page_names_exists():
@@ -78,11 +78,11 @@ def test_a_new_run_fills_its_cell(monkeypatch):
     )
     monkeypatch.setattr(paper, "measured", lambda: {cell: [found]})
     assert paper.ours(cell) == [
-        "code: *not run*",
+        "code: *open*",
         "paper: [-95±7](results/classic_control.md) (2x100k)",
     ]
     near = paper.Measured(
         paper.Match(cell, "epochs 4"), recipe, "results/pong/records.csv", (-90.0,), 2_000_000
     )
     monkeypatch.setattr(paper, "measured", lambda: {cell: [near]})
-    assert paper.ours(cell) == ["*not run*", "near [-90](results/pong/records.csv) (1x2M)"]
+    assert paper.ours(cell) == ["*open*", "near [-90](results/pong/records.csv) (1x2M)"]
