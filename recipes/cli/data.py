@@ -127,16 +127,17 @@ def describe(episodes: Episodes) -> str:
         "unfinished": int((~finished).sum()),
     }
     kinds = ", ".join(f"{count} {name}" for name, count in counts.items())
+    kinds += _parts(episodes)
     lines = {
         "source": episodes.source,
         "transitions": str(episodes.num_transitions),
         "episodes": f"{len(lengths)} ({kinds})",
         "length": f"min {lengths.min():.0f}, mean {lengths.mean():.1f}, max {lengths.max():.0f}",
-        "return": "no episode is finished",
+        "return": "no episode is whole",
         "score": "no reference returns for this task",
     }
-    if finished.any():
-        returns = episodes.returns[finished]
+    if (finished & ~episodes.cut).any():
+        returns = episodes.returns[episodes.whole]
         lines["return"] = _range(returns)
         if name := _scored_name(episodes):
             scores = normalized_score(returns, name)
@@ -186,11 +187,17 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
         write_minari(episodes, target, env_name or known)
     text = (
         f"{episodes.num_transitions} transitions in {len(episodes.lengths)} episodes written to "
-        f"{target}"
+        f"{target}{_parts(episodes)}"
     )
     if episodes.left_out:
         text += f"\nnot converted: {', '.join(episodes.left_out)}"
     return text
+
+
+def _parts(episodes: Episodes) -> str:
+    """How many episodes are parts of others; files do not record it."""
+    count = int(episodes.cut.sum())
+    return f"; {count} are parts of others, cut at gaps" if count else ""
 
 
 def _scored_name(episodes: Episodes) -> str | None:

@@ -48,6 +48,22 @@ def test_text_of_a_file_does_not_control_the_terminal(
     assert "policy        a\\x1b[2J\\nscore  100\n" in capsys.readouterr().out
 
 
+def test_parts_that_gaps_cut_are_counted(
+    tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start, _ = max(spans(rolled), key=lambda span: span[1] - span[0])
+    following = rolled["next_observations"].copy()
+    following[start] += 1
+    path = write(tmp_path / "a.hdf5", {**rolled, "next_observations": following})
+    main(["data", "info", str(path), "--gaps", "cut"])
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert lines["episodes"].endswith("unfinished; 2 are parts of others, cut at gaps)")
+    whole = [rolled["rewards"][a:b].sum(dtype=np.float64) for a, b in spans(rolled) if a != start]
+    assert lines["return"].endswith(f"mean {np.mean(whole):.3f}, max {max(whole):.3f}")
+    main(["data", "convert", str(path), str(tmp_path / "b.hdf5"), "--gaps", "cut"])
+    assert "; 2 are parts of others, cut at gaps\n" in capsys.readouterr().out
+
+
 def test_convert_there_and_back(
     tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]
 ) -> None:
