@@ -20,7 +20,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives.value.functional import td0_return_estimate
 
-from torchrl_tit.datasets import DatasetError, Episodes, HistoryStorage
+from torchrl_tit.datasets import DatasetError, Episodes, HistoryStorage, select_episodes
 from torchrl_tit.datasets.hdf5_files import damage_named, find, open_hdf5
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.frames import NormalizedFrames
@@ -88,10 +88,12 @@ def evaluate_on_data(
                 f"{recipe.backbone.history.name} carries a state: leave out --ope"
             )
         evaluation["ope"] = ope
+        known = recorded_log_probs(dataset, episodes) if ope == "wis" else None
+        if episodes.cut.any():
+            episodes, known = without_parts(episodes, known)
         if ope == "fqe":
             evaluation |= fitted_q(algorithm, episodes, UPDATES[ope])
         else:
-            known = recorded_log_probs(dataset, episodes)
             evaluation |= weighted_returns(algorithm, episodes, known, UPDATES[ope])
     return evaluation
 
@@ -230,6 +232,20 @@ def recorded_log_probs(dataset: str, episodes: Episodes) -> Tensor | None:
         problem = f"must be {episodes.num_transitions} finite numbers, at most 0."
         raise DatasetError(dataset, problem, LOG_PROBS)
     return torch.from_numpy(values)
+
+
+def without_parts(episodes: Episodes, log_probs: Tensor | None) -> tuple[Episodes, Tensor | None]:
+    """Selects the whole episodes: parts begin or end at a gap, where no episode does.
+
+    Args:
+        episodes: the data.
+        log_probs: those of their actions, [N], if they are known.
+    """
+    kept = torch.zeros_like(episodes.cut)
+    kept[episodes.whole] = True
+    if log_probs is not None:
+        log_probs = log_probs[kept.repeat_interleave(episodes.lengths)]
+    return select_episodes(episodes, episodes.whole), log_probs
 
 
 def clone(behavior: TensorDictModuleBase, items: HistoryStorage, updates: int) -> None:

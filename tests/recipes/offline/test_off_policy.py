@@ -21,7 +21,14 @@ from recipes.iql import IQL
 from recipes.offline import read_data, with_spaces
 from recipes.ppo import PPO
 from recipes.tools import off_policy
-from recipes.tools.off_policy import clone, fit_q, fitted_q, recorded_log_probs, weighted_returns
+from recipes.tools.off_policy import (
+    clone,
+    evaluate_on_data,
+    fit_q,
+    fitted_q,
+    recorded_log_probs,
+    weighted_returns,
+)
 from tests.agents.runs import make_run
 from tests.recipes.commands import fails
 from tests.recipes.offline.test_without_env import log_machine
@@ -148,6 +155,29 @@ def test_weights_are_those_of_the_formula(tmp_path):
     rows["action"][episodes.step_rows[~same.ravel()]] = actions.max() + 1
     with pytest.raises(ValueError, match="up to its end"):
         weighted_returns(algorithm, replace(episodes, rows=rows), known, 0)
+
+
+@pytest.mark.parametrize("ope", ["fqe", "wis"])
+def test_parts_of_episodes_that_a_gap_cut_are_left_out(tmp_path, monkeypatch, ope):
+    draw = np.random.default_rng(0)
+    observations = draw.normal(size=(200, 5))
+    following = np.roll(observations, -1, 0)
+    following[24] += 1  # of ten episodes of 20 steps, the second lost a step
+    arrays: dict[str, Any] = {"observations": observations, "next_observations": following}
+    data = log_machine(tmp_path / "log.hdf5", actions=np.arange(200) % 3, **arrays)
+    log_probs = -draw.random(200)
+    with h5py.File(data, "a") as file:
+        file["action_log_probs"] = log_probs
+    recipe = with_spaces(
+        BC(dataset=str(data), backbone=SMALL, total_updates=1, gaps="cut", name="bc/mine")
+    )
+    run, found = train(recipe, tmp_path / "run"), []
+    name = {"fqe": "fitted_q", "wis": "weighted_returns"}[ope]
+    monkeypatch.setattr(off_policy, name, lambda _, *given: found.extend(given) or {})
+    evaluate_on_data(run, recipe, str(data), ope=ope)
+    assert found[0].lengths.tolist() == [20] * 9
+    if ope == "wis":
+        assert found[1].tolist() == np.delete(log_probs, np.s_[20:40]).tolist()
 
 
 def test_behavior_is_cloned_and_not_learnt_by_heart(tmp_path):
