@@ -347,7 +347,7 @@ class OnlineData:
                 rows=rows,
                 lengths=state_dict["lengths"],
                 final_known=(known := state_dict["final_known"]),
-                cut=state_dict.get("cut", torch.zeros_like(known)),  # as before 0.2
+                cut=state_dict.get("cut", torch.zeros_like(known)),  # version 0.1 wrote none
                 source=self._episodes.source,
             ).to(self._episodes.lengths.device)
             self._buffer = self._make_buffer()

@@ -242,10 +242,10 @@ def without_parts(episodes: Episodes, log_probs: Tensor | None) -> tuple[Episode
         log_probs: those of their actions, [N], if they are known.
     """
     kept = torch.zeros_like(episodes.cut)
-    kept[episodes.whole] = True
+    kept[whole := episodes.whole] = True
     if log_probs is not None:
         log_probs = log_probs[kept.repeat_interleave(episodes.lengths)]
-    return select_episodes(episodes, episodes.whole), log_probs
+    return select_episodes(episodes, whole), log_probs
 
 
 def clone(behavior: TensorDictModuleBase, items: HistoryStorage, updates: int) -> None:

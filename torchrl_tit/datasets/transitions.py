@@ -315,12 +315,12 @@ def _truncations(
     """Where episodes were truncated, and where that is only because of a gap; bool [N] each."""
     marked = "timeouts" in reader.fields
     truncated = reader.flags("timeouts") if marked else np.zeros_like(terminated)
-    ends = terminated | truncated
+    flagged = terminated | truncated
     if "next_observations" in reader.fields and (gaps == "cut" or not marked):
         truncated |= _gaps(reader) & ~terminated
     if times is not None and gaps == "cut":
         truncated |= _pauses(times)[0] & ~terminated
-    cuts = truncated & ~ends & marked  # otherwise gaps are where episodes end
+    cuts = truncated & ~flagged & marked  # otherwise gaps are where episodes end
     if max_episode_steps is not None and not marked:
         ends = np.flatnonzero(terminated | truncated)
         for before, last in pairwise([-1, *ends, reader.num_rows - 1]):
