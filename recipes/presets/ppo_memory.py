@@ -44,8 +44,9 @@ _T_MAZES = {10: 100_000, 50: 400_000, 250: 2_000_000, 500: 4_000_000}
 """The number of steps by the corridor's length: 8,000 episodes or more. K frames just reach the cue
 at the junction."""
 
-_REPEATS = {"easy": 500_000, "medium": 500_000}
-"""The number of steps of POPGym's RepeatPrevious by difficulty: 4 or 32 steps back."""
+_REPEATS = {"easy": (32, 500_000), "medium": (32, 500_000), "hard": (64, 1_000_000)}
+"""Frames K and the number of steps of POPGym's RepeatPrevious by difficulty: 4, 32 or 64 steps
+back."""
 
 _MINIGRIDS = {
     "S7": 1_000_000,
@@ -123,11 +124,11 @@ def _named() -> list[Preset]:
             total_steps=total_steps,
             **_t_maze_settings(length),
         )
-    for difficulty, total_steps in _REPEATS.items():
+    for difficulty, (num_frames, total_steps) in _REPEATS.items():
         recipes += of_networks(
             PPO,
             f"ppo/repeat-previous-{difficulty}",
-            memory_networks(32),
+            memory_networks(num_frames),
             env=f"popgym-RepeatPrevious{difficulty.title()}-v0",
             total_steps=total_steps,
             **MEMORY_SETTINGS,
