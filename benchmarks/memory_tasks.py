@@ -159,7 +159,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs and runs.csv")
     options = parser.parse_args(arguments)
 
-    recipes = {recipe.name: recipe for recipe in map(find_recipe, options.recipes)}
+    try:
+        recipes = {recipe.name: recipe for recipe in map(find_recipe, options.recipes)}
+    except (ImportError, ValueError, OSError) as error:
+        parser.error(" ".join(str(error).split()))
 
     def measure_run(name: str, seed: int) -> list[object]:
         recipe = replace(recipes[name], seed=seed)

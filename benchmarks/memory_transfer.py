@@ -28,7 +28,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--out", type=Path, required=True, help="CSV")
     options = parser.parse_args(arguments)
-    found = [Run.open(folder) for folder in options.runs]
+    try:
+        found = [Run.open(folder) for folder in options.runs]
+    except (ValueError, OSError) as error:
+        parser.error(" ".join(str(error).split()))
     runs = {(run.recipe.name, run.recipe.seed): run for run in found}
 
     def play(name: str, seed: int, maze: str) -> list[object]:

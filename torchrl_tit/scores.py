@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TypeVar
 
 import numpy as np
@@ -87,6 +88,5 @@ def _reference(name: str) -> tuple[float, float]:
 
 
 def _family(name: str) -> str:
-    """The task in a name: "hopper" in "mujoco/hopper/medium-v0" and "Hopper-v5"."""
-    parts = name.lower().removeprefix("mujoco/").replace("/", "-").split("-")
-    return parts[0]
+    """The task in a name: "hopper" in "mujoco/hopper/medium-v0", "hopper_medium-v2.hdf5"."""
+    return re.split("[-_/]", name.lower().removeprefix("mujoco/"), maxsplit=1)[0]

@@ -201,10 +201,11 @@ def _parts(episodes: Episodes) -> str:
 
 
 def _scored_name(episodes: Episodes) -> str | None:
-    """Returns the first of the data set's names that has reference returns."""
-    recorded = str(episodes.attributes.get("env_id", ""))
-    names = [episodes.source, Path(episodes.source).name, recorded]
-    return next((name for name in names if has_reference(name)), None)
+    """Returns the recorded task, else the data set's name, if it has reference returns."""
+    source = Path(episodes.source)
+    name = source.name if source.exists() else episodes.source  # no folder names a task
+    name = str(episodes.attributes.get("env_id", name))
+    return name if has_reference(name) else None
 
 
 def _range(values: Tensor) -> str:

@@ -1,11 +1,13 @@
 """Agents play mazes that they were not trained in."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from benchmarks import memory_transfer
+from benchmarks import memory_tasks, memory_transfer
 from benchmarks.measuring import read_rows
 from recipes.core.registry import get_recipe
 from tests.recipes.small import train
@@ -36,3 +38,21 @@ def test_a_row_for_each_maze_and_none_twice(tmp_path, monkeypatch, capsys):
         memory_transfer.runner, "evaluate", lambda *_: pytest.fail("measured again")
     )
     memory_transfer.main(words)
+
+
+@pytest.mark.parametrize(
+    ("program", "problem"),
+    [
+        (memory_tasks.main, "unknown recipe 'absent'"),
+        (memory_transfer.main, "absent is not a run folder"),
+    ],
+)
+def test_a_mistake_gives_one_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    program: Callable[[list[str]], None],
+    problem: str,
+) -> None:
+    with pytest.raises(SystemExit):
+        program(["absent", "--out", str(tmp_path / "out")])
+    assert f"error: {problem}" in capsys.readouterr().err

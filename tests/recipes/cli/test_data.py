@@ -40,6 +40,35 @@ def test_info(tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture
     assert lines["policy"] == "random"
 
 
+@pytest.mark.parametrize(
+    ("file", "task", "scored"),
+    [
+        ("hopper/a.hdf5", None, False),
+        ("hopper/a.hdf5", "CartPole-v1", False),
+        ("walker2d/a.hdf5", "Hopper-v5", True),
+        ("hopper_medium-v2.hdf5", None, True),
+    ],
+)
+def test_the_recorded_task_or_the_file_says_how_returns_are_scored(
+    tmp_path: Path,
+    rolled: Transitions,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    task: str | None,
+    scored: bool,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(file).parent.mkdir(exist_ok=True)
+    write(Path(file), rolled, **({"env_id": task} if task else {}))
+    main(["data", "info", file])
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    returns = np.array([rolled["rewards"][a:b].sum(dtype=np.float64) for a, b in spans(rolled)])
+    expected = f"mean {normalized_score(returns, 'hopper').mean():.3f}"
+    assert (expected in lines["score"]) == scored
+    assert scored or lines["score"] == "no reference returns for this task"
+
+
 def test_text_of_a_file_does_not_control_the_terminal(
     tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]
 ) -> None:
