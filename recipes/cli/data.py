@@ -121,6 +121,8 @@ def describe(episodes: Episodes) -> str:
     """
     terminated, finished = episodes.terminated, episodes.finished
     lengths = episodes.lengths.double()
+    returns, name = episodes.returns[finished & ~episodes.cut], _scored_name(episodes)
+    unscored = "no reference returns for this task"
     counts = {
         "terminated": int(terminated.sum()),
         "truncated": int((finished & ~terminated).sum()),
@@ -133,15 +135,9 @@ def describe(episodes: Episodes) -> str:
         "transitions": str(episodes.num_transitions),
         "episodes": f"{len(lengths)} ({kinds})",
         "length": f"min {lengths.min():.0f}, mean {lengths.mean():.1f}, max {lengths.max():.0f}",
-        "return": "no episode is whole",
-        "score": "no reference returns for this task",
+        "return": _range(returns),
+        "score": _range(normalized_score(returns, name)) if name else unscored,
     }
-    if (finished & ~episodes.cut).any():
-        returns = episodes.returns[episodes.whole]
-        lines["return"] = _range(returns)
-        if name := _scored_name(episodes):
-            scores = normalized_score(returns, name)
-            lines["score"] = _range(scores)
     for field in ("observation", "action", "reward"):
         values = episodes.rows[field]
         lines[field] = f"{list(values.shape[1:])} {str(values.dtype).removeprefix('torch.')}"
@@ -209,4 +205,6 @@ def _scored_name(episodes: Episodes) -> str | None:
 
 
 def _range(values: Tensor) -> str:
+    if not len(values):
+        return "no episode is whole"
     return f"min {values.min():.3f}, mean {values.mean():.3f}, max {values.max():.3f}"

@@ -69,6 +69,18 @@ def test_the_recorded_task_or_the_file_says_how_returns_are_scored(
     assert scored or lines["score"] == "no reference returns for this task"
 
 
+def test_parts_of_an_episode_have_no_score(
+    tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]
+) -> None:
+    start, stop = max(spans(rolled), key=lambda span: span[1] - span[0])
+    episode = {name: array[start:stop].copy() for name, array in rolled.items()}
+    episode["next_observations"][0] += 1
+    path = write(tmp_path / "a.hdf5", episode, env_id="Hopper-v5")
+    main(["data", "info", str(path), "--gaps", "cut"])
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert lines["return"] == lines["score"] == "no episode is whole"
+
+
 def test_text_of_a_file_does_not_control_the_terminal(
     tmp_path: Path, rolled: Transitions, capsys: pytest.CaptureFixture[str]
 ) -> None:
