@@ -121,7 +121,7 @@ def describe(episodes: Episodes) -> str:
     """
     terminated, finished = episodes.terminated, episodes.finished
     lengths = episodes.lengths.double()
-    returns, name = episodes.returns[finished & ~episodes.cut], _scored_name(episodes)
+    returns, task = episodes.returns[finished & ~episodes.cut], _scored_name(episodes)
     unscored = "no reference returns for this task"
     counts = {
         "terminated": int(terminated.sum()),
@@ -136,7 +136,7 @@ def describe(episodes: Episodes) -> str:
         "episodes": f"{len(lengths)} ({kinds})",
         "length": f"min {lengths.min():.0f}, mean {lengths.mean():.1f}, max {lengths.max():.0f}",
         "return": _range(returns),
-        "score": _range(normalized_score(returns, name)) if name else unscored,
+        "score": _range(normalized_score(returns, task)) if task else unscored,
     }
     for field in ("observation", "action", "reward"):
         values = episodes.rows[field]
