@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl_tit.modules import make_squashed_actor
 from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
-from torchrl_tit.settings.numbers import Count, Fraction, Rate, Weight, Widths
+from torchrl_tit.settings.numbers import Count, Fraction, Rate, StepsOrNone, Weight, Widths
 
 from .core.algorithm import Terms, descend
 from .core.compilation import check_compiler, compile_and_time, should_compile
@@ -98,6 +98,9 @@ class CQL(ConservativeRecipe, algorithm="cql"):
     """Learning rate of Adam for the critics."""
     temperature_learning_rate: Rate = 1e-4
     """Learning rate of Adam for the temperature."""
+    cloning_updates: StepsOrNone = 0
+    """Gradient steps at the start in which the actor imitates the data's actions, while the critics
+    learn; 40,000 of 1,000,000 in the code of arXiv 2006.04779."""
     action_samples: Count = 10
     """Actions sampled in each state from each of: uniform, the policy at s, the policy at s'."""
     over_critics: Literal["mean", "sum"] = "mean"
@@ -160,6 +163,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         self._sample_policy = self.compiled(self.model.sample_policy, "the policy")
         self._loss = self.compiled(self.loss, "the critics' loss")
         self._actor_loss = self.compiled(self.actor_loss, "the actor's loss")
+        self._cloning_loss = self.compiled(self.cloning_loss, "the actor's cloning loss")
 
     def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of critics and temperature; see :meth:`TransitionAlgorithm.loss`.
@@ -183,9 +187,16 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         Args:
             samples: as in :meth:`loss`.
         """
+        return self._actor_terms(self.model.actor_loss(samples)[0], samples)
+
+    def cloning_loss(self, samples: TensorDictBase) -> Terms:
+        """As :meth:`actor_loss`, in the first ``cloning_updates``."""
+        return self._actor_terms(self.model.actor_bc_loss(samples)[0], samples)
+
+    def _actor_terms(self, loss_actor: Tensor, samples: TensorDictBase) -> Terms:
         log_prob = samples["policy_samples", "log_prob"].detach()
         return {
-            "loss_actor": self.model.actor_loss(samples)[0],
+            "loss_actor": loss_actor,
             "alpha": self.model.log_alpha.detach().exp(),
             "entropy": -log_prob.mean(),
         }
@@ -199,7 +210,8 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         samples = self._sample_policy(batch)
         terms = self._loss(samples)
         descend(terms, self.optimizer)
-        actor_terms = self._actor_loss(samples)
+        clones = step < self.recipe.cloning_updates
+        actor_terms = (self._cloning_loss if clones else self._actor_loss)(samples)
         descend(actor_terms, self.optimizer)
         self.target.step()
         return self.numbers({**terms, **actor_terms})

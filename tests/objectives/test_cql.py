@@ -108,6 +108,20 @@ def uniform_actions(monkeypatch):
     return low + np.array(WIDTHS) * drawn.numpy()
 
 
+def log_density(loss, state, action):
+    """The log density of a policy's action in a state, and the action of its mean."""
+    head = loss.actor_network_params
+    weight = {key[-2:]: w.detach().numpy() for key, w in head.items(True, True)}
+    mean, log_std = (
+        state @ weight[name, "weight"].T + weight[name, "bias"] for name in ("mean", "log_std")
+    )
+    middle, half = (SPEC.space.high + SPEC.space.low).numpy() / 2, np.array(WIDTHS) / 2
+    squashed = (action - middle) / half
+    density = norm.logpdf(np.arctanh(squashed), mean, np.exp(log_std))
+    density -= np.log(1 - squashed**2) + np.log(half)
+    return density.sum(), middle + half * np.tanh(mean)
+
+
 @pytest.mark.parametrize("over_critics", ["mean", "sum"])
 def test_critics(monkeypatch, over_critics):
     loss = make_loss(over_critics=over_critics)
@@ -161,6 +175,24 @@ def test_actor():
     assert loss.log_alpha.grad is None
 
 
+def test_actor_that_clones():
+    """Nothing else gets a gradient; where the data's action is at a bound, it is finite."""
+    loss, batch = make_loss(), make_batch()
+    torch.manual_seed(5)
+    log_prob = loss.sample_policy(batch)["policy_samples", "log_prob"].mean().item()
+    torch.manual_seed(5)
+    loss_actor, others = loss.actor_bc_loss(batch)
+    pairs = zip(batch["observation"].numpy(), batch["action"].numpy(), strict=True)
+    likelihood = np.mean([log_density(loss, state, action)[0] for state, action in pairs])
+    assert others["bc_log_prob"].item() == pytest.approx(likelihood)
+    assert loss_actor.item() == pytest.approx(0.3 * log_prob - likelihood)
+    batch["action"][0], batch["action"][1] = SPEC.space.high, SPEC.space.low
+    loss.actor_bc_loss(batch)[0].backward()
+    assert all(w.grad.isfinite().all() for w in weights(loss.actor_network_params).values())
+    assert all(w.grad is None for w in weights(loss.qvalue_network_params).values())
+    assert loss.log_alpha.grad is None
+
+
 def test_temperature():
     loss, (batch, samples) = make_loss(), with_samples(make_batch())
     excess = samples["log_prob"].detach().mean().item() - ACTION  # target entropy: -2
@@ -178,20 +210,11 @@ def test_the_policy_is_sampled_where_it_should_be():
     samples = loss.sample_policy(batch)["policy_samples"]
     assert samples["actions"].shape == (BATCH, 2 * SAMPLES, ACTION)
     assert {key for key, value in samples.items() if value.requires_grad} == {"action", "log_prob"}
-    middle = (SPEC.space.high + SPEC.space.low).numpy() / 2
-    half = np.array(WIDTHS) / 2
-    head = loss.actor_network_params
-    weight = {key[-2:]: w.detach().numpy() for key, w in head.items(True, True)}
 
     def check(state, action, log_prob):
-        mean, log_std = (
-            state @ weight[name, "weight"].T + weight[name, "bias"] for name in ("mean", "log_std")
-        )
-        squashed = (action - middle) / half
-        density = norm.logpdf(np.arctanh(squashed), mean, np.exp(log_std))
-        density -= np.log(1 - squashed**2) + np.log(half)
-        assert log_prob == pytest.approx(density.sum(), rel=1e-5)
-        return middle + half * np.tanh(mean)
+        density, best = log_density(loss, state, action)
+        assert log_prob == pytest.approx(density, rel=1e-5)
+        return best
 
     for b in range(BATCH):
         here, there = (d["observation"][b].numpy() for d in (batch, batch["next"]))

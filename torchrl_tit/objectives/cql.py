@@ -279,6 +279,19 @@ class ContinuousCQLLoss(CQLLoss):
             self.tensor_keys.log_prob: log_prob.detach()
         }
 
+    def actor_bc_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of an actor that clones the data, of a batch [*B], float [].
+
+        TorchRL's, the mean of ``alpha log p(a) - log p(b)`` with the data's actions b, as in the
+        code of arXiv 2006.04779.
+
+        Returns:
+            The loss, and the mean of log p(b), float [], under "bc_log_prob".
+        """
+        keys = [*self.actor_network.in_keys, self.tensor_keys.action]
+        with set_recurrent_mode(True):
+            return super().actor_bc_loss(tensordict.select(*keys, strict=False))
+
     def _samples(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The policy's samples that a batch has, or new ones."""
         samples = tensordict.get(_SAMPLES, None)

@@ -63,6 +63,28 @@ def test_temperature_and_critics_then_actor_then_targets(tmp_path, monkeypatch):
     assert loss.value_estimator.gamma.item() == pytest.approx(0.97)
 
 
+def test_the_actor_clones_first_and_then_maximizes_values(tmp_path, monkeypatch):
+    recipe = make_cql(tmp_path, backbone=SMALL, cloning_updates=2)
+    algorithm, batch = double(recipe, tmp_path)
+    model, taken = algorithm.model, []
+
+    def watch(name):
+        compute = getattr(model, name)
+
+        def watched(samples):
+            loss, others = compute(samples)
+            taken.append((name, loss.item()))
+            return loss, others
+
+        monkeypatch.setattr(model, name, watched)
+
+    for name in ("actor_loss", "actor_bc_loss"):
+        watch(name)
+    terms = [algorithm.update(batch, step)["loss_actor"].item() for step in range(3)]
+    names = ["actor_bc_loss", "actor_bc_loss", "actor_loss"]
+    assert taken == list(zip(names, terms, strict=True))
+
+
 @pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
 def test_dropout_is_on_in_updates_and_off_in_evaluations(tmp_path, make, monkeypatch):
     settings = {"critic": "backbone"} if make is make_cql else {}
