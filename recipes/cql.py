@@ -182,7 +182,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
     def actor_loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the actor, once the others have taken a step on theirs.
 
-        Whatever trains the actor's weights belongs here.
+        Whatever trains the actor's weights belongs here, once ``cloning_updates`` are over.
 
         Args:
             samples: as in :meth:`loss`.
@@ -190,7 +190,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         return self._actor_terms(self.model.actor_loss(samples)[0], samples)
 
     def cloning_loss(self, samples: TensorDictBase) -> Terms:
-        """As :meth:`actor_loss`, in the first ``cloning_updates``."""
+        """Returns the terms of the actor in the first ``cloning_updates``."""
         return self._actor_terms(self.model.actor_bc_loss(samples)[0], samples)
 
     def _actor_terms(self, loss_actor: Tensor, samples: TensorDictBase) -> Terms:
