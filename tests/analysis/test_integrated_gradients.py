@@ -54,6 +54,24 @@ def test_they_add_up(name: str, target: Any) -> None:
 
 
 @pytest.mark.usefixtures("float64")
+def test_points_are_added_until_the_sum_is_right() -> None:
+    """Steep targets need more of them."""
+    pytest.importorskip("captum")
+    network = NETWORKS["enhanced"]
+    policy, states = make_policy(network, OBSERVATION), make_states(network)
+    states["history"] *= 3
+    states["action"] = torch.arange(2)
+    exact = integrated_gradients(policy, states, steps=2000)["observation"]
+    with pytest.warns(UserWarning, match="with 32 points, attributions miss the difference in the"):
+        rough = integrated_gradients(policy, states, steps=1, tolerance=0)["observation"]
+    assert_near(rough, integrated_gradients(policy, states, steps=32, tolerance=9)["observation"])
+    for tolerance in (0.1, 0.01):
+        shares = integrated_gradients(policy, states, steps=8, tolerance=tolerance)["observation"]
+        apart = (shares.sum((1, 2)) - exact.sum((1, 2))).abs()
+        assert (apart <= 1.1 * tolerance * shares.abs().sum((1, 2))).all()
+
+
+@pytest.mark.usefixtures("float64")
 def test_chosen_actions() -> None:
     pytest.importorskip("captum")
     network = NETWORKS["enhanced"]

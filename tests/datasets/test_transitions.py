@@ -258,6 +258,13 @@ def test_what_is_large_and_not_needed_is_left_out(tmp_path: Path, rolled: Transi
     assert data.left_out == ("and others", "data/rewards", "elsewhere")
 
 
+def test_attributes_of_fields_are_said_to_be_left_out(tmp_path: Path, rolled: Transitions) -> None:
+    path = write(tmp_path / "a.hdf5", rolled)
+    with h5py.File(path, "a") as file:
+        file["observations"].attrs["unit"] = "m"
+    assert read_hdf5(path).left_out == ("attributes of observations",)
+
+
 def _at(name: str, place: Any, value: float) -> Callable[[Transitions], Any]:
     return lambda arrays: arrays[name].__setitem__(place, value)
 

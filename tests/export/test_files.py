@@ -110,6 +110,25 @@ def test_a_file_says_how_many_steps_it_reads(tmp_path):
     assert said["num_frames"] == 2
 
 
+def test_a_decision_transformer_is_compared_within_its_episodes(tmp_path):
+    """Beyond ``max_ep_len``, it has no time step."""
+    network = DecisionTransformer((4,), action_dim=2, num_frames=4, max_ep_len=7)
+    policy = make_dt_actor(network, DTHead(network.features_dim, 2, "discrete")).eval()
+
+    def task(copies):
+        transforms = TargetReturn(50.0), SequenceHistory(4)
+        return make_env("CartPole-v1", copies).append_transform(Compose(*transforms))
+
+    said = export_policy(policy, task, tmp_path / "policy.pt2", step_by_step=True)
+    assert said["difference"] < 1e-5
+
+
+def test_actions_of_several_dimensions(tmp_path):
+    policy, task = make_policy("BoxActions-v0", Linear(embed_dim=4))
+    said = export_policy(policy, task, tmp_path / "policy.pt2", step_by_step=True)
+    assert said["outputs"]["action"]["shape"] == [2, 2]
+
+
 def test_nothing_is_left_of_a_file_that_acts_differently(tmp_path, monkeypatch):
     policy, task = small()
 

@@ -34,7 +34,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
         path: the file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
             "terminals" [N], and optionally "timeouts" [N], "next_observations" [N, *obs], and
             "timestamps" [N], whose order is checked.
-            Other fields, and attributes that are neither text nor a few numbers, are not read.
+            Other fields, attributes of fields, and attributes of the file that are neither text nor
+            a few numbers, are not read.
         **settings: as for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
             which describes how missing fields are replaced.
 
@@ -70,6 +71,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
         for name in (*FIELDS, TIMESTAMPS):
             if isinstance(field := find(source, file, name), h5py.Dataset):
                 fields[name] = field
+                if len(field.attrs):
+                    fields[f"attributes of {name}"] = None
         return episodes_from_transitions(fields, source=source, attributes=attributes, **settings)
 
 

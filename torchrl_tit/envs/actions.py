@@ -72,7 +72,7 @@ class ActionWriter:
             actions = torch.where(below, low, torch.where(above, high, inside))
         if self.start is not None:
             actions = actions + self.start
-        return actions if self.shape is None else actions.reshape(len(actions), *self.shape)
+        return actions if self.shape is None else actions.reshape(actions.shape[0], *self.shape)
 
 
 def refuse_nan(actions: Tensor) -> None:

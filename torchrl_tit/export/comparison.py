@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase, RenameTransform, TransformedEnv
 
 from torchrl_tit.export.formats import Run
 from torchrl_tit.export.program import NOISE, Program, Step
+from torchrl_tit.histories.decision_transformer import DecisionTransformer
 
 TOLERANCE = 1e-5
 """Largest difference, relative to the largest entry if that is above 1."""
@@ -58,11 +59,12 @@ def compare(
     keys = _keep_untouched(program, env)
     env.set_seed(0)
     generator = torch.Generator().manual_seed(0)
+    longest = _longest_episode(policy)
     steps, largest = -(-observations // max(1, env.batch_size.numel())), 0.0
     tensordict, episode, state = env.reset(), list[Step](), dict[str, Tensor]()
     reward = torch.zeros(tensordict.numel())
     for step in range(steps):
-        if step == _EPISODE:
+        if step == _EPISODE or len(episode) == longest:
             tensordict, episode = env.reset(), []
         flat = tensordict.reshape(-1)
         with set_interaction_type(InteractionType.DETERMINISTIC):
@@ -96,6 +98,18 @@ def compare(
         if taken["next", "done"].any():
             tensordict, episode = env.reset(), []
     return largest
+
+
+def _longest_episode(policy: TensorDictModuleBase) -> int | None:
+    """The number of steps after which a Decision Transformer has no time step left."""
+    return next(
+        (
+            module.max_ep_len
+            for module in policy.modules()
+            if isinstance(module, DecisionTransformer) and module.timestep_embedding is not None
+        ),
+        None,
+    )
 
 
 def _keep_untouched(program: Program, env: EnvBase) -> list[NestedKey]:

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, permutation_test, trim_mean
+from scipy.stats import norm, permutation_test
 
 from ...core.numbers import mean_std, number
 from ...core.recipe import Recipe
 from .experiments import TASK
-from .interval import FEWEST, Interval
+from .interval import FEWEST, Interval, middle_half
 from .package_rows import read_rows
 from .table import measure_of, read_evaluations, value_of
 
@@ -136,7 +136,7 @@ def interquartile_mean(values: Values) -> Interval:
 
     def middle(draws: Sequence[np.ndarray]) -> np.ndarray:
         equal = [np.repeat(x, size // x.shape[-1], axis=-1) for x in draws]
-        return trim_mean(np.concatenate(equal, -1), 0.25, axis=-1)
+        return middle_half(np.concatenate(equal, -1))
 
     found = middle([_resampled(x, task) for task, x in enumerate(groups)])
     return _with_interval(middle(groups), found, groups)
@@ -145,7 +145,8 @@ def interquartile_mean(values: Values) -> Interval:
 def probability_of_improvement(ours: Values, others: Values) -> Interval:
     """The probability that a run is better than one of others, the mean over tasks.
 
-    Ties count half. The interval is a bootstrap of the runs within each task (arXiv 2108.13264).
+    Ties count half. The interval is a bootstrap of the runs within each task (arXiv 2108.13264);
+    there is none where a task has a single run, or one of both fewer than five in all.
 
     Args:
         ours: values by task.
@@ -160,13 +161,15 @@ def probability_of_improvement(ours: Values, others: Values) -> Interval:
         _better(_resampled(x, 2 * i), _resampled(y, 2 * i + 1)) for i, (x, y) in enumerate(pairs)
     ]
     better = np.mean([_better(x, y) for x, y in pairs])
-    return _with_interval(better, np.mean(draws, 0), [x for pair in pairs for x in pair])
+    return _with_interval(better, np.mean(draws, 0), *zip(*pairs, strict=True))
 
 
-def _with_interval(value: np.ndarray, draws: np.ndarray, groups: list[np.ndarray]) -> Interval:
-    """A number with the interval of its resamples, or with none of too few runs."""
-    counts = [*map(len, groups)]
-    enough = min(counts) > 1 and sum(counts) >= FEWEST
+def _with_interval(
+    value: np.ndarray, draws: np.ndarray, *networks: Sequence[np.ndarray]
+) -> Interval:
+    """A number with the interval of its resamples, or with none if a network has too few runs."""
+    counts = [[*map(len, groups)] for groups in networks]
+    enough = min(map(min, counts)) > 1 and min(map(sum, counts)) >= FEWEST
     low, high = np.quantile(draws, [0.025, 0.975]) if enough else (nan, nan)
     return Interval(float(value), float(low), float(high))
 

@@ -5,6 +5,7 @@ import pytest
 
 from recipes.cli import main
 from recipes.tools.results.comparison import compare, interquartile_mean, probability_of_improvement
+from recipes.tools.results.interval import interval_of
 from tests.recipes.commands import fails
 from tests.recipes.results.report_runs import metrics_of, write_run
 
@@ -43,12 +44,25 @@ def test_all_tasks_count_equally_and_runs_are_drawn_within_their_task():
     assert (found.middle, found.low, found.high) == (2.5, 2.5, 2.5)
     ours = {"a": [2.0, 3.0], "b": [1.0, 1.0]}
     others = {"b": [0.0, 0.0], "a": [1.0, 3.0]}
+    assert np.isnan(probability_of_improvement(ours, others).low)  # of four runs each
+    ours["b"].append(1.0)
+    assert np.isnan(probability_of_improvement(ours, others).low)
+    others["b"].append(0.0)
     improved = probability_of_improvement(ours, others)
     assert improved.middle == (0.625 + 1) / 2
     assert (improved.low, improved.high) == (0.5, 1)
     single = {"a": [2.0, 3.0], "b": [1.0]}
     assert str(interquartile_mean(single)) == "1.5"  # no interval
     assert np.isnan(probability_of_improvement(single, others).low)
+
+
+def test_the_middle_half_is_a_half_however_many_runs_there_are():
+    """Else networks with more runs would be compared by another statistic."""
+    runs = [1.0, 2.0, 3.0, 4.0, 100.0, 100.0]
+    middle = (2.0 / 2 + 3 + 4 + 100 / 2) / 3  # a quarter is one run and a half
+    assert interval_of(runs).middle == pytest.approx(middle)
+    for repeated in ({"a": runs}, {"a": runs * 4}, {"a": runs, "b": runs}):
+        assert interquartile_mean(repeated).middle == pytest.approx(middle)
 
 
 def test_compare_says_which_is_better(tmp_path, monkeypatch, capsys):
@@ -94,7 +108,7 @@ def test_summary(tasks, capsys):
     printed = capsys.readouterr()
     # (250 - 23.68) / (500 - 23.68) = 0.475; (-90 + 497.08) / (-73.506 + 497.08) = 0.961
     assert "| mlp | 2 | 4 | 0.718 |  |" in printed.out
-    assert "| enhanced-* | 2 | 4 | 0.992 | 1 [1, 1] |" in printed.out
+    assert "| enhanced-* | 2 | 4 | 0.992 | 1 |" in printed.out
     assert "MountainCar-v0 is left out of enhanced-*: not all networks have" in printed.err
     file = tasks / "mine.csv"
     file.write_text(
