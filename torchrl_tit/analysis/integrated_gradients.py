@@ -18,6 +18,7 @@ from torchrl_tit.analysis.targets import (
     find_backbone,
     find_network,
     run_policy,
+    target_name,
 )
 from torchrl_tit.extras import install
 from torchrl_tit.layers.images import bytes_to_floats
@@ -118,9 +119,9 @@ def integrated_gradients(
                 break
         else:
             warnings.warn(
-                f"with {points} points, attributions miss the difference in the {target} by up to "
-                f"{off:.1%} of their magnitudes, more than tolerance {tolerance:.1%}: raise steps "
-                f"({steps}), or tolerance",
+                f"with {points} points, attributions miss the difference in the "
+                f"{target_name(target)} by up to {off:.1%} of their magnitudes, more than "
+                f"tolerance {tolerance:.1%}: raise steps ({steps}), or tolerance",
                 stacklevel=2,
             )
     return {name: share.detach() for name, share in zip(inputs, shares, strict=True)}

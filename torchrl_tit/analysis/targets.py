@@ -144,5 +144,12 @@ def as_batch(tensordict: TensorDictBase) -> TensorDictBase:
 def check_gradient(value: Tensor, target: Target) -> None:
     """Raises ValueError if a target depends on nothing."""
     if not value.requires_grad:
-        name = target if isinstance(target, str) else getattr(target, "__name__", "the target")
-        raise ValueError(f"{name} does not depend on what the network reads: choose another target")
+        raise ValueError(
+            f"{target_name(target)} does not depend on what the network reads: choose another "
+            "target"
+        )
+
+
+def target_name(target: Target) -> str:
+    """What messages call a target."""
+    return target if isinstance(target, str) else getattr(target, "__name__", "the target")

@@ -71,8 +71,9 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
         for name in (*FIELDS, TIMESTAMPS):
             if isinstance(field := find(source, file, name), h5py.Dataset):
                 fields[name] = field
-                if len(field.attrs):
-                    fields[f"attributes of {name}"] = None
+                with damage_named(source, "its attributes cannot be read", name):
+                    if len(field.attrs):
+                        fields[f"attributes of {name}"] = None
         return episodes_from_transitions(fields, source=source, attributes=attributes, **settings)
 
 
