@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, permutation_test
+from scipy.stats import norm, permutation_test, trim_mean
 
 from ...core.numbers import mean_std, number
 from ...core.recipe import Recipe
 from .experiments import TASK
-from .interval import FEWEST, Interval, middle_half
+from .interval import FEWEST, Interval
 from .package_rows import read_rows
 from .table import measure_of, read_evaluations, value_of
 
@@ -131,12 +131,12 @@ def interquartile_mean(values: Values) -> Interval:
         0.5
     """
     groups = [np.asarray(found, float) for found in values.values()]
-    # Every value as often as makes all tasks equally large.
-    size = lcm(*map(len, groups))
+    # Every value as often as makes all tasks equally large, and a quarter of them a whole number.
+    size = 4 * lcm(*map(len, groups))
 
     def middle(draws: Sequence[np.ndarray]) -> np.ndarray:
         equal = [np.repeat(x, size // x.shape[-1], axis=-1) for x in draws]
-        return middle_half(np.concatenate(equal, -1))
+        return trim_mean(np.concatenate(equal, -1), 0.25, axis=-1)
 
     found = middle([_resampled(x, task) for task, x in enumerate(groups)])
     return _with_interval(middle(groups), found, groups)

@@ -49,8 +49,8 @@ def interval_of(values: Sequence[float] | np.ndarray) -> Interval:
     x = np.array(values, dtype=float)
     if len(x) < FEWEST:
         return Interval(float(x.mean()), np.nan, np.nan)
-    found = bootstrap((x,), middle_half, n_resamples=10_000, method="percentile", rng=0)
-    return Interval(float(middle_half(x)), *map(float, found.confidence_interval))
+    found = bootstrap((x,), _iqm, n_resamples=10_000, method="percentile", rng=0)
+    return Interval(float(_iqm(x)), *map(float, found.confidence_interval))
 
 
 def intervals_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -71,14 +71,10 @@ def intervals_of(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
         unknown = np.full(values.shape[1], np.nan)
         return values.mean(0), unknown, unknown
     found = bootstrap(
-        (values,), middle_half, axis=0, n_resamples=2_000, batch=200, method="percentile", rng=0
+        (values,), _iqm, axis=0, n_resamples=2_000, batch=200, method="percentile", rng=0
     )
-    return middle_half(values, axis=0), *found.confidence_interval
+    return _iqm(values, axis=0), *found.confidence_interval
 
 
-def middle_half(x: np.ndarray, axis: int = -1) -> np.ndarray:
-    """The mean of the middle half of numbers: their interquartile mean.
-
-    Where a quarter is no whole number of them, those at its ends count in part.
-    """
-    return trim_mean(np.repeat(x, 4, axis=axis), 0.25, axis=axis)
+def _iqm(x: np.ndarray, axis: int = -1) -> np.ndarray:
+    return trim_mean(x, 0.25, axis=axis)
