@@ -155,3 +155,18 @@ def test_a_run_of_which_nothing_fits_is_refused(tmp_path, capsys):
     line = fails(capsys, *words, "--init-from", str(tmp_path / "other"))
     assert "of other shapes: backbone.module.history_encoder.layers.0.bias [8] instead of" in line
     assert not (tmp_path / "new").exists()
+
+
+def test_statistics_of_other_observations_are_not_counted(tmp_path):
+    """A count that is taken without its mean weighs a mean of 0, and a variance of 1."""
+    seen = replace(PPO, normalize_observations=True)
+    theirs = begin(tmp_path / "other", seen)
+    statistics = {name for name in theirs if name.endswith((".count", ".mean", ".variance"))}
+    assert len(statistics) == 3
+    taken, _ = weights_from(tmp_path / "other", make_algorithm(seen))
+    assert statistics < taken.keys()
+    other = make_algorithm(replace(seen, env="MountainCarContinuous-v0"))
+    taken, line = weights_from(tmp_path / "other", other)
+    assert taken
+    assert not statistics & taken.keys()
+    assert "observation.mean [3] instead of [2]" in line
