@@ -11,12 +11,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from recipes.bc import BC
 from recipes.iql import IQL
 from recipes.offline import with_spaces
 from recipes.ppo import PPO
+from recipes.sac import SAC
 from tests.agents.runs import make_run
 from tests.recipes.offline.test_without_env import log_machine
 from tests.recipes.small import make_dt, tit, train
@@ -198,3 +200,22 @@ def test_a_file_acts_as_its_agent(made, tmp_path, name):
     frames[1, 0] = np.nan
     with pytest.raises(ValueError, match="the first observation of an episode is missing or has N"):
         exported.act(frames)
+
+
+def test_transforms_that_change_actions(tmp_path):
+    """The policy's actions are between -1 and 1, the task's between -2 and 2."""
+    recipe = SAC(
+        env="Pendulum-v1",
+        backbone=mlp(hidden_dim=8),
+        wrappers=("torchrl.envs:ActionScaling",),
+        evaluation_episodes=1,
+    )
+    agent = load_agent(make_run(tmp_path / "run", recipe))
+    frames = np.random.default_rng(0).normal(size=(6, 3)).astype(np.float32)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        steps = TensorDict({"observation": frames, "history": frames[:, None]}, [6])
+        chosen = agent.policy(steps)["action"].numpy()
+    assert 0.01 < np.abs(chosen).max() <= 1
+    np.testing.assert_allclose(agent.act(frames), 2 * chosen, rtol=1e-5)
+    with pytest.raises(ValueError, match="changes actions by ActionScaling, which a file cannot"):
+        export_policy(agent.policy, agent.make_env, tmp_path / "agent.pt2")

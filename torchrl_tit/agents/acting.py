@@ -42,7 +42,7 @@ class Actor:
 
     def __init__(self, policy: TensorDictModuleBase, make_env: Callable[[int], EnvBase]) -> None:
         self._policy, self._make_env = policy, make_env
-        self._env: EnvBase | None = None
+        self._env: TransformedEnv | None = None
         self._steps: TensorDictBase | None = None
         self._begins = torch.zeros(1, 1, dtype=torch.bool)
 
@@ -113,7 +113,8 @@ class Actor:
             else:  # also resets the copies in which an episode begins
                 _, steps = self._env.step_and_maybe_reset(self._steps)
             self._steps = self._policy(steps)
-        action = self._to_task(self._steps["action"].cpu()).numpy()
+        taken = self._env.transform.inv(self._steps.copy())["action"]  # as the environment does
+        action = self._to_task(taken.cpu()).numpy()
         self._begins = torch.zeros_like(self._begins)
         return action if self._batched else action[0]
 

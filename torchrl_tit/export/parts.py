@@ -307,6 +307,13 @@ def read_parts(policy: nn.Module, env: EnvBase) -> Parts:
             raise ValueError(f"the policy reads {key!r}, which the environment does not write")
     keys = dict(zip(identifiers([_last_name(key) for key in further]), further, strict=True))
     specs = {name: env.observation_spec[key] for name, key in keys.items()}
+    for transform in transforms_of(env):
+        if "action" in transform.in_keys_inv:
+            kind = type(transform).__name__
+            raise ValueError(
+                f"the environment changes actions by {kind}, which a file cannot hold: train with "
+                "a gymnasium.Wrapper instead, or write the actions in the policy itself"
+            )
     writer = getattr(env.base_env, "action_writer", None)
     action = env.action_spec_unbatched
     sequences = [t for t in transforms_of(env) if isinstance(t, SequenceHistory)]
