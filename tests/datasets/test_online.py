@@ -10,6 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import ReplayBuffer, SliceSampler
+from torchrl.envs import MultiStepTransform
 
 from recipes.replay import BufferState
 from tests.datasets.several import MOST_FRAMES, newest, play_several
@@ -261,3 +262,11 @@ def test_what_is_refused() -> None:
         other.storage.load_state_dict(storage.state_dict())
     with pytest.raises(ValueError, match="begin at 15, but 27 were written: add all parts"):
         storage.add_part(storage.part(15))
+
+
+def test_steps_of_several_steps_are_refused() -> None:
+    """Their next observations do not follow, so each would be an episode of its own."""
+    buffer = make(3, 90, 2)
+    buffer.append_transform(MultiStepTransform(n_steps=3, gamma=0.9))
+    with pytest.raises(ValueError, match="next observations are n steps away"):
+        buffer.extend(without_histories(play_several(3, STEPS, 2, "same")))

@@ -176,8 +176,8 @@ class OnlineHistoryStorage(LazyTensorStorage):
 
         Raises:
             RuntimeError: if items are to be changed, or written out of order.
-            ValueError: if the steps do not cover all environments, or have histories of another
-                entry than "observation".
+            ValueError: if the steps do not cover all environments, have histories of another entry
+                than "observation", or were made n-step ones by TorchRL's `MultiStepTransform`.
         """
         if not set_cursor:
             raise RuntimeError("Stored steps cannot be changed, only added.")
@@ -190,6 +190,12 @@ class OnlineHistoryStorage(LazyTensorStorage):
                 f"{list(data.shape)} as stored; choose the ndim of the collector's batches."
             )
         _check_histories(data)
+        if "steps_to_next_obs" in data.keys():  # noqa: SIM118 (a tensordict)
+            raise ValueError(
+                'These steps have "steps_to_next_obs": their next observations are n steps away, '
+                "so they give no histories. Store single steps, without MultiStepTransform, and "
+                "draw slices for n-step targets."
+            )
         steps = data.select(*_STORED).update(data.select(*_OPTIONAL, strict=False))
         steps = steps.to(self.device)
         steps = steps if self.ndim == 2 else steps.unsqueeze(-1)  # [T, envs]
