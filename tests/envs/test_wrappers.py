@@ -2,6 +2,7 @@
 
 import gymnasium
 import pytest
+import torch
 
 from tests.envs.test_spaces import kinds
 from torchrl_tit.envs import make_env, time_limit
@@ -94,3 +95,14 @@ def test_one_line_says_what_is_wrong(name, wrappers, words):
     with pytest.raises(ValueError, match=words) as caught:
         make_env(name, wrappers=wrappers)
     assert "\n" not in str(caught.value)
+
+
+def test_transforms_that_do_not_fit_a_task():
+    with pytest.raises(ValueError, match=r"CatTensors'\] do not fit CartPole-v1: ") as raised:
+        make_env("CartPole-v1", wrappers=["torchrl.envs:CatTensors"])
+    assert "\n" not in str(raised.value)
+    name = "torchrl.envs:ActionDiscretizer(num_intervals=5)"
+    made = make_env("Pendulum-v1", wrappers=[name], clip_actions=False)
+    assert made.action_spec.rand().dtype == torch.int64
+    with pytest.raises(ValueError, match="must be Bounded"):
+        make_env("Pendulum-v1", wrappers=[name])

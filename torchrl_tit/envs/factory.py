@@ -170,6 +170,8 @@ def make_env(
     env = TransformedVectorEnv(
         env, Compose(*transforms), transient_keys=() if keep_histories else ("history",)
     )
+    if transforms:
+        _check_fit(env, name, wrappers)
     if hide_velocities:
         whole = ("observation", "observation")  # beside other observations, such as PreviousStep's
         keys = [key for key in keys_of(env) if key in ("observation", whole)]
@@ -177,6 +179,18 @@ def make_env(
     env.append_transform(RewardSum())
     env.append_transform(History(num_frames, keys_of(env), padding=padding))
     return env
+
+
+def _check_fit(env: EnvBase, name: str, wrappers: Sequence[str]) -> None:
+    """Raises ValueError if transforms cannot be applied to a task."""
+    try:
+        _ = env.input_spec, env.output_spec
+    except Exception as error:  # a transform can raise anything
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        env.close()
+        raise ValueError(
+            f"the transforms in wrappers {list(wrappers)} do not fit {name or 'the task'}: {reason}"
+        ) from error
 
 
 class TransformedVectorEnv(TransformedEnv):
