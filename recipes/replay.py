@@ -66,9 +66,9 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     buffer_size: Batch = 1_000_000
     """Capacity of the replay buffer in steps; when it is full, new steps replace the oldest."""
     normalize_observations: bool = False
-    """Whether to normalize observations by their mean and standard deviation in the random steps,
-    and to clip them to +-10; only for arrays of floats. Entries that are constant in these steps
-    have a deviation of 1."""
+    """Whether to normalize observations by their mean and standard deviation in the random steps
+    (with ``--init-from``, also in those of the other run), and to clip them to +-10; only for
+    arrays of floats. Entries that are constant in these steps have a deviation of 1."""
     storage_device: Device = "cpu"
     """Device of the stored data, from which batches are moved to the networks; those on the CPU
     store data there, too. "cuda" is faster if all data fit on the GPU."""
@@ -78,6 +78,11 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_divides("steps_per_batch", "random_steps", self.random_steps)
+        if self.final_step <= self.random_steps:
+            raise ValueError(
+                f"total_steps {self.total_steps} end within the {self.random_steps} random_steps, "
+                "so nothing would be learned: raise total_steps, or lower random_steps"
+            )
         updates = self.steps_per_batch * self.updates_per_step
         if self.updates_per_batch < 1 or not math.isclose(updates, self.updates_per_batch):
             raise ValueError(

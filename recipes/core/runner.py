@@ -196,8 +196,9 @@ def load_networks(
             step, weights = state["best"]["step"], state["best"]["networks"]
     if step is None:
         raise ValueError(
-            f"{run.folder} has no best weights yet: fewer than {EPISODES} training episodes ended, "
-            "or none was evaluated; take the last ones (without --best)"
+            f"{run.folder} has no best weights yet: fewer than {EPISODES} training episodes ended "
+            "(random actions do not count), or none was evaluated; take the last ones (without "
+            "--best)"
         )
     with run.restoring(step):
         load_weights(algorithm.model, weights)

@@ -162,7 +162,10 @@ def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: 
     }
     if not draw_curves(axes, curves, 1 if recipe.offline else WINDOW):
         folders = ", ".join(str(run.folder) for one in experiments for run in one.runs)
-        raise ValueError(f"there is nothing to draw: no episode has ended in {folders}")
+        raise ValueError(
+            f"there is nothing to draw: no episode has ended in {folders}, or no row of metrics "
+            "was written, if log_interval is longer than the run"
+        )
     add_legend(figure)
     save_figure(figure, picture)
     notes = []

@@ -176,3 +176,8 @@ def test_critics_read_the_history_where_velocities_are_hidden(
     with loss.qvalue_network_params[0].to_module(loss.qvalue_network):
         left, right = loss.qvalue_network(states)["state_action_value"]
     assert (left != right).item() is differ
+
+
+def test_a_run_that_ends_at_random_is_refused() -> None:
+    with pytest.raises(ValueError, match="total_steps 20 end within the 20 random_steps"):
+        replace(SMALL, total_steps=20)
