@@ -112,6 +112,15 @@ class CQL(ConservativeRecipe, algorithm="cql"):
     critic_hidden: Widths = (256, 256, 256)
     """Widths of the critics' hidden layers."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if 0 < self.total_updates <= self.cloning_updates:
+            raise ValueError(
+                f"cloning_updates is {self.cloning_updates}, so an actor of {self.total_updates} "
+                "updates (total_updates) only imitates the data: raise total_updates, or lower "
+                "cloning_updates"
+            )
+
     def build(self) -> CQLAlgorithm:
         """Builds the algorithm."""
         return CQLAlgorithm(self)

@@ -155,6 +155,7 @@ ON_DATA: list[tuple[Any, dict[str, Any], str]] = [
     (CQL, {"dataset": "./no.hdf5"}, r"no\.hdf5"),
     (CQL, {"backbone": nature_cnn()}, r"\(11,\) is that of an array, but this encoder reads imag"),
     (CQL, {"slice_length": 2, "compile": "on"}, "compile is on, but slices of 2 are not compiled"),
+    (CQL, {"total_updates": 9, "cloning_updates": 9}, "so an actor of 9 updates .* only imitates"),
     (CQL, {"gamma": float("nan")}, "gamma must be at least 0, not nan"),
     (CQL, {"tau": -0.1}, r"tau must be at least 0, not -0\.1"),
     (CQL, {"critic_hidden": (8, 0)}, r"critic_hidden must be at least one width .*, not \(8, 0\)"),
