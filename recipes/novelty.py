@@ -169,8 +169,8 @@ class FirstVisits:
 
 
 def _hashes(cells: Tensor) -> list[list[int]]:
-    """Hashes of cells, [envs, time, entries] -> [envs][time]."""
-    return [[hash(cell.tobytes()) for cell in env] for env in cells.cpu().numpy()]
+    """Hashes of cells, [envs, time, entries] -> [envs][time]; -0.0 becomes 0.0."""
+    return [[hash(cell.tobytes()) for cell in env] for env in (cells + 0).cpu().numpy()]
 
 
 class NovelActorCritic(ActorCritic):

@@ -297,7 +297,9 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
                 f"of {length}: use longer episodes"
             )
         size = getattr(recipe, "slice_length", 1)
-        stride = max(size, math.ceil(count * size / _MOST_MEASURED))  # a step counts once
+        stride = max(
+            size, math.ceil(count * size / _MOST_MEASURED)
+        )  # steps count once, but for the last slice's
         starts = torch.arange(0, count + stride - 1, stride).clamp(max=count - 1)
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
         sums, total = dict.fromkeys(self.measures, 0.0), 0

@@ -148,7 +148,8 @@ def test_a_resumed_run_begins_new_episodes_and_loses_nothing(kind: str, tmp_path
         states.append(train_in(tmp_path / name, recipe, stop))
         seen.append(stop.batches)
     assert [len(batches) for batches in seen] == [2, 2]
-    assert_same(seen[0][0], seen[1][0])
+    # Several processes number their trajectories in the order in which they happen to begin.
+    assert_same(*(batches[0].exclude(("collector", "traj_ids")) for batches in seen))
     assert_same(*states)
     assert rows_of(tmp_path / "first") == rows_of(tmp_path / "second")
     assert rows_of(tmp_path / "first")[: len(stopped)] == stopped

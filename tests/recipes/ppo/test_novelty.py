@@ -120,6 +120,8 @@ def test_first_visits_go_on_from_batch_to_batch():
             after = following[env, step].tolist()
             assert found[env, step].item() == (after not in seen)
             seen = [] if done[env, step] else [*seen, after]
+    zeros, ended = torch.tensor([[[-0.0]]]), torch.tensor([[[False]]])
+    assert not FirstVisits().add(zeros.abs(), zeros, ended).any()  # 0.0 and -0.0 are equal
 
 
 def test_cells_are_coarse_for_floats_and_exact_for_bytes_and_without_width():
