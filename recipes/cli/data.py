@@ -191,7 +191,7 @@ def convert_episodes(episodes: Episodes, target: str, env_name: str | None = Non
 
 
 def _parts(episodes: Episodes) -> str:
-    """How many episodes are parts of others; files do not record it."""
+    """How many episodes are parts of others, or were going on when the recording ended."""
     count = int(episodes.cut.sum())
     return f"; {count} are parts of others, cut at gaps" if count else ""
 

@@ -16,6 +16,7 @@ from torchrl_tit.datasets import (
     TransitionParts,
     episodes_from_arrays,
     load_episodes,
+    write_hdf5,
     write_minari,
 )
 
@@ -134,3 +135,24 @@ def test_parts_that_do_not_fit(arrays: Transitions, tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DatasetError, match=r"000000000010.hdf5: is not a whole HDF5 file"):
         parts.episodes()
+
+
+def test_what_goes_on_at_the_end_of_a_stream_is_not_whole(
+    arrays: Transitions, tmp_path: Path
+) -> None:
+    """Its return says nothing, neither here nor in the files that are written."""
+    (part,) = split(arrays, 2, [100])
+    for name in ("terminals", "timeouts"):
+        part[name] = np.zeros((2, 100), bool)
+    part["terminals"][:, 60], part["timeouts"][1, 99] = True, True
+    part["next_observations"][:, :-1] = part["observations"][:, 1:]
+    episodes = write_all(tmp_path / "parts", [part]).episodes()
+    write_hdf5(episodes, tmp_path / "a.hdf5")
+    write_minari(episodes, tmp_path / "a-v0")
+    read = [load_episodes(tmp_path / name) for name in ("a.hdf5", "a-v0")]
+    for found in (episodes, *read):
+        assert found.lengths.tolist() == [61, 39, 61, 39]
+        assert found.finished.all()
+        assert found.cut.tolist() == [False, True, False, False]
+        assert found.whole.tolist() == [0, 2, 3]
+        assert found.left_out == ()

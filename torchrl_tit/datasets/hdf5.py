@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from torchrl_tit.datasets.checks import DatasetError
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations, rows_per_chunk
 from torchrl_tit.datasets.hdf5_files import (
     array_names,
@@ -18,9 +20,10 @@ from torchrl_tit.datasets.hdf5_files import (
     new_hdf5,
     open_hdf5,
 )
-from torchrl_tit.datasets.transitions import FIELDS, TIMESTAMPS, episodes_from_transitions
+from torchrl_tit.datasets.transitions import CUTS, FIELDS, TIMESTAMPS, episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
 
+_MOST_CUTS = 16_000  # an attribute has room for 64 KB
 _LIKE_TASK = ("observations", "actions", "next_observations")  # others are one number a row
 
 
@@ -33,7 +36,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     Args:
         path: the file, with "observations" [N, *obs], "actions" [N, *action], "rewards" [N],
             "terminals" [N], and optionally "timeouts" [N], "next_observations" [N, *obs], and
-            "timestamps" [N], whose order is checked.
+            "timestamps" [N], whose order is checked. The attribute "cuts" of "timeouts" lists the
+            rows at which an episode ends only because the data do, or have a gap.
             Other fields, attributes of fields, and attributes of the file that are neither text nor
             a few numbers, are not read.
         **settings: as for :func:`~torchrl_tit.datasets.transitions.episodes_from_transitions`,
@@ -72,8 +76,10 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
             if isinstance(field := find(source, file, name), h5py.Dataset):
                 fields[name] = field
                 with damage_named(source, "its attributes cannot be read", name):
-                    if len(field.attrs):
+                    if set(field.attrs) - {CUTS}:
                         fields[f"attributes of {name}"] = None
+                    if name == "timeouts" and CUTS in field.attrs:
+                        fields[CUTS] = _cuts(source, field)
         return episodes_from_transitions(fields, source=source, attributes=attributes, **settings)
 
 
@@ -81,7 +87,8 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     """Writes episodes with one row per transition, in chunks.
 
     Fields keep their dtypes. Next observations are written if all are known, and left out if none
-    is, because the data came without them.
+    is, because the data came without them. Which episodes are cut, D4RL's layout does not say: an
+    attribute does.
 
     Args:
         episodes: the episodes. Only the last one may be unfinished.
@@ -90,7 +97,8 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     Raises:
         FileExistsError: if the file exists already.
         ValueError: if an episode before the last is unfinished, or the final observations of only
-            some truncated ones are known; the layout cannot represent either.
+            some truncated ones are known; the layout cannot represent either. Or if very many are
+            cut.
         OSError: if the file cannot be written.
 
     Example:
@@ -116,6 +124,12 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     fields = {name: (episodes.rows[field], steps) for name, field in kept}
     if episodes.final_known.any():
         fields["next_observations"] = (episodes.rows["observation"], steps + 1)
+    cuts = (episodes.lengths.cumsum(0) - 1)[episodes.cut].numpy().astype(np.uint32)
+    if len(cuts) > _MOST_CUTS:
+        raise ValueError(
+            f"{episodes.source} has {len(cuts)} episodes that are cut at gaps, of which an HDF5 "
+            f"file can note {_MOST_CUTS}: write it as a Minari data set"
+        )
     with whole_or_not_at_all(path) as hidden, new_hdf5(hidden, path) as (file, check):
         file.attrs.update(episodes.attributes)
         for name, (values, rows) in fields.items():
@@ -127,6 +141,20 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
             for start in range(0, len(rows), size):
                 dataset[start : start + size] = array[rows[start : start + size].numpy()]
                 check()
+        if len(cuts):
+            file["timeouts"].attrs[CUTS] = cuts
+
+
+def _cuts(source: str, timeouts: h5py.Dataset) -> NDArray:
+    """Whether an episode ends at a row only because the data do, or have a gap; bool [N]."""
+    rows = np.asarray(timeouts.attrs[CUTS] if attribute_fits(timeouts, CUTS) else None)
+    count = len(timeouts)
+    if rows.dtype.kind not in "iu" or not ((rows >= 0) & (rows < count)).all():
+        problem = f"its attribute {CUTS!r} must list some of its {count} rows."
+        raise DatasetError(source, problem, "timeouts")
+    cuts = np.zeros(count, bool)
+    cuts[rows] = True
+    return cuts
 
 
 def _attributes(file: h5py.File) -> dict[str, Any]:

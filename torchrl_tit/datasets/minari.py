@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from torchrl_tit.datasets.checks import DatasetError, task_spaces
 from torchrl_tit.datasets.episodes import Episodes, check_final_observations
 from torchrl_tit.datasets.hdf5_files import JoinedField, check_size, find, h5py, new_hdf5, open_hdf5
-from torchrl_tit.datasets.transitions import episodes_from_transitions
+from torchrl_tit.datasets.transitions import CUTS, episodes_from_transitions
 from torchrl_tit.envs import is_atari
 from torchrl_tit.extras import Missing
 from torchrl_tit.files import whole_or_not_at_all
@@ -204,7 +204,7 @@ def _folder(name: str | os.PathLike[str]) -> Path:
 
 def _joined(
     source: str, file: h5py.File, num_episodes: int, image: tuple[int, ...] | None
-) -> tuple[dict[str, JoinedField], NDArray, set[str]]:
+) -> tuple[dict[str, Any], NDArray, set[str]]:
     """Joins the fields of all episodes in the layout of D4RL.
 
     Args:
@@ -219,12 +219,14 @@ def _joined(
     pieces: dict[str, list] = {name: [] for name in (*_NAMES, "next_observations")}
     rows: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
     noted: set[str] = set()
+    cuts: list[bool] = []
     for number in range(num_episodes):
         place = f"{source}: episode {number}"
         group = find(source, file, f"episode_{number}")
         if not isinstance(group, h5py.Group):
             raise DatasetError(source, "is missing.", f"episode_{number}")
         noted |= {"infos"} & set(group)
+        cuts.append(bool(group.attrs.get(CUTS, False)))
         noted |= {"seed", "options"} & {key.split("/")[0] for key in group.attrs}
         found: dict[str, Any] = {n: find(place, group, theirs) for n, (theirs, _) in _NAMES.items()}
         for name, field in found.items():
@@ -254,7 +256,8 @@ def _joined(
                 pieces["next_observations"].append((steps, later))
     rows["next_observations"] = rows["observations"]
     fields = {name: JoinedField(parts, *rows[name]) for name, parts in pieces.items()}
-    return fields, np.array([steps for steps, _ in pieces["rewards"]]), noted
+    lengths = np.array([steps for steps, _ in pieces["rewards"]])
+    return fields | {CUTS: np.repeat(cuts, lengths)}, lengths, noted
 
 
 def _rows(file: h5py.File, name: str, shape: tuple[int, ...], start: int, stop: int) -> NDArray:
@@ -335,6 +338,8 @@ def write_minari(
             for number, steps in enumerate(_steps(episodes)):
                 group = file.create_group(f"episode_{number}")
                 group.attrs.update({"id": number, "total_steps": len(steps["rewards"])})
+                if episodes.cut[number]:
+                    group.attrs[CUTS] = True
                 for field, values in steps.items():
                     shape = (None, *values.shape[1:])  # resizable, like Minari's own
                     group.create_dataset(field, data=values, chunks=True, maxshape=shape)

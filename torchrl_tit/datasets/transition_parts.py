@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torchrl_tit.datasets.checks import DatasetError
 from torchrl_tit.datasets.episodes import Episodes
 from torchrl_tit.datasets.hdf5_files import JoinedField, find, h5py, new_hdf5, open_hdf5
-from torchrl_tit.datasets.transitions import FIELDS, episodes_from_transitions
+from torchrl_tit.datasets.transitions import CUTS, FIELDS, episodes_from_transitions
 from torchrl_tit.files import whole_or_not_at_all
 
 
@@ -103,7 +103,7 @@ class TransitionParts:
     def episodes(self, last: int | None = None, **settings: Any) -> Episodes:
         """Joins the parts, one stream after the other, without reading them all at once.
 
-        An unfinished episode is truncated at the end of its stream, and where a part does not begin
+        An unfinished episode is cut off at the end of its stream, and where a part does not begin
         with the observation with which the previous part ended.
 
         Args:
@@ -144,8 +144,9 @@ class TransitionParts:
         ends, timeouts = (
             fields[name][:].reshape(streams, -1) for name in ("terminals", "timeouts")
         )
-        timeouts[:, -1] |= ~ends[:, -1]
-        fields["timeouts"] = timeouts.reshape(-1)
+        cuts = np.zeros_like(timeouts)
+        cuts[:, -1] = ~(ends | timeouts)[:, -1]
+        fields |= {"timeouts": (timeouts | cuts).reshape(-1), CUTS: cuts.reshape(-1)}
         return episodes_from_transitions(
             fields, source=str(self.folder), gaps="cut", **{"dtype": None, **settings}
         )

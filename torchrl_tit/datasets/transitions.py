@@ -32,10 +32,12 @@ from torchrl_tit.settings.choices import Gaps
 from torchrl_tit.settings.numbers import Steps
 
 FIELDS = ("observations", "actions", "rewards", "terminals", "timeouts", "next_observations")
+CUTS = "cuts"
+"""A further field: whether an episode ends with a row only because the data end or have a gap."""
 TIMESTAMPS = "timestamps"
 """A further field, which is checked and not kept."""
 _REQUIRED = FIELDS[:4]
-_NUMBERS = (*FLAGS, "rewards")  # fields with one number a row
+_NUMBERS = (*FLAGS, "rewards", CUTS)  # fields with one number a row
 
 
 def episodes_from_arrays(
@@ -164,6 +166,9 @@ def episodes_from_transitions(
     if times is not None:
         _check_times(source, times, ends)
     last_steps = np.flatnonzero(ends)
+    cut = cuts[last_steps] | np.append(False, cuts[last_steps[:-1]])
+    if CUTS in fields:
+        cut |= reader.flags(CUTS)[last_steps]
     rows = memory_mapped_rows(reader.num_rows + len(last_steps), reader.row_fields(), directory)
     # The final observation of an episode is an additional row, so all later rows move by one.
     row_of = torch.arange(reader.num_rows)
@@ -184,10 +189,10 @@ def episodes_from_transitions(
         rows=rows,
         lengths=torch.from_numpy(np.diff(last_steps, prepend=-1)),
         final_known=torch.full((len(last_steps),), has_next),
-        cut=torch.from_numpy(cuts[last_steps] | np.append(False, cuts[last_steps[:-1]])),
+        cut=torch.from_numpy(cut),
         source=source,
         attributes=attributes or {},
-        left_out=tuple(sorted(set(fields) - set(FIELDS))),
+        left_out=tuple(sorted(set(fields) - {*FIELDS, CUTS})),
     )
 
 
@@ -206,7 +211,7 @@ class _Reader:
             if name not in fields:
                 found = ", ".join(sorted(map(str, fields))) or "nothing"
                 raise DatasetError(source, f"is missing; there is {found}.", name)
-        given = [name for name in FIELDS if name in fields]
+        given = [name for name in (*FIELDS, CUTS) if name in fields]
         self.shapes = {name: self._shape(name) for name in given}
         self.num_rows = len(fields["observations"])
         self.dtypes = {

@@ -330,6 +330,7 @@ def _play(
     episodes = []
     for index, length in enumerate(lengths):
         episode = {name: values[index, :length].numpy() for name, values in fields.items()}
-        episode["timeouts"][-1] |= not episode["terminals"][-1]
+        if length < max_steps:  # otherwise it may be going on, and is cut off
+            episode["timeouts"][-1] |= not episode["terminals"][-1]
         episodes.append(episode)
     return episodes

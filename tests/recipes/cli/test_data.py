@@ -103,6 +103,9 @@ def test_parts_that_gaps_cut_are_counted(
     assert lines["return"].endswith(f"mean {np.mean(whole):.3f}, max {max(whole):.3f}")
     main(["data", "convert", str(path), str(tmp_path / "b.hdf5"), "--gaps", "cut"])
     assert "; 2 are parts of others, cut at gaps\n" in capsys.readouterr().out
+    main(["data", "info", str(tmp_path / "b.hdf5")])
+    again = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert again["return"] == lines["return"]
 
 
 def test_convert_there_and_back(
