@@ -14,7 +14,7 @@ import torch
 from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.modules.models.exploration import gSDEModule
 
@@ -54,6 +54,7 @@ class StateDependentNoise(nn.Module):
         scale: standard deviation of each entry for features of scale 1, float [A].
 
     Example:
+        >>> from torchrl.envs import set_exploration_type
         >>> noise = StateDependentNoise(64, 2, steps=4, scale=torch.ones(2)).eval()
         >>> with set_exploration_type(ExplorationType.RANDOM):
         ...     loc, scale, drawn = noise(torch.zeros(8, 2), torch.randn(8, 64))
@@ -86,9 +87,9 @@ class StateDependentNoise(nn.Module):
         """
         features = features.detach()
         if self.training or exploration_type() is not ExplorationType.RANDOM:
-            with set_exploration_type(ExplorationType.DETERMINISTIC):
-                mean, scale, _, _ = self.gsde(mean, features, None)
-            return mean, scale, torch.zeros_like(mean)
+            # As in gSDEModule, whose checks of its numbers could not be exported.
+            variance = (self.gsde.sigma * features.unsqueeze(-2)).square().sum(-1)
+            return mean, variance.clamp_min(1e-5).sqrt(), torch.zeros_like(mean)
         mean, scale, action, _ = self.gsde(mean, features, self._draw(features))
         return mean, scale, action - mean
 
