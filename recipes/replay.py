@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import closing
@@ -78,11 +79,6 @@ class ReplayRecipe(OnlineRecipe, SamplesRecipe):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_divides("steps_per_batch", "random_steps", self.random_steps)
-        if self.final_step <= self.random_steps:
-            raise ValueError(
-                f"total_steps {self.total_steps} end within the {self.random_steps} random_steps, "
-                "so nothing would be learned: raise total_steps, or lower random_steps"
-            )
         updates = self.steps_per_batch * self.updates_per_step
         if self.updates_per_batch < 1 or not math.isclose(updates, self.updates_per_batch):
             raise ValueError(
@@ -145,6 +141,17 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
     def make_env(self, num_envs: int, seed: int | None = None, **settings: Any) -> EnvBase:
         """As :meth:`OnlineAlgorithm.make_env`; actions are passed on unchanged."""
         return super().make_env(num_envs, seed, clip_actions=False, **settings)
+
+    def check(self) -> None:
+        """As :meth:`OnlineAlgorithm.check`; warns if the run ends before anything is learned."""
+        recipe = self.recipe
+        if recipe.final_step <= recipe.random_steps:
+            warnings.warn(
+                f"total_steps {recipe.total_steps} end within the {recipe.random_steps} "
+                "random_steps, so nothing will be learned: raise total_steps",
+                stacklevel=2,
+            )
+        super().check()
 
     def prepare(self, step: int, folder: Path) -> None:
         """Builds optimizer, collector and replay buffer."""
