@@ -94,7 +94,6 @@ class DQNAlgorithm(ReplayAlgorithm[DQN]):
 
     draws_random_steps = False  # epsilon is 1 until then, and there may be masks
     columns = ("loss", "epsilon")
-    optional_columns = columns  # nothing is learned during the random steps
 
     target: TargetNetUpdater
 

@@ -208,7 +208,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
             set_statistics(self.policy, self.model, add)
         self.buffer.extend(self.collected(batch).select(*_STORED, strict=False))
         if step + count <= recipe.random_steps:
-            return dict.fromkeys(self.columns, torch.nan)
+            return {}
         done = (step - recipe.random_steps) // recipe.steps_per_batch * recipe.updates_per_batch
         self.policy.train()
         for number in range(done, done + recipe.updates_per_batch):

@@ -65,7 +65,6 @@ class SACAlgorithm(ReplayAlgorithm[SAC]):
     """
 
     columns = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy")
-    optional_columns = columns  # nothing is learned during the random steps
     model: SACLoss
 
     def networks(self, env: EnvBase) -> nn.Module:

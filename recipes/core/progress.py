@@ -55,6 +55,8 @@ class Record:
         """Adds the returns of a batch and the numbers of its update, without waiting for a GPU."""
         if returns is not None:
             self._returns += returns.flatten().tolist()
+        if not values:  # nothing was learned
+            return
         cpu = torch.device("cpu")
         device = next((x.device for x in values.values() if isinstance(x, Tensor)), cpu)
         wide = widest_float(device)
@@ -89,8 +91,8 @@ class Record:
             row |= {f"held_out_{name}": x for name, x in self.held_out[-1].values.items()}
         if not means:
             return row
-        assert self._sums is not None
-        row |= dict(zip(self._names, (self._sums / self._count).tolist(), strict=True))
+        if self._sums is not None:
+            row |= dict(zip(self._names, (self._sums / self._count).tolist(), strict=True))
         if not self._recipe.offline:
             episodes = len(self._returns)
             row["episodes"] = episodes

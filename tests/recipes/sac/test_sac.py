@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -181,3 +182,16 @@ def test_critics_read_the_history_where_velocities_are_hidden(
 def test_a_run_that_ends_at_random_is_warned_of() -> None:
     with pytest.warns(UserWarning, match="total_steps 20 end within the 20 random_steps"):
         make(replace(SMALL, total_steps=20)).check()
+
+
+def test_a_row_of_random_and_other_steps_has_the_means_of_the_others(tmp_path: Path) -> None:
+    fine, coarse = (
+        read_metrics(
+            train(replace(SMALL, log_interval=n), tmp_path / str(n)).folder / "metrics.csv"
+        )
+        for n in (10, 60)
+    )
+    for name in SACAlgorithm.columns:
+        values = [row[name] for row in fine]
+        assert np.isnan(values[:2]).all()
+        assert coarse[0][name] == pytest.approx(np.mean(values[2:]), rel=1e-6)
