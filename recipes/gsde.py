@@ -143,7 +143,6 @@ class SmoothPPOAlgorithm(PPOAlgorithm):
     """
 
     recipe: SmoothPPO
-    graph_breaks = True  # gSDEModule checks its numbers
 
     def networks(self, env: EnvBase) -> ActorCritic:
         """Builds the networks of PPO, with an actor whose noise depends on the state."""

@@ -61,8 +61,6 @@ class Algorithm(ABC, Generic[RecipeT]):
     """The columns that may be NaN, because there is nothing to measure yet."""
     held_out_columns: Sequence[str] = ()
     """Names of what :meth:`measure` measures: columns of the metrics."""
-    graph_breaks: bool = False
-    """Whether the graph of the loss breaks: `torch.compile` then needs all its guards."""
 
     def __init__(self, recipe: RecipeT) -> None:
         self.recipe = recipe

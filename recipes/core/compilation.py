@@ -87,8 +87,7 @@ def compile_and_time(function: Callable[P, T], name: str, owner: Algorithm[Any])
     """
     package = str(__package__).rpartition(".")[0]
     ours = type(owner).__module__.startswith(f"{package}.")
-    guarded = not ours or owner.graph_breaks
-    fast = torch.compile(function, **(STATIC_SHAPES if guarded else ONLY_TENSORS))
+    fast = torch.compile(function, **(ONLY_TENSORS if ours else STATIC_SHAPES))
     first = True
 
     @wraps(function)
