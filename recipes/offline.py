@@ -297,9 +297,8 @@ class DatasetAlgorithm(Algorithm[DatasetRecipeT]):
                 f"of {length}: use longer episodes"
             )
         size = getattr(recipe, "slice_length", 1)
-        stride = max(
-            size, math.ceil(count * size / _MOST_MEASURED)
-        )  # steps count once, but for the last slice's
+        # Steps count once, but for those that the last slice shares with the one before.
+        stride = max(size, math.ceil(count * size / _MOST_MEASURED))
         starts = torch.arange(0, count + stride - 1, stride).clamp(max=count - 1)
         index = starts.unsqueeze(-1) + torch.arange(length) if length > 1 else starts
         sums, total = dict.fromkeys(self.measures, 0.0), 0

@@ -17,17 +17,16 @@ from torchrl.objectives.value import ValueEstimatorBase
 from .algorithm import Algorithm
 from .run import Run
 
-_STATISTICS = ("count", "mean", "variance")
 _IN_A_BACKBONE = re.compile(r"(.*?)(frame_encoders?|history_encoder)\.")
 
 
 def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Tensor], str]:
     """Takes the weights of another run's newest checkpoint that fit an algorithm's networks.
 
-    Weights fit if they have the same name and shape; statistics of observations, if all of an
-    observation do. From a run of another algorithm, only the
-    policy's backbone is taken, by the names within it. Hyperparameters that a loss keeps among its
-    tensors, such as the discount, always come from the recipe.
+    Weights fit if they have the same name and shape; the count of observations, if their mean
+    does. From a run of another algorithm, only the policy's backbone is taken, by the names within
+    it. Hyperparameters that a loss keeps among its tensors, such as the discount, always come from
+    the recipe.
 
     Args:
         folder: the other run's folder.
@@ -63,10 +62,10 @@ def weights_from(folder: Path, algorithm: Algorithm[Any]) -> tuple[dict[str, Ten
         for name, other in names.items()
         if other in theirs and _kind(theirs[other]) == _kind(own[name])
     }
-    for prefix in _statistics(own):  # a count without its mean would weigh another one
-        if len(found := {f"{prefix}.{x}" for x in _STATISTICS} & taken.keys()) < len(_STATISTICS):
-            for name in found:
-                del taken[name]
+    for name in [name for name in taken if name.endswith(".count")]:
+        mean = f"{name.removesuffix('count')}mean"
+        if mean in own and mean not in taken:  # the count would weigh the initial mean
+            del taken[name]
     reshaped = [
         f"{name} {_kind(theirs[other])} instead of {_kind(own[name])}"
         for name, other in names.items()
@@ -106,15 +105,6 @@ def _hyperparameters(names: Iterable[str], algorithm: Algorithm[Any]) -> set[str
     bounds = tuple(_buffers(algorithm.policy, TanhModule))  # a loss keeps them under its own name
     of_losses = _buffers(algorithm.model, LossModule | ValueEstimatorBase)
     return {*of_losses, *(name for name in names if name.endswith(bounds))}
-
-
-def _statistics(names: Iterable[str]) -> set[str]:
-    """Prefixes of the names of the statistics of observations."""
-    found = [
-        {x.removesuffix(f".{kind}") for x in names if x.endswith(f".{kind}")}
-        for kind in _STATISTICS
-    ]
-    return set.intersection(*found)
 
 
 def _buffers(networks: nn.Module, kind: type[nn.Module] | UnionType) -> Iterator[str]:

@@ -226,7 +226,7 @@ def _joined(
         if not isinstance(group, h5py.Group):
             raise DatasetError(source, "is missing.", f"episode_{number}")
         noted |= {"infos"} & set(group)
-        cuts.append(bool(group.attrs.get(CUTS, False)))
+        cuts.append(CUTS in group.attrs)
         noted |= {"seed", "options"} & {key.split("/")[0] for key in group.attrs}
         found: dict[str, Any] = {n: find(place, group, theirs) for n, (theirs, _) in _NAMES.items()}
         for name, field in found.items():

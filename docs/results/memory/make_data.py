@@ -11,25 +11,24 @@ from torchrl_tit.tasks import TMaze
 RIGHT, UP, DOWN = 0, 1, 3
 
 
-def play(length: int, episodes: int, wrong_every: int) -> list[tuple]:
-    """Walks down corridors, and turns to the wrong side in each episode of that number."""
+def play(length: int, episodes: int, wrong_turns: bool = False) -> list[tuple]:
+    """Walks down corridors; if asked to, turns to the wrong side in every other one."""
     env, rows = TMaze(length), []
     for episode in range(episodes):
         observation, _ = env.reset(seed=episode)
-        right_is_up = (observation[1] > 0) != (episode % wrong_every == wrong_every - 1)
-        for action in [RIGHT] * length + [UP if right_is_up else DOWN]:
+        goes_up = (observation[1] > 0) != (wrong_turns and episode % 2 == 1)
+        for action in [RIGHT] * length + [UP if goes_up else DOWN]:
             following, reward, terminated, _, _ = env.step(np.int64(action))
             rows.append((observation, action, reward, terminated))
             observation = following
     return rows
 
 
-NEVER = 1_000_000
-for name, *settings in (
-    ("50", 50, 200, NEVER),
-    ("100", 100, 200, NEVER),
-    ("100-mixed", 100, 400, 2),
-    ("500", 500, 100, NEVER),
-):
-    arrays = (np.array(column) for column in zip(*play(*settings), strict=True))
+for name, rows in {
+    "50": play(50, 200),
+    "100": play(100, 200),
+    "100-mixed": play(100, 400, wrong_turns=True),
+    "500": play(500, 100),
+}.items():
+    arrays = (np.array(column) for column in zip(*rows, strict=True))
     write_hdf5(episodes_from_arrays(*arrays), f"tmaze-{name}.hdf5")
