@@ -13,10 +13,13 @@ from gymnasium.envs.registration import parse_env_id
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import Compose, Transform
 
 from torchrl_tit.envs import is_atari, make_games
 from torchrl_tit.envs.gymnasium_tasks import make_unchecked
 from torchrl_tit.envs.names import load_wrappers
+from torchrl_tit.envs.spaces import ObservationReader
 from torchrl_tit.settings.checks import checked_arguments
 
 FLAGS = ("terminals", "timeouts")
@@ -69,7 +72,8 @@ def task_spaces(env_name: str, *, wrappers: Sequence[str] = (), **settings: Any)
         env_name: a name that Gymnasium has registered, such as "Hopper-v5". Atari games such as
             "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one gray
             image of 84 x 84.
-        wrappers: Gymnasium wrappers around it; see :func:`~torchrl_tit.envs.make_env`.
+        wrappers: Gymnasium wrappers around it, then TorchRL transforms; see
+            :func:`~torchrl_tit.envs.make_env`.
         **settings: passed to `gymnasium.make`.
 
     Returns:
@@ -82,20 +86,36 @@ def task_spaces(env_name: str, *, wrappers: Sequence[str] = (), **settings: Any)
         >>> task_spaces("Pendulum-v1").action.shape
         (1,)
     """
+    wraps, transforms = load_wrappers(wrappers)
     if is_atari(env_name):
         games = make_games(env_name, **settings)
         games.close()
-        return TaskSpaces(games.single_observation_space, games.single_action_space, env_name)
+        observation = _transformed(games.single_observation_space, transforms)
+        return TaskSpaces(observation, games.single_action_space, env_name)
     try:
         env = make_unchecked(env_name, **settings)
     except Exception as error:  # a package is missing, the task has no such setting, ...
         raise ValueError(f"Task {env_name!r} cannot be made: {error}") from error
     try:
-        for wrap in load_wrappers(wrappers)[0]:
+        for wrap in wraps:
             env = wrap(env)
-        return TaskSpaces(env.observation_space, env.action_space, env_name)
+        observation = _transformed(env.observation_space, transforms)
+        return TaskSpaces(observation, env.action_space, env_name)
     finally:
         env.close()
+
+
+def _transformed(space: Space, transforms: Sequence[Transform]) -> Space:
+    """The space of what the transforms make of an observation."""
+    if not transforms:
+        return space
+    before = Composite(observation=ObservationReader(space).spec)
+    after = Compose(*transforms).transform_observation_spec(before.clone())["observation"]
+    if after == before["observation"]:
+        return space
+    if after.dtype == torch.uint8:
+        return Box(0, 255, tuple(after.shape), np.uint8)
+    return Box(-np.inf, np.inf, tuple(after.shape), np.float32)
 
 
 def check_task_name(source: str, recorded: object, task: TaskSpaces) -> None:

@@ -300,6 +300,18 @@ def test_data_are_those_of_the_task_as_it_is_built(tmp_path):
     assert read_data(replace(wrapped, dataset=str(data))).rows["action"].max() == 1
 
 
+def test_data_are_those_of_the_transformed_task(tmp_path):
+    """TorchRL transforms change what a task writes, as Gymnasium wrappers do."""
+    actions = np.zeros((200, 1))
+    data = log_machine(tmp_path / "a.hdf5", observations=np.zeros((200, 3)), actions=actions)
+    hide = "torchrl_tit.transforms:HideEntries(hidden=[2])"
+    recipe = BC(env="Pendulum-v1", wrappers=(hide,), dataset=str(data), backbone=SMALL)
+    with pytest.raises(DatasetError, match=r"shape \[3\], but in Pendulum-v1 it is \[2\]"):
+        read_data(recipe)
+    seen = log_machine(tmp_path / "b.hdf5", observations=np.zeros((200, 2)), actions=actions)
+    assert read_data(replace(recipe, dataset=str(seen))).rows["observation"].shape[1:] == (2,)
+
+
 @pytest.mark.parametrize(
     "space",
     [Box(0, 255, (6, 8, 3), np.uint8), Box(-9, 9, (5,), np.int64), Discrete(4, start=1)],
