@@ -23,7 +23,12 @@ from torchrl.data import Bounded, Categorical, MultiCategorical, ReplayBuffer, T
 from torchrl.envs import Compose, EnvBase, TargetReturn
 
 from torchrl_tit import settings
-from torchrl_tit.datasets import Episodes, SequenceStorage, make_replay_buffer
+from torchrl_tit.datasets import (
+    Episodes,
+    SequenceStorage,
+    make_replay_buffer,
+    select_episodes,
+)
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames
@@ -255,6 +260,23 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
                 encoder.set_statistics(*episodes.observation_statistics(encoder.samples))
         return episodes.to(storage_device(recipe))
 
+    def split(self, episodes: Episodes) -> Episodes:
+        """Leaves out unfinished episodes and parts of others, and holds some of the rest out.
+
+        Raises:
+            ValueError: if some are to be held out of a single episode, whose parts would not have
+                its return.
+        """
+        whole = episodes.whole
+        if self.recipe.held_out_fraction and len(whole) == 1:
+            raise ValueError(
+                f"{episodes.source} has a single whole episode, of which no part can be held out "
+                "(validation_fraction), because its return would be another: record more"
+            )
+        if len(whole) < len(episodes.lengths):
+            episodes = select_episodes(episodes, whole)
+        return super().split(episodes)
+
     def measured_items(self, episodes: Episodes) -> SequenceStorage:
         """Cuts windows out of episodes, as in training."""
         recipe = self.recipe
@@ -396,7 +418,7 @@ def check_data(recipe: SequenceRecipe, episodes: Episodes) -> None:
         )
     if not episodes.finished.any():
         raise ValueError(f"no episode in {dataset} is finished, so their returns are not known")
-    longest = int(episodes.lengths[episodes.finished].max())  # the others are not trained on
+    longest = int(episodes.lengths[episodes.whole].max())  # the others are not trained on
     if settings.timestep_embedding and longest > settings.max_ep_len:
         raise ValueError(
             f"episodes in {dataset} have up to {longest} steps, but max_ep_len is "

@@ -7,6 +7,8 @@ import math
 import os
 import shutil
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -23,7 +25,7 @@ class Metrics:
     """One row of numbers at a time, in ``metrics.csv`` and in ``tensorboard/``.
 
     The CSV is the record: its first columns are ``step``, ``time`` (seconds since 1970) and
-    ``steps_per_second`` since the row before, or since the start.
+    ``steps_per_second`` since the row before, or since the start, without pauses.
     TensorBoard's files are rewritten from it when a run is resumed, so that neither holds a row of
     work that was lost.
 
@@ -66,6 +68,14 @@ class Metrics:
             self._file.flush()
         self._draw(row)
         return row
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Leaves the time in the block out of ``steps_per_second``: no steps are made in it."""
+        began = time.monotonic()
+        yield
+        step, then = self._last
+        self._last = (step, then + time.monotonic() - began)
 
     def sync(self) -> None:
         """Flushes the rows to the disk."""

@@ -113,7 +113,8 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
                         check_weights(algorithm.model)
             enough = any([callback.updated(step, algorithm.policy) for callback in callbacks])
             if evaluation_due:
-                with _naming(f"in {recipe.env}, in the evaluation at step {step}", saved_step):
+                where = f"in {recipe.env}, in the evaluation at step {step}"
+                with metrics.paused(), _naming(where, saved_step):
                     outcomes, held_out = algorithm.play(step), algorithm.measure(step)
                 if not record.outcomes and outcomes:
                     best.forget()  # training episodes do not count where there are evaluations
@@ -142,7 +143,8 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
                 metrics.sync()  # the checkpoint's rows must be on the disk before it
                 for callback in callbacks:
                     callback.saving(step)
-                _save(run, step, parts)
+                with metrics.paused():
+                    _save(run, step, parts)
                 saved_step = step
                 for callback in callbacks:
                     callback.saved(step)

@@ -18,6 +18,8 @@ from torchrl_tit.datasets import (
     SequenceStorage,
     episodes_from_arrays,
     make_replay_buffer,
+    select_episodes,
+    split_episodes,
 )
 from torchrl_tit.transforms import History
 
@@ -147,6 +149,22 @@ def test_every_sequence(arrays: Transitions, num_frames: int, with_next: bool) -
             index += 1
     assert len(storage) == index < len(arrays["rewards"])
     assert (items["mask"].dtype, items["timestep"].dtype) == (torch.bool, torch.int64)
+
+
+def test_parts_of_episodes_are_no_sequences() -> None:
+    """Their returns to go would be those of the part, and their first step would be step 0."""
+    ends = np.isin(np.arange(9), [2, 8])
+    states, times = np.arange(9.0)[:, None], np.array([0, 1, 2, 3, 4, 9, 10, 11, 12])
+    episodes = episodes_from_arrays(
+        states, states, np.ones(9), ends, np.zeros(9, bool), timestamps=times, gaps="cut"
+    )
+    assert episodes.lengths.tolist() == [3, 2, 4]
+    storage = SequenceStorage(episodes, 1)
+    assert storage.get(EVERY)["observation"].flatten().tolist() == [0, 1, 2]
+    rest, held_out = split_episodes(select_episodes(episodes, torch.tensor([0])), 0.3, seed=0)
+    for part in (rest, held_out):
+        with pytest.raises(DatasetError, match="nothing can be drawn"):
+            SequenceStorage(part, 1)
 
 
 def test_returns_to_go_of_long_data_stay_exact() -> None:

@@ -40,6 +40,16 @@ def test_rows_that_stay_are_not_changed_and_later_ones_are_cut(tmp_path):
     assert scalars(tmp_path, "return") == [(128, 9.0), (192, 7.0)]
 
 
+def test_the_time_of_pauses_is_not_that_of_steps(tmp_path, monkeypatch):
+    clock = iter([0.0, 1.0, 9.0, 10.0])
+    monkeypatch.setattr("recipes.core.metrics.time.monotonic", lambda: next(clock))
+    metrics = Metrics(tmp_path, ["loss"], last_step=0)
+    with metrics.paused():
+        pass  # from 1 to 9
+    assert metrics.log(64, loss=1.0)["steps_per_second"] == 64 / 2
+    metrics.close()
+
+
 def test_a_process_killed_while_it_opens_loses_no_row(tmp_path, monkeypatch):
     write(tmp_path, [(64, 1.0, 2.0), (128, 3.0, 4.0)])
     before = (tmp_path / "metrics.csv").read_bytes()

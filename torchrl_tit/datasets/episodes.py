@@ -281,6 +281,7 @@ def _split_single(episodes: Episodes, fraction: float) -> tuple[Episodes, Episod
         if name != "observation":  # the last row is the final observation
             values[-1] = 0
     before["truncated"][-2] = True
+    single = replace(single, cut=torch.tensor([True]))
     first = replace(
         single, rows=before, lengths=torch.tensor([place]), final_known=torch.tensor([True])
     )

@@ -251,12 +251,13 @@ class HistoryStorage(EpisodeStorage):
 
 
 class SequenceStorage(EpisodeStorage):
-    """Windows of up to K steps that start at any step of a finished episode, padded on the left.
+    """Windows of up to K steps that start at any step of a whole episode, padded on the left.
 
     An item has "observation" [K, *obs], "action" [K, *action] (int64 if it is discrete),
     "return_to_go" [K, 1], "timestep" int64 [K] and "mask" bool [K], which is False at padding.
     A uniformly drawn index selects an episode with a probability proportional to its length, and a
-    uniformly distributed start within it.
+    uniformly distributed start within it. Unfinished episodes and parts of others are left out,
+    because the rest of their returns is not known.
 
     Args:
         episodes: the data.
@@ -266,7 +267,7 @@ class SequenceStorage(EpisodeStorage):
 
     Raises:
         ValueError: if ``num_frames`` is less than 1, or ``return_scale`` is not positive.
-        DatasetError: if no episode is finished.
+        DatasetError: if no episode is whole.
 
     Source: "Decision Transformer" (arXiv 2106.01345), section 3 and its authors' code.
 
@@ -288,7 +289,7 @@ class SequenceStorage(EpisodeStorage):
         return_scale: Positive = 1000.0,
         action_padding: Real = -10.0,
     ) -> None:
-        super().__init__(episodes, episodes.lengths * episodes.finished)
+        super().__init__(episodes, episodes.lengths * (episodes.finished & ~episodes.cut))
         self._last_rows = episodes.last_rows
         self._returns_to_go = _returns_to_go(episodes).div_(return_scale).float()  # [R]
         self._action_padding = action_padding

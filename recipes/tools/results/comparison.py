@@ -6,12 +6,12 @@ import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from math import ceil, lcm, nan
+from math import ceil, nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, permutation_test, trim_mean
+from scipy.stats import norm, permutation_test
 
 from ...core.numbers import mean_std, number
 from ...core.recipe import Recipe
@@ -131,12 +131,15 @@ def interquartile_mean(values: Values) -> Interval:
         0.5
     """
     groups = [np.asarray(found, float) for found in values.values()]
-    # Every value as often as makes all tasks equally large, and a quarter of them a whole number.
-    size = 4 * lcm(*map(len, groups))
+    weights = np.concatenate([np.full(len(x), 1 / len(x) / len(groups)) for x in groups])
 
     def middle(draws: Sequence[np.ndarray]) -> np.ndarray:
-        equal = [np.repeat(x, size // x.shape[-1], axis=-1) for x in draws]
-        return trim_mean(np.concatenate(equal, -1), 0.25, axis=-1)
+        drawn = np.concatenate(draws, -1)
+        order = drawn.argsort(-1)
+        ends = weights[order].cumsum(-1)
+        starts = ends - weights[order]
+        inside = ends.clip(0.25, 0.75) - starts.clip(0.25, 0.75)
+        return (np.take_along_axis(drawn, order, -1) * inside).sum(-1) / 0.5
 
     found = middle([_resampled(x, task) for task, x in enumerate(groups)])
     return _with_interval(middle(groups), found, groups)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
@@ -38,13 +38,20 @@ class Curve:
     Args:
         steps: float [points].
         values: float [points].
+        end: steps that the run has made; None for those of the last point.
     """
 
     steps: np.ndarray
     values: np.ndarray
+    end: float | None = None
+
+    @property
+    def length(self) -> float:
+        """The steps that the run has made."""
+        return self.steps[-1] if self.end is None else self.end
 
 
-def curve_of(rows: Iterable[Mapping[str, float]], column: str = "return_mean") -> Curve:
+def curve_of(rows: Sequence[Mapping[str, float]], column: str = "return_mean") -> Curve:
     """Returns a metric at the steps where it is known; of more than 400 rows, means of neighbors.
 
     Args:
@@ -62,7 +69,7 @@ def curve_of(rows: Iterable[Mapping[str, float]], column: str = "return_mean") -
         counts = np.diff(starts, append=len(steps))
         values = np.add.reduceat(values, starts) / counts
         steps = steps[starts + counts - 1]
-    return Curve(steps, values)
+    return Curve(steps, values, rows[-1]["step"] if rows else None)
 
 
 def draw_curves(
@@ -75,8 +82,9 @@ def draw_curves(
 
     Args:
         axes: where to draw.
-        groups: the curves of each group's runs by the group's name. Runs that have fewer than 90%
-            of the steps of the longest one are left out of bold lines.
+        groups: the curves of each group's runs by the group's name. Runs that have made fewer than
+            90% of the steps of the longest one are left out of bold lines, which end where the
+            first of the others has its last value.
         window: points over which bold lines are averaged.
 
     Returns:
@@ -91,8 +99,8 @@ def draw_curves(
         color, line = f"C{index % 10}", _LINES[index // 10 % len(_LINES)]
         for run in runs if few and (len(runs) > 1 or window > 1) else ():
             axes.plot(run.steps, run.values, c=color, ls=line, lw=1, alpha=0.35)
-        longest = max(run.steps[-1] for run in runs)
-        whole = [run for run in runs if run.steps[-1] >= NEARLY * longest]
+        longest = max(run.length for run in runs)
+        whole = [run for run in runs if run.length >= NEARLY * longest]
         steps, values = _on_one_grid([_smoothed(run, window) for run in whole])
         middle, low, high = intervals_of(values)
         label = f"{name} ({len(whole)} runs)" if len(whole) > 1 else name
@@ -171,7 +179,7 @@ def plot_comparison(experiments: Sequence[Experiment], picture: Path, *, title: 
     notes = []
     for experiment, found in zip(experiments, curves.values(), strict=True):
         seeds = [f"seed {run.recipe.seed}" for run in experiment.runs]
-        ends = {x: int(y.steps[-1]) for x, y in zip(seeds, found, strict=True) if len(y.steps)}
+        ends = {x: int(y.length) for x, y in zip(seeds, found, strict=True) if len(y.steps)}
         notes += short_runs(experiment.label, ends)
     return notes
 

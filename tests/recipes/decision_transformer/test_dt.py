@@ -205,6 +205,24 @@ def test_every_entry_of_an_action_must_reach_as_far_as_the_heads(tmp_path):
         make_algorithm(make_dt(tmp_path, env="tests/Lopsided-v0"))
 
 
+def test_nothing_is_learned_from_parts_of_episodes(tmp_path):
+    """The rest of their returns, and the steps before them, are not known."""
+    arrays = roll(max_episode_steps=15)
+    ends = np.flatnonzero(arrays["terminals"] | arrays["timeouts"])
+    arrays["next_observations"][ends[3] - 4] += 1.0
+    recipe = make_dt(tmp_path, dataset=str(write(tmp_path / "a.hdf5", arrays)), gaps="cut")
+    data = load_episodes(recipe.dataset, gaps="cut")
+    assert int(data.cut.sum()) == 2
+    rest = make_algorithm(recipe).load_data()
+    assert rest.lengths.tolist() == data.lengths[data.whole].tolist()
+
+    single = select_episodes(data, data.whole[:1])
+    write_minari(single, folder := tmp_path / "hopper-v0")
+    recipe = make_dt(tmp_path, dataset=str(folder), validation_fraction=0.5)
+    with pytest.raises(ValueError, match="has a single whole episode, of which no part can be"):
+        make_algorithm(recipe).load_data()
+
+
 def test_only_episodes_that_are_trained_on_must_be_short(tmp_path):
     """The last one, which the data break off in, is left out."""
     arrays = roll(max_episode_steps=15)

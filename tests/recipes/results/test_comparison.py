@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import trim_mean
 
 from recipes.cli import main
 from recipes.tools.results.comparison import compare, interquartile_mean, probability_of_improvement
@@ -61,6 +62,9 @@ def test_a_summary_is_of_half_of_the_runs_however_many_there_are():
     middle = (2.0 / 2 + 3 + 4 + 100 / 2) / 3  # a quarter is one run and a half
     for repeated in ({"a": runs}, {"a": runs * 4}, {"a": runs, "b": runs}):
         assert interquartile_mean(repeated).middle == pytest.approx(middle)
+    groups = {count: np.random.default_rng(count).normal(size=count) for count in range(7, 12)}
+    equal = np.concatenate([x.repeat(4 * 27720 // count) for count, x in groups.items()])
+    assert interquartile_mean(groups).middle == pytest.approx(trim_mean(equal, 0.25))
 
 
 def test_compare_says_which_is_better(tmp_path, monkeypatch, capsys):

@@ -62,6 +62,16 @@ def test_bold_lines_are_interquartile_means_of_runs_that_are_as_far():
     assert not axes.collections  # too few for a band
 
 
+def test_runs_without_an_end_of_an_episode_are_as_far_as_their_steps():
+    """The best run of a task in which episodes become longer is the last to end one."""
+    rows = [{"step": step, "return_mean": 5.0} for step in range(1, 11)]
+    best = [row if row["step"] < 7 else row | {"return_mean": np.nan} for row in rows]
+    _, axes = new_chart("", TINY)
+    bold = draw_curves(axes, {"a": [curve_of(rows), curve_of(best)]})["a"]
+    assert axes.lines[-1].get_label() == "a (2 runs)"
+    assert (bold.steps[0], bold.steps[-1]) == (1, 6)
+
+
 def test_runs_with_other_steps_are_interpolated_and_returns_averaged():
     _, axes = new_chart("", TINY)
     runs = [Curve(np.array([0.0, 10]), np.array([0.0, 10])), Curve(np.array([2.0, 9]), np.ones(2))]
