@@ -159,8 +159,10 @@ class Rollout:
 
         Yields:
             Frames, each once, [R, *observation_shape] of each observation, and the next windows on
-            them, [..., K]; E windows in all.
+            them, [..., K]; E windows in all, and nothing if there are none.
         """
+        if not steps.any():
+            return
         chosen = steps.flatten()
         newest, oldest = self.newest[chosen] + 1, self.oldest[chosen]
         size = max(1, max_frames // self.num_frames)

@@ -309,6 +309,12 @@ class _Trial:
                 return self._end(TrialState.PRUNED)
             return False
         if self.process is not None and self.process.returncode:
+            # Code 2: refused, as a process that a killed search left behind started the run first.
+            assert self.started is not None
+            begun = self.started.is_in_use() or self.started.is_complete()
+            if self.process.returncode == 2 and begun:
+                self.process = self.started = None
+                return False
             return self._end(TrialState.FAIL)
         if self.started is not None and not self.started.is_complete():
             self._explain(f"the process ended, but the run {self.started.folder} is not complete")

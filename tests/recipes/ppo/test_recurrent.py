@@ -82,6 +82,23 @@ def test_the_next_values_know_the_state_before_them(batch):
     assert (next_value - forgetful)[~terminated].abs().max() > 1e-3
 
 
+@pytest.mark.parametrize("history", ["lstm", "gru"])
+def test_nothing_follows_where_all_copies_terminate(history):
+    """As in tasks whose episodes are equally long: no state is left to evaluate."""
+    recipe = replace(
+        RECIPE, backbone=replace(RECIPE.backbone, history=HistorySettings.get(history)())
+    )
+    algorithm = PPOAlgorithm(recipe)
+    env = algorithm.make_env(2, seed=0, keep_histories=False)
+    batch = env.rollout(8, algorithm.policy)
+    ends = torch.zeros_like(batch["next", "done"])
+    ends[:, -1] = True
+    batch["next"].update({"terminated": ends, "done": ends})
+    batch["state_value"] = torch.ones(2, 8, 1)
+    values = algorithm.next_values(batch, Rollout(batch, 1, "same"))
+    assert_near(values, (~ends).float())
+
+
 def test_minibatches_are_sequences_and_show_every_step_once_an_epoch(batch):
     batch, algorithm = batch
     number = torch.arange(400).view(2, 200, 1)

@@ -248,6 +248,20 @@ def test_a_run_that_a_killed_search_left_at_work_is_waited_for(tmp_path, monkeyp
     assert events == ["wait"] * 3 + ["start trial-0", "wait"]
 
 
+def test_a_run_that_another_process_starts_first_is_waited_for(tmp_path, naps, monkeypatch):
+    """One that a killed search left behind: until it writes its first file, it cannot be seen."""
+
+    def start(job):
+        complete(job)
+        return Process(2)  # refused
+
+    monkeypatch.setattr(tune, "start", start)
+    with Search(tmp_path, SETTINGS) as search:
+        assert search.run(1, workers=1) == []
+        (trial,) = search.study.trials
+        assert trial.value == trial.params["learning_rate"]
+
+
 def test_no_more_trials_than_workers_go_on(tmp_path, naps, monkeypatch):
     begun = []
     with Search(tmp_path, SETTINGS) as search:
