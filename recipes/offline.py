@@ -203,7 +203,7 @@ def with_spaces(recipe: DatasetRecipeT) -> DatasetRecipeT:
         )
         raise DatasetError(episodes.source, problem, "actions")
     if discrete:
-        found["num_actions"] = int(steps.max()) + 1
+        found["num_actions"] = max(1, int(steps.max()) + 1)  # negative ones are refused below
     else:
         low, high = steps.amin(0), steps.amax(0)
         if low.min() >= -1 and high.max() <= 1:
@@ -518,7 +518,9 @@ class TransitionAlgorithm(LearnsFromSamples, DatasetAlgorithm[RecipeT]):
             set_statistics(
                 self.policy,
                 self.model,
-                lambda x: x.set_statistics(*episodes.observation_statistics(x.samples)),
+                lambda x: x.set_statistics(
+                    *episodes.observation_statistics(x.samples, unfinished=recipe.unfinished)
+                ),
             )
         storage = self.measured_items(episodes.to(storage_device(recipe)))
         held_out = [] if self._held_out is None else [self.measured_items(self._held_out)]

@@ -323,6 +323,7 @@ class LearnsFromSamples(ABC):
     recipe: Any
     device: torch.device
     columns: Sequence[str]
+    optional_columns: Sequence[str]
     normalized_by: ClassVar[Mapping[str, float]] = {}
     """Settings of what normalizes observations, if the recipe says so."""
     _policy: TensorDictModuleBase
@@ -383,7 +384,12 @@ class LearnsFromSamples(ABC):
         ).to(self.device)
 
     def numbers(self, terms: Terms) -> dict[str, Tensor]:
-        """Selects and checks the numbers that an update returns from the terms of its losses."""
-        values = torch.stack([terms[name].detach() for name in self.columns])
-        check_without_waiting(self.columns, values)
-        return dict(zip(self.columns, values, strict=True))
+        """Selects and checks the numbers that an update returns from the terms of its losses.
+
+        An optional one that the update did not compute is NaN.
+        """
+        names = [x for x in self.columns if x in terms or x not in self.optional_columns]
+        values = torch.stack([terms[name].detach() for name in names])
+        check_without_waiting(names, values)
+        absent = dict.fromkeys(self.columns, torch.full_like(values[0], math.nan))
+        return absent | dict(zip(names, values, strict=True))

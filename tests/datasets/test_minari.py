@@ -1,6 +1,7 @@
 """Minari data sets, read and written."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,14 @@ def test_hdf5_to_minari_and_back_is_lossless(rolled: Transitions, tmp_path: Path
     write_minari(read_hdf5(path, dtype=None), tmp_path / "sets" / "a-v0")
     write_hdf5(load_episodes(tmp_path / "sets" / "a-v0", dtype=None), tmp_path / "b.hdf5")
 
+    with h5py.File(path, "a") as file:
+        file["cuts"] = np.arange(9.0)  # an array of theirs with the name of an attribute of ours
+    assert read_hdf5(path).left_out == ("array cuts",)
+    told = replace(read_hdf5(path), attributes={"note": None})
+    with pytest.raises(ValueError, match="HDF5 cannot store the attribute 'note', None"):
+        write_hdf5(told, tmp_path / "c.hdf5")
+    with h5py.File(path, "a") as file:
+        del file["cuts"]
     with h5py.File(path) as before, h5py.File(tmp_path / "b.hdf5") as after:
         assert dict(before.attrs) == dict(after.attrs)
         for name in before:

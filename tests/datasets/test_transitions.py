@@ -118,6 +118,10 @@ def test_a_trailing_unfinished_episode_is_separate(arrays: Transitions) -> None:
     np.testing.assert_allclose(std, observations.std(0), rtol=1e-6)
     with pytest.raises(DatasetError, match="no observations of finished episodes"):
         select_episodes(data, torch.tensor([len(data.lengths) - 1])).observation_statistics()
+    mean, _, count = data.observation_statistics(unfinished="keep")
+    assert count == len(cut["observations"])
+    observations = cut["observations"].astype(np.float64)
+    np.testing.assert_allclose(mean, observations.mean(0), rtol=1e-6)
     # Without next observations, its last step is never drawn.
     del cut["next_observations"], whole["next_observations"]
     kept = HistoryStorage(episodes_from_arrays(**cut), unfinished="keep")
@@ -182,6 +186,22 @@ def test_timestamps_are_checked_within_episodes(arrays: Transitions, tmp_path: P
             episodes_from_arrays(**arrays, timestamps=times)
     with pytest.raises(DatasetError, match=r"'timestamps': must be \d+ numbers"):
         episodes_from_arrays(**arrays, timestamps=times[1:])
+
+
+def test_a_pause_is_no_end_of_an_episode() -> None:
+    """Also in data that do not mark time limits, where only a gap is one."""
+    states = np.arange(20.0)[:, None]
+    fields = {"observations": states, "actions": states, "rewards": np.ones(20)}
+    times = np.arange(20.0) + 5 * (np.arange(20) > 2)
+    ends = np.isin(np.arange(20), [9, 19])
+    data = episodes_from_arrays(**fields, terminals=ends, timestamps=times, gaps="cut")
+    assert data.lengths.tolist() == [3, 7, 10]
+    assert data.cut.tolist() == [True, True, False]
+    limited = episodes_from_arrays(
+        **fields, terminals=ends & False, timestamps=times, gaps="cut", max_episode_steps=10
+    )
+    assert limited.lengths.tolist() == [3, 7, 10]
+    assert limited.cut.tolist() == [True, True, False]
 
 
 def test_a_gap_is_refused_or_ends_the_episode(arrays: Transitions) -> None:

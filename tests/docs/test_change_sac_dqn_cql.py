@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -82,3 +84,5 @@ def test_cql_clones(page: dict[str, Any], tmp_path: Path) -> None:
         assert (rows[-2]["loss_bc"] != 0) == bool(weight)
         actors.append(algorithm.model.actor_network_params.data)
     assert not (actors[0] == actors[1]).all()
+    _, rows = run(replace(recipe, cloning_updates=1), tmp_path / "first")
+    assert np.isnan(rows[0]["loss_bc"])

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from torchrl_tit.datasets.checks import DatasetError
+
+Unfinished = Literal["keep", "drop"]
 
 CHUNK_BYTES = 4 * 2**20  # bytes read, checked and converted at a time
 
@@ -137,13 +139,17 @@ class Episodes:
         )
 
     def observation_statistics(
-        self, samples: Callable[[Tensor], Tensor] = lambda observations: observations
+        self,
+        samples: Callable[[Tensor], Tensor] = lambda observations: observations,
+        *,
+        unfinished: Unfinished = "drop",
     ) -> tuple[Tensor, Tensor, int]:
-        """Computes the mean and standard deviation of the observations of finished episodes.
+        """Computes the mean and standard deviation of the observations.
 
         Args:
             samples: what is counted of observations [N, *obs], [M, *sample]: see
                 :meth:`torchrl_tit.frames.FrameEncoder.samples`.
+            unfinished: whether observations of unfinished episodes count ("keep") or not ("drop").
 
         Returns:
             Mean and population standard deviation, float32 [*sample] each, and the number of
@@ -154,15 +160,16 @@ class Episodes:
         Raises:
             DatasetError: if there are none, because no episode is finished or all sets are empty.
         """
+        kept = self.finished | (unfinished == "keep")
         count, total = 0, torch.zeros((), dtype=torch.float64)
-        for chunk in map(samples, self._observations()):
+        for chunk in map(samples, self._observations(kept)):
             count, total = count + len(chunk), total + chunk.double().sum(0)
         if not count:
             problem = "has no observations of finished episodes, so they have no mean: record more."
             raise DatasetError(self.source, problem)
         mean = total / count
         squares = torch.zeros_like(mean)
-        for chunk in map(samples, self._observations()):
+        for chunk in map(samples, self._observations(kept)):
             squares += chunk.double().sub_(mean).square_().sum(0)
         std = (squares / count).sqrt().float()
         varies = std > 1e-7 * mean.abs()  # less is rounding
@@ -174,9 +181,9 @@ class Episodes:
             )
         return mean.float(), std.where(varies, 1.0), count
 
-    def _observations(self) -> Iterator[Tensor]:
-        """The observations at the steps of finished episodes, in chunks."""
-        chosen = self.finished.repeat_interleave(self.lengths + 1)  # [R]
+    def _observations(self, kept: Tensor) -> Iterator[Tensor]:
+        """The observations at the steps of some episodes, bool [E], in chunks."""
+        chosen = kept.repeat_interleave(self.lengths + 1)  # [R]
         chosen[self.last_rows + 1] = False  # final observations are not steps
         observations = self.rows["observation"]
         size = rows_per_chunk(observations[0].numel() * 8)  # as float64
@@ -350,9 +357,11 @@ def check_final_observations(episodes: Episodes) -> None:
     """
     unknown = ~episodes.final_known & ~episodes.terminated
     if unknown.any():
+        number = int(unknown.int().argmax())
+        kind = "was truncated" if episodes.truncated[number] else "is unfinished"
         raise DatasetError(
             episodes.source,
-            f"episode {int(unknown.int().argmax())} was truncated and its final observation is "
+            f"episode {number} {kind} and its final observation is "
             f"unknown, because there are no 'next_observations': it cannot be written.",
         )
 

@@ -70,7 +70,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
     with open_hdf5(path) as file:
         with damage_named(source, "cannot be read"):
             # The arrays of the layout, and the names of others, which are not opened.
-            fields: dict[str, Any] = dict.fromkeys(set(array_names(file)) - set(FIELDS))
+            others = set(array_names(file)) - set(FIELDS)
+            fields: dict[str, Any] = dict.fromkeys(x if x != CUTS else f"array {x}" for x in others)
             attributes = _attributes(file)
         for name in (*FIELDS, TIMESTAMPS):
             if isinstance(field := find(source, file, name), h5py.Dataset):
@@ -97,8 +98,8 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     Raises:
         FileExistsError: if the file exists already.
         ValueError: if an episode before the last is unfinished, or the final observations of only
-            some truncated ones are known; the layout cannot represent either. Or if very many are
-            cut.
+            some truncated ones are known; the layout cannot represent either. Or if HDF5 cannot
+            store an attribute, such as None, or very many episodes are cut.
         OSError: if the file cannot be written.
 
     Example:
@@ -131,7 +132,14 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
             f"file can note {_MOST_CUTS}: write it as a Minari data set"
         )
     with whole_or_not_at_all(path) as hidden, new_hdf5(hidden, path) as (file, check):
-        file.attrs.update(episodes.attributes)
+        for name, value in episodes.attributes.items():
+            try:
+                file.attrs[name] = value
+            except (TypeError, ValueError) as error:
+                raise ValueError(
+                    f"{episodes.source}: HDF5 cannot store the attribute {name!r}, {value!r}: "
+                    "remove it there, or write a Minari data set"
+                ) from error
         for name, (values, rows) in fields.items():
             array = values.numpy()
             array = array if name in _LIKE_TASK else array.squeeze(-1)

@@ -17,7 +17,7 @@ from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 
 from torchrl_tit.datasets.checks import DatasetError
-from torchrl_tit.datasets.episodes import Episodes
+from torchrl_tit.datasets.episodes import Episodes, Unfinished
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import Padding
 from torchrl_tit.settings.numbers import Frames, Positive, Real
@@ -26,7 +26,6 @@ from torchrl_tit.windows import find_windows, take
 Entries = dict[NestedKey, Tensor]
 TimeLimits = Literal["keep", "drop"]
 TerminalObservations = Literal["keep", "zero"]
-Unfinished = Literal["keep", "drop"]
 
 
 class StateCheckpointer(StorageCheckpointerBase):

@@ -321,17 +321,19 @@ def _truncations(
     marked = "timeouts" in reader.fields
     truncated = reader.flags("timeouts") if marked else np.zeros_like(terminated)
     flagged = terminated | truncated
+    jumps = pauses = np.zeros_like(terminated)
     if "next_observations" in reader.fields and (gaps == "cut" or not marked):
-        truncated |= _gaps(reader) & ~terminated
+        jumps = _gaps(reader) & ~flagged
+        truncated |= jumps  # without marks, this is where episodes end
     if times is not None and gaps == "cut":
-        truncated |= _pauses(times)[0] & ~terminated
-    cuts = truncated & ~flagged & marked  # otherwise gaps are where episodes end
+        pauses = _pauses(times)[0] & ~flagged & ~jumps
     if max_episode_steps is not None and not marked:
         ends = np.flatnonzero(terminated | truncated)
         for before, last in pairwise([-1, *ends, reader.num_rows - 1]):
             truncated[before + max_episode_steps : last + 1 : max_episode_steps] = True
         truncated &= ~terminated
-    return truncated, cuts
+        pauses &= ~truncated
+    return truncated | pauses, pauses | jumps & marked
 
 
 def _times(reader: _Reader) -> NDArray | None:

@@ -361,6 +361,7 @@ def test_bad_settings_in_one_line(tmp_path, capsys):
         "and one choice as integers": {"actions": np.eye(3, dtype=int)[integers]},
         "floats [N, A]": {"actions": 0.5 * integers},
         "row 0: is -1": {"actions": integers - 1},
+        "row 0: is -2": {"actions": -2 + 0 * integers},
         "mark the last row of each in 'timeouts'.": {"timeouts": np.zeros(200, bool)},
     }
     for message, arrays in bad.items():
