@@ -68,6 +68,7 @@ WRAPPERS = {
     "torchrl.envs": frozenset(_TORCHRL.split()),
     "torchrl.envs.transforms": frozenset(_TORCHRL.split()),
     "torchrl_tit.tasks": frozenset({"FirstActions", "PreviousStep"}),
+    "torchrl_tit.transforms": frozenset({"HideEntries"}),
 }
 """The wrappers and transforms that a file may name, by their module."""
 
