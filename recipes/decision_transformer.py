@@ -23,12 +23,7 @@ from torchrl.data import Bounded, Categorical, MultiCategorical, ReplayBuffer, T
 from torchrl.envs import Compose, EnvBase, TargetReturn
 
 from torchrl_tit import settings
-from torchrl_tit.datasets import (
-    Episodes,
-    SequenceStorage,
-    make_replay_buffer,
-    select_episodes,
-)
+from torchrl_tit.datasets import Episodes, SequenceStorage, make_replay_buffer, select_episodes
 from torchrl_tit.envs import observation_specs
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.frames import NormalizedFrames

@@ -161,10 +161,10 @@ class Rollout:
             Frames, each once, [R, *observation_shape] of each observation, and the next windows on
             them, [..., K]; E windows in all, and nothing if there are none.
         """
-        if not steps.any():
-            return
         chosen = steps.flatten()
         newest, oldest = self.newest[chosen] + 1, self.oldest[chosen]
+        if not len(newest):  # split would make one empty part
+            return
         size = max(1, max_frames // self.num_frames)
         for pair in zip(newest.split(size), oldest.split(size), strict=True):
             rows, windows = self._windows(*pair).used()

@@ -121,7 +121,7 @@ def describe(episodes: Episodes) -> str:
     """
     terminated, finished = episodes.terminated, episodes.finished
     lengths = episodes.lengths.double()
-    returns, task = episodes.returns[finished & ~episodes.cut], _scored_name(episodes)
+    returns, task = episodes.returns[episodes.is_whole], _scored_name(episodes)
     unscored = "no reference returns for this task"
     counts = {
         "terminated": int(terminated.sum()),

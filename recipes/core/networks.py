@@ -391,5 +391,6 @@ class LearnsFromSamples(ABC):
         names = [x for x in self.columns if x in terms or x not in self.optional_columns]
         values = torch.stack([terms[name].detach() for name in names])
         check_without_waiting(names, values)
-        absent = dict.fromkeys(self.columns, torch.full_like(values[0], math.nan))
-        return absent | dict(zip(names, values, strict=True))
+        found = dict(zip(names, values, strict=True))
+        absent = [name for name in self.columns if name not in found]
+        return found | {name: torch.full_like(values[0], math.nan) for name in absent}

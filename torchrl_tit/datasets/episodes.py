@@ -109,13 +109,18 @@ class Episodes:
         return self.terminated | self.truncated
 
     @property
+    def is_whole(self) -> Tensor:
+        """Whether each episode is finished and not cut at a gap; bool [E]."""
+        return self.finished & ~self.cut
+
+    @property
     def whole(self) -> Tensor:
-        """Indices of the episodes that are finished and not cut at a gap; int64 [M], on the CPU.
+        """Indices of the episodes of which :attr:`is_whole` is true; int64 [M], on the CPU.
 
         Raises:
             DatasetError: if there are none.
         """
-        whole = (self.finished & ~self.cut).nonzero().squeeze(-1).cpu()
+        whole = self.is_whole.nonzero().squeeze(-1).cpu()
         if not len(whole):
             problem = "has no whole episode, only unfinished ones or parts of others: record more."
             raise DatasetError(self.source, problem)

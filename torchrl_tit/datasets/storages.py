@@ -288,7 +288,7 @@ class SequenceStorage(EpisodeStorage):
         return_scale: Positive = 1000.0,
         action_padding: Real = -10.0,
     ) -> None:
-        super().__init__(episodes, episodes.lengths * (episodes.finished & ~episodes.cut))
+        super().__init__(episodes, episodes.lengths * episodes.is_whole)
         self._last_rows = episodes.last_rows
         self._returns_to_go = _returns_to_go(episodes).div_(return_scale).float()  # [R]
         self._action_padding = action_padding
