@@ -106,7 +106,8 @@ _NEWEST: dict[str, Episodes] = {}
 def _load(recipe: DatasetRecipe) -> Episodes:
     """Loads a data set as the task writes it: channels first, all that is discrete from 0."""
     env, wrappers = recipe.env, recipe.wrappers
-    spaces = task_spaces(env, wrappers=wrappers, **recipe.task_settings) if env else None
+    reads = {"wrappers": wrappers, "image_layout": recipe.image_layout}
+    spaces = task_spaces(env, **reads, **recipe.task_settings) if env else None
     episodes = load_episodes(recipe.dataset, task=spaces, **recipe.reading())
     if np.any(start := getattr(spaces and spaces.action, "start", 0)):
         episodes.rows["action"] -= torch.as_tensor(start)

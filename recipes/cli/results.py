@@ -86,6 +86,8 @@ def table(arguments: list[str]) -> None:
     parser.add_argument("--format", choices=["md", "csv"], default="md", help="format to print")
     parser.add_argument("--out", type=Path, help="folder for table.md, table.csv and table.png")
     options = parser.parse_args(arguments)
+    if options.out is not None and options.out.is_file():
+        fail(f"--out {options.out} is a file, but must be a folder, for the table in three formats")
     from torchrl_tit.files import write_text_atomic
 
     from ..tools.results.table import make_table, plot_table, to_csv, to_markdown

@@ -68,6 +68,25 @@ def test_every_field_is_that_of_minari(rolled: Transitions, folder: Path) -> Non
         assert episodes.final_known.all()
 
 
+def test_unknown_terminal_observations_are_copies_of_the_last(
+    rolled: Transitions, tmp_path: Path
+) -> None:
+    """Zeros would be an observation that nobody has seen, in statistics, too."""
+    whole = episodes_from_arrays(**rolled)
+    number = int(whole.terminated.int().argmax())
+    last = int(whole.last_rows[number])
+    whole.rows["observation"][last + 1] = 0
+    known = whole.final_known & (torch.arange(len(whole.lengths)) != number)
+    part = replace(whole, final_known=known)
+    write_minari(part, tmp_path / "walk-v0")
+    write_hdf5(part, tmp_path / "walk.hdf5")
+    for source in (tmp_path / "walk-v0", tmp_path / "walk.hdf5"):
+        observations = load_episodes(source).rows["observation"]
+        expected = whole.rows["observation"].clone()
+        expected[last + 1] = expected[last]
+        torch.testing.assert_close(observations, expected, rtol=0, atol=0)
+
+
 def test_a_missing_set_is_downloaded(rolled: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(name: str) -> None:
         raise RuntimeError(f"no network for {name}")

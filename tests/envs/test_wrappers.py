@@ -89,6 +89,7 @@ def test_names_in_modules():
         ),
         ("ALE/Pong-v5", [FLATTEN], "read in one way"),
         ("CartPole-v1", ["torchrl.envs:FrameSkipTransform"], "has ended, and loses its end"),
+        ("CartPole-v1", ["torchrl.envs:EndOfLifeTransform"], "games here step together"),
     ],
 )
 def test_one_line_says_what_is_wrong(name, wrappers, words):

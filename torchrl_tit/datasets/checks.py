@@ -21,6 +21,7 @@ from torchrl_tit.envs.gymnasium_tasks import make_unchecked
 from torchrl_tit.envs.names import load_wrappers
 from torchrl_tit.envs.spaces import ObservationReader
 from torchrl_tit.settings.checks import checked_arguments
+from torchrl_tit.settings.choices import ImageLayout
 
 FLAGS = ("terminals", "timeouts")
 
@@ -65,7 +66,13 @@ class TaskSpaces(NamedTuple):
 
 
 @checked_arguments
-def task_spaces(env_name: str, *, wrappers: Sequence[str] = (), **settings: Any) -> TaskSpaces:
+def task_spaces(
+    env_name: str,
+    *,
+    wrappers: Sequence[str] = (),
+    image_layout: ImageLayout = "auto",
+    **settings: Any,
+) -> TaskSpaces:
     """Returns the spaces of a Gymnasium task.
 
     Args:
@@ -73,6 +80,8 @@ def task_spaces(env_name: str, *, wrappers: Sequence[str] = (), **settings: Any)
             "ALE/Pong-v5" have the observations of :func:`~torchrl_tit.envs.make_env`: one gray
             image of 84 x 84.
         wrappers: Gymnasium wrappers around it, then TorchRL transforms; see
+            :func:`~torchrl_tit.envs.make_env`.
+        image_layout: where the images that transforms read have their channels: see
             :func:`~torchrl_tit.envs.make_env`.
         **settings: passed to `gymnasium.make`.
 
@@ -90,7 +99,7 @@ def task_spaces(env_name: str, *, wrappers: Sequence[str] = (), **settings: Any)
     if is_atari(env_name):
         games = make_games(env_name, **settings)
         games.close()
-        observation = _transformed(games.single_observation_space, transforms)
+        observation = _transformed(games.single_observation_space, transforms, image_layout)
         return TaskSpaces(observation, games.single_action_space, env_name)
     try:
         env = make_unchecked(env_name, **settings)
@@ -99,17 +108,17 @@ def task_spaces(env_name: str, *, wrappers: Sequence[str] = (), **settings: Any)
     try:
         for wrap in wraps:
             env = wrap(env)
-        observation = _transformed(env.observation_space, transforms)
+        observation = _transformed(env.observation_space, transforms, image_layout)
         return TaskSpaces(observation, env.action_space, env_name)
     finally:
         env.close()
 
 
-def _transformed(space: Space, transforms: Sequence[Transform]) -> Space:
+def _transformed(space: Space, transforms: Sequence[Transform], layout: ImageLayout) -> Space:
     """The space of what the transforms make of an observation."""
     if not transforms:
         return space
-    before = Composite(observation=ObservationReader(space).spec)
+    before = Composite(observation=ObservationReader(space, image_layout=layout).spec)
     after = Compose(*transforms).transform_observation_spec(before.clone())["observation"]
     if after == before["observation"]:
         return space

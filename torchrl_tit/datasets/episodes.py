@@ -81,6 +81,11 @@ class Episodes:
         return (self.lengths + 1).cumsum(0) - 2
 
     @property
+    def final_rows(self) -> Tensor:
+        """Row to write as each episode's final observation, the last step's if unknown; int64 [E]."""
+        return self.last_rows + self.final_known
+
+    @property
     def step_rows(self) -> Tensor:
         """Row of each step, in order: all rows but those of final observations; int64 [N]."""
         shifts = torch.arange(len(self.lengths), device=self.lengths.device)

@@ -87,8 +87,8 @@ def read_hdf5(path: str | os.PathLike[str], **settings: Any) -> Episodes:
 def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     """Writes episodes with one row per transition, in chunks.
 
-    Fields keep their dtypes. Next observations are written if all are known, and left out if none
-    is, because the data came without them. Which episodes are cut, D4RL's layout does not say: an
+    Fields keep their dtypes. Next observations are left out if none is known, because the data came
+    without them; an unknown one after a terminal step is written as a copy of its observation. Which episodes are cut, D4RL's layout does not say: an
     attribute does.
 
     Args:
@@ -120,12 +120,14 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
         )
     if episodes.final_known.any():
         check_final_observations(episodes)
-    steps = episodes.step_rows
+    steps, ends = episodes.step_rows, episodes.lengths.cumsum(0) - 1
     kept = zip(FIELDS, ("observation", "action", "reward", "terminated", "truncated"), strict=False)
     fields = {name: (episodes.rows[field], steps) for name, field in kept}
     if episodes.final_known.any():
-        fields["next_observations"] = (episodes.rows["observation"], steps + 1)
-    cuts = (episodes.lengths.cumsum(0) - 1)[episodes.cut].numpy().astype(np.uint32)
+        following = steps + 1
+        following[ends] = episodes.final_rows
+        fields["next_observations"] = (episodes.rows["observation"], following)
+    cuts = ends[episodes.cut].numpy().astype(np.uint32)
     if len(cuts) > _MOST_CUTS:
         raise ValueError(
             f"{episodes.source} has {len(cuts)} episodes that are cut at gaps, of which an HDF5 "

@@ -289,9 +289,10 @@ def write_minari(
 ) -> None:
     """Writes episodes as a Minari data set, one at a time.
 
-    Fields keep their dtypes. Minari writes its metadata; this function writes the episodes, in
-    Minari's layout, because it survives a full disk. The attributes "algorithm", "description",
-    "author", "author_email" and "code_permalink" also go into Minari's own metadata.
+    Fields keep their dtypes. An unknown observation after a terminal step is written as a copy of
+    the one before it. Minari writes its metadata; this function writes the episodes, in Minari's
+    layout, because it survives a full disk. The attributes "algorithm", "description", "author",
+    "author_email" and "code_permalink" also go into Minari's own metadata.
 
     Args:
         episodes: the data.
@@ -408,10 +409,11 @@ def _box(values: torch.Tensor) -> Box:
 
 def _steps(episodes: Episodes) -> Iterator[dict[str, NDArray]]:
     """The fields of each episode by Minari's names."""
-    for first, last in zip(episodes.first_rows.tolist(), episodes.last_rows.tolist(), strict=True):
+    rows = (episodes.first_rows, episodes.last_rows, episodes.final_rows)
+    for first, last, final in zip(*(row.tolist() for row in rows), strict=True):
         steps = {}
         for name, (theirs, ours) in _NAMES.items():
-            stop = last + 2 if name == "observations" else last + 1
-            values = episodes.rows[ours][first:stop].numpy()
+            wanted = [*range(first, last + 1)] + [final] * (name == "observations")
+            values = episodes.rows[ours][wanted].numpy()
             steps[theirs] = values if name in ("observations", "actions") else values.squeeze(-1)
         yield steps

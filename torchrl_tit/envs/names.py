@@ -9,7 +9,7 @@ from typing import Any
 
 import gymnasium
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import FrameSkipTransform, Transform
+from torchrl.envs.transforms import EndOfLifeTransform, FrameSkipTransform, Transform
 
 from torchrl_tit.extras import install
 from torchrl_tit.settings.checks import nearest
@@ -107,6 +107,19 @@ def _maker(module: ModuleType, own: str, name: str) -> Callable[..., EnvBase]:
     )
 
 
+_UNFIT: dict[type[Transform], str] = {
+    FrameSkipTransform: (
+        "steps on where an episode has ended, and loses its end: repeat actions with "
+        "gymnasium.wrappers:RepeatAction(num_repeats=4), or in the task"
+    ),
+    EndOfLifeTransform: (
+        "asks a single game for its lives, but games here step together: agents learn from whole "
+        "games"
+    ),
+}
+"""Transforms that cannot be used, and why."""
+
+
 def load_wrappers(names: Sequence[str]) -> tuple[list[Wrap], list[Transform]]:
     """Finds the wrappers and transforms to apply to a task.
 
@@ -138,11 +151,9 @@ def load_wrappers(names: Sequence[str]) -> tuple[list[Wrap], list[Transform]]:
         except ImportError as error:
             raise ValueError(f"Wrapper {name!r} cannot be used: {error}.") from error
         kind = found if isinstance(found, type) else type(None)
-        if issubclass(kind, FrameSkipTransform):
-            raise ValueError(
-                f"Wrapper {name!r} steps on where an episode has ended, and loses its end: repeat "
-                "actions with gymnasium.wrappers:RepeatAction(num_repeats=4), or in the task"
-            )
+        for transform, problem in _UNFIT.items():
+            if issubclass(kind, transform):
+                raise ValueError(f"Wrapper {name!r} {problem}")
         if issubclass(kind, Transform):
             transforms.append(_called(kind, name, **arguments))
         elif not issubclass(kind, gymnasium.Wrapper):

@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ from tests.recipes.small import (
     train,
 )
 from torchrl_tit import load_agent
-from torchrl_tit.datasets import DatasetError, TaskSpaces, load_episodes
+from torchrl_tit.datasets import DatasetError, TaskSpaces, checks, load_episodes
 from torchrl_tit.envs.spaces import ObservationReader
 from torchrl_tit.evaluation_file import check_evaluation
 from torchrl_tit.settings.networks import gru
@@ -310,6 +311,20 @@ def test_data_are_those_of_the_transformed_task(tmp_path):
         read_data(recipe)
     seen = log_machine(tmp_path / "b.hdf5", observations=np.zeros((200, 2)), actions=actions)
     assert read_data(replace(recipe, dataset=str(seen))).rows["observation"].shape[1:] == (2,)
+
+
+@pytest.mark.parametrize(("layout", "shape"), [("HWC", (3, 3, 8)), ("CHW", (3, 8, 3))])
+def test_transforms_read_images_in_their_layout(monkeypatch, layout, shape):
+    """Where the shape does not say it, ``image_layout`` does."""
+    images = SimpleNamespace(
+        observation_space=Box(0, 255, (3, 8, 3), np.uint8),
+        action_space=Discrete(2),
+        close=lambda: None,
+    )
+    monkeypatch.setattr(checks, "make_unchecked", lambda name: images)
+    stack = "torchrl.envs:UnsqueezeTransform(dim=-4,in_keys=['observation'])"
+    task = checks.task_spaces("Images-v0", wrappers=(stack,), image_layout=layout)
+    assert task.observation.shape == (1, *shape)
 
 
 @pytest.mark.parametrize(

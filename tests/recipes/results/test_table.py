@@ -204,6 +204,13 @@ def test_published_results_stand_beside_the_same_task_and_network(tmp_path):
     assert "published" not in to_markdown(make_table([tmp_path / "2"])[0])
 
 
+def test_of_a_folder_that_is_a_file(runs, tmp_path, capsys):
+    (tmp_path / "table.md").touch()
+    with pytest.raises(SystemExit):
+        main(["table", str(runs / "ppo"), "--out", str(tmp_path / "table.md")])
+    assert "table.md is a file, but must be a folder" in capsys.readouterr().err
+
+
 def test_command(runs, tmp_path, capsys):
     out = tmp_path / "tables"
     main(["table", str(runs / "ppo"), "--out", str(out)])
