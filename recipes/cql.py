@@ -19,7 +19,15 @@ from torchrl.envs import EnvBase
 from torchrl_tit.modules import make_squashed_actor
 from torchrl_tit.modules.action_specs import has_bounds
 from torchrl_tit.objectives import ContinuousCQLLoss, DelayedDiscreteCQLLoss
-from torchrl_tit.settings.numbers import Count, Fraction, Rate, StepsOrNone, Weight, Widths
+from torchrl_tit.settings.numbers import (
+    Count,
+    Fraction,
+    Positive,
+    Rate,
+    StepsOrNone,
+    Weight,
+    Widths,
+)
 
 from .core.algorithm import Terms, descend
 from .core.compilation import check_compiler, compile_and_time, should_compile
@@ -98,6 +106,8 @@ class CQL(ConservativeRecipe, algorithm="cql"):
     """Learning rate of Adam for the critics."""
     temperature_learning_rate: Rate = 1e-4
     """Learning rate of Adam for the temperature."""
+    alpha_init: Positive = 1.0
+    """Initial temperature."""
     cloning_updates: StepsOrNone = 0
     """Gradient steps at the start in which the actor imitates the data's actions, while the critics
     learn; 40,000 of 1,000,000 in the code of arXiv 2006.04779."""
@@ -162,6 +172,7 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
             min_q_weight=recipe.conservative_weight,
             num_random=recipe.action_samples,
             over_critics=recipe.over_critics,
+            alpha_init=recipe.alpha_init,
         )
         loss.make_value_estimator(gamma=recipe.gamma)
         return loss

@@ -57,7 +57,7 @@ from .core.networks import (
     set_statistics,
     state_transforms,
 )
-from .core.recipe import DatasetRecipe, SamplesRecipe
+from .core.recipe import DatasetRecipe, Recipe, SamplesRecipe
 from .core.task import make_task
 
 
@@ -92,7 +92,7 @@ def read_data(recipe: DatasetRecipe) -> Episodes:
     key = repr((recipe.dataset, path.absolute(), reading, stamps))
     if key not in _NEWEST:
         _NEWEST.clear()  # frees their memory first
-        _NEWEST[key] = _load(recipe)
+        _NEWEST[key] = load_data(recipe, recipe.dataset, **recipe.reading())
     episodes, spaces = _NEWEST[key], recipe.task_settings
     if recipe.env or "observation_shape" not in spaces:
         return episodes
@@ -103,12 +103,22 @@ _NEWEST: dict[str, Episodes] = {}
 """The episodes that were read last, by what they were read from: commands need them repeatedly."""
 
 
-def _load(recipe: DatasetRecipe) -> Episodes:
-    """Loads a data set as the task writes it: channels first, all that is discrete from 0."""
-    env, wrappers = recipe.env, recipe.wrappers
-    reads = {"wrappers": wrappers, "image_layout": recipe.image_layout}
-    spaces = task_spaces(env, **reads, **recipe.task_settings) if env else None
-    episodes = load_episodes(recipe.dataset, task=spaces, **recipe.reading())
+def load_data(recipe: Recipe, source: str, **reading: Any) -> Episodes:
+    """Loads a data set as the task writes it: channels first, all that is discrete from 0.
+
+    Args:
+        recipe: its task is that of the data.
+        source: the data set.
+        **reading: passed to :func:`~torchrl_tit.datasets.load_episodes`.
+
+    Raises:
+        FileNotFoundError: if there are no such data.
+        DatasetError: if they cannot be used, or belong to another task.
+        ValueError: if the task cannot be made.
+    """
+    reads: dict[str, Any] = {"wrappers": recipe.wrappers, "image_layout": recipe.image_layout}
+    spaces = task_spaces(recipe.env, **reads, **recipe.task_settings) if recipe.env else None
+    episodes = load_episodes(source, task=spaces, **reading)
     if np.any(start := getattr(spaces and spaces.action, "start", 0)):
         episodes.rows["action"] -= torch.as_tensor(start)
     stored = episodes.rows["observation"]

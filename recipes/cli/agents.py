@@ -152,18 +152,19 @@ def explain(arguments: list[str]) -> None:
     actions, which = None, f"the episode of seed {seed}"
     if options.dataset is not None:
         from torchrl_tit.agents.acting import make_given_env
-        from torchrl_tit.datasets import load_episodes
 
         from ..core.recipe import DatasetRecipe
         from ..core.recipe_json import recipe_from_json
-        from ..offline import read_data
+        from ..offline import load_data, read_data
         from ..tools.results.recorded import Recording
 
         recipe = recipe_from_json(json.dumps(agent.recipe), agent.name)
+        if getattr(recipe, "mask_actions", False):
+            fail(f"{agent.name} reads which actions are allowed, which data do not say")
         if isinstance(recipe, DatasetRecipe):
             episodes = read_data(replace(recipe, dataset=options.dataset))
         else:
-            episodes = load_episodes(options.dataset)
+            episodes = load_data(recipe, options.dataset)
         recording = Recording(episodes, options.episode or 0)
         actions, which = recording.actions, f"episode {options.episode or 0} of {options.dataset}"
 

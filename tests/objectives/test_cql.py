@@ -193,6 +193,18 @@ def test_actor_that_clones():
     assert loss.log_alpha.grad is None
 
 
+def test_cloned_actions_keep_away_from_the_bounds():
+    """At them, a squashed Gaussian's mean would have to be infinite."""
+    loss, batch, likelihoods = make_loss(), make_batch(), []
+    high, low = SPEC.space.high, SPEC.space.low
+    for share in (1.0, 0.995, 0.99):
+        batch["action"] = (low + share * (high - low)).expand_as(batch["action"]).clone()
+        likelihoods.append(loss.actor_bc_loss(batch)[1]["bc_log_prob"])
+    at_bound, at_margin, inside = likelihoods
+    torch.testing.assert_close(at_bound, at_margin)
+    assert not torch.isclose(at_margin, inside, rtol=1e-3)
+
+
 def test_temperature():
     loss, (batch, samples) = make_loss(), with_samples(make_batch())
     excess = samples["log_prob"].detach().mean().item() - ACTION  # target entropy: -2

@@ -82,7 +82,7 @@ class Episodes:
 
     @property
     def final_rows(self) -> Tensor:
-        """Row to write as each episode's final observation, the last step's if unknown; int64 [E]."""
+        """Row of each final observation, or of the one before it if it is unknown; int64 [E]."""
         return self.last_rows + self.final_known
 
     @property

@@ -88,8 +88,8 @@ def write_hdf5(episodes: Episodes, path: str | os.PathLike[str]) -> None:
     """Writes episodes with one row per transition, in chunks.
 
     Fields keep their dtypes. Next observations are left out if none is known, because the data came
-    without them; an unknown one after a terminal step is written as a copy of its observation. Which episodes are cut, D4RL's layout does not say: an
-    attribute does.
+    without them; an unknown one after a terminal step is written as a copy of its observation.
+    Which episodes are cut, D4RL's layout does not say: an attribute does.
 
     Args:
         episodes: the episodes. Only the last one may be unfinished.

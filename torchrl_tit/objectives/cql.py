@@ -24,6 +24,8 @@ Reduction = Literal["none", "mean", "sum"]
 Distance = Literal["l1", "l2", "smooth_l1"]
 
 _SAMPLES = "policy_samples"
+_MARGIN = 0.005
+"""Share of an action's range that cloned actions keep away from its bounds."""
 
 
 class ContinuousCQLLoss(CQLLoss):
@@ -283,14 +285,18 @@ class ContinuousCQLLoss(CQLLoss):
         """The loss of an actor that clones the data, of a batch [*B], float [].
 
         TorchRL's, the mean of ``alpha log p(a) - log p(b)`` with the data's actions b, as in the
-        code of arXiv 2006.04779.
+        code of arXiv 2006.04779, but b is kept 0.5% of the action's range away from the bounds,
+        where data sets have many actions, but a squashed Gaussian none of finite x.
 
         Returns:
             The loss, and the mean of log p(b), float [], under "bc_log_prob".
         """
-        keys = [*self.actor_network.in_keys, self.tensor_keys.action]
+        batch = tensordict.select(*self.actor_network.in_keys, strict=False)
+        margin = _MARGIN * (self._high - self._low)
+        action = tensordict.get(self.tensor_keys.action)
+        batch.set(self.tensor_keys.action, action.clamp(self._low + margin, self._high - margin))
         with set_recurrent_mode(True):
-            return super().actor_bc_loss(tensordict.select(*keys, strict=False))
+            return super().actor_bc_loss(batch)
 
     def _samples(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The policy's samples that a batch has, or new ones."""

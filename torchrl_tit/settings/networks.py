@@ -52,7 +52,7 @@ class Network:
     num_frames: Frames = 1
     """Number K of observations that the network reads."""
     trunks: Literal["shared", "separate"] = "shared"
-    """Whether policy and value share one network or have one each."""
+    """Whether PPO's policy and value share one network or have one each."""
     initialization: Literal["normal", "default"] = "default"
     """Initialization of the weights: normal with a standard deviation of 0.02, as in the authors'
     code, or the default of each layer."""

@@ -29,7 +29,8 @@ class Choice:
     """The meaning of the heights."""
     labels: list[str]
     heights: np.ndarray
-    """Probabilities or values of the options, or the entries of a continuous action, [n]."""
+    """Probabilities of the options, or values, NaN where forbidden, or the entries of a continuous
+    action, [n]."""
     spreads: np.ndarray | None
     """The standard deviations of these entries, if the policy samples them, [n]."""
     chosen: list[bool]
@@ -67,7 +68,8 @@ class ExplainedStep:
         """Says in words what was chosen and what was read most, for those who cannot see it."""
         choice = self.choice
         options = ", ".join(
-            f"{label} {height:.2f}{' (chosen)' if chosen else ''}"
+            f"{label} {'forbidden' if np.isnan(height) else f'{height:.2f}'}"
+            f"{' (chosen)' if chosen else ''}"
             for label, height, chosen in zip(
                 choice.labels, choice.heights, choice.chosen, strict=True
             )
@@ -198,7 +200,7 @@ class Page:
         shown = places[:: -(-len(places) // _MOST_LABELS)]
         axes.set_xticks(shown, [choice.labels[i] for i in shown])
         spreads = 0 if choice.spreads is None else choice.spreads
-        low, high = (choice.heights - spreads).min(), (choice.heights + spreads).max()
+        low, high = np.nanmin(choice.heights - spreads), np.nanmax(choice.heights + spreads)
         is_share = "probabilit" in choice.title
         axes.set_ylim((0, 1) if is_share else self._grown(axes, 1.1 * low, 1.1 * high))
 

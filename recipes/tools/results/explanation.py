@@ -133,6 +133,8 @@ def describe_choice(
             title, spreads = "action, and its spread", _array(base.scale[0].flatten())
     elif distribution is None:
         title, heights = "values of actions", outputs["action_value"][0]
+        forbidden = heights == torch.finfo(heights.dtype).min  # what TorchRL writes for them
+        heights = heights.masked_fill(forbidden, torch.nan)
         chosen = [i == int(action) for i in range(len(heights))]
     elif isinstance(base, distributions.Bernoulli):
         title, heights = "probabilities of on", base.probs[0].flatten()

@@ -11,6 +11,7 @@ import pytest
 from recipes.bc import BC
 from recipes.cli import main
 from recipes.core.runner import load_trained
+from recipes.dqn import DQN
 from recipes.offline import with_spaces
 from recipes.ppo import PPO
 from recipes.tools.results import explanation, paper_figures
@@ -240,3 +241,50 @@ def test_a_recorded_episode(tmp_path, capsys, monkeypatch):
     }.items():
         more = ["--dataset", data, "--out", tmp_path / "no.png", *words]
         assert message in fails(capsys, "explain", run.folder, *more)
+
+
+def test_recorded_episodes_are_those_of_the_agents_task(tmp_path, capsys, monkeypatch):
+    """As it writes them: categories are counted from 0, and floats are none."""
+    pytest.importorskip("captum")
+    run = untrained(tmp_path / "run", make_ppo("FrozenLake-v1", enhanced_tit(2, **TIT)))
+    states, actions = np.arange(200)[:, None] % 16, np.arange(200) % 4
+    data = log_machine(tmp_path / "a.hdf5", observations=states, actions=actions)
+    seen = []
+
+    class Watching(explanation.Explainer):
+        def explain(self, tensordict):
+            seen.append(tensordict["history"][0].flatten().tolist())
+            return super().explain(tensordict)
+
+    monkeypatch.setattr(explanation, "Explainer", Watching)
+    explain(run.folder, "--dataset", data, "--step", 7, "--out", tmp_path / "step.png")
+    assert seen == [[6, 7]]
+    wrong = {
+        "categories: store integers": states / 2,
+        "are [16], which Discrete(16) does not have": states + 1,
+        "but in FrozenLake-v1 it is []": np.ones((200, 5)),
+    }
+    for number, (message, observations) in enumerate(wrong.items()):
+        other = log_machine(tmp_path / f"{number}", observations=observations, actions=actions)
+        more = ["--dataset", other, "--out", tmp_path / "no.png"]
+        assert message in fails(capsys, "explain", run.folder, *more)
+    taxi = make_ppo("Taxi-v4", enhanced_tit(2, **TIT), mask_actions=True)
+    run = untrained(tmp_path / "taxi", taxi)
+    more = ["--dataset", data, "--out", tmp_path / "no.png"]
+    assert "which actions are allowed" in fails(capsys, "explain", run.folder, *more)
+
+
+def test_forbidden_actions_have_no_value(tmp_path):
+    """TorchRL writes the lowest float for them."""
+    pytest.importorskip("captum")
+    recipe = DQN(
+        name="explained",
+        env="Taxi-v4",
+        backbone=enhanced_tit(2, **TIT),
+        mask_actions=True,
+        total_steps=40,
+        random_steps=20,
+    )
+    run, page = untrained(tmp_path / "run", recipe), tmp_path / "page.png"
+    explain(run.folder, "--out", page, "--step", 1)
+    assert imageio.imread(page).shape == PAGE

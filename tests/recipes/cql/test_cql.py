@@ -85,6 +85,11 @@ def test_the_actor_clones_first_and_then_maximizes_values(tmp_path, monkeypatch)
     assert taken == list(zip(names, terms, strict=True))
 
 
+def test_the_temperature_begins_where_the_recipe_says(tmp_path):
+    algorithm, _ = double(make_cql(tmp_path, backbone=SMALL, alpha_init=0.05), tmp_path)
+    assert algorithm.model.log_alpha.exp().item() == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize("make", [make_cql, make_discrete_cql])
 def test_dropout_is_on_in_updates_and_off_in_evaluations(tmp_path, make, monkeypatch):
     settings = {"critic": "backbone"} if make is make_cql else {}

@@ -91,6 +91,11 @@ def test_values_of_actions():
     assert choice.title == "values of actions"
     assert choice.heights.tolist() == [1.0, -3.0, 2.0]
     assert choice.chosen == [False, False, True]
+    forbidden = torch.tensor([[1.0, torch.finfo(torch.float32).min]])  # as TorchRL writes it
+    choice = described(None, 0, action_value=forbidden)
+    np.testing.assert_array_equal(choice.heights, [1.0, np.nan])
+    words = ExplainedStep({}, None, choice, None).describe()
+    assert words == "Values of actions: 0 1.00 (chosen), 1 forbidden."
 
 
 @pytest.mark.parametrize(
