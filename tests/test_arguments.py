@@ -272,6 +272,7 @@ CALLS: list[tuple[Callable[[], object], str]] = [
     (lambda: load_episodes(""), "source must name a file, a folder or a data set, not ''"),
     (lambda: load_episodes("a.hdf5", task=5), "task must be a name, or what task_spaces"),
     (lambda: task_spaces(5), "field 'env_name' is 5: Expected `str`"),
+    (lambda: task_spaces("torchrl.envs:PendulumEnv"), "makes a TorchRL environment, but data"),
     (lambda: HistoryStorage("x"), "episodes must be Episodes, as of load_episodes, not 'x'"),
     (lambda: SequenceStorage(episodes(), 2, return_scale=INF), "return_scale must be at most"),
     (lambda: OnlineHistoryStorage(1.5), "field 'max_size' is 1.5: Expected `int`"),

@@ -18,7 +18,7 @@ from torchrl.envs import Compose, Transform
 
 from torchrl_tit.envs import is_atari, make_games
 from torchrl_tit.envs.gymnasium_tasks import make_unchecked
-from torchrl_tit.envs.names import load_wrappers
+from torchrl_tit.envs.names import find_task, load_wrappers
 from torchrl_tit.envs.spaces import ObservationReader
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
@@ -101,6 +101,11 @@ def task_spaces(
         games.close()
         observation = _transformed(games.single_observation_space, transforms, image_layout)
         return TaskSpaces(observation, games.single_action_space, env_name)
+    if ":" in env_name and callable(find_task(env_name)):
+        raise ValueError(
+            f"Task {env_name!r} makes a TorchRL environment, but data sets are compared with a "
+            "Gymnasium task: name one, or leave the task out"
+        )
     try:
         env = make_unchecked(env_name, **settings)
     except Exception as error:  # a package is missing, the task has no such setting, ...

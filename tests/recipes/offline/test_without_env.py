@@ -323,7 +323,7 @@ def test_transforms_read_images_in_their_layout(monkeypatch, layout, shape):
     )
     monkeypatch.setattr(checks, "make_unchecked", lambda name: images)
     stack = "torchrl.envs:UnsqueezeTransform(dim=-4,in_keys=['observation'])"
-    task = checks.task_spaces("Images-v0", wrappers=(stack,), image_layout=layout)
+    task = checks.task_spaces("CartPole-v1", wrappers=(stack,), image_layout=layout)
     assert task.observation.shape == (1, *shape)
 
 
