@@ -195,7 +195,7 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
                 self.collector.update_policy_weights_()
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor | float]:
-        """Stores a batch, then takes gradient steps on samples from the buffer."""
+        """Stores a batch, then takes gradient steps; returns the means of their terms."""
         recipe, count = self.recipe, batch.numel()
         if recipe.normalize_observations and step < recipe.random_steps:
             seen = batch["observation"].flatten(0, 1).to(self.device)
@@ -211,10 +211,12 @@ class ReplayAlgorithm(LearnsFromSamples, OnlineAlgorithm[RecipeT]):
             return {}
         done = (step - recipe.random_steps) // recipe.steps_per_batch * recipe.updates_per_batch
         self.policy.train()
-        for number in range(done, done + recipe.updates_per_batch):
-            terms = self.learn(to_networks(self.buffer.sample(), self.device), number)
+        taken = [
+            self.numbers(self.learn(to_networks(self.buffer.sample(), self.device), number))
+            for number in range(done, done + recipe.updates_per_batch)
+        ]
         self.policy.eval()
-        return self.numbers(terms)
+        return {name: torch.stack([t[name] for t in taken]).nanmean() for name in self.columns}
 
     @abstractmethod
     def learn(self, samples: TensorDictBase, number: int) -> Terms:

@@ -82,6 +82,23 @@ def test_random_steps_are_uniform_and_learn_nothing(tmp_path: Path) -> None:
     assert read_metrics(run.folder / "metrics.csv")[-1]["alpha"] < 1
 
 
+def test_metrics_are_means_over_the_gradient_steps_of_a_batch(tmp_path: Path, monkeypatch) -> None:
+    taken: list[float] = []
+    learn = SACAlgorithm.learn
+
+    def watch(self, samples, number):
+        terms = learn(self, samples, number)
+        taken.append(terms["loss_qvalue"].item())
+        return terms
+
+    monkeypatch.setattr(SACAlgorithm, "learn", watch)
+    recipe = replace(SMALL, random_steps=100, total_steps=120, steps_per_batch=20, log_interval=20)
+    run = train(recipe, tmp_path / "run")
+    [row] = [row for row in read_metrics(run.folder / "metrics.csv") if row["step"] == 120]
+    assert len(set(taken)) == len(taken) == 4
+    assert row["loss_qvalue"] == pytest.approx(sum(taken) / len(taken), rel=1e-5)
+
+
 def observed(size: int, value: float) -> dict[str, Any]:
     """Observations of Pendulum's shape."""
     return {"observation": torch.full((size, 3), value)}
