@@ -87,7 +87,7 @@ def tune(arguments: list[str]) -> None:
         "--space", type=Path, help="JSON file with the search space; default: the recipe's, if ppo"
     )
     parser.add_argument(
-        "--seeds", type=int, nargs="+", default=[0], help="of each trial; default: 0"
+        "--seeds", type=int, nargs="+", help="of each trial; default: the recipe's seed"
     )
     for name, default, words in (
         ("trials", 50, "trials of the whole search"),
@@ -113,7 +113,7 @@ def tune(arguments: list[str]) -> None:
         if name in given:
             fail(f"{name} is searched, so it has no value: leave it out, or out of --space")
     make_algorithm(recipe).check()
-    settings = Settings(recipe, space, seeds=tuple(dict.fromkeys(options.seeds)))
+    settings = Settings(recipe, space, seeds=tuple(dict.fromkeys(options.seeds or [recipe.seed])))
     with Search(options.out, settings) as search:
         try:
             failed = search.run(options.trials, options.workers)

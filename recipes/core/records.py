@@ -84,9 +84,10 @@ class Record:
         return tuple(self.row[column] for column in ("settings", "seed", "ended", "steps"))
 
     def is_beginning_of(self, other: Record) -> bool:
-        """Whether it is the same run before it had ended."""
+        """Whether it is the same run before it had ended, or was evaluated."""
         same = all(self.row[x] == other.row[x] for x in ("settings", "seed", "versions"))
-        return same and other.curve.startswith(self.curve) and other.curve != self.curve
+        more = other.curve != self.curve or (not self.row["steps"] and bool(other.row["steps"]))
+        return same and other.curve.startswith(self.curve) and more
 
 
 class Records:

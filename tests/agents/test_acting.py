@@ -6,6 +6,7 @@ import runpy
 from functools import cache, reduce
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -21,6 +22,7 @@ from recipes.ppo import PPO
 from recipes.sac import SAC
 from tests.agents.runs import make_run
 from tests.recipes.offline.test_without_env import log_machine
+from tests.recipes.ppo import tasks as ppo_tasks
 from tests.recipes.small import make_dt, tit, train
 from torchrl_tit import load_agent
 from torchrl_tit.agents import agent_names
@@ -124,6 +126,26 @@ def test_missing_values_are_held(made):
         agent.act(np.array(["a"] * 11))
     with pytest.raises(ValueError, match="there are 2 rewards, but 1 copies"):
         agent.act(frames[0], reward=[1.0, 2.0])
+
+
+def test_masks_of_several_choices(tmp_path):
+    """As Gymnasium has them, or in one row."""
+    recipe = PPO(
+        env="MultiDiscreteActions-v0",
+        backbone=mlp(2, hidden_dim=8),
+        mask_actions=True,
+        evaluation_episodes=1,
+    )
+    agent = load_agent(make_run(tmp_path / "run", recipe))
+    space: Any = ppo_tasks.ACTIONS["MultiDiscrete"]
+    observation = {"image": np.zeros((3, 12, 12), np.uint8), "state/0": np.ones(3), "state/1": [2]}
+    masks = tuple(np.eye(n, dtype=bool)[-1] for n in space.nvec)
+    action = agent.act(observation, action_mask=masks)
+    assert action.tolist() == (space.nvec - 1 + space.start).tolist(), "the last of each"
+    agent.reset()
+    assert (agent.act(observation, action_mask=np.concatenate(masks)) == action).all()
+    with pytest.raises(ValueError, match="action_mask has the shape"):
+        agent.act(observation, action_mask=masks[0])
 
 
 def test_images_are_not_cut_to_bytes(tmp_path):

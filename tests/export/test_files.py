@@ -123,6 +123,20 @@ def test_a_decision_transformer_is_compared_within_its_episodes(tmp_path):
     assert said["difference"] < 1e-5
 
 
+def test_a_decision_transformer_of_one_frame_has_no_earlier_ones(tmp_path):
+    policy = make_dt_actor(
+        network := DecisionTransformer((4,), action_dim=2, num_frames=1),
+        DTHead(network.features_dim, 2, "discrete"),
+    ).eval()
+
+    def task(copies):
+        transforms = TargetReturn(50.0), SequenceHistory(1)
+        return make_env("CartPole-v1", copies).append_transform(Compose(*transforms))
+
+    said = export_policy(policy, task, tmp_path / "policy.pt2", step_by_step=True)
+    assert said["difference"] < 1e-5
+
+
 def test_actions_of_several_dimensions(tmp_path):
     policy, task = make_policy("BoxActions-v0", Linear(embed_dim=4))
     said = export_policy(policy, task, tmp_path / "policy.pt2", step_by_step=True)

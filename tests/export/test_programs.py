@@ -6,9 +6,13 @@ from tensordict.nn import TensorDictModule, TensorDictSequential, set_interactio
 from tensordict.nn.probabilistic import InteractionType
 from torch import nn
 
+from recipes.dqn import DQN
+from tests.agents.runs import make_run
 from tests.export.policies import make_policy, program_of
 from tests.numerics import assert_near
 from tests.recipes.ppo import tasks
+from tests.recipes.small import tit
+from torchrl_tit import load_agent
 from torchrl_tit.envs import make_env
 from torchrl_tit.export.comparison import COPIES, NotTheSameError, compare
 from torchrl_tit.export.parts import Entry, read_parts
@@ -130,6 +134,14 @@ def test_every_kind_of_action_and_of_observation(action, masked):
         actions = program(given)["action"]
     assert all(tasks.ACTIONS[action].contains(x.numpy()) for x in actions)  # as the task takes it
     assert difference(policy, task, step_by_step=True, sample=True) < 1e-5
+
+
+@pytest.mark.parametrize("step_by_step", [False, True])
+def test_values_of_forbidden_actions_do_not_count(step_by_step, tmp_path):
+    """TorchRL writes the lowest number for them, once the action is chosen."""
+    recipe = DQN(env="Taxi-v4", backbone=tit(2), mask_actions=True, evaluation_episodes=1)
+    agent = load_agent(make_run(tmp_path / "run", recipe))
+    assert difference(agent.policy, agent.make_env, step_by_step=step_by_step) < 1e-5
 
 
 def test_samples_follow_the_distribution():

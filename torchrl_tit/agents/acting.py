@@ -76,15 +76,17 @@ class Actor:
                 NaN, or None for all of it, the last value is held.
             reward: the reward since the last action, a number or [N], which only a Decision
                 Transformer reads.
-            action_mask: which actions are allowed, for an agent that reads it.
+            action_mask: which actions are allowed, for an agent that reads it, [actions] or
+                [N, actions]; of several choices, those of all in one row, or a tuple, as
+                Gymnasium has them.
 
         Returns:
             The action in the task's own form, clipped to its bounds; [N, ...] for several copies.
 
         Raises:
             ValueError: if the observation has another shape, is infinite, or has numbers that its
-                integers cannot hold, the number of copies changes without :meth:`reset`, or there
-                is no last value to hold.
+                integers cannot hold, the number of copies changes without :meth:`reset`, there is
+                no last value to hold, or the mask is missing or has another size.
         """
         if self._env is None:
             self._start(observation)
@@ -93,8 +95,15 @@ class Actor:
         if "action_mask" in self._specs:
             if action_mask is None:
                 raise ValueError("the agent reads which actions are allowed: give action_mask")
+            if isinstance(action_mask, tuple):  # Gymnasium's of several choices
+                action_mask = np.concatenate(action_mask, -1)
             mask = torch.as_tensor(np.asarray(action_mask, bool))
-            given["action_mask"] = mask.reshape(self._env.observation_spec["action_mask"].shape)
+            shape = self._env.observation_spec["action_mask"].shape
+            if mask.numel() != shape.numel():
+                raise ValueError(
+                    f"action_mask has the shape {list(mask.shape)}, but must have {list(shape)}"
+                )
+            given["action_mask"] = mask.reshape(shape)
         rewards = torch.as_tensor(np.asarray(reward, np.float32)).reshape(-1, 1)
         if len(rewards) not in (1, copies := len(self._begins)):
             raise ValueError(

@@ -146,7 +146,9 @@ def _distance(mine: Tensor, other: Tensor) -> float:
         return float("inf")
     if not mine.is_floating_point():
         return 0.0 if torch.equal(mine, other) else float("inf")
-    same = (mine == other) | (mine.isnan() & other.isnan())  # -inf of options that do not exist
+    # -inf of options that do not exist; TorchRL's values of actions that a mask forbids
+    masked = other == torch.finfo(other.dtype).min
+    same = (mine == other) | (mine.isnan() & other.isnan()) | masked
     apart = (mine - other).abs().masked_fill(same, 0).nan_to_num(nan=float("inf"))
-    scale = other.abs().masked_fill(~other.isfinite(), 0).max().clamp(min=1)
+    scale = other.abs().masked_fill(~other.isfinite() | masked, 0).max().clamp(min=1)
     return (apart.max() / scale).item()

@@ -41,7 +41,7 @@ def make_program(parts: Parts, *, step_by_step: bool = False, sample: bool = Fal
                 f"{', '.join(trunk.history_encoder.context)} beside observations, which only a "
                 "Decision Transformer on a SequenceHistory can be exported with"
             )
-        kind = SequenceSteps if step_by_step else SequenceWindows
+        kind = SequenceSteps if step_by_step and trunk.num_frames > 1 else SequenceWindows
         program = kind(parts, sample=sample)
     elif trunk.carries_state:
         program = RecurrentSteps(parts, sample=sample)

@@ -276,6 +276,7 @@ class _Trial:
         self.jobs: list[Job] | None = None
         self.process: subprocess.Popen[bytes] | None = None
         self.started: Job | None = None  # the process's
+        self.was_killed = False
         try:
             recipe = search.recipe(trial.number, trial.params)
             algorithm = make_algorithm(recipe)
@@ -312,7 +313,9 @@ class _Trial:
             # Code 2: refused, as a process that a killed search left behind started the run first.
             assert self.started is not None
             begun = self.started.is_in_use() or self.started.is_complete()
-            if self.process.returncode == 2 and begun:
+            killed = self.process.returncode < 0 and not self.was_killed  # it is resumed once
+            if killed or (self.process.returncode == 2 and begun):
+                self.was_killed |= killed
                 self.process = self.started = None
                 return False
             return self._end(TrialState.FAIL)

@@ -88,6 +88,19 @@ def test_a_run_that_had_not_ended_is_replaced(runs, tmp_path, capsys):
         record_runs([runs / "wide"], out)
 
 
+def test_a_run_that_is_evaluated_later_is_replaced(runs, tmp_path):
+    run = runs / "wide"
+    evaluation = (run / "evaluation.json").read_text()
+    (run / "evaluation.json").unlink()
+    record_runs([run], tmp_path / "page")
+    (run / "evaluation.json").write_text(evaluation)
+    record_runs([run], tmp_path / "page")
+    [recorded] = find_runs([tmp_path / "page"])
+    assert (recorded.read_evaluation() or {})["mean"] == json.loads(evaluation)["mean"]
+    with pytest.raises(ValueError, match="holds wide already"):
+        record_runs([run], tmp_path / "page")
+
+
 def test_each_metric_that_is_kept_has_four_digits(runs, tmp_path):
     folder = runs / "stopped"
     (folder / "successes.csv").write_text("step,episodes,successes\n2,7,3\n")

@@ -144,6 +144,18 @@ def test_a_run_in_use_is_waited_for(tmp_path):
     assert begun == [(free, False), (used, False)]
 
 
+def test_a_file_that_is_changed_in_between_is_a_failure(tmp_path):
+    """Later seeds would have other settings than the first, and nobody would know."""
+    job = sweep.Job(replace(TINY, seed=1), tmp_path / "seed-1")
+
+    def start(job):
+        begin(job.folder, replace(job.recipe, epochs=job.recipe.epochs + 1))
+        return subprocess.Popen([sys.executable, "-c", ""])
+
+    assert sweep.run_jobs([job], workers=1, start=start) == [job]
+    assert "seed-1 holds a run of " in job.log.read_text()
+
+
 @pytest.mark.parametrize("completes", [True, False])
 def test_a_run_that_another_sweep_began_first_is_no_failure(completes, tmp_path, monkeypatch):
     job = begin(tmp_path / "run", TINY)

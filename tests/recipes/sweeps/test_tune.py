@@ -160,6 +160,18 @@ def test_trials_are_recorded_and_their_study_is_made_again(searched, monkeypatch
     assert not (folder / "importance.csv").exists(), "two complete trials say nothing"
 
 
+@pytest.mark.parametrize("kills", [1, 2])
+def test_a_trial_whose_process_is_killed_is_resumed_once(tmp_path, naps, monkeypatch, kills):
+    codes = [-9] * kills
+
+    def start(job):
+        return Process(codes.pop()) if codes else complete(job)
+
+    monkeypatch.setattr(tune, "start", start)
+    with Search(tmp_path, SETTINGS) as search:
+        assert search.run(1, workers=1) == [[], [0]][kills - 1]
+
+
 def test_a_trial_below_the_median_is_pruned(tmp_path, naps, monkeypatch):
     """Earlier trials are told; the new one's metrics are written by hand."""
     settings = Settings(RECIPE, SPACE, startup_trials=2, warmup=0.4)
@@ -358,6 +370,7 @@ def test_fields_are_options(files, naps, capsys, monkeypatch):
     main([*words(files, 2), *typed])
     recipe = recipe_from_json((files / "out" / "best.json").read_bytes(), "best.json")
     assert (recipe.env, recipe.seed) == ("Acrobot-v1", 3)
+    assert (files / "out" / "trial-1" / "seed-3").exists(), "what is reported is what was trained"
     assert recipe.backbone.history.name == "lstm"
     assert "other settings" in fails(capsys, *words(files, 2))  # without these fields
     assert "--evn" in fails(capsys, *words(files, 2), "--evn", "Acrobot-v1")
