@@ -113,8 +113,8 @@ _UNFIT: dict[type[Transform], str] = {
         "gymnasium.wrappers:RepeatAction(num_repeats=4), or in the task"
     ),
     EndOfLifeTransform: (
-        "asks a single game for its lives, but games here step together: agents learn from whole "
-        "games"
+        "asks a single game for its lives, but games here step together, and end an episode at "
+        "each lost life already"
     ),
 }
 """Transforms that cannot be used, and why."""
