@@ -411,9 +411,9 @@ def _steps(episodes: Episodes) -> Iterator[dict[str, NDArray]]:
     """The fields of each episode by Minari's names."""
     rows = (episodes.first_rows, episodes.last_rows, episodes.final_rows)
     for first, last, final in zip(*(row.tolist() for row in rows), strict=True):
-        steps = {}
+        steps, taken = {}, [*range(first, last + 1)]
         for name, (theirs, ours) in _NAMES.items():
-            wanted = [*range(first, last + 1)] + [final] * (name == "observations")
+            wanted = [*taken, final] if name == "observations" else taken
             values = episodes.rows[ours][wanted].numpy()
             steps[theirs] = values if name in ("observations", "actions") else values.squeeze(-1)
         yield steps

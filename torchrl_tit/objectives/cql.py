@@ -285,8 +285,8 @@ class ContinuousCQLLoss(CQLLoss):
         """The loss of an actor that clones the data, of a batch [*B], float [].
 
         TorchRL's, the mean of ``alpha log p(a) - log p(b)`` with the data's actions b, as in the
-        code of arXiv 2006.04779, but b is kept 0.5% of the action's range away from the bounds,
-        where data sets have many actions, but a squashed Gaussian none of finite x.
+        code of arXiv 2006.04779. Data sets have many actions at the bounds, which a squashed
+        Gaussian reaches only at infinity, so b is kept 0.5% of the range away from them.
 
         Returns:
             The loss, and the mean of log p(b), float [], under "bc_log_prob".

@@ -233,14 +233,15 @@ def run_jobs(
                     if code == 2 and job.is_in_use():
                         waiting.append(job)
                         continue
+                    succeeded = not code or job.is_complete()
                     try:
                         job.check()
                     except ValueError as error:  # its file was changed after the sweep began
+                        succeeded = False
                         with job.log.open("a", encoding="utf-8") as log:
                             log.write(f"error: {error}\n")
+                    if not succeeded:
                         failed.append(job)
-                    else:
-                        failed += [job] if code and not job.is_complete() else []
                     progress.update()
         except KeyboardInterrupt:
             for worker in running.values():
