@@ -80,8 +80,6 @@ def resume(
         if lengths:
             _lengthen(run, lengths)
         run.recipe = override(run.recipe, device=device, threads=threads)
-        if changes := run.version_changes():
-            note(f"versions changed since the start: {'; '.join(changes)}")
         _finish(run, wandb)
 
 
@@ -111,6 +109,8 @@ def _finish(run: Run, wandb: str | None) -> None:
             f"{option(recipe.length)} trains it further"
         )
         return
+    if changes := run.add_versions():
+        note(f"versions changed since the start: {'; '.join(changes)}")
     try:
         with ExitStack() as stack:
             callbacks: list[Callback] = [] if recipe.offline else [UnusedFrames(recipe)]

@@ -8,7 +8,7 @@ import json
 import os
 import platform
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -97,8 +97,7 @@ class Run:
         folder.mkdir(parents=True, exist_ok=True)
         with run:
             cls.check_new(folder)  # another process may have created it since
-            versions = json.dumps(package_versions(), indent=2) + "\n"
-            write_text_atomic(folder / "versions.json", versions)
+            run._write_versions(package_versions())
             if modules := allowed_modules():
                 write_text_atomic(folder / _IMPORTS, json.dumps(modules) + "\n")
             if initial_weights is not None:
@@ -301,17 +300,29 @@ class Run:
         return self.folder / "learning_curve.png"
 
     def versions(self) -> dict[str, Any]:
-        """Returns the versions that the run began with; none if they are lost or damaged."""
+        """Returns the versions that the run ran with; none if they are lost or damaged.
+
+        Those of a run that was resumed with others are "2.12.0 -> 2.13.0".
+        """
         try:
             return dict(json.loads(self.read("versions.json") or b"{}"))
         except (OSError, RecursionError, TypeError, ValueError):
             return {}
 
     def version_changes(self) -> list[str]:
-        """Returns how the versions of this process differ from those that the run began with."""
+        """Returns how the versions of this process differ from those that the run last ran with."""
         before, now = self.versions(), package_versions()
-        changed = [k for k in now if before and before.get(k) != now[k]]
-        return [f"{k} {before.get(k)} -> {now[k]}" for k in changed]
+        last = {name: str(version).split(" -> ")[-1] for name, version in before.items()}
+        return [f"{k} {before.get(k)} -> {now[k]}" for k in now if before and last.get(k) != now[k]]
+
+    def add_versions(self) -> list[str]:
+        """Adds the versions of this process to the folder's; returns what changed."""
+        if changes := self.version_changes():
+            self._write_versions(self.versions() | dict(x.split(" ", 1) for x in changes))
+        return changes
+
+    def _write_versions(self, versions: Mapping[str, Any]) -> None:
+        write_text_atomic(self.folder / "versions.json", json.dumps(versions, indent=2) + "\n")
 
 
 class RecordedRun(Run):

@@ -157,6 +157,20 @@ def test_version_changes(tmp_path):
         assert run.version_changes() == []
 
 
+def test_a_resumed_run_keeps_all_versions_it_ran_with(tmp_path, capsys):
+    run = Run.create(tmp_path / "run", SMALL)
+    edit(run.folder / "versions.json", torch="1.0", removed="1")
+    main(["train", "--resume", str(run.folder)])
+    changed = f"1.0 -> {version('torch')}"
+    assert f"versions changed since the start: torch {changed}\n" in capsys.readouterr().err
+    assert run.versions()["torch"] == changed
+    assert run.versions()["removed"] == "1"
+    before = run.read("versions.json")
+    main(["train", "--resume", str(run.folder), "--total-steps", "128"])
+    assert "versions changed" not in capsys.readouterr().err
+    assert run.read("versions.json") == before
+
+
 def test_a_damaged_list_of_imports_does_not_hide_the_reason(tmp_path):
     run = Run.create(tmp_path / "run", SMALL)
     edit(run.folder / "recipe.json", env="evilmod:Mine-v0")
