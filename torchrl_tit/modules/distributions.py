@@ -46,7 +46,12 @@ class IndependentCategorical(distributions.Independent):
         else:  # its cross-entropy does not support several samples at once
             base = MaskedCategorical(logits=logits, mask=mask, use_cross_entropy=False)
         super().__init__(base, event_dim, validate_args=False)
-        self._dtype = dtype
+        self._dtype, self._logits = dtype, logits
+
+    @property
+    def exists(self) -> Tensor:
+        """Whether a component has an option, allowed or not; bool, of the shape of the logits."""
+        return self._logits != -torch.inf
 
     def sample(self, sample_shape: Sequence[int] = ()) -> Tensor:
         """Draws actions, [*sample_shape, *batch, *components]."""

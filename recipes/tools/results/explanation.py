@@ -143,9 +143,10 @@ def describe_choice(
         heights = base.probs[0]
         index = int(action.int().argmax()) if action.ndim else int(action)
         chosen = [i == index for i in range(len(heights))]
-    else:  # several choices; one with fewer options than another is padded with zeros
+    else:  # several choices; one with fewer options than another is padded
         rows = base.probs[0].flatten(0, -2)
-        options = [int(row.nonzero().max()) + 1 for row in rows]
+        exists = getattr(distribution, "exists", torch.ones_like(base.probs))
+        options = exists[0].flatten(0, -2).int().sum(-1).tolist()
         labels = [f"{i}: {option}" for i, count in enumerate(options) for option in range(count)]
         heights = torch.cat([row[:count] for row, count in zip(rows, options, strict=True)])
         likely = rows.argmax(-1).tolist()

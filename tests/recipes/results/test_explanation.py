@@ -34,6 +34,7 @@ LOGITS = torch.tensor([[0.1, 0.2, 0.7]]).log()
 
 
 SEVERAL = torch.tensor([[[0.25, 0.75, 0.0], [0.5, 0.25, 0.25]]]).log()
+ALLOWED = torch.tensor([[[True, True, False], [True, True, False]]])
 OPTIONS = ["0: 0", "0: 1", "1: 0", "1: 1", "1: 2"]
 ONE, TWO = [False, True, False], [False, True, True, False, False]
 
@@ -56,6 +57,13 @@ ONE, TWO = [False, True, False], [False, True, True, False, False]
             TWO,
             OPTIONS,
             [0.25, 0.75, 0.5, 0.25, 0.25],
+            TWO,
+        ),
+        (
+            IndependentCategorical(SEVERAL, ALLOWED),
+            [1, 0],
+            OPTIONS,
+            [0.25, 0.75, 2 / 3, 1 / 3, 0.0],
             TWO,
         ),
     ],
