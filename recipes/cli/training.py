@@ -76,21 +76,23 @@ def resume(
         wandb: as in :func:`start`.
     """
     check_wandb(wandb)
+    settings: dict[str, Any] = {"device": device, "threads": threads}
     with Run.open(folder) as run:
         if lengths:
-            _lengthen(run, lengths)
-        run.recipe = override(run.recipe, device=device, threads=threads)
+            _lengthen(run, lengths, settings)
+        run.recipe = override(run.recipe, **settings)
         _finish(run, wandb)
 
 
-def _lengthen(run: Run, lengths: Mapping[str, int]) -> None:
-    """Changes the length of a run, and says which schedules that affects."""
+def _lengthen(run: Run, lengths: Mapping[str, int], settings: Mapping[str, Any]) -> None:
+    """Changes the length of a run that can be resumed, and says which schedules that affects."""
     field = run.recipe.length
     if wrong := [name for name in lengths if name != field]:
         raise ValueError(
             f"{run.folder} is a run of {run.recipe.algorithm}, whose length is {option(field)}, "
             f"not {option(wrong[0])}"
         )
+    make_algorithm(override(run.recipe, **settings, **lengths)).check()
     before = getattr(run.recipe, field)
     run.lengthen(lengths[field])
     if run.recipe.schedules and lengths[field] != before:

@@ -20,6 +20,7 @@ from recipes.core.metrics import read_metrics
 from recipes.core.progress import Record
 from recipes.core.recipe_json import recipe_to_json, settings_to_dict
 from recipes.core.run import Run
+from recipes.ppo import PPOAlgorithm
 from recipes.tools.results.plot import plot_run
 from tests.recipes.commands import Command, fails
 from tests.recipes.small import TINY, assert_same_run, train
@@ -169,6 +170,24 @@ def test_a_resumed_run_keeps_all_versions_it_ran_with(tmp_path, capsys):
     main(["train", "--resume", str(run.folder), "--total-steps", "128"])
     assert "versions changed" not in capsys.readouterr().err
     assert run.read("versions.json") == before
+
+
+def test_a_refused_resume_changes_nothing(tmp_path, capsys, monkeypatch):
+    run = Run.create(tmp_path / "run", SMALL)
+    main(["train", "--resume", str(run.folder)])
+    before = contents(run.folder)
+    longer = ["train", "--resume", run.folder, "--total-steps", "640"]
+    assert "threads" in fails(capsys, *longer, "--threads", "99999")
+
+    def check(algorithm):
+        raise ValueError("the data are gone")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PPOAlgorithm, "check", check)
+        assert "the data are gone" in fails(capsys, *longer)
+    assert contents(run.folder) == before
+    main([str(word) for word in longer])
+    assert Run.open(run.folder).recipe.total_steps == 640
 
 
 def test_a_damaged_list_of_imports_does_not_hide_the_reason(tmp_path):

@@ -12,7 +12,7 @@ from typing import Any
 
 import imageio.v2 as imageio
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, Transform
 
 from torchrl_tit.evaluation import evaluate
 from torchrl_tit.extras import install
@@ -37,6 +37,8 @@ def film_policy(
     max_pictures: int | None = None,
 ) -> list[float]:
     """Films a policy while it plays with its most likely actions.
+
+    There is a picture before each step, and one of how the episode ends.
 
     Args:
         make_env: makes the task, given the number of copies and ``render_mode``.
@@ -64,14 +66,31 @@ def film_policy(
         new_film(video, env.base_env.render_fps) as pictures,
     ):
 
-        def filmed(tensordict: TensorDictBase) -> TensorDictBase:
+        def show() -> None:
             nonlocal left
             if left > 0:
                 pictures.append_data(take_picture(env, name))
                 left -= 1
+
+        def filmed(tensordict: TensorDictBase) -> TensorDictBase:
+            show()
             return policy(tensordict)
 
+        env.append_transform(_AtTheEnd(show))
         return evaluate(env, filmed, episodes, seed=seed).tolist()
+
+
+class _AtTheEnd(Transform):
+    """Calls a function at the end of each episode, before the next one begins."""
+
+    def __init__(self, function: Callable[[], None]) -> None:
+        super().__init__()
+        self._function = function
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if next_tensordict["done"].any():
+            self._function()
+        return next_tensordict
 
 
 def make_rendered(make_env: Callable[..., EnvBase], name: str | Path) -> Any:

@@ -43,7 +43,7 @@ def test_an_agent_plays_and_is_filmed(run, tmp_path, capsys):
     returned = evaluation["returns"][1]  # of the second episode, whose seed is 5 + 1
     assert f"return {number(returned)} over 1 episode of" in capsys.readouterr().out
     shown = [imageio.immeta(film, index=i)["duration"] for i in range(len(imageio.imread(film)))]
-    assert sum(shown) == 20 * returned  # a picture a step, at 50 a second
+    assert sum(shown) == 20 * (returned + 1)  # a picture a step and one of the end, at 50 a second
     assert f"{film} exists already" in fails(capsys, "play", run, "--out", film)
 
 

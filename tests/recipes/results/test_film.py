@@ -3,7 +3,9 @@
 from functools import partial
 
 import imageio.v3 as imageio
+import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageSequence
 
 from recipes.cli import main
@@ -33,7 +35,7 @@ def cartpole(tmp_path_factory):
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".mp4"])
-def test_one_picture_a_step(cartpole, tmp_path, capsys, suffix):
+def test_one_picture_a_step_and_one_of_each_end(cartpole, tmp_path, capsys, suffix):
     pytest.importorskip("pygame")
     if suffix == ".mp4":
         pytest.importorskip("imageio_ffmpeg")
@@ -46,11 +48,28 @@ def test_one_picture_a_step(cartpole, tmp_path, capsys, suffix):
     pictures = imageio.imread(film)
     assert pictures.shape[1:] == (400, 600, 3)
     if suffix == ".gif":  # where two pictures are the same, one is shown for longer
-        assert sum(durations(film)) == 20 * returns.sum()  # milliseconds, at 50 a second
+        assert sum(durations(film)) == 20 * (returns.sum() + 2)  # milliseconds, at 50 a second
     else:
-        assert len(pictures) == returns.sum()
+        assert len(pictures) == returns.sum() + 2
     assert (pictures[0] != pictures[-1]).any()
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
+
+
+def test_the_end_is_shown(tmp_path):
+    """In a T-Maze, the last step is the turn."""
+    recipe = PPO(env="TMaze-v0", env_settings=("corridor_length=3",), backbone=mlp())
+    algorithm = make_algorithm(recipe)
+    walk = iter([0, 0, 0, 1] * 2)
+
+    def policy(tensordict):
+        return tensordict.set("action", torch.full(tensordict.shape, next(walk)))
+
+    film_policy(algorithm.make_env, policy, "it", tmp_path / "film.gif")
+    *before, last = imageio.imread(tmp_path / "film.gif")
+    assert len(before) == 4
+    agent = [np.argwhere((picture == (200, 0, 0)).all(-1)).mean(0) // 8 for picture in before]
+    assert [place.tolist() for place in agent] == [[2, x] for x in (1, 2, 3, 4)]
+    assert ((last == (200, 0, 0)).all(-1).nonzero()[0] // 8 == 1).all()
 
 
 def test_atari(tmp_path):
