@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..core.numbers import plus_minus
+from ..core.numbers import measured_words, plus_minus
 from ..core.recipe import Recipe
 from .arguments import Parser, add_machine_options, fail, override, say
 
@@ -149,9 +149,8 @@ def one_line(recipe: Recipe, evaluation: dict[str, Any]) -> str:
 
 def _measured(evaluation: dict[str, Any]) -> str:
     """What was measured on episodes of data, in words."""
-    words = [f"{name} {value:.4g}" for name, value in evaluation["held_out"].items()]
     episodes = evaluation["held_out_episodes"]
-    text = f"on {episodes} episodes of {evaluation['dataset']}: {', '.join(words)}"
+    text = f"on {episodes} episodes of {evaluation['dataset']}: {measured_words(evaluation)}"
     if "ope" in evaluation:
         low, high = f"{evaluation['low']:.4g}", f"{evaluation['high']:.4g}"
         text += (

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import floor, isfinite, log10
 from statistics import fmean, stdev
+from typing import Any
 
 _DIGITS = 3
 _MOST_DECIMALS = 6  # smaller numbers are written with a power of ten
@@ -71,3 +72,13 @@ def mean_std(values: Sequence[float]) -> str:
     if len(values) == 1:
         return number(values[0])
     return plus_minus(fmean(values), stdev(values))
+
+
+def measured_words(evaluation: Mapping[str, Any]) -> str:
+    """Says what an evaluation measured on held-out episodes.
+
+    Example:
+        >>> measured_words({"held_out": {"action_error": 0.02262, "nll": 1.3}})
+        'action_error 0.02262, nll 1.3'
+    """
+    return ", ".join(f"{name} {value:.4g}" for name, value in evaluation["held_out"].items())

@@ -18,7 +18,7 @@ from torchrl_tit.agents.folder import CARD, RECIPE, VERSIONS, WEIGHTS
 from torchrl_tit.agents.hub import import_hub
 from torchrl_tit.evaluation_file import EVALUATION
 
-from ...core.numbers import plus_minus
+from ...core.numbers import measured_words, plus_minus
 from ...core.recipe import DatasetRecipe, Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.run import Run
@@ -164,10 +164,9 @@ action = agent.act(observation)  # for each observation of an episode"""
 def _results(evaluation: Mapping[str, Any]) -> str:
     """Says what an evaluation found."""
     if "mean" not in evaluation:
-        measures = ", ".join(f"{name} {x:.4g}" for name, x in evaluation["held_out"].items())
         return (
             f"There is no environment. On {evaluation['held_out_episodes']} episodes that were "
-            f"held out of training: **{measures}**."
+            f"held out of training: **{measured_words(evaluation)}**."
         )
     target, first, episodes = "", evaluation["seed"], evaluation["episodes"]
     if "target_return" in evaluation:

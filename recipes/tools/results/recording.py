@@ -63,7 +63,10 @@ def record_runs(
 def _record(name: str, run: Run, commit: str) -> Record:
     metrics = _metrics(run)
     if not metrics:
-        raise ValueError(f"{run.folder} has no metrics yet: train it first, or leave it out")
+        raise ValueError(
+            f"{run.folder} has no metrics yet: train it first, for more steps than its "
+            "log_interval, or leave it out"
+        )
     named = RECIPES.get(run.recipe.name)
     changes = changes_of(named, run.recipe) if named else {}
     changes |= {"initial_weights": run.initial_weights} if run.initial_weights else {}

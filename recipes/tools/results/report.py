@@ -29,7 +29,7 @@ from torchrl_tit.agents import TrainedAgent
 from torchrl_tit.checkpoint import checkpoint_steps
 from torchrl_tit.files import write_text_atomic
 
-from ...core.numbers import number, numbers
+from ...core.numbers import measured_words, number, numbers
 from ...core.recipe import Recipe
 from ...core.recipe_json import recipe_to_json
 from ...core.registry import RECIPES
@@ -165,7 +165,8 @@ def report(
             one = group.experiment
             found = [replace(cell, recipe=one.name, changes=one.changes) for cell in found]
         except ValueError as error:  # none of the runs is trained and evaluated
-            found, texts = [], [f"{group.label} has no results: {error}"]
+            found = []
+            texts = _held_out(group) or [f"{group.label} has no results: {error}"]
         cells += found
         notes += texts
     media = _make_media(groups, say) if pictures else Media()
@@ -216,7 +217,8 @@ def _read(run: Run) -> RunData:
     rows = read_metrics(run)
     if not rows:
         raise ValueError(
-            f"{run.folder} has no metrics yet: train it first, or leave it out of the report"
+            f"{run.folder} has no metrics yet: train it first, for more steps than its "
+            "log_interval, or leave it out of the report"
         )
     if "return_mean" not in rows[0]:
         raise ValueError(f"{run.folder / 'metrics.csv'} is damaged: it has no column return_mean")
@@ -227,6 +229,17 @@ def _read(run: Run) -> RunData:
     ):
         evaluation = None
     return RunData(run, rows, evaluation)
+
+
+def _held_out(group: Group) -> list[str]:
+    """What was measured on the held-out episodes of runs without an environment."""
+    found = [(data, data.run.read_evaluation()) for data in group.runs]
+    return [
+        f"{group.label}, {data.name}, on {evaluation['held_out_episodes']} held-out episodes: "
+        f"{measured_words(evaluation)}"
+        for data, evaluation in found
+        if evaluation is not None and "held_out" in evaluation
+    ]
 
 
 def _make_media(groups: Sequence[Group], say: Callable[[str], None]) -> Media:
@@ -291,6 +304,7 @@ def _context(
     columns = _columns(groups)
     same = _constants(groups, columns)
     returns = [column for column in columns if "return" in column]
+    returns = returns or [column for column in columns if column.startswith("held_out_")][:1]
     order = {column: place for place, column in enumerate(known_columns(recipe.algorithm))}
     health = sorted({*columns} - {*returns} - {*same}, key=lambda one: order.get(one, len(order)))
     curves = [_chart(groups, column) for column in returns]
@@ -434,11 +448,12 @@ def _share_outside(data: RunData, words: MetricWords, bound: float, sign: int) -
 def _description(groups: Sequence[Group]) -> str:
     algorithms = dict.fromkeys(group.recipe.algorithm.upper() for group in groups)
     runs = sum(len(group.runs) for group in groups)
-    steps = max(data.steps for group in groups for data in group.runs)
+    steps = [data.steps for group in groups for data in group.runs]
+    length = " to ".join(f"{x:,}" for x in dict.fromkeys((min(steps), max(steps))))
     many = f"{len(groups)} experiments, " if len(groups) > 1 else ""
     return (
         f"{groups[0].recipe.task_name}, {' and '.join(algorithms)}: {many}{runs} "
-        f"run{'s' * (runs > 1)} of {steps:,} {_unit(groups[0].recipe)}{' each' * (runs > 1)}"
+        f"run{'s' * (runs > 1)} of {length} {_unit(groups[0].recipe)}{' each' * (runs > 1)}"
     )
 
 

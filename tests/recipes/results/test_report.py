@@ -159,6 +159,25 @@ def test_a_run_that_is_not_as_far_is_named(tmp_path):
     report(tmp_path, "--out", tmp_path / "a.html", "--no-pictures")
     text = Page(tmp_path / "a.html").text
     assert "seed 2 is at 20,480 of 61,440 steps: bold lines leave it out" in text
+    assert "3 runs of 20,480 to 61,440 environment steps each" in text
+
+
+def test_runs_without_an_environment_show_what_was_held_out(tmp_path):
+    columns = {"step": [100, 200], "return_mean": [np.nan] * 2, "loss": [2.0, 1.0]}
+    columns["held_out_action_error"] = [0.5, 0.25]
+    for seed in range(2):
+        run = tmp_path / f"seed-{seed}"
+        write_run(run, "bc/mlp", seed, metrics=columns, total_updates=200)
+        measured = {"held_out": {"action_error": 0.25 + seed}, "held_out_episodes": 7}
+        evaluation = {"steps": 200, "env": "", "dataset": "a.hdf5", **measured}
+        (run / "evaluation.json").write_text(json.dumps(evaluation))
+    report(tmp_path, "--out", tmp_path / "a.html", "--no-pictures")
+    page = Page(tmp_path / "a.html")
+    assert "seed 0, on 7 held-out episodes: action_error 0.25" in page.text
+    assert "seed 1, on 7 held-out episodes: action_error 1.25" in page.text
+    assert "has no results" not in page.text
+    curves = page.source[page.source.index('id="learning-curves"') :]
+    assert curves.index("held_out_action_error") < curves.index('id="health-of-training"')
 
 
 def test_settings_under_one_name_that_is_not_registered(tmp_path):
