@@ -247,7 +247,8 @@ def read_networks(
 
     Returns:
         By network, and then by task, the value of each run, and notes about runs and tasks that are
-        left out, changed settings and different lengths. All networks have the same tasks.
+        left out, changed settings, and lengths and algorithms that differ. All networks have the
+        same tasks.
 
     Raises:
         ValueError: if a pattern has no run, a network has two settings on a task, or no task is
@@ -257,6 +258,7 @@ def read_networks(
     returns = read_references(references)
     networks: dict[str, dict[Task, list[float]]] = {pattern: {} for pattern in patterns}
     lengths: dict[Task, set[int]] = {}
+    algorithms: dict[Task, str] = {}
     for experiment, evaluations in experiments:
         settings = experiment.settings
         last = experiment.name.rpartition("/")[2]
@@ -271,6 +273,7 @@ def read_networks(
                 "or patterns that hold one of them"
             )
         lengths.setdefault(task, set()).add(settings.final_step)
+        algorithms[task] = settings.algorithm
         if experiment.changes:
             notes.append(f"{name} has changed settings on {settings.env}: {experiment.changes}")
         values = [value_of(evaluation) for evaluation in evaluations]
@@ -296,6 +299,8 @@ def read_networks(
         for task, found in lengths.items()
         if task in common and len(found) > 1
     ]
+    if len(together := {algorithms[task] for task in common}) > 1:
+        notes.append(f"several algorithms count together: {', '.join(sorted(together))}")
     return {
         name: {task: values for task, values in found.items() if task in common}
         for name, found in networks.items()

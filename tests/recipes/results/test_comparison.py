@@ -133,6 +133,10 @@ def test_a_summary_says_which_settings_differ(tasks, capsys):
     said = capsys.readouterr().err
     assert "lstm has changed settings on CartPole-v1: total_steps 122880, epochs 5\n" in said
     assert "runs of CartPole-v1 have different lengths: 100352, 122880 steps\n" in said
+    assert "algorithms" not in said
+    write_run(tasks / "dqn", "dqn/cartpole/mlp", 0, [-80.0], env="Acrobot-v1")
+    main(["summary", str(tasks / "cartpole" / "mlp"), str(tasks / "dqn")])
+    assert "several algorithms count together: dqn, ppo\n" in capsys.readouterr().err
 
 
 def test_what_cannot_be_summarized(tasks, capsys):
