@@ -32,7 +32,7 @@ class Agent:
     def act(self, observation, *, reward=0.0, action_mask=True):
         """Maps an observation, or those of N copies, [N, ...], to actions; holds values for NaN."""
         shape = tuple(self.facts["inputs"]["observation"]["shape"])
-        frames = np.asarray(np.full(shape, np.nan) if observation is None else observation)
+        frames = np.atleast_1d(np.full(shape, np.nan) if observation is None else observation)
         several = frames.ndim > len(shape)
         if frames.shape[several:] != shape:
             raise ValueError(f"expected observations {shape} or N of them, not {frames.shape}")

@@ -22,7 +22,7 @@ while not done:
     inputs = {x: np.asarray((given | state)[x], kinds[x][1]) for x in kinds}
     inputs = {x: inputs[x].reshape(1, *kinds[x][0]) for x in kinds}
     outputs = policy(**{name: torch.from_numpy(x) for name, x in inputs.items()})
-    action = outputs["action"][0].numpy(force=True)
+    action = outputs["action"].numpy(force=True)[0]
     state = {name: outputs[f"next_{name}"].numpy(force=True) for name in state}
     observation, reward, terminated, truncated, info = env.step(action)
     first, total, done = False, total + reward, terminated or truncated

@@ -46,16 +46,19 @@ OURS = ("torchrl_tit", "recipes", "torchrl", "tensordict")
 @pytest.mark.parametrize(
     ("example", "without"), [("act_from_pt2.py", OURS), ("act_from_onnx.py", (*OURS, "torch"))]
 )
-def test_the_examples_play_the_episode_that_the_policy_plays(example, without, tmp_path):
+@pytest.mark.parametrize(("env", "hides"), [("CartPole-v1", True), ("Taxi-v4", False)])
+def test_the_examples_play_the_episode_that_the_policy_plays(
+    example, without, env, hides, tmp_path
+):
     if "onnx" in example:
         pytest.importorskip("onnxruntime")
         pytest.importorskip("onnxscript")
-    policy, task = small(hide_velocities=True)
+    policy, task = small(env=env, hide_velocities=hides)
     file = tmp_path / f"policy.{example.split('_')[-1].removesuffix('.py')}"
-    facts = {"task": {"id": "CartPole-v1", "max_episode_steps": 60}}
+    facts = {"task": {"id": env, "max_episode_steps": 60}}
     said = export_policy(policy, task, file, step_by_step=True, facts=facts)
     assert said["difference"] < 1e-5
-    shorter = partial(make_env, "CartPole-v1", num_frames=3, hide_velocities=True)
+    shorter = partial(make_env, env, num_frames=3, hide_velocities=hides)
     returns = evaluate(partial(shorter, max_episode_steps=60), policy, 1, seed=0)
     assert act(example, file, without) == f"return {returns.item():g}\n"
     assert str(Path.cwd()).encode() not in file.read_bytes()  # nothing of this machine
