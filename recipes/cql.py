@@ -110,7 +110,7 @@ class CQL(ConservativeRecipe, algorithm="cql"):
     """Initial temperature."""
     cloning_updates: StepsOrNone = 0
     """Gradient steps at the start in which the actor imitates the data's actions, while the critics
-    learn; 40,000 of 1,000,000 in the code of arXiv 2006.04779."""
+    learn and the temperature waits; 40,000 of 1,000,000 in the code of arXiv 2006.04779."""
     action_samples: Count = 10
     """Actions sampled in each state from each of: uniform, the policy at s, the policy at s'."""
     over_critics: Literal["mean", "sum"] = "mean"
