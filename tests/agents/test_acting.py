@@ -146,6 +146,17 @@ def test_masks_of_several_choices(tmp_path):
     assert (agent.act(observation, action_mask=np.concatenate(masks)) == action).all()
     with pytest.raises(ValueError, match="action_mask has the shape"):
         agent.act(observation, action_mask=masks[0])
+    misspelled = observation | {"picture": 1}
+    del misspelled["image"]
+    for _ in range(2):  # after a first observation, and as the first one
+        with pytest.raises(ValueError, match="has state/0, state/1, picture, but not image: give"):
+            agent.act(misspelled, action_mask=masks)
+        with pytest.raises(ValueError, match="must be a mapping with image, state/0, state/1, not"):
+            agent.act(1.0, action_mask=masks)
+        agent = load_agent(tmp_path / "run")
+    agent.act(observation, action_mask=masks)
+    held = agent.act(observation | {"image": None}, action_mask=masks)
+    assert held.tolist() == action.tolist()
 
 
 def test_images_are_not_cut_to_bytes(tmp_path):

@@ -187,7 +187,7 @@ def test_a_refused_resume_changes_nothing(tmp_path, capsys, monkeypatch):
         assert "the data are gone" in fails(capsys, *longer)
     assert contents(run.folder) == before
     main([str(word) for word in longer])
-    assert Run.open(run.folder).recipe.total_steps == 640
+    assert Run.open(run.folder).recipe.final_step == 640
 
 
 def test_a_damaged_list_of_imports_does_not_hide_the_reason(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
@@ -84,9 +84,10 @@ class Actor:
             The action in the task's own form, clipped to its bounds; [N, ...] for several copies.
 
         Raises:
-            ValueError: if the observation has another shape, is infinite, or has numbers that its
-                integers cannot hold, the number of copies changes without :meth:`reset`, there is
-                no last value to hold, or the mask is missing or has another size.
+            ValueError: if the observation lacks a name, has another shape, is infinite, or has
+                numbers that its integers cannot hold, the number of copies changes without
+                :meth:`reset`, there is no last value to hold, or the mask is missing or has another
+                size.
         """
         if self._env is None:
             self._start(observation)
@@ -134,9 +135,10 @@ class Actor:
         spec = self._specs["observation"]
         several = isinstance(spec, Composite)
         name = next(iter(spec.keys())) if several else None
-        if observation is None or (several and not isinstance(observation, Mapping)):
-            expected = f"a mapping with {', '.join(spec.keys())}" if several else "an array"
-            raise ValueError(f"the first observation must be {expected}, not {observation!r}")
+        if several:
+            _check_names(observation, list(spec.keys()))
+        elif observation is None:
+            raise ValueError("the first observation must be an array, not None")
         first = np.asarray(observation[name] if several else observation)
         ndim = (spec[name] if several else spec).ndim
         self._batched = first.ndim > ndim
@@ -151,8 +153,9 @@ class Actor:
         spec = self._specs["observation"]
         if not isinstance(spec, Composite):
             return self._hold("observation", observation, spec)
-        values = observation or {}
-        return {name: self._hold(name, values.get(name), leaf) for name, leaf in spec.items()}
+        values = dict.fromkeys(spec.keys()) if observation is None else observation
+        _check_names(values, list(spec.keys()))
+        return {name: self._hold(name, values[name], leaf) for name, leaf in spec.items()}
 
     def _hold(self, name: str, value: Any, spec: Any) -> Tensor:
         """Converts an observation, [N, *obs], and fills in what is missing."""
@@ -196,6 +199,19 @@ class Actor:
             frame = torch.where(missing, last, frame)
         self._last[name] = frame
         return frame
+
+
+def _check_names(observation: Any, names: Sequence[str]) -> None:
+    """Raises ValueError if an observation is no mapping, or lacks one of these names."""
+    if not isinstance(observation, Mapping):
+        raise ValueError(
+            f"the observation must be a mapping with {', '.join(names)}, not {observation!r}"
+        )
+    if missing := [name for name in names if name not in observation]:
+        raise ValueError(
+            f"the observation has {', '.join(map(str, observation))}, but not {missing[0]}: give "
+            "it, or None to hold its last value"
+        )
 
 
 def make_given_env(make_env: Callable[[int], EnvBase], feed: Feed, num_envs: int = 1) -> EnvBase:
