@@ -110,7 +110,7 @@ class CQL(ConservativeRecipe, algorithm="cql"):
     """Initial temperature."""
     cloning_updates: StepsOrNone = 0
     """Gradient steps at the start in which the actor imitates the data's actions, while the critics
-    learn and the temperature waits; 40,000 of 1,000,000 in the code of arXiv 2006.04779."""
+    learn; 40,000 of 1,000,000 in the code of arXiv 2006.04779."""
     action_samples: Count = 10
     """Actions sampled in each state from each of: uniform, the policy at s, the policy at s'."""
     over_critics: Literal["mean", "sum"] = "mean"
@@ -225,19 +225,12 @@ class CQLAlgorithm(ConservativeAlgorithm[CQL]):
         """Updates temperature and critics, then the actor, then the targets.
 
         The actor runs once for all losses. Its own loss uses the critics and the temperature after
-        their updates, as in d3rlpy. While the actor clones, the temperature waits: it would fall to
-        almost 0, where the actor would then collapse to single actions. Their density is so high
-        that the conservative term leaves them out.
+        their updates, as in d3rlpy.
         """
-        clones = step < self.recipe.cloning_updates
-        self.model.log_alpha.requires_grad_(not clones)
-        if step == self.recipe.cloning_updates:
-            # Adam would divide the gradients of values by the much smaller ones of the cloning.
-            for weight in self._policy.parameters():
-                self.optimizer.state.pop(weight, None)
         samples = self._sample_policy(batch)
         terms = self._loss(samples)
         descend(terms, self.optimizer)
+        clones = step < self.recipe.cloning_updates
         actor_terms = (self._cloning_loss if clones else self._actor_loss)(samples)
         descend(actor_terms, self.optimizer)
         self.target.step()

@@ -199,9 +199,15 @@ class ContinuousCQLLoss(CQLLoss):
             s and then m at s', their "log_probs", float [*B, 2m], and "next_action", float [*B, A],
             the deterministic one at s'.
         """
-        dist = self._get_dist(tensordict)
-        with torch.no_grad():
-            next_dist = self._get_dist(tensordict["next"])
+        network = self.actor_network
+        with (
+            self.actor_network_params.to_module(network, preserve_module_state=False),
+            set_recurrent_mode(True),
+        ):
+            dist = network.get_dist(tensordict.select(*network.in_keys, strict=False))
+            with torch.no_grad():
+                following = tensordict["next"].select(*network.in_keys, strict=False)
+                next_dist = network.get_dist(following)
         action, log_prob = rsample_and_log_prob(dist)
         with torch.no_grad():
             shape = torch.Size([self.num_random])
@@ -278,28 +284,19 @@ class ContinuousCQLLoss(CQLLoss):
     def actor_bc_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of an actor that clones the data, of a batch [*B], float [].
 
-        The mean of ``-log p(b)`` with the data's actions b. TorchRL's, as in the code of arXiv
-        2006.04779, adds ``alpha log p(a)``, which outweighs it at a temperature of 1. Data sets
-        have many actions at the bounds, which a squashed Gaussian reaches only at infinity, so b is
-        kept 0.5% of the range away from them.
+        TorchRL's, the mean of ``alpha log p(a) - log p(b)`` with the data's actions b, as in the
+        code of arXiv 2006.04779. Data sets have many actions at the bounds, which a squashed
+        Gaussian reaches only at infinity, so b is kept 0.5% of the range away from them.
 
         Returns:
             The loss, and the mean of log p(b), float [], under "bc_log_prob".
         """
+        batch = tensordict.select(*self.actor_network.in_keys, strict=False)
         margin = _MARGIN * (self._high - self._low)
         action = tensordict.get(self.tensor_keys.action)
-        inside = action.clamp(self._low + margin, self._high - margin)
-        log_prob = self._get_dist(tensordict).log_prob(inside)
-        return self._reduced(-log_prob), {"bc_log_prob": log_prob.detach().mean()}
-
-    def _get_dist(self, tensordict: TensorDictBase) -> Any:
-        """The distribution of actions in states [*B]."""
-        network = self.actor_network
-        with (
-            self.actor_network_params.to_module(network, preserve_module_state=False),
-            set_recurrent_mode(True),
-        ):
-            return network.get_dist(tensordict.select(*network.in_keys, strict=False))
+        batch.set(self.tensor_keys.action, action.clamp(self._low + margin, self._high - margin))
+        with set_recurrent_mode(True):
+            return super().actor_bc_loss(batch)
 
     def _samples(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The policy's samples that a batch has, or new ones."""

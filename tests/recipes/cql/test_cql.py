@@ -85,26 +85,6 @@ def test_the_actor_clones_first_and_then_maximizes_values(tmp_path, monkeypatch)
     assert taken == list(zip(names, terms, strict=True))
 
 
-def test_the_temperature_and_adam_begin_anew_after_cloning(tmp_path):
-    """Gradients of values are far larger than those of likelihoods, and no entropy is chosen."""
-    algorithm, batch = double(make_cql(tmp_path, backbone=SMALL, cloning_updates=2), tmp_path)
-    model, state = algorithm.model, algorithm.optimizer.state
-    actor, critics = (
-        list(algorithm.policy.parameters()),
-        list(model.qvalue_network_params.values(True, True)),
-    )
-    for updates, of_actor, of_alpha in ((1, 1, 0), (2, 2, 0), (3, 1, 1), (4, 2, 2)):
-        algorithm.update(batch, updates - 1)
-        assert {int(state[weight]["step"]) for weight in actor} == {of_actor}
-        assert {int(state[weight]["step"]) for weight in critics} == {updates}
-        assert (
-            int(state[model.log_alpha]["step"]) == of_alpha
-            if of_alpha
-            else model.log_alpha not in state
-        )
-        assert (model.log_alpha.item() == 0) == (of_alpha == 0)
-
-
 def test_the_temperature_begins_where_the_recipe_says(tmp_path):
     algorithm, _ = double(make_cql(tmp_path, backbone=SMALL, alpha_init=0.05), tmp_path)
     assert algorithm.model.log_alpha.exp().item() == pytest.approx(0.05)
