@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -12,14 +13,12 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import DiscreteIQLLoss, IQLLoss
 
-from torchrl_tit.datasets import DatasetError, Episodes
+from torchrl_tit.datasets import Episodes
 from torchrl_tit.settings.numbers import Inside, Rate, Weight
 
 from .core.algorithm import descend
 from .core.networks import check_actions, is_continuous, is_discrete, make_cloning_policy
 from .offline import ActorCriticRecipe, TransitionAlgorithm
-
-_RETURN_RANGE = 1000.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +36,10 @@ class IQL(ActorCriticRecipe, algorithm="iql"):
     """Expectile of Q(s, a) over the data's actions that V(s) estimates; 0.5 is the mean."""
     temperature: Weight = 3.0
     """Inverse temperature of the weights exp(temperature * advantage) of the actor's loss."""
-    normalize_rewards: bool = False
-    """Whether rewards are divided by the range of the whole episodes' returns and multiplied by
-    1000, as in the paper for MuJoCo."""
+    normalize_rewards: bool = True
+    """Whether rewards are divided by the range of the whole episodes' returns and multiplied by the
+    length of the longest, which is 1000 in the paper's data of MuJoCo: temperature takes advantages
+    to be of that scale."""
 
     def build(self) -> IQLAlgorithm:
         """Builds the algorithm."""
@@ -99,24 +99,21 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         return loss
 
     def load_data(self) -> Episodes:
-        """As :meth:`TransitionAlgorithm.load_data`, with rewards scaled as in the paper.
-
-        Raises:
-            DatasetError: if rewards are to be scaled, but the returns of all episodes are the same.
-        """
+        """As :meth:`TransitionAlgorithm.load_data`, with rewards scaled."""
         episodes = super().load_data()
         if not self.recipe.normalize_rewards:
             return episodes
-        returns = episodes.returns[episodes.whole]
-        spread = (returns.max() - returns.min()).item()
-        if not spread > 0:
-            raise DatasetError(
-                episodes.source,
-                "normalize_rewards is on, but no two whole episodes differ in return: switch it "
-                "off",
+        returns = episodes.returns[episodes.is_whole]
+        if len(returns.unique()) < 2:
+            warnings.warn(
+                f"{episodes.source}: no two whole episodes differ in return, so rewards are not "
+                "normalized",
+                stacklevel=2,
             )
+            return episodes
+        longest = episodes.lengths[episodes.is_whole].max()
         rows = episodes.rows.copy()
-        rows["reward"] = rows["reward"] * (_RETURN_RANGE / spread)
+        rows["reward"] = rows["reward"] * (longest / (returns.max() - returns.min()))
         return replace(episodes, rows=rows)
 
     def loss(self, samples: TensorDictBase) -> TensorDictBase:

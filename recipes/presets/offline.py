@@ -39,7 +39,7 @@ def _named() -> Iterator[Preset]:
                 fields: dict[str, Any] = {"dataset": data, "env": env, "backbone": backbone}
                 name = f"{data}/{network}"
                 yield BC(name=f"bc/{name}", **fields)
-                yield IQL(name=f"iql/{name}", normalize_rewards=True, **fields)
+                yield IQL(name=f"iql/{name}", **fields)
                 yield TD3BC(name=f"td3bc/{name}", **fields)
 
 

@@ -226,15 +226,6 @@ def test_actions_of_the_right_shape_but_the_other_kind(make_recipe, task, messag
         make_algorithm(make_recipe(tmp_path, dataset=data)).check()
 
 
-def test_rewards_that_cannot_be_scaled(tmp_path: Path) -> None:
-    rolled = roll()
-    rolled["rewards"][:] = 0
-    data = str(write(tmp_path / "same.hdf5", rolled))
-    recipe = make(IQL, tmp_path, dataset=data, normalize_rewards=True)
-    with pytest.raises(ValueError, match=r"normalize_rewards is on, but no two .*: switch it off"):
-        make_algorithm(recipe).check()
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [

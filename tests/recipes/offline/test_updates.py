@@ -160,11 +160,21 @@ def test_iql(tmp_path, env):
 
 
 def test_iql_scales_rewards(tmp_path):
-    recipe = make(IQL, tmp_path, normalize_rewards=True)
+    recipe = make(IQL, tmp_path)
     algorithm, _ = double(recipe, tmp_path)
     scaled = algorithm.load_data()
-    returns = scaled.returns[scaled.finished]
-    assert (returns.max() - returns.min()).item() == pytest.approx(1000, rel=1e-4)
+    returns, longest = scaled.returns[scaled.finished], scaled.lengths[scaled.finished].max()
+    assert (returns.max() - returns.min()).item() == pytest.approx(longest.item(), rel=1e-4)
+
+
+def test_iql_says_where_rewards_cannot_be_scaled(tmp_path):
+    rolled = roll()
+    rolled["rewards"][:] = 0
+    data = str(write(tmp_path / "same.hdf5", rolled))
+    algorithm = make_algorithm(make(IQL, tmp_path, dataset=data))
+    with pytest.warns(UserWarning, match="no two whole episodes differ in return, so rewards are"):
+        episodes = algorithm.load_data()
+    assert not episodes.rows["reward"].any()
 
 
 def test_td3bc(tmp_path):
