@@ -8,12 +8,13 @@ from torchrl.collectors import Collector
 from torchrl.data import Bounded
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 from torchrl.modules import RandomPolicy, get_primers_from_module, set_recurrent_mode
+from torchrl.objectives.value import GAE
 
 from tests.numerics import assert_near
 from tests.transforms.streams import StreamEnv
 from torchrl_tit import Backbone, settings
 from torchrl_tit.envs import make_env
-from torchrl_tit.modules import as_sequences, make_actor
+from torchrl_tit.modules import as_sequences, make_actor, make_value
 from torchrl_tit.networks import HistoryNetwork, build_network
 from torchrl_tit.transforms import History
 
@@ -66,6 +67,28 @@ def test_sequences_equal_single_steps(trunks, name):
     for key, state in states.items():  # the states that sequences end with
         torch.testing.assert_close(state, whole["next", key][:, -1], rtol=0, atol=1e-9)
     assert set(backbone.out_keys) == {*backbone.features_keys, *(("next", key) for key in states)}
+
+
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("name", ["lstm", "gru", "mingru", "gated-deltanet", "mamba2"])
+@torch.no_grad()
+def test_the_next_values_of_gae_are_those_of_the_steps_that_follow(name):
+    """It marks the next step of a first one as first, too: its state is not that of a start."""
+    backbone = make_backbone(name=name)
+    value = TensorDictSequential(backbone, make_value(backbone.features_dim))
+    transforms = Compose(InitTracker(), History(1), backbone.make_tensordict_primer())
+    env = TransformedEnv(StreamEnv([N], (2,), torch.float64), transforms)
+    steps = env.rollout(20, lambda td: env.rand_action(backbone(td)), break_when_any_done=False)
+    steps = steps.exclude("features")
+    walked = value(steps.clone())["state_value"]
+    for batch, expected in ((steps.clone(), walked), (steps[1].clone(), walked[1])):
+        with set_recurrent_mode(True):
+            GAE(gamma=0.9, lmbda=0.9, value_network=value, deactivate_vmap=True)(batch)
+        assert_near(batch["state_value"], expected)
+        inside = ~batch["next", "done"][..., :-1, :]
+        assert 0 < inside.sum() < inside.numel()
+        following = batch["next", "state_value"][..., :-1, :]
+        assert_near(following[inside], expected[..., 1:, :][inside])
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,12 @@ from torchrl.modules import set_recurrent_mode
 
 from torchrl_tit.histories.encoder import RecurrentEncoder
 from torchrl_tit.modules.acting import ActingModule, trunks_of
-from torchrl_tit.modules.sequences import SequenceKeys, beside, default_observation_keys
+from torchrl_tit.modules.sequences import (
+    SequenceKeys,
+    beside,
+    default_observation_keys,
+    step_episodes,
+)
 from torchrl_tit.networks import HistoryNetwork
 from torchrl_tit.networks.history_network import weights_dtype
 from torchrl_tit.settings.checks import checked_arguments
@@ -74,7 +79,7 @@ class Backbone(ActingModule):
     is encoded once, not once for each of the K windows that contain it. The features are the same
     as those of single steps. A network with further inputs, or with ``every_frame``, reads its
     windows as ever. A recurrent network reads its state only at the first step of each
-    sequence (slices of a replay buffer, which have none, are arranged by
+    sequence and at ``is_init`` (slices of a replay buffer, which have none, are arranged by
     :func:`~torchrl_tit.modules.as_sequences`); any other network reads:
 
     ==================  =====================  =====================================================
@@ -392,7 +397,7 @@ class Backbone(ActingModule):
             for prefix, trunk in trunks.items()
         ]
         compute = [
-            lambda *histories, trunk=trunk, state=state: trunk.step(histories, state, is_init)
+            lambda *x, trunk=trunk, state=state: step_episodes(trunk.step, x, state, is_init)
             for trunk, state in zip(trunks.values(), states, strict=True)
         ]
         outputs = self._call_trunks(histories, compute)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.modules import recurrent_mode
 
+from torchrl_tit.histories.encoder import State
 from torchrl_tit.modules.frame_tables import (
     FrameTable,
     find_starts,
@@ -149,6 +152,59 @@ class SequenceKeys:
             trunk.check_frames(*(x.flatten(0, leading - 1) for x in observations))
             if present:
                 trunk.check(*(tensordict.get(key) for key in present))
+
+
+def step_episodes(
+    step: Callable[[Sequence[Tensor], State, Tensor], tuple[Tensor, State]],
+    histories: Sequence[Tensor],
+    state: State,
+    is_init: Tensor,
+) -> tuple[Tensor, State]:
+    """Reads steps, or in recurrent mode sequences, of a network that carries a state.
+
+    As an `LSTMModule` does, a sequence starts from the stored state wherever ``is_init`` is True.
+    It is not always zero: a `SliceSampler` marks where slices begin, and `GAE` marks next steps
+    like the steps before them. As networks start an episode from zeros, these are told that none
+    begins. While PyTorch records or transforms the computation, every stored state counts as zero.
+
+    Args:
+        step: :meth:`HistoryNetwork.step`.
+        histories: [*B, 1, *observation_shape] each; the last dimension of B is time.
+        state: the state before each step, [*B, ...] each.
+        is_init: bool [*B, 1].
+
+    Returns:
+        What ``step`` returns: features, float [*B, F], and the state after each step, of which only
+        the last one of a sequence is right.
+    """
+    begins = is_init.squeeze(-1)
+    if not recurrent_mode() or is_transformed() or begins.is_meta:
+        return step(histories, state, is_init)
+    if not any(x[begins].any() for x in state.values()):
+        return step(histories, state, is_init)
+    time, outputs = begins.ndim - 1, []
+    cuts = {0, *begins.reshape(-1, begins.shape[-1]).any(0).nonzero().flatten().tolist()}
+    after: State = {}
+    for first, end in pairwise([*sorted(cuts), begins.shape[-1]]):
+        length, now = end - first, begins.select(time, first)
+        part = [x.narrow(time, first, length) for x in histories]
+        before = {key: x.select(time, first) for key, x in state.items()}
+        if first:
+            before = {
+                key: torch.where(expand_as_right(now, x), x, after[key])
+                for key, x in before.items()
+            }
+        entries = {
+            key: x.unsqueeze(time).expand(*x.shape[:time], length, *x.shape[time:])
+            for key, x in before.items()
+        }
+        none = torch.zeros_like(is_init.narrow(time, first, length))
+        output, found = step(part, entries, none)
+        outputs.append(output)
+        after = {key: x.select(time, length - 1) for key, x in found.items()}
+    return torch.cat(outputs, time), {
+        key: x.unsqueeze(time).expand(*begins.shape, *x.shape[time:]) for key, x in after.items()
+    }
 
 
 def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:
