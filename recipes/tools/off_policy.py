@@ -364,8 +364,12 @@ def fit_q(
 
     everything = torch.arange(len(items), device=items.device)
     following = torch.cat([_act(policy, draw(i)["next"]) for i in everything.split(_AT_ONCE)])
+    rewards = items[:]["next", "reward"]
     # Values are then of scale 1.
-    scale = (1 - gamma) / items[:]["next", "reward"].abs().mean().clamp(min=1e-8).item()
+    scale = (1 - gamma) / rewards.abs().mean().clamp(min=1e-8).item()
+    # No value is beyond these; without them, a fit to actions that the data lack can diverge.
+    low, high = (scale / (1 - gamma) * x.item() for x in (rewards.min(), rewards.max()))
+    low, high = min(low, 0.0), max(high, 0.0)
     target = copy.deepcopy(critic).requires_grad_(False).eval()
     pairs = list(zip(target.parameters(), critic.parameters(), strict=True))
     optimizer = torch.optim.Adam(critic.parameters(), lr=learning_rate, fused=True)
@@ -378,7 +382,8 @@ def fit_q(
             action_values(target, outcome, following[index.to(device)]).unsqueeze(-1),
             scale * outcome["reward"],
             outcome["terminated"],
-        ).squeeze(-1)
+        )
+        goal = goal.squeeze(-1).clamp(low, high)
         loss = F.mse_loss(action_values(critic, batch, batch["action"]), goal)
         descend({"loss_value": loss}, optimizer)
         for slow, fast in pairs:
@@ -388,7 +393,8 @@ def fit_q(
     def value(index: Tensor) -> Tensor:
         found = draw(index)
         with evaluating(critic):
-            return action_values(critic, found, _act(policy, found)).double() / scale
+            values = action_values(critic, found, _act(policy, found))
+            return values.double().clamp(low, high) / scale
 
     return value
 

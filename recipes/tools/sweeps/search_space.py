@@ -32,8 +32,9 @@ _KINDS: dict[str, type[BaseDistribution]] = {
     "float": FloatDistribution,
     "int": IntDistribution,
 }
-# Fields that define the search, which therefore cannot vary them. A search has its own seeds.
-_FIXED = {"algorithm", "name", "seed"}
+# Fields that define the search, which therefore cannot vary them. A search has its own seeds, and
+# trials are comparable if they were evaluated in the same way.
+_FIXED = {"algorithm", "name", "seed", "evaluation_seed", "evaluation_episodes"}
 
 
 def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
@@ -61,7 +62,10 @@ def load_space(source: Path | None, recipe: Recipe) -> SearchSpace:
     if not space:
         raise ValueError(f"{source} names no field to search")
     for field, arguments in space.items():
-        for value in arguments.get("choices") or (arguments["low"], arguments["high"]):
+        values = arguments.get("choices") or (arguments["high"], arguments["low"])
+        for value in values:
+            # A float's ends need not be what lies between them.
+            value = float(value) if arguments["type"] == "float" else value
             with_values(recipe, {field: value}, source)
     return space
 

@@ -99,6 +99,20 @@ def test_value_of_a_continuous_policy():
     assert value(torch.tensor([0])).item() == pytest.approx(0.5 / (1 - GAMMA), rel=0.03)
 
 
+def test_no_value_is_beyond_what_the_rewards_allow():
+    """Where a policy does what the data lack, nothing else would hold its values."""
+    items, beyond = two_states(), nn.Linear(2, 2)
+    critic = TensorDictModule(beyond, ["observation"], ["state_action_value"])
+    policy = TensorDictModule(lambda x: x.argmax(-1), ["observation"], ["action"])
+    for bias, expected in ((1e3, 2 / (1 - GAMMA)), (-1e3, 0)):
+        nn.init.constant_(beyond.bias, bias)
+        value = fit_q(policy, critic, items, gamma=GAMMA, updates=0)
+        torch.testing.assert_close(value(torch.arange(3)), torch.full([3], expected).double())
+    nn.init.constant_(beyond.bias, 1e3)  # targets of twice the values are cut, so none grows
+    fit_q(policy, critic, items, gamma=GAMMA, updates=150, learning_rate=10.0)
+    assert beyond(torch.eye(2)).abs().max() < 60
+
+
 def test_an_estimate_of_an_algorithms_policy(tmp_path):
     """Every step pays 2, whatever the action; the interval covers the episodes' starts."""
     data = log_machine(tmp_path / "log.hdf5", rewards=np.full(200, 2.0))

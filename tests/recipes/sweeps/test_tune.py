@@ -215,6 +215,8 @@ def test_a_trial_below_the_median_is_pruned(tmp_path, naps, monkeypatch):
         ({"seed": SPACE["epochs"]}, "unknown field 'seed'"),
         ({"epochs": {"type": "int", "low": 0, "high": 3}}, "epochs must be at least 1, not 0"),
         ({"epochs": {"type": "float", "low": 1, "high": 3.5}}, "field 'epochs' is 3.5"),
+        ({"epochs": {"type": "float", "low": 1, "high": 3}}, "field 'epochs' is 3.0"),
+        ({"evaluation_seed": SPACE["epochs"]}, "unknown field 'evaluation_seed'"),
         ({"epochs": {"type": "int", "low": 3, "high": 1}}, "`low <= high` must hold"),
         ({"gamma": {"type": "uniform", "low": 0}}, "gamma is none of categorical, float, int"),
         ({"gamma": [1, 2]}, "is not a search space"),
