@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.collectors.utils import split_trajectories
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 from torchrl.envs import InitTracker
 from torchrl.modules import set_recurrent_mode
@@ -173,6 +174,20 @@ def test_flat_batches_of_a_slice_sampler(padding: Padding) -> None:
     starts = flat["is_init"].sum()
     assert (~valid).sum() == 3 * (50 - starts)
     assert_near(features[valid.squeeze(-1)], expected[valid.squeeze(-1)])
+
+
+def test_trajectories_that_a_collector_filled_up() -> None:
+    """With ``split_trajs``, zeros follow a trajectory, though it need not be done there."""
+    rollout = rollout_of(4, "same")
+    count = torch.arange(180).view(3, 60)
+    rollout["collector", "traj_ids"] = count // 60 + 3 * rollout["is_init"].squeeze(-1).cumsum(1)
+    filled = split_trajectories(rollout, trajectory_key=("collector", "traj_ids"))
+    mask = filled["collector", "mask"]
+    last = mask & ~torch.cat([mask[:, 1:], torch.zeros_like(mask[:, :1])], 1)
+    assert not filled["next", "done"][last].all()
+    backbone = Backbone(EnhancedTIT((4,), 4).double())
+    expected = backbone(filled.select("history"))["features"]
+    assert_near(read(backbone, filled)[mask], expected[mask])
 
 
 def test_every_frame_and_leading_dimensions() -> None:

@@ -104,6 +104,8 @@ class SequenceKeys:
         is_init = flags(tensordict.get("is_init"))
         ends = [tensordict.get(key, None) for key in ("done", ("next", "done"))]
         starts = find_starts(is_init, [flags(end) for end in ends if end is not None])
+        if (mask := tensordict.get(("collector", "mask"), None)) is not None:
+            starts = starts | ~flags(mask)  # a collector's split_trajs fills up with zeros
         following = [tensordict.get(unravel_key(("next", key)), None) for key in self.observations]
         for now, after in zip(observations, following, strict=True):
             if after is not None:
@@ -299,7 +301,8 @@ def _check_consecutive(observation: Tensor, following: Tensor, starts: Tensor) -
         raise ValueError(
             "in recurrent mode the last batch dimension is time, but the next observation of a "
             "step is not the observation of the step after it: leave is_init out of shuffled steps "
-            "(or read them within set_recurrent_mode(False)), and set it where a sequence begins"
+            "and those of MultiStep (or read them within set_recurrent_mode(False)), and set it "
+            "where a sequence begins"
         )
 
 
