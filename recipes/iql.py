@@ -38,8 +38,8 @@ class IQL(ActorCriticRecipe, algorithm="iql"):
     """Inverse temperature of the weights exp(temperature * advantage) of the actor's loss."""
     normalize_rewards: bool = True
     """Whether rewards are divided by the range of the whole episodes' returns and multiplied by the
-    length of the longest, which is 1000 in the paper's data of MuJoCo: temperature takes advantages
-    to be of that scale."""
+    length of the longest, which is 1000 in the paper's data of MuJoCo. The temperature assumes
+    advantages of that scale."""
 
     def build(self) -> IQLAlgorithm:
         """Builds the algorithm."""
@@ -103,7 +103,8 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
         episodes = super().load_data()
         if not self.recipe.normalize_rewards:
             return episodes
-        returns = episodes.returns[episodes.is_whole]
+        whole = episodes.is_whole
+        returns = episodes.returns[whole]
         if len(returns.unique()) < 2:
             warnings.warn(
                 f"{episodes.source}: no two whole episodes differ in return, so rewards are not "
@@ -111,7 +112,7 @@ class IQLAlgorithm(TransitionAlgorithm[IQL]):
                 stacklevel=2,
             )
             return episodes
-        longest = episodes.lengths[episodes.is_whole].max()
+        longest = episodes.lengths[whole].max()
         rows = episodes.rows.copy()
         rows["reward"] = rows["reward"] * (longest / (returns.max() - returns.min()))
         return replace(episodes, rows=rows)

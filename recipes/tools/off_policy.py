@@ -365,11 +365,10 @@ def fit_q(
     everything = torch.arange(len(items), device=items.device)
     following = torch.cat([_act(policy, draw(i)["next"]) for i in everything.split(_AT_ONCE)])
     rewards = items[:]["next", "reward"]
-    # Values are then of scale 1.
-    scale = (1 - gamma) / rewards.abs().mean().clamp(min=1e-8).item()
+    size = rewards.abs().mean().clamp(min=1e-8).item()
+    scale = (1 - gamma) / size  # values are then of scale 1
     # No value is beyond these; without them, a fit to actions that the data lack can diverge.
-    low, high = (scale / (1 - gamma) * x.item() for x in (rewards.min(), rewards.max()))
-    low, high = min(low, 0.0), max(high, 0.0)
+    low, high = min(rewards.min().item(), 0.0) / size, max(rewards.max().item(), 0.0) / size
     target = copy.deepcopy(critic).requires_grad_(False).eval()
     pairs = list(zip(target.parameters(), critic.parameters(), strict=True))
     optimizer = torch.optim.Adam(critic.parameters(), lr=learning_rate, fused=True)

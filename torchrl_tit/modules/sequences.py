@@ -166,7 +166,7 @@ def step_episodes(
 
     As an `LSTMModule` does, a sequence starts from the stored state wherever ``is_init`` is True.
     It is not always zero: a `SliceSampler` marks where slices begin, and `GAE` marks next steps
-    like the steps before them. As networks start an episode from zeros, these are told that none
+    like the steps before them. A network starts an episode from zeros, so it is told here that none
     begins. While PyTorch records or transforms the computation, every stored state counts as zero.
 
     Args:
@@ -180,33 +180,31 @@ def step_episodes(
         the last one of a sequence is right.
     """
     begins = is_init.squeeze(-1)
-    if not recurrent_mode() or is_transformed() or begins.is_meta:
-        return step(histories, state, is_init)
-    if not any(x[begins].any() for x in state.values()):
+    values_count = recurrent_mode() and not (is_transformed() or begins.is_meta)
+    if not (values_count and any(x[begins].any() for x in state.values())):
         return step(histories, state, is_init)
     time, outputs = begins.ndim - 1, []
-    cuts = {0, *begins.reshape(-1, begins.shape[-1]).any(0).nonzero().flatten().tolist()}
-    after: State = {}
-    for first, end in pairwise([*sorted(cuts), begins.shape[-1]]):
-        length, now = end - first, begins.select(time, first)
-        part = [x.narrow(time, first, length) for x in histories]
-        before = {key: x.select(time, first) for key, x in state.items()}
-        if first:
-            before = {
-                key: torch.where(expand_as_right(now, x), x, after[key])
-                for key, x in before.items()
-            }
-        entries = {
+
+    def repeat(state: State, length: int) -> State:
+        return {
             key: x.unsqueeze(time).expand(*x.shape[:time], length, *x.shape[time:])
-            for key, x in before.items()
+            for key, x in state.items()
         }
-        none = torch.zeros_like(is_init.narrow(time, first, length))
-        output, found = step(part, entries, none)
+
+    cuts = {0, *begins.reshape(-1, begins.shape[-1]).any(0).nonzero().flatten().tolist()}
+    now = {key: x.select(time, 0) for key, x in state.items()}
+    for first, end in pairwise([*sorted(cuts), begins.shape[-1]]):
+        stored = {key: x.select(time, first) for key, x in state.items()}
+        begin = begins.select(time, first)
+        now = {
+            key: torch.where(expand_as_right(begin, x), stored[key], x) for key, x in now.items()
+        }
+        part = [x.narrow(time, first, end - first) for x in histories]
+        none = torch.zeros_like(is_init.narrow(time, first, end - first))
+        output, after = step(part, repeat(now, end - first), none)
         outputs.append(output)
-        after = {key: x.select(time, length - 1) for key, x in found.items()}
-    return torch.cat(outputs, time), {
-        key: x.unsqueeze(time).expand(*begins.shape, *x.shape[time:]) for key, x in after.items()
-    }
+        now = {key: x.select(time, -1) for key, x in after.items()}
+    return torch.cat(outputs, time), repeat(now, begins.shape[-1])
 
 
 def as_sequences(samples: TensorDictBase, burn_in: int = 0) -> TensorDictBase:

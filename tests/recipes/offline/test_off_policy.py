@@ -108,7 +108,7 @@ def test_no_value_is_beyond_what_the_rewards_allow():
         nn.init.constant_(beyond.bias, bias)
         value = fit_q(policy, critic, items, gamma=GAMMA, updates=0)
         torch.testing.assert_close(value(torch.arange(3)), torch.full([3], expected).double())
-    nn.init.constant_(beyond.bias, 1e3)  # targets of twice the values are cut, so none grows
+    nn.init.constant_(beyond.bias, 1e3)  # targets are cut, so values fall at once
     fit_q(policy, critic, items, gamma=GAMMA, updates=150, learning_rate=10.0)
     assert beyond(torch.eye(2)).abs().max() < 60
 
