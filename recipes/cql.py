@@ -290,10 +290,11 @@ class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
     def loss(self, samples: TensorDictBase) -> Terms:
         """Returns the terms of the loss; see :meth:`TransitionAlgorithm.loss`."""
         terms = self.model(samples)
+        values = samples[self.model.tensor_keys.pred_val]  # "pred_value" averages all actions
         return {
             "loss_qvalue": terms["loss_qvalue"],
             "loss_cql": self.recipe.conservative_weight * terms["loss_cql"],
-            "value": terms["pred_value"],
+            "value": values.gather(-1, samples["action"].unsqueeze(-1)).mean(),
         }
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor]:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torchrl.modules import set_recurrent_mode
 
 from tests.datasets.rollouts import roll, write
 from tests.recipes.small import (
@@ -118,6 +119,21 @@ def test_the_discrete_target_follows_the_trained_network_slowly(tmp_path):
         if weight.is_floating_point():
             torch.testing.assert_close(weight, 0.75 * before[name] + 0.25 * trained[name])
     assert not (trained == before).all()
+
+
+@pytest.mark.parametrize("slice_length", [1, 4])
+def test_the_discrete_value_is_that_of_the_recorded_actions(tmp_path, slice_length):
+    """Not the mean over all actions, which falls without end as the others are pushed down."""
+    recipe = make_discrete_cql(tmp_path, backbone=SMALL, slice_length=slice_length)
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    batch = next(algorithm.batches())
+    with torch.no_grad(), set_recurrent_mode(slice_length > 1):
+        values = algorithm.policy(batch.copy())["action_value"]
+        terms = algorithm.loss(batch.copy())
+    recorded = values.take_along_dim(batch["action"].unsqueeze(-1), -1).mean()
+    assert not torch.isclose(recorded, values.mean(), rtol=1e-3)
+    torch.testing.assert_close(terms["value"], recorded)
 
 
 def test_how_the_data_are_read_is_passed_on(tmp_path):
