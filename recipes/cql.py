@@ -271,6 +271,7 @@ class DiscreteCQLAlgorithm(ConservativeAlgorithm[DiscreteCQL]):
 
     columns = ("loss_qvalue", "loss_cql", "value")
     measures = ("action_error", "loss_cql", "value")
+    model: DelayedDiscreteCQLLoss
 
     def networks(self, env: EnvBase) -> nn.Module:
         """Builds the loss with the network of the values, the policy, and its target."""
