@@ -87,7 +87,8 @@ def read_data(recipe: DatasetRecipe) -> Episodes:
     path = Path(recipe.dataset)
     files = [path, *path.rglob("*")] if path.is_dir() else [path]
     stamps = {file: file.stat().st_mtime_ns for file in files if file.exists()}
-    task = (recipe.env, recipe.wrappers, recipe.env_settings) if recipe.env else ()
+    settings = (recipe.wrappers, recipe.env_settings, recipe.observation_keys)
+    task = (recipe.env, *settings) if recipe.env else ()
     reading = (*recipe.reading().values(), recipe.image_layout, task)
     key = repr((recipe.dataset, path.absolute(), reading, stamps))
     if key not in _NEWEST:
@@ -116,7 +117,8 @@ def load_data(recipe: Recipe, source: str, **reading: Any) -> Episodes:
         DatasetError: if they cannot be used, or belong to another task.
         ValueError: if the task cannot be made.
     """
-    reads: dict[str, Any] = {"wrappers": recipe.wrappers, "image_layout": recipe.image_layout}
+    names = ("wrappers", "observation_keys", "image_layout")
+    reads: dict[str, Any] = {name: getattr(recipe, name) for name in names}
     spaces = task_spaces(recipe.env, **reads, **recipe.task_settings) if recipe.env else None
     episodes = load_episodes(source, task=spaces, **reading)
     if np.any(start := getattr(spaces and spaces.action, "start", 0)):

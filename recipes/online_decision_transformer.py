@@ -211,7 +211,9 @@ class ODTAlgorithm(SequenceAlgorithm[ODT]):
 
     def loss(self, samples: TensorDictBase) -> TensorDictBase:
         """Returns the terms of the loss; see :meth:`SequenceAlgorithm.loss`."""
-        return self.odt_loss(samples)
+        terms = self.odt_loss(samples)
+        terms["entropy"] = -terms["loss_entropy"].detach() / terms["alpha"]  # TorchRL's has padding
+        return terms
 
     def update(self, batch: TensorDictBase, step: int) -> Mapping[str, Tensor | float]:
         """Takes a gradient step on windows [B], of the network and of the temperature."""

@@ -4,9 +4,8 @@
     recipes.json.xz   the runs' recipes without their seeds, each once
     curves.csv.xz     the rows of the runs' metrics, below one another
 
-What is left out: metrics keep four significant digits and returns of single episodes six, a
-metric that follows from the settings or other metrics (:data:`LEFT_OUT`) is not kept, and neither
-are checkpoints.
+What is left out: metrics keep four significant digits and returns of single episodes six, and the
+metrics in :data:`LEFT_OUT` and checkpoints are not kept.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ class Run:
                 write_text_atomic(folder / _IMPORTS, json.dumps(modules) + "\n")
             if initial_weights is not None:
                 save_checkpoint(folder / _WEIGHTS, 0, initial_weights)
-            write_text_atomic(folder / "recipe.json", recipe_to_json(recipe))
+            run.save_recipe(recipe)
         return run
 
     @staticmethod
@@ -180,6 +180,10 @@ class Run:
         if done and recipe != self.recipe and recipe.schedules:
             earlier = [*self.earlier_lengths(), (done, getattr(self.recipe, field))]
             write_text_atomic(self.folder / _LENGTHS, json.dumps(earlier) + "\n")
+        self.save_recipe(recipe)
+
+    def save_recipe(self, recipe: Recipe) -> None:
+        """Replaces the recipe of an open run."""
         write_text_atomic(self.folder / "recipe.json", recipe_to_json(recipe))
         self.recipe = recipe
 

@@ -25,6 +25,7 @@ from .callback import Callback
 from .evaluation import summarize
 from .interrupt import Interrupt
 from .metrics import Metrics
+from .networks import name_chosen_encoders
 from .numbers import number
 from .optional import tqdm
 from .progress import EPISODES, Best, Record, RecordState, read_state
@@ -55,8 +56,10 @@ def train(recipe: Recipe, run: Run, callbacks: Sequence[Callback] = ()) -> None:
     np.random.seed(recipe.seed)
     torch.manual_seed(recipe.seed)
     algorithm = make_algorithm(recipe)
-    recipe = algorithm.recipe  # with what only its data say
+    given, (recipe, _) = recipe, name_chosen_encoders(algorithm)
     step = saved_step = max(checkpoint_steps(run.checkpoints), default=0)
+    if step == 0 and recipe != given:
+        run.save_recipe(recipe)  # with what only its data say
     if step == 0 and (weights := run.load_initial_weights()):
         with run.restoring(step):
             networks = algorithm.model

@@ -122,6 +122,8 @@ def test_missing_values_are_held(made):
         agent.act(held[2])
     with pytest.raises(ValueError, match=r"has the shape \[4\], but must have \[11\]"):
         agent.act(np.zeros(4))
+    with pytest.raises(ValueError, match=r"must have \[11\]: call reset\(\) before another number"):
+        agent.act(np.zeros((2, 11)))
     with pytest.raises(ValueError, match="must be numbers, not <U1"):
         agent.act(np.array(["a"] * 11))
     with pytest.raises(ValueError, match="there are 2 rewards, but 1 copies"):

@@ -170,9 +170,11 @@ class Actor:
                 raise ValueError(f"the {name} must be numbers, not {array.dtype}")
             if array.shape != (shape if self._batched else shape[1:]):
                 expected = list(shape) if self._batched else list(shape[1:])
+                hint = ", with its channels first" if spec.ndim == 3 else ""  # an image
+                if array.shape[-spec.ndim :] == spec.shape:
+                    hint = ": call reset() before another number of copies"
                 raise ValueError(
-                    f"the {name} has the shape {list(array.shape)}, but must have {expected}: call "
-                    "reset() before another number of copies"
+                    f"the {name} has the shape {list(array.shape)}, but must have {expected}{hint}"
                 )
             numbers = torch.as_tensor(np.ascontiguousarray(array)).reshape(shape)
             missing, frame = numbers.isnan(), numbers.to(spec.dtype)

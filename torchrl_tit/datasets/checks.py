@@ -19,7 +19,7 @@ from torchrl.envs import Compose, Transform
 from torchrl_tit.envs import is_atari, make_games
 from torchrl_tit.envs.gymnasium_tasks import make_unchecked
 from torchrl_tit.envs.names import find_task, load_wrappers
-from torchrl_tit.envs.spaces import ObservationReader
+from torchrl_tit.envs.spaces import ObservationReader, only_space
 from torchrl_tit.settings.checks import checked_arguments
 from torchrl_tit.settings.choices import ImageLayout
 
@@ -70,6 +70,7 @@ def task_spaces(
     env_name: str,
     *,
     wrappers: Sequence[str] = (),
+    observation_keys: Sequence[str] = (),
     image_layout: ImageLayout = "auto",
     **settings: Any,
 ) -> TaskSpaces:
@@ -81,6 +82,8 @@ def task_spaces(
             image of 84 x 84.
         wrappers: Gymnasium wrappers around it, then TorchRL transforms; see
             :func:`~torchrl_tit.envs.make_env`.
+        observation_keys: names of the observations to keep, for a task with several; all if empty.
+            If it is one, its space is returned.
         image_layout: where the images that transforms read have their channels: see
             :func:`~torchrl_tit.envs.make_env`.
         **settings: passed to `gymnasium.make`.
@@ -113,7 +116,8 @@ def task_spaces(
     try:
         for wrap in wraps:
             env = wrap(env)
-        observation = _transformed(env.observation_space, transforms, image_layout)
+        observation = only_space(env.observation_space, observation_keys)
+        observation = _transformed(observation, transforms, image_layout)
         return TaskSpaces(observation, env.action_space, env_name)
     finally:
         env.close()

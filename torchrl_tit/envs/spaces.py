@@ -294,6 +294,26 @@ def choose(
     return kept
 
 
+def only_space(space: Space, keys: Sequence[str] = ()) -> Space:
+    """Returns the space of the one observation that is read, or the whole space if there are more.
+
+    Args:
+        space: the observation space of a task.
+        keys: names of the observations to keep; if empty, all.
+
+    Raises:
+        ValueError: if a key is unknown, or an observation is of an unsupported kind.
+
+    Example:
+        >>> only_space(Dict(camera=Box(0, 255, (84, 84, 3), np.uint8), gear=Discrete(5)), ["gear"])
+        Discrete(5)
+    """
+    if not keys and not isinstance(space, Dict | Tuple):
+        return space
+    chosen = [part for _, part in choose(dict(_leaf_spaces(space)), keys, _is_supported).values()]
+    return chosen[0] if len(chosen) == 1 else space
+
+
 def leaf_name(keys: Iterable[str]) -> str:
     """The name of a nested observation, without dots, which names of modules cannot have."""
     return "/".join(keys).replace(".", "_")

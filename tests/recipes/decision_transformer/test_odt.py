@@ -77,6 +77,22 @@ def test_a_step_is_the_protocols(tmp_path):
     torch.testing.assert_close(state["alpha"]["value"], log_alpha.detach(), rtol=1e-4, atol=1e-5)
 
 
+def test_no_number_depends_on_padding(tmp_path):
+    backbone = dt_tit(**SMALL_DT, timestep_embedding=False, dropout=0.0)
+    algorithm = make_algorithm(make_odt(tmp_path, backbone=backbone))
+    algorithm.prepare(0, tmp_path)
+    batch = next(algorithm.batches())
+    assert not batch["mask"].all()
+    other = batch.clone()
+    other["observation"][~batch["mask"]] = 5.0
+    terms = []
+    for samples in (batch, other):
+        torch.manual_seed(0)
+        terms.append(algorithm.loss(samples))
+    for name, value in terms[0].items():
+        torch.testing.assert_close(terms[1][name], value, msg=name)
+
+
 def test_what_a_run_writes(tmp_path):
     recipe = make_odt(tmp_path)
     with train(recipe, tmp_path / "run") as run:

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict.nn import set_skip_existing
@@ -16,6 +17,7 @@ from torchrl.objectives import BCLoss
 from recipes.bc import BCAlgorithm
 from recipes.cql import CQL, DiscreteCQL
 from recipes.dqn import DQN
+from recipes.offline import read_data
 from recipes.sac import SAC
 from tests.datasets.rollouts import roll, write
 from tests.recipes.small import (
@@ -32,7 +34,7 @@ from tests.recipes.small import (
     train,
 )
 from torchrl_tit.datasets import HistoryStorage, load_episodes
-from torchrl_tit.settings.networks import lstm
+from torchrl_tit.settings.networks import lstm, mlp
 
 
 def value(loss, network, td, params=None):
@@ -366,3 +368,33 @@ def test_slices_have_the_loss_and_gradient_of_their_transitions(tmp_path, kind, 
         gradients = [w.grad for w in algorithm.model.parameters() if w.grad is not None]
         results.append([*(x for x in terms.values() if isinstance(x, torch.Tensor)), *gradients])
     torch.testing.assert_close(results[1], results[0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(("key", "shape"), [("camera", (3, 5, 6)), ("arm/joint_angles", (3,))])
+def test_data_of_one_of_several_observations(tmp_path, monkeypatch, key, shape):
+    """The file has it as the task writes it: images with their channels last."""
+    monkeypatch.setenv("TORCHRL_TIT_IMPORTS", "tests.envs.tasks")
+    draw, steps = np.random.default_rng(0), 60
+    image = key == "camera"
+    pixels, angles = draw.integers(0, 256, (steps, 5, 6, 3), np.uint8), draw.random((steps, 3))
+    observations = pixels if image else angles.astype(np.float32)
+    arrays = {
+        "observations": observations,
+        "actions": draw.integers([0, -1], [2, 2], (steps, 2)),
+        "rewards": draw.random(steps),
+        "terminals": np.arange(steps) % 10 == 9,
+        "timeouts": np.zeros(steps, bool),
+    }
+    data = write(tmp_path / "robot.hdf5", arrays)
+    task = {"env": "tests.envs.tasks:Robot-v0", "observation_keys": (key,)}
+    recipe = make(BC, tmp_path, **task, backbone=mlp(2, hidden_dim=8), dataset=str(data))
+    rows = read_data(recipe).rows["observation"].unflatten(0, (6, 11))
+    stored = rows[:, :10].flatten(0, 1)  # the final ones are unknown
+    expected = torch.as_tensor(observations)
+    assert torch.equal(stored, expected.permute(0, 3, 1, 2) if image else expected)
+    algorithm = make_algorithm(recipe)
+    algorithm.check()
+    algorithm.prepare(0, tmp_path)
+    batch = next(algorithm.batches())
+    assert batch["history"].shape[2:] == shape
+    algorithm.update(batch, 0)

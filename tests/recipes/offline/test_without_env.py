@@ -101,6 +101,20 @@ def test_trains_and_resumes_bit_for_bit(tmp_path, name):
     assert errors[best["steps"]] == min(errors.values())
 
 
+@pytest.mark.parametrize("name", ["bc", "dt"])
+def test_a_run_of_python_records_what_its_data_said(tmp_path, name):
+    """As one of the command line does."""
+    data = log_machine(tmp_path / "log.hdf5")
+    run = train(RECIPES[name](tmp_path, dataset=str(data)), tmp_path / "run")
+    recipe: Any = run.recipe
+    assert Run.open(run.folder).recipe == recipe == make_algorithm(recipe).recipe
+    assert "observation_shape" in recipe.task_settings
+    if name == "dt":
+        assert len(recipe.target_returns) == 1
+    data.unlink()
+    assert load_agent(run.folder).act(np.zeros(5)).shape == (2,)
+
+
 def test_the_measures_of_held_out_episodes(tmp_path):
     recipe = BC(dataset=str(log_machine(tmp_path / "log.hdf5")), backbone=SMALL, seed=1)
     algorithm = make_algorithm(recipe)
