@@ -14,7 +14,7 @@ A table stands between two comments. The first says where its numbers are from, 
 The first row is the header. ``=`` gives the form of the rows that follow: each names its runs and,
 after a colon, the cells that are not measured. A line that begins with ``|`` is a row with its own
 form. ``{mean}`` is a measure of :data:`MEASURES`, ``{mean @ hopper/mlp}`` that of the runs of a
-path below docs/results, ``{median FILE.json / KEY / ...}`` a number of a benchmark. Where a row
+path below docs/results, ``{mean @ ./mlp}`` below the row's path, ``{median FILE.json / KEY / ...}`` a number of a benchmark. Where a row
 names ``FILE.json / KEY``, or a key below ``<!-- table: FILE.json``, a measure names the rest:
 ``{median KEY / ...}``. A path may have a ``*``: ``{overall @ update_size/new_seeds/*/lstm}`` is the
 interquartile mean over tasks, and ``{improvement @ PATH}`` compares a row's runs with others, also
@@ -343,6 +343,7 @@ def measure(text: str, path: str) -> str:
         ValueError: if it is no measure, or there is no such run.
     """
     words, _, of = (part.strip() for part in text.partition("@"))
+    of = f"{path}{of[1:]}" if of.startswith("./") else of
     name, _, rest = words.partition(" ")
     if name in ("median", "ratio", "spread"):
         below = f"{path} / " if ".json" in path else ""
