@@ -7,6 +7,8 @@ function of the features whose random weights stay the same for several steps.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,6 +94,15 @@ class StateDependentNoise(nn.Module):
             return mean, variance.clamp_min(1e-5).sqrt(), torch.zeros_like(mean)
         mean, scale, action, _ = self.gsde(mean, features, self._draw(features))
         return mean, scale, action - mean
+
+    @contextmanager
+    def acting(self) -> Iterator[None]:
+        """Begins and ends without weights; see :func:`~torchrl_tit.modules.acting`."""
+        self._weights = None
+        try:
+            yield
+        finally:
+            self._weights = None
 
     @torch.compiler.disable
     def _draw(self, features: Tensor) -> Tensor:

@@ -14,12 +14,12 @@ A table stands between two comments. The first says where its numbers are from, 
 The first row is the header. ``=`` gives the form of the rows that follow: each names its runs and,
 after a colon, the cells that are not measured. A line that begins with ``|`` is a row with its own
 form. ``{mean}`` is a measure of :data:`MEASURES`, ``{mean @ hopper/mlp}`` that of the runs of a
-path below docs/results, ``{mean @ ./mlp}`` below the row's path, ``{median FILE.json / KEY / ...}`` a number of a benchmark. Where a row
-names ``FILE.json / KEY``, or a key below ``<!-- table: FILE.json``, a measure names the rest:
-``{median KEY / ...}``. A path may have a ``*``: ``{overall @ update_size/new_seeds/*/lstm}`` is the
-interquartile mean over tasks, and ``{improvement @ PATH}`` compares a row's runs with others, also
-of ``sb3.csv stable_baselines3=2.9.2``. Means of fewer than five seeds are marked, and a line below
-the table says so.
+path below docs/results, ``{mean @ ./mlp}`` below the row's path, ``{median FILE.json / KEY / ...}``
+a number of a benchmark. Where a row names ``FILE.json / KEY``, or a key below ``<!-- table:
+FILE.json``, a measure names the rest: ``{median KEY / ...}``. A path may have a ``*``: ``{overall @
+update_size/new_seeds/*/lstm}`` is the interquartile mean over tasks, and ``{improvement @ PATH}``
+compares a row's runs with others, also of ``sb3.csv stable_baselines3=2.9.2``. Means of fewer than
+five seeds are marked, and a line below the table says so.
 
 A folder ``paper/...`` is a table of docs/paper.md, which :mod:`docs.tools.paper` prints.
 

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from torchrl_tit.evaluation_file import BEST_EVALUATION, EVALUATION
+
 from ..core.numbers import measured_words, plus_minus
 from ..core.recipe import Recipe
 from .arguments import Parser, add_machine_options, fail, override, say
@@ -81,6 +83,10 @@ def evaluate(arguments: list[str]) -> None:
         fail("--env and --env-settings name what is played: leave them out where data are measured")
     if options.episodes is not None and (options.dataset is not None or not recipe.env):
         fail("--episodes are those that are played: leave it out where data are measured")
+    name = _file_name(run.recipe, recipe, options.best, options.dataset, options.ope)
+    kept = [run.folder / own for own in (EVALUATION, BEST_EVALUATION) if own != name]
+    if options.out is not None and options.out.resolve() in [file.resolve() for file in kept]:
+        fail(f"--out {options.out} is for another evaluation of the run: leave it out for {name}")
     # Only one process at a time may write to the run folder.
     lock: AbstractContextManager[Any] = run if options.out is None else nullcontext()
     with lock:

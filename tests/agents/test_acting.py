@@ -148,6 +148,8 @@ def test_masks_of_several_choices(tmp_path):
     assert (agent.act(observation, action_mask=np.concatenate(masks)) == action).all()
     with pytest.raises(ValueError, match="action_mask has the shape"):
         agent.act(observation, action_mask=masks[0])
+    with pytest.raises(ValueError, match="action_mask allows no action: give every copy"):
+        agent.act(observation, action_mask=tuple(np.zeros(n, bool) for n in space.nvec))
     misspelled = observation | {"picture": 1}
     del misspelled["image"]
     for _ in range(2):  # after a first observation, and as the first one

@@ -104,6 +104,8 @@ class Actor:
                 raise ValueError(
                     f"action_mask has the shape {list(mask.shape)}, but must have {list(shape)}"
                 )
+            if not mask.any(-1).all():
+                raise ValueError("action_mask allows no action: give every copy at least one")
             given["action_mask"] = mask.reshape(shape)
         rewards = torch.as_tensor(np.asarray(reward, np.float32)).reshape(-1, 1)
         if len(rewards) not in (1, copies := len(self._begins)):

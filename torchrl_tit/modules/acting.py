@@ -158,6 +158,8 @@ def modules_in_order(policy: nn.Module) -> Iterator[TensorDictModuleBase]:
 def acting(policy: Callable[..., Any]) -> Iterator[None]:
     """Puts every backbone of a policy into acting mode: only the newest frames are encoded.
 
+    Enters the context ``acting()`` of each module that has one.
+
     Args:
         policy: a module that contains any number of backbones (see :meth:`Backbone.acting`, also
             for weights that change within the context). Other functions are left unchanged.
@@ -174,14 +176,14 @@ def acting(policy: Callable[..., Any]) -> Iterator[None]:
         ...     steps = make_env("CartPole-v1", 2, num_frames=8).rollout(10, policy)
     """
     with ExitStack() as stack:
-        for module in _within(policy):
-            stack.enter_context(module.acting())
+        for act in _methods(policy, "acting"):
+            stack.enter_context(act())
         yield
 
 
-def _within(policy: Callable[..., Any]) -> list[ActingModule]:
+def _methods(policy: Callable[..., Any], name: str) -> list[Callable[[], Any]]:
     modules = policy.modules() if isinstance(policy, nn.Module) else ()
-    return [module for module in modules if isinstance(module, ActingModule)]
+    return [getattr(module, name) for module in modules if hasattr(module, name)]
 
 
 class ActingCollector(Collector):
@@ -222,5 +224,5 @@ class ActingCollector(Collector):
     def update_policy_weights_(self, *args: Any, **kwargs: Any) -> None:
         """Updates the policy's weights; in a worker process, called in another thread."""
         super().update_policy_weights_(*args, **kwargs)
-        for module in _within(self.policy):
-            module.mark_weight_update()
+        for mark in _methods(self.policy, "mark_weight_update"):
+            mark()

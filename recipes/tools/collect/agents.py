@@ -291,6 +291,8 @@ def _check(recipe: Recipe, env: str) -> None:
     problem = None
     if recipe.offline:
         problem = "is trained on a data set, not in its task"
+    elif recipe.algorithm == "dqn":
+        problem = "is of dqn, whose policy has no distribution to sample actions from"
     elif recipe.env != env:
         problem = f"is of the task {recipe.env}, not {env}"
     elif getattr(recipe, "hide_velocities", False):

@@ -216,9 +216,10 @@ class _Sets:
         if not minari.exists():
             write_minari(episodes, minari, self.settings.env)
         shutil.rmtree(parts.folder)
+        whole = episodes.returns[episodes.is_whole]
         return (
             f"{kind}: {episodes.num_transitions} transitions in {len(episodes.lengths)} episodes, "
-            f"mean return {number(episodes.returns.mean().item())}: {hdf5} and {minari.name}"
+            f"mean return of whole ones {number(whole.mean().item())}: {hdf5} and {minari.name}"
         )
 
     def _random(self, parts: TransitionParts) -> Episodes:

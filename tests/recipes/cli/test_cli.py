@@ -121,6 +121,9 @@ def test_an_evaluation_of_ones_own_does_not_replace_the_runs(capsys, tmp_path):
     for name, options in names.items():
         main(["evaluate", str(run), *options])
         assert capsys.readouterr().out.endswith(f"written to {run / name}\n")
+    for name in ("evaluation.json", "evaluation_best.json"):
+        line = fails(capsys, "evaluate", run, "--seed", 7, "--out", run / name)
+        assert line.endswith("leave it out for evaluation_seed-7.json")
     assert (run / "evaluation.json").read_bytes() == own
     assert json.loads((run / "evaluation_seed-7.json").read_text())["seed"] == 7
 

@@ -62,6 +62,7 @@ def test_the_agent_of_a_finished_run(cartpole: Path, tmp_path: Path) -> None:
         ({"env": "Blackjack-v1", "sets": ("random",)}, r"Blackjack-v1 has observations Tuple\("),
         ({"agent": "ppo/pendulum/mlp"}, "unknown recipe 'ppo/pendulum/mlp': did you mean"),
         ({"agent": "ppo/cartpole/mlp"}, "is of the task CartPole-v1, not Pendulum-v1"),
+        ({"agent": "dqn/cartpole/mlp"}, "of dqn, whose policy has no distribution to sample"),
         ({"agent": "dt/hopper-medium-v2/dt"}, "trained on a data set, not in its task: choose sac"),
     ],
 )

@@ -15,6 +15,7 @@ from recipes.gsde import SmoothPPO, StateDependentNoise
 from tests.numerics import assert_near
 from tests.recipes.ppo import tasks
 from tests.recipes.small import train
+from torchrl_tit.evaluation import evaluate as play
 from torchrl_tit.settings.networks import enhanced_tit, lstm, mlp
 
 SMALL: dict[str, Any] = {"embed_dim": 8, "features_dim": 8}
@@ -102,6 +103,16 @@ def test_it_trains_and_is_evaluated_without_noise(tmp_path, monkeypatch):
     assert (noise.gsde.log_sigma.diff(dim=-1) != 0).all()  # they were all the same
     monkeypatch.delattr(StateDependentNoise, "_draw")
     assert evaluate(run)["episodes"] == 2
+
+
+def test_noise_of_one_evaluation_is_not_left_for_the_next():
+    algorithm = make_algorithm(RECIPE)
+    algorithm.policy.eval()
+
+    def returns():
+        return play(algorithm.make_env, algorithm.policy, 4, seed=3, deterministic=False)
+
+    assert torch.equal(returns(), returns())
 
 
 def test_choices_are_refused():
