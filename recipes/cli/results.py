@@ -37,6 +37,9 @@ def compare(arguments: list[str]) -> None:
     notes += plot_comparison(experiments, options.out, title=options.title)
     say(f"written to {options.out}")
     evaluated, left_out = read_evaluations(folders.values())
+    lengths = sorted({evaluation["steps"] for _, found in evaluated for evaluation in found})
+    if len(lengths) > 1:
+        notes.append(f"the runs were evaluated after {', '.join(map(str, lengths))} steps")
     for line in [*notes, *left_out]:
         note(line)
     labels = {run.folder: one.label for one in experiments for run in one.runs}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -205,8 +206,9 @@ def read_references(path: Path | None = None) -> dict[str, tuple[float, float]]:
         if path is not None:
             rows = list(csv.DictReader(path.read_text(encoding="utf-8").splitlines()))
         references = {row["env"]: (float(row["random"]), float(row["best"])) for row in rows}
-        if same := [env for env, (random, best) in references.items() if not best > random]:
-            raise ValueError(f"best must be above random, but is not for {same[0]}")
+        for env, (random, best) in references.items():
+            if not -math.inf < random < best < math.inf:
+                raise ValueError(f"best must be above random and finite, but is not for {env}")
         return references
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(

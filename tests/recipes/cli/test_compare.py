@@ -1,5 +1,6 @@
 """Which runs `compare` draws as one curve."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,6 +55,18 @@ def test_the_logs_of_a_sweep_are_passed_over(begun, drawn, capsys):
     Path("seed-0.log").touch()
     assert drawn("seed-0", "seed-0.log") == {NAME: ["seed-0"]}
     assert "seed-0.log is not a run folder, but a log" in fails(capsys, "compare", "seed-0.log")
+
+
+def test_it_says_how_far_runs_of_different_lengths_were_trained(begun, drawn, capsys):
+    for folder, steps in (("a", 1024), ("b", 2048)):
+        begun(folder, total_steps=steps, seed=steps)
+        evaluation = {"env": "CartPole-v1", "steps": steps, "seed": 0, "weights": "last"}
+        evaluation |= {"mean": 1.0, "std": 0.0, "episodes": 1, "returns": [1.0]}
+        (Path(folder) / "evaluation.json").write_text(json.dumps(evaluation))
+    drawn("a")
+    assert "runs were evaluated" not in capsys.readouterr().err
+    drawn("a", "b")
+    assert "the runs were evaluated after 1024, 2048 steps" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

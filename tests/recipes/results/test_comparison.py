@@ -144,6 +144,7 @@ def test_what_cannot_be_summarized(tasks, capsys):
     write_run(tasks / "own" / "a", "ppo/enhanced-tit", 0, [1.0], env="Taxi-v4")
     (tasks / "bad.csv").write_text("env,random\nCartPole-v1,0\n")
     (tasks / "flat.csv").write_text("env,random,best\nCartPole-v1,5,5\n")
+    (tasks / "endless.csv").write_text("env,random,best\nCartPole-v1,5,inf\n")
     only = [str(tasks / "cartpole")]
     for words, message in {
         (str(tasks / "more"), *only): "mlp has two settings on CartPole-v1",
@@ -151,6 +152,7 @@ def test_what_cannot_be_summarized(tasks, capsys):
         (*only, "--networks", "lstm"): "no evaluated run of lstm",
         (*only, "--references", str(tasks / "bad.csv")): "bad.csv must be a CSV file with the",
         (*only, "--references", str(tasks / "flat.csv")): "is not for CartPole-v1",
+        (*only, "--references", str(tasks / "endless.csv")): "finite, but is not for CartPole-v1",
         (str(tasks / "mountaincar"), str(tasks / "cartpole" / "mlp")): "no task has runs of all",
     }.items():
         assert message in fails(capsys, "summary", *words)
