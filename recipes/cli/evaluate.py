@@ -86,7 +86,7 @@ def evaluate(arguments: list[str]) -> None:
     name = _file_name(run.recipe, recipe, options.best, options.dataset, options.ope)
     kept = [run.folder / own for own in (EVALUATION, BEST_EVALUATION) if own != name]
     if options.out is not None and options.out.resolve() in [file.resolve() for file in kept]:
-        fail(f"--out {options.out} is for another evaluation of the run: leave it out for {name}")
+        fail(f"--out {options.out} holds another evaluation of the run: leave it out for {name}")
     # Only one process at a time may write to the run folder.
     lock: AbstractContextManager[Any] = run if options.out is None else nullcontext()
     with lock:

@@ -307,6 +307,8 @@ def only_space(space: Space, keys: Sequence[str] = ()) -> Space:
     Example:
         >>> only_space(Dict(camera=Box(0, 255, (84, 84, 3), np.uint8), gear=Discrete(5)), ["gear"])
         Discrete(5)
+        >>> only_space(Dict(gear=Discrete(5)))
+        Discrete(5)
     """
     if not keys and not isinstance(space, Dict | Tuple):
         return space

@@ -217,9 +217,10 @@ class _Sets:
             write_minari(episodes, minari, self.settings.env)
         shutil.rmtree(parts.folder)
         whole = episodes.returns[episodes.is_whole]
+        mean = number(whole.mean().item()) if len(whole) else "unknown"
         return (
             f"{kind}: {episodes.num_transitions} transitions in {len(episodes.lengths)} episodes, "
-            f"mean return of whole ones {number(whole.mean().item())}: {hdf5} and {minari.name}"
+            f"mean return of whole ones {mean}: {hdf5} and {minari.name}"
         )
 
     def _random(self, parts: TransitionParts) -> Episodes:

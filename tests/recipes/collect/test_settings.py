@@ -9,6 +9,7 @@ import pytest
 from gymnasium.spaces import Box, Discrete, MultiDiscrete, Space
 
 from recipes.cli import main
+from recipes.core.numbers import number
 from recipes.core.recipe_json import recipe_to_json
 from recipes.sac import SAC
 from recipes.tools.collect import Collection
@@ -17,7 +18,7 @@ from recipes.tools.collect.collect import collect
 from tests.recipes.collect.collected import CARTPOLE, CARTPOLE_RECIPE, PENDULUM, attributes, read
 from tests.recipes.commands import fails
 from torchrl_tit.checkpoint import checkpoint_steps
-from torchrl_tit.datasets import TaskSpaces, task_spaces
+from torchrl_tit.datasets import TaskSpaces, load_episodes, task_spaces
 from torchrl_tit.settings.networks import mlp
 
 
@@ -175,3 +176,13 @@ def test_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "holds data of other settings" in fails(
         capsys, *words, "--out", str(tmp_path / "c"), "--seed", "1"
     )
+
+
+@pytest.mark.parametrize("transitions", [100, 3])
+def test_parts_of_episodes_do_not_count_in_the_summary(transitions: int, tmp_path: Path) -> None:
+    settings = Collection(env="CartPole-v1", sets=("random",), transitions=transitions)
+    [line] = collect(settings, tmp_path / "c")
+    episodes = load_episodes(tmp_path / "c" / "random.hdf5")
+    assert episodes.is_whole.all() if transitions == 100 else not episodes.is_whole.any()
+    mean = number(episodes.returns.mean().item()) if transitions == 100 else "unknown"
+    assert f"mean return of whole ones {mean}:" in line
