@@ -225,17 +225,62 @@ def test_masks_of_several_actions():
     assert masks[..., 2:].gather(-1, second).all()
 
 
+class Mask(MultiBinary):
+    """Masks by chance, which always allow the first action."""
+
+    def sample(self, mask=None, probability=None):
+        drawn = super().sample()
+        drawn[0] = True
+        return drawn
+
+
 def test_masks_among_observations():
-    space = Dict({"action_mask": MultiBinary(3), "place": Discrete(4)})
+    space = Dict({"action_mask": Mask(3), "place": Discrete(4)})
     env = echo(Discrete(3), space, mask_actions=True)
     assert kinds(env) == [4]
     check_env_specs(env)
     assert env.reset()["action_mask"].shape == (2, 3)
-    parts = TupleSpace([MultiBinary(2), MultiBinary(3)])
+    parts = TupleSpace([Mask(2), Mask(3)])
     env = echo(MultiDiscrete([2, 3]), Dict(action_mask=parts, at=Discrete(4)), mask_actions=True)
     assert env.reset()["action_mask"].shape == (2, 5)
     # Otherwise it is an observation as any other.
     assert kinds(echo(Discrete(3), space)) == {"action_mask": [2, 2, 2], "place": [4]}
+
+
+class Blocked(gymnasium.Env):
+    """Blocks all its motors at its third step."""
+
+    observation_space = Box(-9, 9, (2,))
+    action_space = MultiDiscrete([2, 3])
+
+    def __init__(self, length: int) -> None:
+        self.length, self.steps = length, 0
+
+    def _observe(self) -> tuple[Any, dict[str, Any]]:
+        mask = np.full(2, True), np.full(3, self.steps != 3)
+        return np.zeros(2, np.float32), {"action_mask": mask}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._observe()
+
+    def step(self, action):
+        self.steps += 1
+        observation, info = self._observe()
+        return observation, 1.0, self.steps >= self.length, False, info
+
+
+def test_a_mask_may_allow_nothing_only_at_the_end():
+    for length in (3, 5):
+        tasks = [lambda length=length: Blocked(length)] * 2
+        vector = SyncVectorEnv(tasks, autoreset_mode=AutoresetMode.DISABLED)
+        env = GymVectorEnv(vector, mask_actions=True)
+        if length == 3:
+            assert env.rollout(7, break_when_any_done=False)["next", "done"].sum() == 4
+            continue
+        with pytest.raises(ValueError, match=r"allows no action, though the episode goes on"):
+            env.rollout(7, break_when_any_done=False)
 
 
 def test_chosen_observations():

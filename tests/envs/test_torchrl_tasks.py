@@ -23,6 +23,7 @@ from tests.transforms.streams import assert_histories
 from torchrl_tit.agents.acting import Actor
 from torchrl_tit.envs import make_env
 from torchrl_tit.envs.torchrl_specs import TensorReader, action_spec
+from torchrl_tit.envs.torchrl_tasks import TorchRLTask
 
 CORRIDOR = "tests.envs.tasks:Corridor"
 
@@ -157,10 +158,30 @@ def test_masks():
     assert rollout["action_mask"][..., 0].all()
 
 
-def masked() -> EnvBase:
+def masked(*closed: int) -> EnvBase:
     from torchrl.envs import RenameTransform, TransformedEnv
 
-    return TransformedEnv(Corridor(), RenameTransform(["allowed"], ["action_mask"]))
+    return TransformedEnv(Closed(*closed), RenameTransform(["allowed"], ["action_mask"]))
+
+
+class Closed(Corridor):
+    """Allows nothing at some places."""
+
+    def __init__(self, *closed: int) -> None:
+        self.closed = closed
+        super().__init__()
+
+    def _observe(self):
+        found = super()._observe()
+        return found.set("allowed", found["allowed"] & (abs(self.place) not in self.closed))
+
+
+def test_a_mask_may_allow_nothing_only_at_the_end():
+    ends = TorchRLTask(masked(3), mask_actions=True, observation_keys=["place"])
+    assert not ends.rollout(1_000)["next", "action_mask"][-1].any()
+    middle = TorchRLTask(masked(1), mask_actions=True, observation_keys=["place"])
+    with pytest.raises(ValueError, match="allows no action, though the episode goes on"):
+        middle.rollout(1_000)
 
 
 def test_transforms_are_inside():

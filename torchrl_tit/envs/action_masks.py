@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,28 @@ from numpy.typing import NDArray
 
 MASK = "action_mask"
 """Key of the mask, in a tensordict and in Gymnasium's observations or info."""
+
+
+def check_allowed(masks: NDArray, ended: NDArray, sizes: Sequence[int]) -> None:
+    """Checks that every copy that goes on has an action to take.
+
+    Args:
+        masks: the allowed options of all entries of an action; bool [..., sum(sizes)].
+        ended: where the episode has ended, so that no action is needed; bool [...].
+        sizes: number of options of each entry.
+
+    Raises:
+        ValueError: if an entry has no allowed option.
+
+    Example:
+        >>> check_allowed(np.array([[True, False], [False, False]]), np.array([False, True]), [2])
+    """
+    possible = np.logical_or.reduceat(masks, np.cumsum([0, *sizes[:-1]]), -1).all(-1)
+    if not (possible | ended).all():
+        raise ValueError(
+            f'The task\'s "{MASK}" allows no action, though the episode goes on: let it allow one, '
+            "or end the episode."
+        )
 
 
 class ActionMasks:
@@ -32,15 +55,15 @@ class ActionMasks:
 
     def __init__(self, num_envs: int, space: Space) -> None:
         if isinstance(space, Discrete):
-            size = int(space.n)
+            self.sizes = [int(space.n)]
         elif isinstance(space, MultiDiscrete):
-            size = int(space.nvec.sum())
+            self.sizes = space.nvec.ravel().tolist()
         else:
             raise ValueError(
                 f"Only Discrete and MultiDiscrete actions can be masked, but these are {space}: "
                 "leave out mask_actions."
             )
-        self.shape = (num_envs, size)
+        self.shape = (num_envs, sum(self.sizes))
         self._masks = np.ones(self.shape, bool)
 
     def from_observations(self, parts: list[Any]) -> NDArray:

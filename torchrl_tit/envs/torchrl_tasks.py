@@ -15,7 +15,7 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
-from torchrl_tit.envs.action_masks import MASK
+from torchrl_tit.envs.action_masks import MASK, check_allowed
 from torchrl_tit.envs.actions import refuse_nan
 from torchrl_tit.envs.names import load_wrappers
 from torchrl_tit.envs.spaces import end_flags
@@ -73,7 +73,8 @@ class TorchRLTask(EnvBase):
         self._carried: TensorDictBase | None = None  # what the environment reads next
         entries = {"observation": read.spec}
         if read.mask_key is not None:
-            mask = _mask_size(spec)
+            self._options = _options(spec)
+            mask = sum(self._options)
             found = env.full_observation_spec[read.mask_key].shape.numel()
             if found != mask:
                 raise ValueError(f'The task\'s "{MASK}" has {found} entries, not {mask}.')
@@ -109,6 +110,8 @@ class TorchRLTask(EnvBase):
         if self._read.mask_key is not None:
             entries[MASK] = outcome.get(self._read.mask_key).bool().reshape(-1)
         done = outcome.get("done").reshape(1)
+        if MASK in entries:
+            check_allowed(entries[MASK].numpy(force=True), done.numpy(force=True), self._options)
         truncated = outcome.get("truncated", torch.zeros_like(done)).reshape(1)
         terminated = outcome.get("terminated", done & ~truncated).reshape(1)
         entries |= {"done": done, "terminated": terminated, "truncated": truncated}
@@ -309,10 +312,10 @@ def _check(env: EnvBase) -> None:
         )
 
 
-def _mask_size(spec: Any) -> int:
-    """The number of entries of an action mask."""
+def _options(spec: Any) -> list[int]:
+    """The number of options of each entry of an action."""
     if type(spec) is Categorical:
-        return int(spec.space.n)
+        return [int(spec.space.n)]
     if hasattr(spec, "nvec"):
-        return int(torch.as_tensor(spec.nvec).sum())
+        return torch.as_tensor(spec.nvec).flatten().tolist()
     raise ValueError("only discrete actions can be masked; leave out mask_actions")

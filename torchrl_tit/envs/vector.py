@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from torchrl_tit.envs.action_masks import MASK, ActionMasks
+from torchrl_tit.envs.action_masks import MASK, ActionMasks, check_allowed
 from torchrl_tit.envs.actions import ActionWriter, refuse_nan
 from torchrl_tit.envs.spaces import ObservationReader, end_flags
 from torchrl_tit.settings.choices import ImageLayout
@@ -129,7 +129,7 @@ class GymVectorEnv(EnvBase):
         stepped = self._env.step(self._write(action).numpy())
         observations, rewards, terminated, truncated, info = stepped
         return self._tensordict(
-            **self._observed(observations, info),
+            **self._observed(observations, info, terminated | truncated),
             reward=self._tensor(rewards.astype(np.float32)).unsqueeze(-1),
             terminated=self._tensor(terminated).unsqueeze(-1),
             truncated=self._tensor(truncated).unsqueeze(-1),
@@ -141,7 +141,8 @@ class GymVectorEnv(EnvBase):
         self, tensordict: TensorDictBase | None = None, *, seed: int | Sequence[int] | None = None
     ) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        options = None if mask is None else {"reset_mask": mask.flatten().numpy(force=True)}
+        reset = np.ones(self.batch_size, bool) if mask is None else mask.flatten().numpy(force=True)
+        options = None if mask is None else {"reset_mask": reset}
         self._seed_spaces(seed)
         try:
             # Gymnasium's vector environments take sequences too; their base class does not say so.
@@ -151,14 +152,16 @@ class GymVectorEnv(EnvBase):
             raise
         flag = torch.zeros(*self.batch_size, 1, dtype=torch.bool, device=self.device)
         return self._tensordict(
-            **self._observed(observations, info),
+            **self._observed(observations, info, ~reset),
             terminated=flag,
             truncated=flag.clone(),
             done=flag.clone(),
             **self._further(info),
         )
 
-    def _observed(self, observations: Any, info: dict[str, Any]) -> dict[str, Any]:
+    def _observed(
+        self, observations: Any, info: dict[str, Any], ended: np.ndarray
+    ) -> dict[str, Any]:
         """The observation, or several in a tensordict, and the action mask."""
         values = self._read(observations)
         if not isinstance(values, dict):
@@ -168,9 +171,10 @@ class GymVectorEnv(EnvBase):
             entries = {"observation": self._tensordict(**parts)}
         if self._masks is not None:
             observed = self._read.masks(observations)
-            entries[MASK] = self._tensor(
-                self._masks.from_observations(observed) if observed else self._masks.from_info(info)
-            )
+            masks = self._masks
+            found = masks.from_observations(observed) if observed else masks.from_info(info)
+            check_allowed(found, ended, masks.sizes)
+            entries[MASK] = self._tensor(found)
         return entries
 
     def _check_shapes(self) -> None:
@@ -192,7 +196,7 @@ class GymVectorEnv(EnvBase):
                 f'The task has no mask of its actions, neither an observation "{MASK}" nor one in '
                 "its info: leave out mask_actions."
             )
-        self._observed(observations, info)
+        self._observed(observations, info, np.zeros(self.batch_size, bool))
 
     def _further(self, info: dict[str, Any]) -> dict[str, Tensor]:
         """Further entries of a subclass, from the vector environment's info."""
