@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -234,6 +235,14 @@ class _Sets:
         agent, (name, mark) = self.agent, self.settings.mark(kind)
         assert agent is not None
         score = agent.reach(name, mark)
+        if kind == "expert" and "medium" in self.settings.sets:
+            medium = agent.reach(*self.settings.mark("medium"))
+            if medium.step == score.step:
+                warnings.warn(
+                    f"medium and expert are the same agent: after {score.step} steps, it has a mean "
+                    f"return of {number(score.mean)}, which reaches both marks; move them apart",
+                    stacklevel=2,
+                )
         if kind == "mixed":
             assert isinstance(agent, AgentInTraining)  # a finished run was rejected earlier
             episodes = agent.parts.episodes(score.step, task=self.task)

@@ -40,6 +40,9 @@ def test_the_agent_of_a_finished_run(cartpole: Path, tmp_path: Path) -> None:
         collect(replace(settings, sets=("mixed",)), tmp_path / "m")
     with pytest.raises(ValueError, match="expert_return 1000 is not reached by the run in"):
         collect(replace(settings, expert_return=1000), tmp_path / "n")
+    both = replace(settings, sets=("medium", "expert"), medium_return=100, transitions=50)
+    with pytest.warns(UserWarning, match=r"medium and expert are the same agent: after \d+ steps"):
+        collect(both, tmp_path / "both")
 
 
 @pytest.mark.parametrize(
