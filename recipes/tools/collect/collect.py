@@ -239,8 +239,8 @@ class _Sets:
             medium = agent.reach(*self.settings.mark("medium"))
             if medium.step == score.step:
                 warnings.warn(
-                    f"medium and expert are the same agent: after {score.step} steps, it has a mean "
-                    f"return of {number(score.mean)}, which reaches both marks; move them apart",
+                    f"medium and expert are the same agent: after {score.step} steps, its mean "
+                    f"return, {number(score.mean)}, reaches both marks; move them apart",
                     stacklevel=2,
                 )
         if kind == "mixed":

@@ -41,6 +41,7 @@ SUMMARY = (
     "probability of improvement over the first [95%]",
 )
 """The header of :func:`summarize`."""
+_ALTER = ("env_settings", "wrappers", "hide_velocities")  # what its returns can be
 _LEVEL, _POWER = 0.05, 0.8
 _RESAMPLES = 2_000
 _PERMUTATIONS = 10_000
@@ -249,8 +250,8 @@ def read_networks(
 
     Returns:
         By network, and then by task, the value of each run, and notes about runs and tasks that are
-        left out, changed settings, and lengths and algorithms that differ. All networks have the
-        same tasks.
+        left out, changed settings, altered tasks, and lengths and algorithms that differ. All
+        networks have the same tasks.
 
     Raises:
         ValueError: if a pattern has no run, a network has two settings on a task, or no task is
@@ -278,6 +279,11 @@ def read_networks(
         algorithms[task] = settings.algorithm
         if experiment.changes:
             notes.append(f"{name} has changed settings on {settings.env}: {experiment.changes}")
+        if altered := [key for key in _ALTER if getattr(settings, key, None)]:
+            notes.append(
+                f"{settings.env} of {name} is normalized as the task without its "
+                f"{' and '.join(altered)}"
+            )
         values = [value_of(evaluation) for evaluation in evaluations]
         scored = measure_of(settings, evaluations[0]) != "return"
         found[task] = (

@@ -134,6 +134,11 @@ def test_a_summary_says_which_settings_differ(tasks, capsys):
     assert "lstm has changed settings on CartPole-v1: total_steps 122880, epochs 5\n" in said
     assert "runs of CartPole-v1 have different lengths: 100352, 122880 steps\n" in said
     assert "algorithms" not in said
+    assert "normalized as" not in said
+    write_run(tasks / "hidden", "ppo/cartpole/mlp", 0, [1.0], hide_velocities=True)
+    main(["summary", str(tasks / "hidden")])
+    said = capsys.readouterr().err
+    assert "CartPole-v1 of mlp is normalized as the task without its hide_velocities\n" in said
     write_run(tasks / "dqn", "dqn/cartpole/mlp", 0, [-80.0], env="Acrobot-v1")
     main(["summary", str(tasks / "cartpole" / "mlp"), str(tasks / "dqn")])
     assert "several algorithms count together: dqn, ppo\n" in capsys.readouterr().err
