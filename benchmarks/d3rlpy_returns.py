@@ -1,8 +1,9 @@
 """d3rlpy's MLPs with its defaults: ``python -m benchmarks.d3rlpy_returns FILE.hdf5 ...``.
 
 Observations are normalized, and IQL's rewards are, as by the recipes; behavior cloning has their
-batch and learning rate. ``benchmarks/offline.py`` says how to install d3rlpy. A row is added to
---out as soon as a run ends; runs that have a row are not repeated.
+batch and learning rate, and CQL what d3rlpy's reproduction sets. ``benchmarks/offline.py`` says how
+to install d3rlpy. A row is added to --out as soon as a run ends; runs that have a row are not
+repeated.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import gymnasium as gym
 import h5py
 import numpy as np
 import torch
-from d3rlpy.algos import BCConfig, IQLConfig, TD3PlusBCConfig
+from d3rlpy.algos import BCConfig, CQLConfig, IQLConfig, TD3PlusBCConfig
 from d3rlpy.dataset import MDPDataset
 from d3rlpy.logging import NoopAdapterFactory
+from d3rlpy.models import VectorEncoderFactory
 from d3rlpy.preprocessing import ReturnBasedRewardScaler, StandardObservationScaler
 from gymnasium.wrappers import ClipAction
 
@@ -28,8 +30,15 @@ from .sb3_returns import EVALUATION_SEED
 COLUMNS = ["data", "algorithm", "seed", "updates", "last", "last_std", "best", "d3rlpy"]
 EPISODES, INTERVAL = 20, 5_000
 _SCALED = {"observation_scaler": StandardObservationScaler()}
+_WIDE = VectorEncoderFactory([256, 256, 256])
 ALGORITHMS = {
     "bc": lambda: BCConfig(**_SCALED, learning_rate=3e-4, batch_size=256),
+    "cql": lambda: CQLConfig(
+        **_SCALED,
+        actor_encoder_factory=_WIDE,
+        critic_encoder_factory=_WIDE,
+        alpha_learning_rate=0.0,
+    ),
     "iql": lambda: IQLConfig(**_SCALED, reward_scaler=ReturnBasedRewardScaler(multiplier=1000)),
     "td3bc": lambda: TD3PlusBCConfig(**_SCALED),
 }
