@@ -79,6 +79,10 @@ class SequenceRecipe(DatasetRecipe):
     acting_num_frames: Frames | None = None
     """Number of steps that the network reads when it acts; the length of a training window by
     default and at most."""
+    full_windows: bool = False
+    """Whether windows that would pass their episode's end begin earlier. With windows as long as
+    episodes, all then begin with the first step, as they do when the agent acts; otherwise one of
+    as many as there are steps."""
     batch_size: Batch = 64
     """Windows in one gradient step."""
     learning_rate: Rate = 1e-4
@@ -280,6 +284,7 @@ class SequenceAlgorithm(DatasetAlgorithm[RecipeT]):
             recipe.backbone.num_frames,
             return_scale=1.0,
             action_padding=self.action_padding,
+            full=recipe.full_windows,
         )
 
     def measure_batch(self, samples: TensorDictBase) -> Mapping[str, Tensor]:

@@ -129,20 +129,24 @@ def sequence(
 
 
 @pytest.mark.parametrize("num_frames", [1, 5, 20])
+@pytest.mark.parametrize("full", [False, True])
 @pytest.mark.parametrize("with_next", [True, False])
-def test_every_sequence(arrays: Transitions, num_frames: int, with_next: bool) -> None:
+def test_every_sequence(arrays: Transitions, num_frames: int, with_next: bool, full: bool) -> None:
     """Of finished episodes, whose final observations need not be known."""
     arrays = {name: array[:-1] for name, array in arrays.items()}
     if not with_next:
         del arrays["next_observations"]
-    storage = SequenceStorage(episodes_from_arrays(**arrays), num_frames, return_scale=10.0)
+    storage = SequenceStorage(
+        episodes_from_arrays(**arrays), num_frames, return_scale=10.0, full=full
+    )
 
     items = storage.get(EVERY)
 
     index = 0
     for start, stop in spans(arrays):
         for step in range(stop - start):
-            expected = sequence(arrays, start, stop, step, num_frames, 10.0)
+            first = min(step, max(0, stop - start - num_frames)) if full else step
+            expected = sequence(arrays, start, stop, first, num_frames, 10.0)
             for name, values in expected.items():
                 found = items[name][index].numpy()
                 np.testing.assert_allclose(found, values, rtol=1e-6, atol=1e-6, err_msg=name)

@@ -263,12 +263,15 @@ class SequenceStorage(EpisodeStorage):
         num_frames: number K of steps, at least 1.
         return_scale: divisor of the returns-to-go.
         action_padding: value of the actions at padding, where all other entries are 0.
+        full: whether windows that would pass their episode's end begin earlier, so that only those
+            of episodes shorter than K are padded.
 
     Raises:
         ValueError: if ``num_frames`` is less than 1, or ``return_scale`` is not positive.
         DatasetError: if no episode is whole.
 
-    Source: "Decision Transformer" (arXiv 2106.01345), section 3 and its authors' code.
+    Source: "Decision Transformer" (arXiv 2106.01345), section 3 and its authors' code: that of
+    MuJoCo, or with ``full`` that of Atari.
 
     Example:
         >>> from torchrl_tit.datasets import episodes_from_arrays
@@ -287,8 +290,10 @@ class SequenceStorage(EpisodeStorage):
         *,
         return_scale: Positive = 1000.0,
         action_padding: Real = -10.0,
+        full: bool = False,
     ) -> None:
         super().__init__(episodes, episodes.lengths * episodes.is_whole)
+        self._full = full
         self._last_rows = episodes.last_rows
         self._returns_to_go = _returns_to_go(episodes).div_(return_scale).float()  # [R]
         self._action_padding = action_padding
@@ -296,6 +301,9 @@ class SequenceStorage(EpisodeStorage):
 
     def _cut(self, row: Tensor, episode: Tensor) -> tuple[Entries, torch.Size]:
         shape, row, episode = row.shape, row.unsqueeze(-1), episode.unsqueeze(-1)
+        if self._full:
+            last_full = self._last_rows[episode] - self._num_frames + 1
+            row = torch.minimum(row, last_full.clamp(min=self._first_rows[episode]))
         length = (self._last_rows[episode] - row + 1).clamp(max=self._num_frames)  # [..., 1]
         # [..., K]: below 0 at padding
         step = torch.arange(self._num_frames, device=self.device) - self._num_frames + length
