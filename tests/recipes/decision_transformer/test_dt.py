@@ -67,6 +67,19 @@ def test_a_step_is_the_protocols(tmp_path):
     torch.testing.assert_close(state["networks"][f"{frames}.variance"], std**2)
 
 
+@pytest.mark.parametrize("full", [False, True])
+def test_windows_are_trained_and_measured_as_the_recipe_says(full, tmp_path):
+    """Windows longer than any episode all begin with its first step, if they are full."""
+    backbone = replace(dt_tit(**SMALL_DT), num_frames=100)
+    recipe = make_dt(tmp_path, backbone=backbone, full_windows=full)
+    algorithm = make_algorithm(recipe)
+    algorithm.prepare(0, tmp_path)
+    measured = algorithm.measured_items(load_episodes(recipe.dataset))
+    for windows in (algorithm.buffer.sample(64), measured.get(range(len(measured)))):
+        first = windows["timestep"].masked_fill(~windows["mask"], 1_000).amin(1)
+        assert (first > 0).any() == (not full)
+
+
 def test_an_episode_of_the_evaluation_is_the_protocols(tmp_path):
     """Step by step in Gymnasium: normalized states, return to go and actions of the last steps."""
     settings: dict[str, Any] = {"target_returns": (60.0,), "evaluation_episodes": 1}
