@@ -27,6 +27,7 @@ IMPORT_HELP = (
 )
 
 _MODULE_AND_NAME = re.compile(r"(?:--[\w.-]+=)?([A-Za-z_][\w.]*):[A-Za-z_][\w/-]*(?:\(.*\))?")
+_OPTION = re.compile(r"--(?:no-)?([A-Za-z][\w.-]*)")
 
 _OURS = (str(Path(torchrl_tit.__file__).parent), str(Path(__file__).parents[1]))
 
@@ -79,6 +80,19 @@ def import_what_is_typed(arguments: list[str]) -> list[str]:
     for module in _named(rest):
         allow(module)
     return rest
+
+
+def refuse_repeated(arguments: list[str]) -> None:
+    """Raises ValueError if an option is typed twice, since only the last would count."""
+    typed: set[str] = set()
+    for found in filter(None, map(_OPTION.match, arguments)):
+        name = found[1].replace("_", "-")
+        if name in typed:
+            raise ValueError(
+                f"--{name} is there twice: type it once, with all its values behind it, such as "
+                "--seeds 0 1"
+            )
+        typed.add(name)
 
 
 def _named(arguments: list[str]) -> Iterator[str]:

@@ -10,7 +10,7 @@ from torchrl_tit.extras import EXTRAS, missing
 from torchrl_tit.settings import resolve
 from torchrl_tit.settings.checks import nearest
 
-from .arguments import fail, import_what_is_typed, one_line_warnings, program
+from .arguments import fail, import_what_is_typed, one_line_warnings, program, refuse_repeated
 
 COMMANDS = {
     "list": "named_recipes:list_recipes",
@@ -118,4 +118,5 @@ def _run(arguments: list[str]) -> None:
     name, *rest = arguments
     if name not in COMMANDS:
         fail(f"unknown command {name!r}: {nearest(name, COMMANDS)} (see `{program()} --help`)")
+    refuse_repeated(rest)
     resolve(f"{__package__}.{COMMANDS[name]}")(rest)

@@ -54,7 +54,8 @@ def summary(arguments: list[str]) -> None:
         "summary",
         "Print the interquartile mean of each network's returns over all tasks that all of them "
         "have, normalized by a random policy and the best published PPO, and the probability that "
-        "it improves on the first (arXiv 2108.13264).",
+        "it improves on the first (arXiv 2108.13264). All tasks count equally, so runs at the ends "
+        "of the middle half count in part; `table` leaves out whole runs.",
     )
     parser.add_argument("folders", type=Path, nargs="+", help="folders of runs, or tables of runs")
     parser.add_argument(

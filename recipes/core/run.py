@@ -178,7 +178,11 @@ class Run:
                 f"for {done} steps already: name a larger number"
             )
         if done and recipe != self.recipe and recipe.schedules:
-            earlier = [*self.earlier_lengths(), (done, getattr(self.recipe, field))]
+            earlier = self.earlier_lengths()
+            if not earlier or earlier[-1][0] != done:
+                earlier.append((done, getattr(self.recipe, field)))
+            elif earlier[-1][1] == length:  # back to the length that was trained with until here
+                earlier.pop()
             write_text_atomic(self.folder / _LENGTHS, json.dumps(earlier) + "\n")
         self.save_recipe(recipe)
 

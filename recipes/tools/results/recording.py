@@ -38,7 +38,7 @@ def record_runs(
 
     Raises:
         ValueError: if a folder holds no run, a run has no metrics or is damaged, the table has it
-            already, or ``under`` leads out of it.
+            already or its folder holds the run, or ``under`` leads out of it.
         RuntimeError: if another process is adding runs.
     """
     records: dict[str, Record] = {}
@@ -46,6 +46,12 @@ def record_runs(
         raise ValueError(f"--under {under} must be a path below {out}, such as screening")
     for folder in folders:
         for run in find_runs([folder]):
+            inside, outside = run.folder.resolve(), out.resolve()
+            if inside in (outside, *outside.parents) or outside in inside.parents:
+                raise ValueError(
+                    f"--out {out} holds the run {run.folder} or lies in it, so that it would count "
+                    "twice: name another folder"
+                )
             below = run.folder.relative_to(folder).as_posix()
             name = str(PurePosixPath(under, folder.resolve().name if below == "." else below))
             if name in records:

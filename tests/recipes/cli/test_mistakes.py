@@ -42,6 +42,15 @@ MISTAKES = [
     (f"{BACKBONE}.history catformer", "num_frames is 1: set it to 2 or more"),
     (f"{BACKBONE}.history decision-transformer", "use a dt or odt recipe"),
     (f"{BACKBONE}.network enhanced", "did you mean enhanced-tit"),
+    (
+        f"train {MLP} --env-settings a=1 --env-settings b=2",
+        "--env-settings is there twice: type it",
+    ),
+    (
+        f"train {MLP} --decay-learning-rate --no-decay_learning_rate",
+        "--decay-learning-rate is there",
+    ),
+    ("summary run --networks mlp --networks=d2rl", "--networks is there twice"),
     ("evaluate nowhere", "is not a run folder"),
     ("evaluate run --dataset a.hdf5 --episodes 3", "--episodes are those that are played"),
     (

@@ -130,6 +130,15 @@ def test_runs_are_added_in_any_order_and_once(runs, tmp_path):
         record_runs([runs / "wide", runs], tmp_path / "three")
 
 
+def test_a_table_apart_from_its_runs(runs, tmp_path):
+    """Otherwise a folder would hold each of them twice."""
+    for out in (runs, runs / "wide", runs / "wide" / "table", tmp_path):
+        with pytest.raises(ValueError, match="so that it would count twice: name another folder"):
+            record_runs([runs], out)
+    assert not (runs / "wide" / "table").exists()
+    assert not list(tmp_path.rglob(records.TABLE))
+
+
 def test_a_table_is_whole_when_recording_is_interrupted(runs, tmp_path, monkeypatch):
     out = tmp_path / "page"
     record_runs([runs / "mlp"], out)
